@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Airframe files: published matrices with their units and signs, converted to SI once, here."""
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+import numpy as np
+import yaml
+from flight_core.parameters import Names, Numbers, ParameterError, Parameters, Positive, as_tuple, require
+from flight_core.units import SI_PER_UNIT
+from flight_core.vectors import FloatArray
+from pydantic import BeforeValidator, Field, model_validator
+
+LIBRARY = Path(str(files("aircraft_sim"))) / "airframes"
+
+Unit = Literal["rad", "deg", "rad/s", "deg/s", "m/s", "1", "%"]
+Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1), BeforeValidator(as_tuple)]
+
+
+class Input(Parameters):
+    """One input: the unit its column of B is given in, and what a positive value does."""
+
+    unit: Unit = Field(description="the unit of this column of B")
+    positive: str = Field(description="what a positive value does")
+
+
+class Gravity(Parameters):
+    """One term f_into += gain sin(angle)."""
+
+    into: str = Field(description="the state whose derivative it adds to")
+    angle: str = Field(description="the angle, a state")
+    gain: float = Field(description="the gain, SI")
+
+
+class Airframe(Parameters):
+    """An airframe as its file states it. `A_matrix` to `gust_direction` give SI arrays."""
+
+    name: str
+    source: str = Field(description="where the figures come from")
+    speed: Positive = Field(description="the trim speed V0, m/s")
+    states: dict[str, Unit] = Field(description="units by state")
+    inputs: dict[str, Input] = Field(description="unit and sign by input")
+    outputs: Names = Field(description="the states that y = C x picks")
+    A: Matrix = Field(description="A, a row a state")
+    B: Matrix = Field(description="B, a row a state, a column an input")
+    gravity: Annotated[tuple[Gravity, ...], BeforeValidator(as_tuple)] = Field(default=(), description="sine terms of f")
+    gusts: dict[str, dict[str, float]] = Field(default={}, description="what w / V0 of each gust adds to each x_dot")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        n, m = len(self.states), len(self.inputs)
+        for key, columns in (("A", n), ("B", m)):
+            shape = [len(row) for row in getattr(self, key)]
+            require(shape == [columns] * n, key, f"rows of {shape} values", f"{n} rows of {columns}")
+        require(len(self.outputs) == m, "outputs", f"{len(self.outputs)} of them", f"{m}, as many as inputs")
+        named = {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
+        named |= {f"gravity[{i}].into": term.into for i, term in enumerate(self.gravity)}
+        named |= {f"gravity[{i}].angle": term.angle for i, term in enumerate(self.gravity)}
+        named |= {f"gusts.{gust}.{state}": state for gust, direction in self.gusts.items() for state in direction}
+        for key, name in named.items():
+            require(name in self.states, key, f"{name!r}", f"a state: {', '.join(self.states)}")
+        return self
+
+    def index(self, state: str) -> int:
+        """Place of a state in x."""
+        return list(self.states).index(state)
+
+    def A_matrix(self) -> FloatArray:
+        """A, shape (n, n), SI: A_ij unit_i / unit_j."""
+        unit = np.array([SI_PER_UNIT[u] for u in self.states.values()])
+        return np.array(self.A) * unit[:, None] / unit[None, :]
+
+    def B_matrix(self) -> FloatArray:
+        """B, shape (n, m), SI: B_ij unit_i / unit_j."""
+        row = np.array([SI_PER_UNIT[u] for u in self.states.values()])
+        column = np.array([SI_PER_UNIT[i.unit] for i in self.inputs.values()])
+        return np.array(self.B) * row[:, None] / column[None, :]
+
+    def C_matrix(self) -> FloatArray:
+        """C, shape (m, n): picks the outputs."""
+        return np.array([[float(state == output) for state in self.states] for output in self.outputs])
+
+    def gravity_matrix(self) -> FloatArray:
+        """Matrix of the sine terms, shape (n, n): f = gravity_matrix @ sin(x)."""
+        matrix = np.zeros((len(self.states), len(self.states)))
+        for term in self.gravity:
+            matrix[self.index(term.into), self.index(term.angle)] += term.gain
+        return matrix
+
+    def gust_direction(self, gust: str) -> FloatArray:
+        """What 1 m/s of a gust adds to x_dot, shape (n,). Raises ParameterError for a gust the airframe does not know."""
+        require(gust in self.gusts, "gusts", f"{gust!r}", f"one the airframe {self.name} knows: {', '.join(self.gusts)}")
+        direction = np.zeros(len(self.states))
+        for state, value in self.gusts[gust].items():
+            direction[self.index(state)] = value / self.speed
+        return direction
+
+
+def load_airframe(name: str) -> Airframe:
+    """An airframe by its name in the library, or by the path of a file. Raises ParameterError."""
+    path = Path(name) if name.endswith(".yaml") else LIBRARY / f"{name}.yaml"
+    known = ", ".join(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
+    require(path.is_file(), "airframe", f"{name!r}", f"one of {known}, or the path of an airframe file ending in .yaml")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ParameterError(f"airframe {path}: cannot be read ({' '.join(str(error).split())})") from None
+    require(isinstance(content, dict), f"airframe {path}", type(content).__name__, "a mapping")
+    return Airframe.validate_mapping(content, f"airframe {name}")

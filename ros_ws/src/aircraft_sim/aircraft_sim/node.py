@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated aircraft's node: equation (1) in real time, u in, y and truth out."""
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from flight_core.rates import nanoseconds, period_ns
+from flight_core.vectors import ChannelError
+from flight_ros.messages import from_message, to_message
+from flight_ros.runtime import FlightNode, run
+from flight_ros.ticker import Tick
+from flight_ros.topics import TRUTH, U, Y
+
+from aircraft_sim import dynamics, truth
+from aircraft_sim.params import AircraftParameters
+from aircraft_sim.plant import advance
+
+
+class AircraftNode(FlightNode[AircraftParameters]):
+    """At tick k: x from t(k-1) to t(k) under the u held since then, y(k) and truth out, then the newest u is taken."""
+
+    def __init__(self) -> None:
+        super().__init__("aircraft", AircraftParameters)
+        self._airframe, self._aircraft = self.parameters.load()
+        self._period_ns = period_ns(self.parameters.rate, "rate")
+        self._truth_names = truth.names(self._airframe, self.parameters)
+        self._x = np.zeros(len(self._airframe.states))
+        self._u = np.zeros(len(self._airframe.inputs))
+        self._u_from: str | None = None
+        self._u_inbox = self.inbox(U)
+        self._y_publisher, self._truth_publisher = self.publisher(Y), self.publisher(TRUTH)
+
+    def period_ns(self) -> int:
+        return self._period_ns
+
+    def start_ns(self) -> int:
+        return nanoseconds(self.parameters.start_time)
+
+    def tick(self, tick: Tick, now_ns: int) -> None:
+        before_ns, t_ns = tick.previous * self._period_ns, tick.index * self._period_ns
+        self._x = advance(before_ns, self._x, self._u, t_ns - before_ns, self.parameters.step_ns, self._aircraft)
+        y = dynamics.y(self._x, self._aircraft)
+        self._y_publisher.publish(to_message(now_ns, self._airframe.outputs, y, self.instance))
+        values = truth.values(t_ns, self._x, self._aircraft)
+        self._truth_publisher.publish(to_message(now_ns, self._truth_names, values, self.instance))
+        self._take_u()
+
+    def _take_u(self) -> None:
+        for received in self._u_inbox.take():
+            message = received.message
+            if self._u_from is None:
+                self._u_from = message.header.frame_id
+                self.get_logger().info(f"flown by {self._u_from}")
+            elif message.header.frame_id != self._u_from:
+                self.reject(self._u_inbox, "sender", f"{message.header.frame_id} commands too, beside {self._u_from}")
+                continue
+            try:
+                self._u = from_message(message, list(self._airframe.inputs)).value
+            except ChannelError as error:
+                self.reject(self._u_inbox, error.reason, str(error))
+        if self._u_from is None:
+            self.waiting_for(self._u_inbox)
+
+    def status(self) -> tuple[bytes, str, dict[str, object]]:
+        if self._u_from is None:
+            return DiagnosticStatus.WARN, "no u yet, flying in trim", {}
+        return DiagnosticStatus.OK, f"flown by {self._u_from}", {}
+
+
+def main() -> None:
+    """Entry point of the executable `aircraft`."""
+    run(AircraftNode)
+
+
+if __name__ == "__main__":
+    main()

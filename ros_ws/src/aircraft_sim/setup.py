@@ -1,0 +1,17 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+setup(
+    name="aircraft_sim",
+    version="0.1.0",
+    description="Simulated aircraft of the RISE-DI flight stack: x_dot = A x + f(x, t) + B u, y = C x, with gusts.",
+    license="Apache-2.0",
+    packages=["aircraft_sim"],
+    package_data={"aircraft_sim": ["airframes/*.yaml"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/aircraft_sim"]),
+        ("share/aircraft_sim", ["package.xml"]),
+    ],
+    entry_points={"console_scripts": ["aircraft = aircraft_sim.node:main"]},
+)

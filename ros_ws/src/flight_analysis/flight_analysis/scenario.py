@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A scenario: the validated parameters of every node that one file holds, checked against each other."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from aircraft_sim.params import AircraftParameters
+from flight_core.parameters import Parameters, Positive, require
+from flight_core.rates import divide, period_ns
+from flight_core.scenario import read_sections
+from flight_recorder.params import RecorderParameters
+from pydantic import Field
+from reference_model.params import ReferenceModelParameters
+from rise_di_controller.params import ControllerParameters
+
+
+class FlightParameters(Parameters):
+    """What whoever runs the scenario needs to know."""
+
+    duration: Positive = Field(description="how long to fly, s")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One scenario file, read and checked."""
+
+    name: str
+    path: Path
+    flight: FlightParameters
+    aircraft: AircraftParameters
+    reference_model: ReferenceModelParameters
+    controller: ControllerParameters
+    recorder: RecorderParameters
+
+    def with_duration(self, duration: float) -> "Scenario":
+        """The same flight, shorter or longer. Raises ParameterError unless the duration is positive."""
+        return replace(self, flight=FlightParameters.validate_mapping({"duration": duration}, "flight"))
+
+    def without_gusts(self) -> "Scenario":
+        """The same flight in calm air."""
+        return replace(self, aircraft=self.aircraft.model_copy(update={"gusts": {}}))
+
+    def gust_windows(self) -> dict[str, tuple[float, float]]:
+        """From when to when each gust blows, s: entry to entry + 2 H / V0."""
+        _, aircraft = self.aircraft.load()
+        return {
+            name: (gust.start, gust.start + 2.0 * gust.length / float(aircraft.speed))
+            for name, gust in self.aircraft.gusts.items()
+        }
+
+
+SCHEMAS: dict[str, type[Parameters]] = {
+    "flight": FlightParameters,
+    "aircraft": AircraftParameters,
+    "reference_model": ReferenceModelParameters,
+    "controller": ControllerParameters,
+    "recorder": RecorderParameters,
+}
+
+
+def load_scenario(path: Path) -> Scenario:
+    """Read a scenario file and check each section alone and all of them together. Raises ParameterError with one sentence."""
+    sections = read_sections(path, tuple(SCHEMAS))
+    checked = {name: schema.validate_mapping(sections[name], name) for name, schema in SCHEMAS.items()}
+    scenario = Scenario(name=path.stem, path=path, **checked)  # type: ignore[arg-type]  # SCHEMAS says which type each has
+    _check_together(scenario)
+    return scenario
+
+
+def _check_together(scenario: Scenario) -> None:
+    airframe, _ = scenario.aircraft.load()
+    controller, reference = scenario.controller, scenario.reference_model
+    for key, found, expected in (
+        ("controller.outputs", controller.outputs, airframe.outputs),
+        ("controller.inputs", controller.inputs, tuple(airframe.inputs)),
+        ("reference_model.outputs", reference.outputs, airframe.outputs),
+    ):
+        require(
+            sorted(found) == sorted(expected),
+            key,
+            ", ".join(found),
+            f"the channels of the airframe {airframe.name} in any order: {', '.join(expected)}",
+        )
+    control_ns = period_ns(controller.rate, "controller.rate")
+    divide(control_ns, period_ns(scenario.aircraft.rate, "aircraft.rate"), "1 / aircraft.rate", "1 / controller.rate")
+    divide(control_ns, period_ns(reference.rate, "reference_model.rate"), "1 / reference_model.rate", "1 / controller.rate")

@@ -1,0 +1,20 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+from glob import glob
+
+from setuptools import setup
+
+setup(
+    name="flight_bringup",
+    version="0.1.0",
+    description="Scenarios, launch files and the rise-di command of the RISE-DI flight stack.",
+    license="Apache-2.0",
+    packages=["flight_bringup"],
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/flight_bringup"]),
+        ("share/flight_bringup", ["package.xml"]),
+        ("share/flight_bringup/launch", sorted(glob("launch/*.launch.py"))),
+        ("share/flight_bringup/config", sorted(glob("config/*.yaml"))),
+    ],
+    entry_points={"console_scripts": ["rise-di = flight_bringup.cli:main"]},
+)

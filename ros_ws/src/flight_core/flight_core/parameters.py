@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Validated parameter sets: one declaration a set, one sentence an error.
+
+A set is a frozen pydantic model. `validate` builds it from the nested mapping that a scenario file or a ROS node
+holds, and turns whatever does not fit into a `ParameterError` of one sentence: the key, what was found, what is expected.
+"""
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Self
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+
+class ParameterError(ValueError):
+    """A parameter, or a set of them, that cannot be flown. The message is one sentence for the user."""
+
+
+class Parameters(BaseModel):
+    """Base of every parameter set: frozen, finite, strictly typed (an int may stand for a float), no unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @classmethod
+    def validate_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
+        """Build the set from a nested mapping; `where` names it in errors, e.g. "controller".
+
+        Raises ParameterError with one sentence for the first key that does not fit.
+        """
+        try:
+            return cls.model_validate(dict(values))
+        except ValidationError as error:
+            first, *others = error.errors()
+            more = f" (and {len(others)} more)" if others else ""
+            raise ParameterError(_sentence(cls, where, first) + more) from None
+
+
+def as_tuple(value: object) -> object:
+    """Lists and arrays as tuples; anything else as it is, for the validator behind to refuse."""
+    return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+
+
+# Sequences of a YAML file or a ROS message arrive as lists or arrays; a frozen set keeps tuples.
+Numbers = Annotated[tuple[float, ...], Field(min_length=1), BeforeValidator(as_tuple)]
+Positives = Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1), BeforeValidator(as_tuple)]
+Names = Annotated[tuple[str, ...], Field(min_length=1), BeforeValidator(as_tuple)]
+Signs = Annotated[tuple[int, ...], Field(min_length=1), BeforeValidator(as_tuple)]
+Positive = Annotated[float, Field(gt=0)]
+
+
+def require(condition: bool, key: str, found: object, expected: str) -> None:
+    """Raise ParameterError naming `key`, what was found and what is expected, unless the condition holds."""
+    if not condition:
+        raise ParameterError(f"{key}: found {found}, expected {expected}")
+
+
+def require_length(key: str, values: Sequence[object], names: Sequence[str]) -> None:
+    """Raise ParameterError unless there is one value for each of the named channels."""
+    require(len(values) == len(names), key, f"{len(values)} values", f"{len(names)}, one for each of {', '.join(names)}")
+
+
+def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Nested mapping -> (dotted name, value) pairs, as ROS 2 names its parameters; absent (None) values are left out."""
+    for key, value in mapping.items():
+        if isinstance(value, Mapping):
+            yield from flatten(value, f"{prefix}{key}.")
+        elif value is not None:
+            yield prefix + key, value
+
+
+def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted names -> nested mapping: the inverse of `flatten`. Raises ParameterError where a name is value and group."""
+    tree: dict[str, Any] = {}
+    for name, value in flat.items():
+        *groups, leaf = name.split(".")
+        node = tree
+        for group in groups:
+            node = node.setdefault(group, {})
+            require(isinstance(node, dict), name, "both a value and a group", "one of the two")
+        require(leaf not in node, name, "both a value and a group", "one of the two")
+        node[leaf] = value
+    return tree
+
+
+def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
+    location, kind, found = error["loc"], error["type"], error["input"]
+    key = where + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
+    if kind == "extra_forbidden":
+        known = sorted(_fields_at(cls, location[:-1]))
+        near = difflib.get_close_matches(str(location[-1]), known, n=1)
+        return f"{key}: unknown key, expected {f'{near[0]} perhaps, or another' if near else 'one'} of {', '.join(known)}"
+    if kind == "missing":
+        field = _fields_at(cls, location[:-1]).get(str(location[-1]))
+        meaning = field.description if field is not None and field.description else "a value"
+        return f"{key}: missing, expected {meaning}"
+    if kind == "value_error":
+        return f"{key}.{error['ctx']['error']}"  # raised by `require`: the rest of the key and the sentence
+    expected = error["msg"].removeprefix("Input should be ").removeprefix("a valid ")
+    return f"{key}: found {found!r}, expected {expected}"
+
+
+def _fields_at(cls: type[BaseModel], location: Sequence[str | int]) -> dict[str, Any]:
+    model: Any = cls
+    for part in location:
+        if not (isinstance(model, type) and issubclass(model, BaseModel)):
+            return {}
+        annotation = model.model_fields[str(part)].annotation if str(part) in model.model_fields else None
+        candidates = [annotation, *getattr(annotation, "__args__", ())]
+        model = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), None)
+    return dict(model.model_fields) if isinstance(model, type) and issubclass(model, BaseModel) else {}

@@ -1,0 +1,35 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Rates and periods. A period is a whole number of nanoseconds, so that k periods add up exactly."""
+
+from flight_core.parameters import require
+
+NANOSECONDS = 1_000_000_000
+
+
+def seconds(time_ns: int) -> float:
+    """Nanoseconds as float seconds, by one rounding only: t = time_ns / 1e9."""
+    return time_ns / NANOSECONDS
+
+
+def nanoseconds(time: float) -> int:
+    """Seconds as the nearest whole number of nanoseconds."""
+    return round(time * NANOSECONDS)
+
+
+def period_ns(rate: float, key: str) -> int:
+    """Period of a rate in Hz. Raises ParameterError naming `key` where 1e9 / rate is not a whole number of nanoseconds."""
+    period = nanoseconds(1.0 / rate)
+    require(abs(period * rate - NANOSECONDS) < 1e-3, key, f"{rate:g} Hz", "a rate whose period is a whole number of nanoseconds")
+    return period
+
+
+def divide(whole_ns: int, part_ns: int, key: str, whole: str) -> int:
+    """How many parts make the whole. Raises ParameterError naming `key` where they do not divide."""
+    require(
+        part_ns > 0 and whole_ns % part_ns == 0,
+        key,
+        f"{seconds(part_ns):g} s",
+        f"a whole fraction of {whole} ({seconds(whole_ns):g} s)",
+    )
+    return whole_ns // part_ns

@@ -1,0 +1,46 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Scenario files: one ROS parameter file, a section for each node, read without ROS.
+
+    /**/controller:
+      ros__parameters:
+        rate: 100.0    # Hz
+"""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from flight_core.parameters import ParameterError, require
+
+Sections = dict[str, dict[str, Any]]
+
+
+def read_sections(path: Path, expected: tuple[str, ...]) -> Sections:
+    """Sections of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
+
+    Raises ParameterError where the file cannot be read, is not such a file, or lacks or adds a section.
+    """
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError(f"{path}: cannot be read ({error}), expected a scenario file") from None
+    except yaml.YAMLError as error:
+        raise ParameterError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    require(isinstance(tree, dict), str(path), f"{type(tree).__name__}", f"a mapping with {', '.join(expected)}")
+    sections: Sections = {}
+    for key, content in tree.items():
+        name = str(key).removeprefix("/**/").removeprefix("/")
+        require(name in expected, f"{path.name}: {name}", "a section", f"only {', '.join(expected)}")
+        values = content.get("ros__parameters") if isinstance(content, dict) else None
+        require(
+            isinstance(values, dict) and set(content) == {"ros__parameters"},
+            f"{path.name}: {name}",
+            "no mapping under ros__parameters",
+            "one mapping there, as in every ROS parameter file",
+        )
+        sections[name] = values
+    for name in expected:
+        require(name in sections, f"{path.name}: {name}", "no such section", f"one for each of {', '.join(expected)}")
+    return sections

@@ -1,0 +1,58 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The tape: the one in-memory log of a flight, whatever flew it (in one process, over topics, read from a bag)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight_core.rates import NANOSECONDS
+from flight_core.vectors import FloatArray
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One topic: N samples of k named channels, SI units and radians.
+
+    stamp_ns: shape (N,), int64, the instant each sample belongs to. values: shape (N, k).
+    """
+
+    stamp_ns: NDArray[np.int64]
+    names: tuple[str, ...]
+    values: FloatArray
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """Samples of one channel, shape (N,). Raises KeyError naming the channels there are."""
+        if name not in self.names:
+            raise KeyError(f"no channel {name} among {', '.join(self.names)}")
+        return self.values[:, self.names.index(name)]
+
+    def group(self, prefix: str) -> "Signal":
+        """The channels called "prefix.name", as a signal with channels "name"."""
+        columns = [i for i, name in enumerate(self.names) if name.startswith(prefix + ".")]
+        names = tuple(self.names[i].removeprefix(prefix + ".") for i in columns)
+        return Signal(self.stamp_ns, names, self.values[:, columns])
+
+
+@dataclass(frozen=True)
+class Tape:
+    """A flight: signals by topic name. `start_ns` is the stamp of flight time t = 0."""
+
+    signals: Mapping[str, Signal]
+    start_ns: int = 0
+    notes: tuple[str, ...] = field(default=())
+
+    def __getitem__(self, topic: str) -> Signal:
+        """The signal of a topic. Raises KeyError naming the topics there are."""
+        if topic not in self.signals:
+            raise KeyError(f"no topic {topic} on this tape, only {', '.join(self.signals) or 'none'}")
+        return self.signals[topic]
+
+    def __contains__(self, topic: str) -> bool:
+        return topic in self.signals
+
+    def time(self, topic: str) -> FloatArray:
+        """Flight time of each sample of a topic in s, shape (N,): t = (stamp - start) / 1e9."""
+        return (self[topic].stamp_ns - self.start_ns) / NANOSECONDS

@@ -1,0 +1,15 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Units of airframe files, converted to SI once, at load. Everything past that point is SI and radians."""
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+
+GRAVITY = 9.81
+"""Standard gravity as the airframes round it, m/s^2."""
+
+SI_PER_UNIT: Mapping[str, float] = MappingProxyType(
+    {"rad": 1.0, "deg": math.pi / 180.0, "rad/s": 1.0, "deg/s": math.pi / 180.0, "m/s": 1.0, "1": 1.0, "%": 0.01}
+)
+"""How much of the SI unit (rad, rad/s, m/s, 1) one of each unit is: value_SI = value * SI_PER_UNIT[unit]."""

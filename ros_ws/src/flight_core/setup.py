@@ -1,0 +1,15 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+setup(
+    name="flight_core",
+    version="0.1.0",
+    description="Shared words of the RISE-DI flight stack: validated parameters, named vectors, integrators, rates, scenario files, tapes.",
+    license="Apache-2.0",
+    packages=["flight_core"],
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/flight_core"]),
+        ("share/flight_core", ["package.xml"]),
+    ],
+)

@@ -1,0 +1,47 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Message definitions from the installed packages, as MCAP and rosbag2 want them. Needs no ROS, only its share folders."""
+
+import json
+import os
+import sys
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+from flight_core.parameters import ParameterError
+
+
+class Definition(NamedTuple):
+    """A message type as a log stores it."""
+
+    name: str  # "sensor_msgs/msg/JointState"
+    text: str  # its definition and those of all it refers to
+    type_hash: str  # "RIHS01_..."
+
+
+@cache
+def definition(name: str) -> Definition:
+    """Definition of "pkg/msg/Type". Raises ParameterError where its package is not installed.
+
+    The text is the main definition, then for each type that it refers to a line of 80 "=", "MSG: pkg/Type" and that definition
+    (MCAP registry, schema encoding ros2msg). The hash is that of REP 2016, read from the package's own JSON.
+    """
+    description = json.loads(_read(name, "json"))
+    parts = [_read(name, "msg")]
+    for referenced in description["type_description_msg"]["referenced_type_descriptions"]:
+        package, _, kind = referenced["type_name"].partition("/msg/")
+        parts.append(f"{'=' * 80}\nMSG: {package}/{kind}\n{_read(referenced['type_name'], 'msg')}")
+    hashes = {entry["type_name"]: entry["hash_string"] for entry in description["type_hashes"]}
+    return Definition(name, "\n".join(parts), hashes[name])
+
+
+def _read(name: str, suffix: str) -> str:
+    package, _, kind = name.partition("/msg/")
+    # The wheels install into the prefix of the interpreter and set no AMENT_PREFIX_PATH.
+    prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
+    for prefix in prefixes:
+        path = Path(prefix) / "share" / package / "msg" / f"{kind}.{suffix}"
+        if path.is_file():
+            return path.read_text(encoding="utf-8")
+    raise ParameterError(f"{name}: no {kind}.{suffix} in {', '.join(prefixes)}; install the package {package}")

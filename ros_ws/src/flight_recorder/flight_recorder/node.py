@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The recorder's node: every topic of a flight, as it came over the wire, to one MCAP bag."""
+
+import time
+from collections import Counter
+from datetime import UTC, datetime
+from pathlib import Path
+
+import yaml
+from diagnostic_msgs.msg import DiagnosticStatus
+from flight_core.parameters import ParameterError
+from flight_core.rates import nanoseconds, period_ns
+from flight_ros.inbox import Inbox
+from flight_ros.runtime import FlightNode, run
+from flight_ros.ticker import Tick
+from flight_ros.topics import FLIGHT, PUBLISH, RECORD, Topic
+from rclpy.qos import QoSProfile
+
+from flight_recorder.bag import BagWriter
+from flight_recorder.params import RecorderParameters
+
+FLUSH_PERIOD = 0.1  # s, what a killed recorder loses at most
+
+READY = "recording to"
+
+
+class RecorderNode(FlightNode[RecorderParameters]):
+    """Takes all that has arrived at each tick and appends it to the bag."""
+
+    def __init__(self) -> None:
+        super().__init__("recorder", RecorderParameters)
+        default = f"runs/{datetime.now(UTC):%Y%m%dT%H%M%SZ}-recording"
+        directory = Path(self.parameters.directory or default).absolute()
+        scenario = self._scenario()
+        try:
+            self._bag = BagWriter(directory)
+        except OSError as error:
+            raise ParameterError(f"recorder.directory: {directory} cannot be written ({error.strerror})") from None
+        if scenario is not None:
+            self._bag.attach(scenario.name, "application/yaml", scenario.read_bytes(), time.time_ns())
+        self._bag.note("rise_di", {"start_ns": str(nanoseconds(self.parameters.start_time))})
+        self._recorded = [self._record(topic) for topic in FLIGHT]
+        self._last_sequence: dict[str, int] = {}
+        self.lost: Counter[str] = Counter()
+        self._flushed_ns = time.monotonic_ns()
+        self.get_logger().info(f"{READY} {self._bag.path}")
+
+    def _scenario(self) -> Path | None:
+        if not self.parameters.scenario_file:
+            return None
+        path = Path(self.parameters.scenario_file)
+        if not path.is_file():
+            raise ParameterError(f"recorder.scenario_file: found {str(path)!r}, expected the path of a scenario file")
+        return path
+
+    def _record(self, topic: Topic) -> Inbox:
+        inbox = self.inbox(topic, RECORD, raw=True)
+        type_name = f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
+        self._bag.add_topic(inbox.name, type_name, _qos_yaml(PUBLISH))
+        return inbox
+
+    def period_ns(self) -> int:
+        return period_ns(self.parameters.rate, "rate")
+
+    def tick(self, tick: Tick, now_ns: int) -> None:
+        for inbox in self._recorded:
+            for received in inbox.take():
+                self._bag.write(inbox.name, received.received_ns, received.sent_ns, received.sequence, received.message)
+                self._count_gap(inbox, received.sequence)
+        if time.monotonic_ns() - self._flushed_ns > nanoseconds(FLUSH_PERIOD):
+            self._flushed_ns = time.monotonic_ns()
+            self._bag.flush()
+
+    def _count_gap(self, inbox: Inbox, sequence: int) -> None:
+        # Every node publishes on /diagnostics, so its sequences interleave and tell nothing.
+        if inbox.topic.name.startswith("/"):
+            return
+        gap = sequence - self._last_sequence.get(inbox.name, sequence - 1) - 1
+        self._last_sequence[inbox.name] = sequence
+        if gap > 0:
+            self.lost[inbox.name] += gap
+            self.get_logger().warning(f"{inbox.name}: {gap} messages lost", throttle_duration_sec=2.0)
+
+    def status(self) -> tuple[bytes, str, dict[str, object]]:
+        counts = {f"messages {name}": channel.count for name, channel in self._bag.channels.items()}
+        lost = {f"lost {name}": count for name, count in self.lost.items()}
+        level = DiagnosticStatus.WARN if lost else DiagnosticStatus.OK
+        return level, f"{READY} {self._bag.path}", counts | lost
+
+    def close(self) -> None:
+        for inbox in self._recorded:
+            for received in inbox.take():
+                self._bag.write(inbox.name, received.received_ns, received.sent_ns, received.sequence, received.message)
+        self._bag.note("rise_di_lost", {name: str(count) for name, count in self.lost.items()})
+        self._bag.close()
+        total = sum(channel.count for channel in self._bag.channels.values())
+        self.get_logger().info(f"{total} messages in {self._bag.path}")
+
+
+def _qos_yaml(qos: QoSProfile) -> str:
+    forever = {"sec": 9223372036, "nsec": 854775807}
+    profile = {
+        "history": "keep_last",
+        "depth": qos.depth,
+        "reliability": qos.reliability.short_key,
+        "durability": qos.durability.short_key,
+        "deadline": forever,
+        "lifespan": forever,
+        "liveliness": "automatic",
+        "liveliness_lease_duration": forever,
+        "avoid_ros_namespace_conventions": False,
+    }
+    return yaml.safe_dump([profile], sort_keys=False)
+
+
+def main() -> None:
+    """Entry point of the executable `recorder`."""
+    run(RecorderNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""ROS parameters as a validated set: what was given is checked as a whole, then every parameter is declared and described."""
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from flight_core.parameters import Parameters, flatten, nest
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+
+P = TypeVar("P", bound=Parameters)
+NOT_OURS = ("use_sim_time", "start_type_description_service", "qos_overrides")
+
+
+def read_parameters(node: Node, schema: type[P]) -> P:
+    """Validate the overrides of a node made with automatically_declare_parameters_from_overrides.
+
+    Afterwards every parameter of the set is declared, read-only, with its description. Raises ParameterError.
+    """
+    given = {
+        name: _plain(parameter.value)
+        for name, parameter in node.get_parameters_by_prefix("").items()
+        if name.split(".")[0] not in NOT_OURS
+    }
+    parameters = schema.validate_mapping(nest(given), node.get_name())
+    descriptions = dict(_descriptions(schema))
+    for name, value in flatten(parameters.model_dump()):
+        descriptor = ParameterDescriptor(description=descriptions.get(name.split(".")[0], ""), read_only=True, dynamic_typing=True)
+        if node.has_parameter(name):
+            node.set_descriptor(name, descriptor)
+        elif value != ():
+            node.declare_parameter(name, value, descriptor)
+    return parameters
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, str | bytes | Mapping) or not hasattr(value, "__iter__") else list(value)
+
+
+def _descriptions(schema: type[Parameters]) -> list[tuple[str, str]]:
+    return [(name, field.description or "") for name, field in schema.model_fields.items()]

@@ -1,0 +1,215 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The skeleton of every node: parameters, topics, ticks, diagnostics, a clean end."""
+
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from flight_core.parameters import ParameterError, Parameters
+from flight_core.rates import NANOSECONDS, nanoseconds, seconds
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.signals import SignalHandlerOptions
+
+from flight_ros import transport
+from flight_ros.inbox import Inbox
+from flight_ros.parameters import read_parameters
+from flight_ros.ticker import Tick, Ticker
+from flight_ros.topics import DIAGNOSTICS, LISTEN, PUBLISH, Topic
+
+P = TypeVar("P", bound=Parameters)
+
+NICE_PAUSE = 0.02  # s, the longest sleep, so that a signal or a service call is not left waiting
+
+
+class FlightNode(Node, Generic[P]):
+    """A node that works at fixed ticks. A subclass says at which rate, and what one tick does."""
+
+    def __init__(self, name: str, schema: type[P]) -> None:
+        super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        self.parameters = read_parameters(self, schema)
+        self.instance = f"{self.get_fully_qualified_name()}#{os.getpid()}"
+        self.rejected: Counter[str] = Counter()
+        self._inboxes: list[Inbox] = []
+        self._diagnostics = self.publisher(DIAGNOSTICS)
+        self._periods: list[int] = []
+        self._compute: list[int] = []
+        self._missed = 0
+        self._last_tick_ns: int | None = None
+
+    # What a subclass says
+
+    def period_ns(self) -> int:
+        """The period of the ticks."""
+        raise NotImplementedError
+
+    def start_ns(self) -> int:
+        """System time of tick 0 in ns; 0 starts at once."""
+        return 0
+
+    def tick(self, tick: Tick, now_ns: int) -> None:
+        """One tick; `now_ns` is the nominal instant of tick.index on the system clock's scale."""
+        raise NotImplementedError
+
+    def status(self) -> tuple[bytes, str, dict[str, object]]:
+        """Level, sentence and further figures for the 1 Hz diagnostics."""
+        return DiagnosticStatus.OK, "running", {}
+
+    def close(self) -> None:
+        """Called once when the node ends, whatever ended it."""
+
+    # What a subclass uses
+
+    def publisher(self, topic: Topic) -> Publisher:
+        """A publisher on a topic of the flight."""
+        return self.create_publisher(topic.type, topic.name, PUBLISH)
+
+    def inbox(self, topic: Topic, qos: QoSProfile = LISTEN, *, raw: bool = False) -> Inbox:
+        """A subscription that is read at the tick; its publishers are checked once a second."""
+        inbox = Inbox(self, topic, qos, raw=raw)
+        self._inboxes.append(inbox)
+        return inbox
+
+    def reject(self, inbox: Inbox, reason: str, sentence: str) -> None:
+        """Count a sample that cannot be used, and say so at most once in 2 s."""
+        self.rejected[f"{inbox.topic.name}: {reason}"] += 1
+        self.get_logger().warning(f"{inbox.name}: sample refused: {sentence}", throttle_duration_sec=2.0)
+
+    def waiting_for(self, inbox: Inbox) -> None:
+        """Say, at most once in 2 s, that nothing comes on a topic, and who is there."""
+        count = self.count_publishers(inbox.name)
+        who = f"{count} publishers but no sample yet" if count else "no publisher there"
+        self.get_logger().warning(f"waiting for {inbox.name}: {who}", throttle_duration_sec=2.0)
+
+    # What the loop does
+
+    def run_tick(self, tick: Tick, now_ns: int) -> None:
+        """One tick, timed."""
+        begin_ns = time.monotonic_ns()
+        if self._last_tick_ns is not None:
+            self._periods.append(begin_ns - self._last_tick_ns)
+        self._last_tick_ns = begin_ns
+        self._missed += tick.missed
+        self.tick(tick, now_ns)
+        self._compute.append(time.monotonic_ns() - begin_ns)
+
+    def check_graph(self) -> None:
+        """Say what keeps a topic silent for ever: another type, or an incompatible quality of service."""
+        for inbox in self._inboxes:
+            wanted = f"{inbox.topic.type.__module__.split('.')[0]}/msg/{inbox.topic.type.__name__}"
+            for peer in self.get_publishers_info_by_topic(inbox.name):
+                node = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
+                if peer.topic_type != wanted:
+                    self.get_logger().error(
+                        f"{inbox.name}: {node} publishes {peer.topic_type}, expected {wanted}", throttle_duration_sec=5.0
+                    )
+                    continue
+                compatibility, reason = qos_check_compatible(peer.qos_profile, inbox.qos)
+                if compatibility == QoSCompatibility.ERROR:
+                    self.get_logger().error(
+                        f"{inbox.name}: quality of service of {node} does not fit: {reason}", throttle_duration_sec=5.0
+                    )
+
+    def publish_diagnostics(self) -> None:
+        """The 1 Hz report: loop period, compute time, missed ticks, refused samples, and what the node adds."""
+        level, sentence, figures = self.status()
+        shown: dict[str, object] = {"missed ticks": self._missed}
+        for key, sample in (("period", self._periods), ("compute time", self._compute)):
+            if sample:
+                values = np.array(sample) * 1e-9
+                shown |= {
+                    f"{key} mean (s)": f"{values.mean():.6f}",
+                    f"{key} p99 (s)": f"{np.percentile(values, 99):.6f}",
+                    f"{key} max (s)": f"{values.max():.6f}",
+                }
+                sample.clear()
+        shown |= {f"refused {reason}": count for reason, count in self.rejected.items()} | figures
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.header.frame_id = self.instance
+        message.status = [
+            DiagnosticStatus(
+                level=level,
+                name=self.get_fully_qualified_name(),
+                message=sentence,
+                hardware_id=self.instance,
+                values=[KeyValue(key=key, value=str(value)) for key, value in shown.items()],
+            )
+        ]
+        self._diagnostics.publish(message)
+
+
+def run(make_node: Callable[[], FlightNode[Any]]) -> None:
+    """Run a node until SIGINT or SIGTERM, then leave with exit status 0; 2 for bad parameters, 1 for a fault.
+
+    Ticks run on the monotonic clock in the main thread; what comes over topics is taken at the tick. The executor serves
+    parameters and services, after ticks and without ever waiting.
+    """
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        transport.prepare()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        node = make_node()
+    except ParameterError as error:
+        sys.exit(_refuse(str(error)))
+    except (InvalidParameterTypeException, rclpy.exceptions.ParameterException, rclpy._rclpy_pybind11.RCLError) as error:
+        sys.exit(_refuse(" ".join(str(error).split())))
+    try:
+        if sockets := transport.open_to_network():
+            node.get_logger().error(f"the loopback profile is not in force: sockets open to the network: {', '.join(sockets)}")
+        _loop(node, stop)
+    except Exception:
+        node.get_logger().fatal(f"fault, the node ends: {traceback.format_exc()}")
+        sys.exit(1)
+    finally:
+        node.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _refuse(sentence: str) -> int:
+    print(f"error: {sentence}", file=sys.stderr)
+    rclpy.try_shutdown()
+    return 2
+
+
+def _loop(node: FlightNode[Any], stop: threading.Event) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    start_ns = node.start_ns() or time.time_ns()
+    ticker = Ticker(node.period_ns(), time.monotonic_ns() + start_ns - time.time_ns())
+    if (lead := start_ns - time.time_ns()) > nanoseconds(60):
+        node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
+    gc.collect()
+    gc.freeze()  # a collection then takes microseconds, not tens of milliseconds
+    serve_ns = report_ns = time.monotonic_ns()
+    while not stop.is_set():
+        pause = ticker.remaining()
+        if pause > 0:
+            time.sleep(min(pause, NICE_PAUSE))
+        if (tick := ticker.due()) is not None:
+            node.run_tick(tick, start_ns + tick.index * ticker.period_ns)
+        now_ns = time.monotonic_ns()
+        if now_ns >= serve_ns:
+            serve_ns = now_ns + nanoseconds(NICE_PAUSE)
+            executor.spin_once(timeout_sec=0)
+        if now_ns >= report_ns:
+            report_ns = now_ns + NANOSECONDS
+            node.publish_diagnostics()
+            node.check_graph()

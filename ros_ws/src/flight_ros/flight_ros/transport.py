@@ -1,0 +1,45 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The middleware's transport: loopback only, unless the user names a profile of his own.
+
+Fast DDS falls back to all interfaces, silently, when it cannot read its profile; so the file is checked before rclpy starts
+and the sockets after.
+"""
+
+import os
+from importlib.resources import files
+from pathlib import Path
+from xml.etree import ElementTree
+
+import psutil
+from flight_core.parameters import ParameterError
+
+PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+DISCOVERY_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+LOOPBACK_PROFILE = Path(str(files("flight_ros"))) / "loopback.xml"
+
+
+def environment() -> dict[str, str]:
+    """Variables that put a process on the loopback transport; empty where the user has named a profile of his own."""
+    if PROFILE_VARIABLE in os.environ:
+        return {}
+    # SYSTEM_DEFAULT leaves discovery to the profile; LOCALHOST would add shared memory to it.
+    return {PROFILE_VARIABLE: str(LOOPBACK_PROFILE), DISCOVERY_VARIABLE: "SYSTEM_DEFAULT"}
+
+
+def prepare() -> None:
+    """Set the environment before rclpy starts. Raises ParameterError where the named profile cannot be read as XML."""
+    os.environ.update(environment())
+    profile = os.environ[PROFILE_VARIABLE]
+    try:
+        ElementTree.parse(profile)  # noqa: S314 - the user's own configuration file, not foreign input
+    except (OSError, ElementTree.ParseError) as error:
+        raise ParameterError(f"{PROFILE_VARIABLE}: {profile} cannot be read ({error}), expected a Fast DDS profile") from None
+
+
+def open_to_network() -> list[str]:
+    """UDP sockets of this process that listen on all interfaces although the loopback profile is in force; should be none."""
+    if os.environ.get(PROFILE_VARIABLE) != str(LOOPBACK_PROFILE):
+        return []
+    sockets = psutil.Process().net_connections(kind="udp")
+    return [f"{s.laddr.ip}:{s.laddr.port}" for s in sockets if s.laddr and s.laddr.ip in ("0.0.0.0", "::")]  # noqa: S104 - compared, not bound

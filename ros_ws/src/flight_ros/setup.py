@@ -1,0 +1,16 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+setup(
+    name="flight_ros",
+    version="0.1.0",
+    description="The only shared ROS code of the RISE-DI flight stack: topics, parameters, messages as named vectors, the ticker, the node skeleton.",
+    license="Apache-2.0",
+    packages=["flight_ros"],
+    package_data={"flight_ros": ["loopback.xml"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/flight_ros"]),
+        ("share/flight_ros", ["package.xml"]),
+    ],
+)

@@ -1,0 +1,53 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The reference model, equation (2): x_m_dot = A_m x_m + B_m u_m, y_m = C x_m."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from flight_core.integrators import rk4
+from flight_core.vectors import Array, FloatArray
+
+
+class Model(NamedTuple):
+    """Matrices of equation (2): A_m (n, n) Hurwitz, B_m (n, m), C (m, n)."""
+
+    A_m: Array
+    B_m: Array
+    C: Array
+
+
+def x_m_dot(t: Any, x_m: Array, u_m: Array, params: Model) -> Array:
+    """Equation (2): A_m x_m + B_m u_m, shape (n,)."""
+    return params.A_m @ x_m + params.B_m @ u_m
+
+
+def output(x_m: Array, params: Model) -> Array:
+    """Reference output y_m = C x_m, shape (m,)."""
+    return params.C @ x_m
+
+
+def step(t: Any, x_m: Array, command: Callable[[Any], Array], dt: Any, params: Model) -> Array:
+    """x_m(t + dt) by one Runge-Kutta step of equation (2) with u_m = command(t) taken at the stages."""
+
+    def driven(time: Any, x: Array, _: None, model: Model) -> Array:
+        return x_m_dot(time, x, command(time), model)
+
+    return rk4(driven, t, x_m, None, params, dt)
+
+
+def second_order(natural_frequency: FloatArray, damping: FloatArray) -> Model:
+    """One filter a channel: y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i, with n = 2m.
+
+    States are [y_m,1, y_m,1', y_m,2, ...]; up to their order these are n = 2m states of which C picks the outputs, as (2) asks.
+    Arguments: shape (m,), rad/s and 1.
+    """
+    m = len(natural_frequency)
+    model = Model(np.zeros((2 * m, 2 * m)), np.zeros((2 * m, m)), np.zeros((m, 2 * m)))
+    for i, (omega, zeta) in enumerate(zip(natural_frequency, damping, strict=True)):
+        block = slice(2 * i, 2 * i + 2)
+        model.A_m[block, block] = [[0.0, 1.0], [-(omega**2), -2.0 * zeta * omega]]
+        model.B_m[2 * i + 1, i] = omega**2
+        model.C[i, 2 * i] = 1.0
+    return model

@@ -1,0 +1,149 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the reference model, validated once, and the arrays that the maths takes."""
+
+from typing import Annotated, Self
+
+import numpy as np
+from flight_core.parameters import Names, Numbers, ParameterError, Parameters, Positive, Positives, require, require_length
+from flight_core.rates import period_ns
+from flight_core.units import GRAVITY
+from flight_core.vectors import FloatArray
+from pydantic import Field, model_validator
+
+from reference_model.command import Profile
+from reference_model.model import Model, second_order
+
+
+class Pulses(Parameters):
+    """Pulses on one channel."""
+
+    start: Numbers = Field(description="the instants at which the pulses begin to rise, s")
+    stop: Numbers = Field(description="the instants at which they begin to fall, s")
+    value: Numbers = Field(description="their heights, in the channel's unit")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for key in ("stop", "value"):
+            require_length(key, getattr(self, key), [f"pulse {k + 1}" for k in range(len(self.start))])
+        for k, (start, stop) in enumerate(zip(self.start, self.stop, strict=True)):
+            require(stop > start, f"stop[{k}]", stop, f"later than start[{k}] = {start:g} s")
+        return self
+
+
+class Sine(Parameters):
+    """A sine on one channel: amplitude sin(frequency t + phase)."""
+
+    amplitude: float = Field(description="the amplitude, in the channel's unit")
+    frequency: Positive = Field(description="the frequency, rad/s")
+    phase: float = Field(default=0.0, description="the phase, rad")
+
+
+class CoordinatedTurn(Parameters):
+    """Adds the turn rate of a coordinated turn, g/V0 sin(integral of the bank rate's command), to a channel."""
+
+    bank_rate: str = Field(description="the channel whose integral is the bank angle, e.g. p")
+    turn_rate: str = Field(description="the channel that takes the turn rate, e.g. r")
+    speed: Positive = Field(description="the speed V0, m/s")
+
+
+class SecondOrder(Parameters):
+    """The model as one second-order filter a channel."""
+
+    natural_frequency: Positives = Field(description="natural frequencies, one a channel, rad/s")
+    damping: Numbers = Field(description="damping ratios, one a channel")
+
+
+class Linear(Parameters):
+    """The model as the matrices of equation (2), row by row."""
+
+    states: Names = Field(description="the names of the states x_m, the outputs among them")
+    A_m: Numbers = Field(description="A_m row by row, 1/s")
+    B_m: Numbers = Field(description="B_m row by row")
+
+
+class ReferenceModelParameters(Parameters):
+    """All parameters of the reference model's node."""
+
+    rate: Annotated[float, Field(gt=0, le=1000)] = Field(description="the rate at which y_m is published, Hz")
+    start_time: float = Field(default=0.0, ge=0, description="system time of t = 0, s since the epoch; 0 starts at once")
+    outputs: Names = Field(description="the names of the outputs y_m")
+    second_order: SecondOrder | None = Field(default=None, description="the model, one filter a channel")
+    linear: Linear | None = Field(default=None, description="the model, as matrices")
+    rise: Positive = Field(description="the duration of a pulse's edge, s; bounds u_m_dot as equation (2) demands")
+    pulses: dict[str, Pulses] = Field(default={}, description="pulses by channel")
+    sines: dict[str, Sine] = Field(default={}, description="sines by channel")
+    coordinated_turn: CoordinatedTurn | None = Field(default=None, description="turn coordination")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        period_ns(self.rate, "rate")
+        turn = self.coordinated_turn
+        named = {f"pulses.{name}": name for name in self.pulses} | {f"sines.{name}": name for name in self.sines}
+        if turn is not None:
+            named |= {"coordinated_turn.bank_rate": turn.bank_rate, "coordinated_turn.turn_rate": turn.turn_rate}
+        for key, name in named.items():
+            require(name in self.outputs, key, f"channel {name!r}", f"one of {', '.join(self.outputs)}")
+        self._check_model()
+        return self
+
+    def _check_model(self) -> None:
+        require(
+            (self.second_order is None) != (self.linear is None),
+            "second_order",
+            "no model" if self.linear is None else "it beside linear",
+            "exactly one model: second_order or linear",
+        )
+        key = "second_order.damping"
+        if self.second_order is not None:
+            require_length("second_order.natural_frequency", self.second_order.natural_frequency, self.outputs)
+            require_length("second_order.damping", self.second_order.damping, self.outputs)
+        elif self.linear is not None:
+            key, n, m = "linear.A_m", len(self.linear.states), len(self.outputs)
+            for name, rows, columns in (("A_m", n, n), ("B_m", n, m)):
+                found = len(getattr(self.linear, name))
+                require(found == rows * columns, f"linear.{name}", f"{found} values", f"{rows} rows of {columns}")
+            for output in self.outputs:
+                require(output in self.linear.states, "linear.states", ", ".join(self.linear.states), f"{output} among them")
+        largest = float(np.linalg.eigvals(self.model().A_m).real.max())
+        require(largest < 0, key, f"an eigenvalue of A_m with real part {largest:.3g}", "A_m Hurwitz: all of them negative")
+
+    def model(self) -> Model:
+        """The matrices of equation (2)."""
+        if self.second_order is not None:
+            return second_order(np.array(self.second_order.natural_frequency), np.array(self.second_order.damping))
+        if self.linear is None:
+            raise ParameterError("second_order: found no model, expected second_order or linear")
+        n, m = len(self.linear.states), len(self.outputs)
+        C = np.array([[float(state == output) for state in self.linear.states] for output in self.outputs])
+        return Model(np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C)
+
+    def profile(self) -> Profile:
+        """The commands u_m(t) as arrays over the outputs, shorter lists of pulses padded with pulses of height 0."""
+        m = len(self.outputs)
+        longest = max((len(pulses.start) for pulses in self.pulses.values()), default=1)
+        start, stop, value = np.zeros((m, longest)), np.ones((m, longest)), np.zeros((m, longest))
+        for name, pulses in self.pulses.items():
+            row, count = self.outputs.index(name), len(pulses.start)
+            start[row, :count], stop[row, :count], value[row, :count] = pulses.start, pulses.stop, pulses.value
+        sines = [self.sines.get(name) for name in self.outputs]
+        bank_rate, turn_rate = np.zeros(m), np.zeros(m)
+        if (turn := self.coordinated_turn) is not None:
+            bank_rate[self.outputs.index(turn.bank_rate)] = 1.0
+            turn_rate[self.outputs.index(turn.turn_rate)] = GRAVITY / turn.speed
+        return Profile(
+            start,
+            stop,
+            value,
+            np.array(self.rise),
+            np.array([0.0 if sine is None else sine.amplitude for sine in sines]),
+            np.array([1.0 if sine is None else sine.frequency for sine in sines]),
+            np.array([0.0 if sine is None else sine.phase for sine in sines]),
+            bank_rate,
+            turn_rate,
+        )
+
+
+def zero_state(model: Model) -> FloatArray:
+    """x_m(0) = 0: the reference starts in trim."""
+    return np.zeros(len(model.A_m))

@@ -1,0 +1,16 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+setup(
+    name="reference_model",
+    version="0.1.0",
+    description="Reference model of the RISE-DI flight stack: commands u_m(t) and x_m_dot = A_m x_m + B_m u_m, y_m = C x_m.",
+    license="Apache-2.0",
+    packages=["reference_model"],
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/reference_model"]),
+        ("share/reference_model", ["package.xml"]),
+    ],
+    entry_points={"console_scripts": ["reference_model = reference_model.node:main"]},
+)

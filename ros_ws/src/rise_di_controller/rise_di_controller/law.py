@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The control law, equations (20)-(22), as one pure step: from y and y_m alone, without A, B, f or any acceleration."""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+from array_api_compat import array_namespace
+from flight_core.vectors import Array
+
+
+class Sign(IntEnum):
+    """How Sgn(e) of equation (21) is sampled."""
+
+    LITERAL = 0
+    IMPLICIT = 1
+
+
+class LawParams(NamedTuple):
+    """Parameters of the law over m channels.
+
+    The law works in inputs scaled to unit response, v_i = u_i / input_scale_i with abs(Omega_ii) about 1, so that K is a
+    bandwidth in rad/s and beta an acceleration rate in units of y / s^3 times s; the theorem holds for v as it does for u.
+    """
+
+    K: Array  # (m,) diagonal of equation (22), 1/s
+    Lambda: Array  # (m,) diagonal of Lambda, 1/s
+    beta: Array  # (m,) diagonal of beta, units of y / s^2
+    D: Array  # (m,) diagonal of D, +1 or -1
+    input_scale: Array  # (m,) u per scaled input: units of u s / units of y
+    omega: Array  # (m,) abs(Omega_ii) in scaled inputs, over-estimated by 1.5 to 2; used by Sign.IMPLICIT alone
+    sign: Sign
+
+
+class LawState(NamedTuple):
+    """What the law carries from tick to tick, each of shape (m,)."""
+
+    e_0: Array  # e at engagement
+    e: Array  # e at the previous tick
+    integral_e: Array  # integral of e
+    Pi: Array  # equation (21), scaled input
+
+
+def gain(k_g: Array, k_d: Array) -> Array:
+    """Diagonal of K, equation (22): K = I + k_g I + diag(k_d, 0), shape (m,), from k_g () and k_d (m - 1,)."""
+    xp = array_namespace(k_d)
+    return 1.0 + k_g + xp.concat([k_d, xp.zeros(1, dtype=k_d.dtype)])
+
+
+def engage(y: Array, y_m: Array) -> LawState:
+    """State at the instant of engagement: e_0 = y - y_m, integral_e = 0, Pi = 0, so that u = 0 there."""
+    xp = array_namespace(y)
+    e = y - y_m
+    return LawState(e, e, xp.zeros_like(e), xp.zeros_like(e))
+
+
+def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) -> tuple[LawState, Array]:
+    """One tick of the law: (state, y, y_m, dt) -> (state, u).
+
+    With e = y - y_m (3), e_p its value at the previous tick, dt the time between the two:
+
+        integral_e += dt (e + e_p) / 2                                    trapezoid
+        LITERAL:   u from Pi as it stands, then Pi += dt beta sgn(e)      (21) by forward Euler
+        IMPLICIT:  Pi += dt beta s first, s = clip(e_hat / (dt^2 omega beta), -1, 1)
+                   e_hat = e + (e - e_p) - dt omega K ((e - e_p) + Lambda dt (e + e_p) / 2)
+        u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi)         (20)
+
+    e_hat is e one tick ahead if Pi stays, and s the element of Sgn(e one tick ahead) that makes the prediction consistent:
+    backward Euler of (21), whose error falls with dt^2 and which does not chatter. u is the deviation from the input
+    at engagement. sgn(0) = 0. dt > 0.
+
+    Shapes: y, y_m, u (m,), dt (). Units: SI and radians; u in the units that input_scale gives it.
+    Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see docs/theory.md.
+    """
+    xp = array_namespace(y)
+    e = y - y_m
+    increment = dt * (e + state.e) / 2.0
+    integral_e = state.integral_e + increment
+    if params.sign is Sign.LITERAL:
+        applied = state.Pi
+        Pi = state.Pi + dt * params.beta * xp.sign(e)
+    else:
+        change = e - state.e
+        e_hat = e + change - dt * params.omega * params.K * (change + params.Lambda * increment)
+        one = xp.ones_like(e)
+        s = xp.minimum(xp.maximum(e_hat / (dt * dt * params.omega * params.beta), -one), one)
+        applied = Pi = state.Pi + dt * params.beta * s
+    v = -params.D * (params.K * (e - state.e_0 + params.Lambda * integral_e) + applied)
+    return LawState(state.e_0, e, integral_e, Pi), params.input_scale * v
+
+

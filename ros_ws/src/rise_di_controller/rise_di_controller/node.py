@@ -1,0 +1,83 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The controller's node: the law at a fixed rate, y and y_m in, u and internals out."""
+
+from collections import deque
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from flight_core.rates import seconds
+from flight_core.vectors import ChannelError
+from flight_ros.inbox import Inbox
+from flight_ros.messages import from_message, to_message
+from flight_ros.runtime import FlightNode, run
+from flight_ros.ticker import Tick
+from flight_ros.topics import INTERNALS, Y_M, LISTEN, U, Y
+
+from rise_di_controller import guard, internals
+from rise_di_controller.guard import Mode, Sample
+from rise_di_controller.params import ControllerParameters
+
+
+class ControllerNode(FlightNode[ControllerParameters]):
+    """Takes the newest y and the last y_m at each tick, steps the law, publishes u with the stamp of y."""
+
+    def __init__(self) -> None:
+        super().__init__("controller", ControllerParameters)
+        self._law, self._guard = self.parameters.law(), self.parameters.guard()
+        self._names = internals.names(self.parameters.outputs)
+        self._state = guard.start(len(self.parameters.inputs))
+        self._y: deque[Sample] = deque(maxlen=1)
+        self._y_m: deque[Sample] = deque(maxlen=LISTEN.depth)
+        self._y_inbox, self._y_m_inbox = self.inbox(Y), self.inbox(Y_M)
+        self._u_publisher, self._internals_publisher = self.publisher(U), self.publisher(INTERNALS)
+
+    def period_ns(self) -> int:
+        return self._guard.period_ns
+
+    def tick(self, tick: Tick, now_ns: int) -> None:
+        now_ns = self.get_clock().now().nanoseconds
+        self._collect(self._y_inbox, self._y)
+        self._collect(self._y_m_inbox, self._y_m)
+        y = self._y[-1] if self._y else None
+        before = self._state.mode
+        self._state, used = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law)
+        if self._state.mode is not before:
+            self.get_logger().info(f"{before.name} -> {self._state.mode.name}")
+        if self._state.mode is not Mode.ENGAGED:
+            self._say_what_is_missing(now_ns)
+        if used is None:
+            return
+        late, age = seconds(tick.late_ns), seconds(now_ns - used.stamp_ns)
+        self._u_publisher.publish(to_message(used.stamp_ns, self.parameters.inputs, self._state.u, self.instance))
+        values = internals.values(self._state, used, late, age)
+        self._internals_publisher.publish(to_message(used.stamp_ns, self._names, values, self.instance))
+
+    def _collect(self, inbox: Inbox, samples: deque[Sample]) -> None:
+        for received in inbox.take():
+            try:
+                sample = Sample(*from_message(received.message, self.parameters.outputs))
+            except ChannelError as error:
+                self.reject(inbox, error.reason, str(error))
+                continue
+            if samples and sample.stamp_ns <= samples[-1].stamp_ns:
+                self.reject(inbox, "order", f"stamp {seconds(sample.stamp_ns - samples[-1].stamp_ns):g} s after the last one")
+            else:
+                samples.append(sample)
+
+    def _say_what_is_missing(self, now_ns: int) -> None:
+        for inbox, samples in ((self._y_inbox, self._y), (self._y_m_inbox, self._y_m)):
+            if not samples or now_ns - samples[-1].stamp_ns > self._guard.max_age_ns:
+                self.waiting_for(inbox)
+
+    def status(self) -> tuple[bytes, str, dict[str, object]]:
+        level = DiagnosticStatus.OK if self._state.mode is Mode.ENGAGED else DiagnosticStatus.WARN
+        return level, self._state.mode.name, {}
+
+
+def main() -> None:
+    """Entry point of the executable `controller`."""
+    run(ControllerNode)
+
+
+if __name__ == "__main__":
+    main()

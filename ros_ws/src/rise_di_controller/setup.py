@@ -1,0 +1,16 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+setup(
+    name="rise_di_controller",
+    version="0.1.0",
+    description="RISE dynamic inversion: the control law from the measured output alone, and its fixed-rate ROS 2 node.",
+    license="Apache-2.0",
+    packages=["rise_di_controller"],
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/rise_di_controller"]),
+        ("share/rise_di_controller", ["package.xml"]),
+    ],
+    entry_points={"console_scripts": ["controller = rise_di_controller.node:main"]},
+)
