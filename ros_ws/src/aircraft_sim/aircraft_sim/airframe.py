@@ -8,10 +8,11 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 import yaml
+from pydantic import BeforeValidator, Field, model_validator
+
 from flight_core.parameters import Names, Numbers, ParameterError, Parameters, Positive, as_tuple, require
 from flight_core.units import SI_PER_UNIT
 from flight_core.vectors import FloatArray
-from pydantic import BeforeValidator, Field, model_validator
 
 LIBRARY = Path(str(files("aircraft_sim"))) / "airframes"
 
@@ -35,7 +36,7 @@ class Gravity(Parameters):
 
 
 class Airframe(Parameters):
-    """An airframe as its file states it. `A_matrix` to `gust_direction` give SI arrays."""
+    """An airframe as its file states it. `matrix_a` to `gust_direction` give SI arrays."""
 
     name: str
     source: str = Field(description="where the figures come from")
@@ -67,23 +68,25 @@ class Airframe(Parameters):
         """Place of a state in x."""
         return list(self.states).index(state)
 
-    def A_matrix(self) -> FloatArray:
+    def matrix_a(self) -> FloatArray:
         """A, shape (n, n), SI: A_ij unit_i / unit_j."""
-        unit = np.array([SI_PER_UNIT[u] for u in self.states.values()])
-        return np.array(self.A) * unit[:, None] / unit[None, :]
+        unit: FloatArray = np.array([SI_PER_UNIT[u] for u in self.states.values()])
+        matrix: FloatArray = np.array(self.A)
+        return matrix * unit[:, None] / unit[None, :]
 
-    def B_matrix(self) -> FloatArray:
+    def matrix_b(self) -> FloatArray:
         """B, shape (n, m), SI: B_ij unit_i / unit_j."""
-        row = np.array([SI_PER_UNIT[u] for u in self.states.values()])
-        column = np.array([SI_PER_UNIT[i.unit] for i in self.inputs.values()])
-        return np.array(self.B) * row[:, None] / column[None, :]
+        row: FloatArray = np.array([SI_PER_UNIT[u] for u in self.states.values()])
+        column: FloatArray = np.array([SI_PER_UNIT[i.unit] for i in self.inputs.values()])
+        matrix: FloatArray = np.array(self.B)
+        return matrix * row[:, None] / column[None, :]
 
-    def C_matrix(self) -> FloatArray:
+    def matrix_c(self) -> FloatArray:
         """C, shape (m, n): picks the outputs."""
         return np.array([[float(state == output) for state in self.states] for output in self.outputs])
 
-    def gravity_matrix(self) -> FloatArray:
-        """Matrix of the sine terms, shape (n, n): f = gravity_matrix @ sin(x)."""
+    def matrix_gravity(self) -> FloatArray:
+        """Matrix of the sine terms, shape (n, n): f = matrix_gravity @ sin(x)."""
         matrix = np.zeros((len(self.states), len(self.states)))
         for term in self.gravity:
             matrix[self.index(term.into), self.index(term.angle)] += term.gain

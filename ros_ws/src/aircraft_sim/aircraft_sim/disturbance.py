@@ -5,6 +5,7 @@
 from typing import NamedTuple
 
 from array_api_compat import array_namespace
+
 from flight_core.vectors import Array
 
 

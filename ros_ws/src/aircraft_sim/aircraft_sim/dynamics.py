@@ -5,9 +5,9 @@
 from typing import Any, NamedTuple
 
 from array_api_compat import array_namespace
-from flight_core.vectors import Array
 
 from aircraft_sim.disturbance import Gusts, one_minus_cosine
+from flight_core.vectors import Array
 
 
 class Aircraft(NamedTuple):
@@ -23,7 +23,7 @@ class Aircraft(NamedTuple):
 
 
 def f(t: Any, x: Array, params: Aircraft) -> Array:
-    """f(x, t) = gravity @ sin(x) + gust_direction @ w(t), shape (n,): the uncertain part of equation (1)."""
+    """Uncertain part of equation (1): gravity @ sin(x) + gust_direction @ w(t), shape (n,)."""
     xp = array_namespace(x)
     return params.gravity @ xp.sin(x) + params.gust_direction @ one_minus_cosine(t, params.gusts, params.speed)
 

@@ -4,16 +4,16 @@
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+
+from aircraft_sim import dynamics, truth
+from aircraft_sim.params import AircraftParameters
+from aircraft_sim.plant import advance
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.vectors import ChannelError
 from flight_ros.messages import from_message, to_message
 from flight_ros.runtime import FlightNode, run
 from flight_ros.ticker import Tick
 from flight_ros.topics import TRUTH, U, Y
-
-from aircraft_sim import dynamics, truth
-from aircraft_sim.params import AircraftParameters
-from aircraft_sim.plant import advance
 
 
 class AircraftNode(FlightNode[AircraftParameters]):
@@ -37,7 +37,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         return nanoseconds(self.parameters.start_time)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        before_ns, t_ns = tick.previous * self._period_ns, tick.index * self._period_ns
+        before_ns, t_ns = tick.previous * self._period_ns, tick.number * self._period_ns
         self._x = advance(before_ns, self._x, self._u, t_ns - before_ns, self.parameters.step_ns, self._aircraft)
         y = dynamics.y(self._x, self._aircraft)
         self._y_publisher.publish(to_message(now_ns, self._airframe.outputs, y, self.instance))

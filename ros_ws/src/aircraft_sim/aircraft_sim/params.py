@@ -5,13 +5,13 @@
 from typing import Annotated, Self
 
 import numpy as np
-from flight_core.parameters import Parameters, Positive
-from flight_core.rates import divide, nanoseconds, period_ns
 from pydantic import Field, model_validator
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
+from flight_core.parameters import Parameters, Positive
+from flight_core.rates import divide, nanoseconds, period_ns
 
 
 class Gust(Parameters):
@@ -50,10 +50,10 @@ class AircraftParameters(Parameters):
         gusts = self.gusts.values()
         direction = [airframe.gust_direction(name) for name in self.gusts]
         return airframe, Aircraft(
-            airframe.A_matrix(),
-            airframe.B_matrix(),
-            airframe.C_matrix(),
-            airframe.gravity_matrix(),
+            airframe.matrix_a(),
+            airframe.matrix_b(),
+            airframe.matrix_c(),
+            airframe.matrix_gravity(),
             np.reshape(direction, (len(direction), len(airframe.states))).T,
             Gusts(*(np.array([getattr(gust, key) for gust in gusts]) for key in ("start", "speed", "length"))),
             np.array(airframe.speed),

@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The aircraft in time: fixed steps of equation (1) under an input held between samples."""
 
+from aircraft_sim.dynamics import Aircraft, x_dot
 from flight_core.integrators import rk4
 from flight_core.rates import divide, seconds
 from flight_core.vectors import Array
-
-from aircraft_sim.dynamics import Aircraft, x_dot
 
 
 def advance(t_ns: int, x: Array, u: Array, duration_ns: int, step_ns: int, params: Aircraft) -> Array:

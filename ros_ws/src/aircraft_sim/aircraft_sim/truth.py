@@ -3,18 +3,18 @@
 """What the aircraft really does: the full state, f(x, t) and the gusts, for the log alone."""
 
 import numpy as np
-from flight_core.rates import seconds
-from flight_core.vectors import FloatArray
 
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import one_minus_cosine
 from aircraft_sim.dynamics import Aircraft, f
 from aircraft_sim.params import AircraftParameters
+from flight_core.rates import seconds
+from flight_core.vectors import FloatArray
 
 
 def names(airframe: Airframe, params: AircraftParameters) -> tuple[str, ...]:
     """Channel names of `truth`: "x.state", "f.state" (the part of x_dot), "gust.name" (m/s)."""
-    groups = {"x": airframe.states, "f": airframe.states, "gust": params.gusts}
+    groups = {"x": tuple(airframe.states), "f": tuple(airframe.states), "gust": tuple(params.gusts)}
     return tuple(f"{group}.{name}" for group, members in groups.items() for name in members)
 
 

@@ -2,19 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCAP bag -> Tape, without ROS: also from a file that was never finished."""
 
-from collections import defaultdict
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from flight_core.parameters import ParameterError
-from flight_core.rates import NANOSECONDS
-from flight_core.tape import Signal, Tape
-from flight_core.vectors import FloatArray
 from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from rosbags.typesys import Stores, get_typestore
+
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
@@ -64,7 +64,7 @@ def read_run(run: Path) -> Run:
                     elif isinstance(record, Channel) and schemas.get(record.schema_id) == JOINT_STATE:
                         vector_channels[record.id] = record.topic.rsplit("/", 1)[-1]
                     elif isinstance(record, Message) and record.channel_id in vector_channels:
-                        message = store.deserialize_cdr(record.data, JOINT_STATE)
+                        message: Any = store.deserialize_cdr(record.data, JOINT_STATE)
                         rows = topics.setdefault(vector_channels[record.channel_id], _Rows(tuple(message.name)))
                         if tuple(message.name) == rows.names and len(message.position) == len(rows.names):
                             rows.stamps.append(message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec)

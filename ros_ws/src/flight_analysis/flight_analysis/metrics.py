@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from numpy.typing import NDArray
 
 Windows = Mapping[str, tuple[float, float]]
 
@@ -35,7 +36,7 @@ class TickFigures(NamedTuple):
 
 
 def tracking_error(tape: Tape) -> Signal:
-    """e = y - y_m at every y whose stamp y_m has too or spans (linear between samples), shape (N, m), channels of y."""
+    """E = y - y_m at every y whose stamp y_m has too or spans (linear between samples), shape (N, m), channels of y."""
     y, y_m = tape["y"], tape["y_m"]
     if len(y.stamp_ns) == 0 or len(y_m.stamp_ns) == 0:
         return Signal(np.zeros(0, dtype=np.int64), y.names, np.zeros((0, len(y.names))))

@@ -5,12 +5,13 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from pydantic import Field
+
 from aircraft_sim.params import AircraftParameters
 from flight_core.parameters import Parameters, Positive, require
 from flight_core.rates import divide, period_ns
 from flight_core.scenario import read_sections
 from flight_recorder.params import RecorderParameters
-from pydantic import Field
 from reference_model.params import ReferenceModelParameters
 from rise_di_controller.params import ControllerParameters
 

@@ -6,8 +6,10 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
+
 from aircraft_sim import dynamics, truth
 from aircraft_sim.plant import advance
+from flight_analysis.scenario import Scenario
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import Array, FloatArray, select
@@ -16,8 +18,6 @@ from reference_model.command import command
 from reference_model.params import zero_state
 from rise_di_controller import guard, internals
 from rise_di_controller.guard import Sample
-
-from flight_analysis.scenario import Scenario
 
 KEPT_REFERENCES = 16  # as many as the controller's node keeps
 

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenario files: one ROS parameter file, a section for each node, read without ROS.
 
-    /**/controller:
-      ros__parameters:
-        rate: 100.0    # Hz
+/**/controller:
+  ros__parameters:
+    rate: 100.0    # Hz
 """
 
 from pathlib import Path
@@ -34,8 +34,9 @@ def read_sections(path: Path, expected: tuple[str, ...]) -> Sections:
         name = str(key).removeprefix("/**/").removeprefix("/")
         require(name in expected, f"{path.name}: {name}", "a section", f"only {', '.join(expected)}")
         values = content.get("ros__parameters") if isinstance(content, dict) else None
+        values = values if isinstance(values, dict) else {}
         require(
-            isinstance(values, dict) and set(content) == {"ros__parameters"},
+            bool(values) and set(content) == {"ros__parameters"},
             f"{path.name}: {name}",
             "no mapping under ros__parameters",
             "one mapping there, as in every ROS parameter file",

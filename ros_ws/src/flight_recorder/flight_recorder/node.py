@@ -9,16 +9,16 @@ from pathlib import Path
 
 import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.qos import QoSProfile
+
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds, period_ns
+from flight_recorder.bag import BagWriter
+from flight_recorder.params import RecorderParameters
 from flight_ros.inbox import Inbox
 from flight_ros.runtime import FlightNode, run
 from flight_ros.ticker import Tick
 from flight_ros.topics import FLIGHT, PUBLISH, RECORD, Topic
-from rclpy.qos import QoSProfile
-
-from flight_recorder.bag import BagWriter
-from flight_recorder.params import RecorderParameters
 
 FLUSH_PERIOD = 0.1  # s, what a killed recorder loses at most
 
@@ -83,8 +83,8 @@ class RecorderNode(FlightNode[RecorderParameters]):
             self.get_logger().warning(f"{inbox.name}: {gap} messages lost", throttle_duration_sec=2.0)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
-        counts = {f"messages {name}": channel.count for name, channel in self._bag.channels.items()}
-        lost = {f"lost {name}": count for name, count in self.lost.items()}
+        counts: dict[str, object] = {f"messages {name}": channel.count for name, channel in self._bag.channels.items()}
+        lost: dict[str, object] = {f"lost {name}": count for name, count in self.lost.items()}
         level = DiagnosticStatus.WARN if lost else DiagnosticStatus.OK
         return level, f"{READY} {self._bag.path}", counts | lost
 

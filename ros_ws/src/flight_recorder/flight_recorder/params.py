@@ -4,8 +4,9 @@
 
 from typing import Annotated
 
-from flight_core.parameters import Parameters
 from pydantic import Field
+
+from flight_core.parameters import Parameters
 
 
 class RecorderParameters(Parameters):

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from builtin_interfaces.msg import Time
+from sensor_msgs.msg import JointState
+
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray, select
-from sensor_msgs.msg import JointState
 
 
 class StampedVector(NamedTuple):

@@ -5,9 +5,10 @@
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from flight_core.parameters import Parameters, flatten, nest
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
+
+from flight_core.parameters import Parameters, flatten, nest
 
 P = TypeVar("P", bound=Parameters)
 NOT_OURS = ("use_sim_time", "start_type_description_service", "qos_overrides")
@@ -26,7 +27,9 @@ def read_parameters(node: Node, schema: type[P]) -> P:
     parameters = schema.validate_mapping(nest(given), node.get_name())
     descriptions = dict(_descriptions(schema))
     for name, value in flatten(parameters.model_dump()):
-        descriptor = ParameterDescriptor(description=descriptions.get(name.split(".")[0], ""), read_only=True, dynamic_typing=True)
+        descriptor = ParameterDescriptor(
+            description=descriptions.get(name.split(".")[0], ""), read_only=True, dynamic_typing=True
+        )
         if node.has_parameter(name):
             node.set_descriptor(name, descriptor)
         elif value != ():

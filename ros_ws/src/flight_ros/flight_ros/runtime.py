@@ -16,8 +16,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from flight_core.parameters import ParameterError, Parameters
-from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -25,6 +23,8 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.signals import SignalHandlerOptions
 
+from flight_core.parameters import ParameterError, Parameters
+from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_ros import transport
 from flight_ros.inbox import Inbox
 from flight_ros.parameters import read_parameters
@@ -62,7 +62,7 @@ class FlightNode(Node, Generic[P]):
         return 0
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        """One tick; `now_ns` is the nominal instant of tick.index on the system clock's scale."""
+        """One tick; `now_ns` is the nominal instant of tick.number on the system clock's scale."""
         raise NotImplementedError
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
@@ -204,7 +204,7 @@ def _loop(node: FlightNode[Any], stop: threading.Event) -> None:
         if pause > 0:
             time.sleep(min(pause, NICE_PAUSE))
         if (tick := ticker.due()) is not None:
-            node.run_tick(tick, start_ns + tick.index * ticker.period_ns)
+            node.run_tick(tick, start_ns + tick.number * ticker.period_ns)
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
             serve_ns = now_ns + nanoseconds(NICE_PAUSE)

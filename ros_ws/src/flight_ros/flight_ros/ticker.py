@@ -9,14 +9,14 @@ from typing import NamedTuple
 class Tick(NamedTuple):
     """A deadline that has come."""
 
-    index: int  # counts periods since the start; missed ones are skipped
-    previous: int  # index of the tick before, 0 at the first
+    number: int  # counts periods since the start; missed ones are skipped
+    previous: int  # number of the tick before, 0 at the first
     late_ns: int  # how long after the deadline the tick began
 
     @property
     def missed(self) -> int:
         """Periods skipped since the previous tick."""
-        return max(self.index - self.previous - 1, 0)
+        return max(self.number - self.previous - 1, 0)
 
 
 class Ticker:
@@ -33,9 +33,9 @@ class Ticker:
 
     def due(self) -> Tick | None:
         """The newest deadline that has come and was not yet returned, else None."""
-        index, late_ns = divmod(time.monotonic_ns() - self._start_ns, self.period_ns)
-        if index <= self._last:
+        number, late_ns = divmod(time.monotonic_ns() - self._start_ns, self.period_ns)
+        if number <= self._last:
             return None
-        tick = Tick(index, max(self._last, 0), late_ns)
-        self._last = index
+        tick = Tick(number, max(self._last, 0), late_ns)
+        self._last = number
         return tick

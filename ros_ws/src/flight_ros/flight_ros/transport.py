@@ -12,6 +12,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import psutil
+
 from flight_core.parameters import ParameterError
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"

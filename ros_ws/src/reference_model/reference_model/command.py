@@ -8,6 +8,7 @@ Equation (2) asks for u_m and u_m_dot bounded, so a pulse has ramps for edges, n
 from typing import NamedTuple
 
 from array_api_compat import array_namespace
+
 from flight_core.vectors import Array
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+
 from flight_core.integrators import rk4
 from flight_core.vectors import Array, FloatArray
 

@@ -8,7 +8,6 @@ from flight_ros.messages import from_message, to_message
 from flight_ros.runtime import FlightNode, run
 from flight_ros.ticker import Tick
 from flight_ros.topics import U_M, Y_M
-
 from reference_model import model
 from reference_model.command import command
 from reference_model.params import ReferenceModelParameters, zero_state
@@ -33,8 +32,8 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
         return nanoseconds(self.parameters.start_time)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        for index in range(tick.previous, tick.index):
-            t = seconds(index * self._period_ns)
+        for number in range(tick.previous, tick.number):
+            t = seconds(number * self._period_ns)
             self._x_m = model.step(t, self._x_m, self._command, seconds(self._period_ns), self._model)
         y_m = model.output(self._x_m, self._model)
         self._y_m_publisher.publish(to_message(now_ns, self.parameters.outputs, y_m, self.instance))

@@ -5,12 +5,12 @@
 from typing import Annotated, Self
 
 import numpy as np
+from pydantic import Field, model_validator
+
 from flight_core.parameters import Names, Numbers, ParameterError, Parameters, Positive, Positives, require, require_length
 from flight_core.rates import period_ns
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from pydantic import Field, model_validator
-
 from reference_model.command import Profile
 from reference_model.model import Model, second_order
 

@@ -7,9 +7,9 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
+
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
-
 from rise_di_controller.law import LawParams, LawState, engage, step
 
 
@@ -65,8 +65,10 @@ def start(m: int) -> ControllerState:
 
 
 def align(samples: Sequence[Sample], stamp_ns: int, reach_ns: int) -> FloatArray | None:
-    """The signal at an instant, shape (m,): the sample of that stamp, else linear between its neighbours, else linear
-    beyond the newest two by at most `reach_ns`; a single sample is held as far. None where none of these reaches.
+    """The signal at an instant, shape (m,), None where no sample reaches it.
+
+    The sample of that stamp, else linear between its neighbours, else linear beyond the newest two by at most `reach_ns`;
+    a single sample is held as far.
 
     Arguments: samples with increasing stamps.
     """

@@ -5,8 +5,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from flight_core.vectors import FloatArray
 
+from flight_core.vectors import FloatArray
 from rise_di_controller.guard import ControllerState, Used
 
 SCALARS = ("mode", "dt", "y_m_offset", "late", "age")
@@ -28,5 +28,3 @@ def values(state: ControllerState, used: Used, late: float, age: float) -> Float
         raise ValueError("internals of a controller that was never engaged")
     scalars = np.array([float(state.mode), used.dt, used.y_m_offset, late, age])
     return np.concatenate([scalars, used.y, used.y_m, state.law.e, state.law.integral_e, state.law.Pi])
-
-

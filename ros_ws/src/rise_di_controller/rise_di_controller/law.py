@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from array_api_compat import array_namespace
+
 from flight_core.vectors import Array
 
 
@@ -87,5 +88,3 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
         applied = Pi = state.Pi + dt * params.beta * s
     v = -params.D * (params.K * (e - state.e_0 + params.Lambda * integral_e) + applied)
     return LawState(state.e_0, e, integral_e, Pi), params.input_scale * v
-
-

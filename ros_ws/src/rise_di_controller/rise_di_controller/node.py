@@ -5,14 +5,14 @@
 from collections import deque
 
 from diagnostic_msgs.msg import DiagnosticStatus
+
 from flight_core.rates import seconds
 from flight_core.vectors import ChannelError
 from flight_ros.inbox import Inbox
 from flight_ros.messages import from_message, to_message
 from flight_ros.runtime import FlightNode, run
 from flight_ros.ticker import Tick
-from flight_ros.topics import INTERNALS, Y_M, LISTEN, U, Y
-
+from flight_ros.topics import INTERNALS, LISTEN, Y_M, U, Y
 from rise_di_controller import guard, internals
 from rise_di_controller.guard import Mode, Sample
 from rise_di_controller.params import ControllerParameters

@@ -5,10 +5,10 @@
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from flight_core.parameters import Names, Parameters, Positive, Positives, Signs, as_tuple, require, require_length
-from flight_core.rates import nanoseconds, period_ns
 from pydantic import BeforeValidator, Field, model_validator
 
+from flight_core.parameters import Names, Parameters, Positive, Positives, Signs, as_tuple, require, require_length
+from flight_core.rates import nanoseconds, period_ns
 from rise_di_controller.guard import GuardParams
 from rise_di_controller.law import LawParams, Sign, gain
 

@@ -1,0 +1,55 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+#
+# make fly     set up what is needed, fly the default scenario     make fly SCENARIO=... ARGS="--duration 10"
+# make test    set up what is needed, run all checks and tests
+# make setup   the set-up alone: .venv/, the workspace built, .venv/bin/rise-di
+
+PYTHON ?= python3
+SCENARIO ?= osprey_gust
+UV_VERSION := 0.13.8
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+
+BIN := $(CURDIR)/.venv/bin
+PACKAGES := $(notdir $(patsubst %/package.xml,%,$(wildcard ros_ws/src/*/package.xml)))
+# With symlinks in place only these need another build; Python sources are live.
+BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/config/*.yaml ros_ws/src/*/launch/*.py)
+
+.PHONY: fly test check setup lock clean
+
+fly: setup
+	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
+
+test: check
+	$(BIN)/python -m pytest $(ARGS)
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+setup: .venv/.workspace
+
+.venv/.installed: requirements.lock
+	@command -v $(PYTHON) > /dev/null || { echo "error: no $(PYTHON) here; install Python 3.11 to 3.13, or say make PYTHON=..." >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
+	  || { echo "error: $$($(PYTHON) --version) found, but the ROS 2 wheels are for 3.11 to 3.13; say make PYTHON=python3.12" >&2; exit 2; }
+	$(PYTHON) -m venv --clear .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
+	$(BIN)/uv pip sync --quiet --python $(BIN)/python requirements.lock
+	@touch $@
+
+.venv/.workspace: .venv/.installed $(BUILD_INPUTS)
+	cd ros_ws && PATH="$(BIN):$$PATH" colcon build --symlink-install --event-handlers console_cohesion- status-
+	@printf '%s\n' $(PACKAGES:%=$(CURDIR)/ros_ws/build/%) \
+	  > "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/rise_di_workspace.pth"
+	@ln -sf ../../ros_ws/install/flight_bringup/lib/flight_bringup/rise-di .venv/bin/rise-di
+	@touch $@
+
+lock: .venv/.installed
+	$(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+	  --custom-compile-command "make lock" requirements.in -o requirements.lock
+
+clean:
+	rm -rf .venv ros_ws/build ros_ws/install ros_ws/log

@@ -1,0 +1,51 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The result of a flight in numbers: what `summary.json` and the table hold."""
+
+import math
+from typing import Any, NamedTuple
+
+from flight_analysis.metrics import error_table, tick_figures
+from flight_analysis.scenario import Scenario
+from flight_core.rates import period_ns
+from flight_core.tape import Tape
+from flight_core.units import SI_PER_UNIT
+
+
+class Shown(NamedTuple):
+    """A unit for people: value_shown = value_SI * factor."""
+
+    unit: str
+    factor: float
+
+
+def shown_units(scenario: Scenario) -> dict[str, Shown]:
+    """Units for tables and pictures by channel of y and u: angular rates in mrad/s, inputs as the airframe file has them."""
+    airframe, _ = scenario.aircraft.load()
+    units = {name: Shown("mrad/s", 1e3) if unit == "rad/s" else Shown(unit, 1.0) for name, unit in airframe.states.items()}
+    return units | {name: Shown(i.unit, 1.0 / SI_PER_UNIT[i.unit]) for name, i in airframe.inputs.items()}
+
+
+def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
+    """Outcome, duration flown, errors by channel and part of the flight (SI), ticks, notes; ready for JSON."""
+    errors = error_table(tape, scenario.gust_windows())
+    ticks = tick_figures(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
+    flown = float(tape.time("y")[-1]) if "y" in tape and len(tape["y"].stamp_ns) else 0.0
+    return {
+        "scenario": scenario.name,
+        "outcome": outcome,
+        "duration": flown,
+        "errors": {
+            channel: {
+                part: {key: _number(value) for key, value in figures._asdict().items()} for part, figures in parts.items()
+            }
+            for channel, parts in errors.items()
+        },
+        "ticks": ticks._asdict() if ticks is not None else None,
+        "notes": list(tape.notes),
+    }
+
+
+def _number(value: float) -> float | None:
+    # JSON has no NaN: a part of the flight without a sample has no figure.
+    return None if math.isnan(value) else value

@@ -1,0 +1,134 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The `rise-di` command."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from flight_analysis.bag_reader import read_run
+from flight_analysis.report import write_report
+from flight_analysis.scenario import Scenario, load_scenario
+from flight_analysis.summary import Shown, shown_units, summarise
+from flight_bringup import fly as flying
+from flight_bringup.graph import scenarios, share
+from flight_core.parameters import ParameterError, require
+
+BAD_INPUT, ENDED_EARLY, INTERRUPTED = 2, 3, 130
+
+app = typer.Typer(help="Fly, record and analyse RISE dynamic inversion.", no_args_is_help=True, add_completion=False)
+
+
+def find_scenario(name: str) -> Scenario:
+    """A scenario by its name in the stack, or by the path of a file ending in .yaml. Raises ParameterError."""
+    path = Path(name) if name.endswith(".yaml") else share() / "config" / f"{name}.yaml"
+    require(path.is_file(), "scenario", f"{name!r}", f"one of {', '.join(scenarios())}, or the path of a scenario file (.yaml)")
+    return load_scenario(path.absolute())
+
+
+@app.command()
+def fly(
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_gust",
+    duration: Annotated[float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")] = None,
+    in_process: Annotated[
+        bool, typer.Option("--in-process", help="Fly in one process without ROS, as fast as it goes.")
+    ] = False,
+    runs: Annotated[Path, typer.Option(help="Folder that the run's folder is made in.")] = Path("runs"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")] = False,
+) -> None:
+    """Fly a scenario: aircraft, reference model, controller and recorder as processes over ROS 2 topics, in real time.
+
+    Exit status: 0 flown to its end, 2 bad input, 3 ended early, 130 interrupted.
+    """
+    chosen = find_scenario(scenario)
+    if duration is not None:
+        chosen = chosen.with_duration(duration)
+    run = flying.new_run(chosen, runs)
+    console = Console(stderr=True, quiet=as_json)
+    columns = (TextColumn("{task.fields[clock]}"), BarColumn(), TextColumn("{task.fields[shown]}"))
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("flight", total=chosen.flight.duration, clock="", shown="")
+
+        def progress(t: float, shown: str) -> None:
+            bar.update(task, completed=t, clock=f"t = {t:5.1f} of {chosen.flight.duration:g} s", shown=shown)
+
+        method = flying.fly_in_process if in_process else flying.fly_over_topics
+        outcome = method(chosen, run, progress)
+        if outcome == "completed":
+            progress(chosen.flight.duration, outcome)
+    flown = flying.conclude(chosen, run, outcome)
+    if as_json:
+        print(json.dumps(flown.summary))
+    else:
+        show(Console(), flown.summary, shown_units(chosen))
+        print(f"outcome: {outcome}\nlog:     {_short(flown.mcap)}\nreport:  {_short(flown.report)}")
+    if outcome != "completed":
+        raise typer.Exit(INTERRUPTED if outcome == "interrupted" else ENDED_EARLY)
+
+
+@app.command()
+def report(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> None:
+    """Write the report of a recorded run again, and print its table."""
+    recorded = read_run(run)
+    require(recorded.scenario is not None, str(run), "a log without its scenario", "a run that was flown from a scenario")
+    stored = run / "scenario.yaml"
+    stored.write_bytes(recorded.scenario or b"")
+    chosen = load_scenario(stored)
+    summary = summarise(chosen, recorded.tape, "read from its log")
+    write_report(run / "report.html", chosen, recorded.tape, summary)
+    show(Console(), summary, shown_units(chosen))
+    print(f"report: {_short(run / 'report.html')}")
+
+
+def show(console: Console, summary: dict[str, Any], units: dict[str, Shown]) -> None:
+    """Print the tables of a summary."""
+    parts = ("whole", "calm", "gust")
+    table = Table(title=f"Tracking error, {summary['duration']:.1f} s flown", title_justify="left", box=box.SIMPLE_HEAD)
+    table.add_column("channel", no_wrap=True)
+    for part in parts:
+        table.add_column(f"{part}\nrms", justify="right", no_wrap=True)
+        table.add_column("\nmax", justify="right", no_wrap=True)
+    for channel, figures in summary["errors"].items():
+        unit, factor = units[channel]
+        cells = [_cell(figures[part][key], factor) for part in parts for key in ("rms", "max")]
+        table.add_row(f"{channel} ({unit})", *cells)
+    console.print(table)
+    if (ticks := summary["ticks"]) is not None:
+        console.print(
+            f"ticks: {ticks['ticks']}, missed {ticks['missed']}; period mean {ticks['period_mean'] * 1e3:.3f} ms,"
+            f" p99 {ticks['period_p99'] * 1e3:.3f}, max {ticks['period_max'] * 1e3:.3f};"
+            f" late p99 {ticks['late_p99'] * 1e3:.3f} ms, max {ticks['late_max'] * 1e3:.3f}",
+            highlight=False,
+        )
+    for note in summary["notes"]:
+        console.print(f"note: {note}", highlight=False)
+
+
+def _cell(value: float | None, factor: float) -> str:
+    return "-" if value is None else f"{value * factor:.3g}"
+
+
+def _short(path: Path) -> str:
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
+def main() -> None:
+    """Entry point: bad input is one sentence and exit status 2, Ctrl-C is quiet."""
+    try:
+        app()
+    except ParameterError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Fly a scenario: over topics in real time, or in one process; then its summary and report."""
+
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from types import FrameType
+from typing import Any, NamedTuple
+
+from flight_analysis.bag_reader import read_run
+from flight_analysis.bag_writer import write_run
+from flight_analysis.report import write_report
+from flight_analysis.scenario import Scenario
+from flight_analysis.simulate import simulate
+from flight_analysis.summary import shown_units, summarise
+from flight_bringup.graph import START_LEAD
+from flight_bringup.processes import Flight
+from flight_core.parameters import ParameterError
+from flight_core.rates import nanoseconds
+from flight_core.tape import Tape
+
+POLL_PERIOD = 0.05  # s, of the progress bar
+
+Progress = Callable[[float, str], None]  # flight time in s, and what to show beside it
+
+
+class Flown(NamedTuple):
+    """A flight that has ended, however."""
+
+    run: Path
+    mcap: Path
+    report: Path
+    summary: dict[str, Any]
+
+
+def new_run(scenario: Scenario, runs: Path) -> Path:
+    """Make the folder of a new run, runs/<UTC stamp>-<scenario>. Raises ParameterError where that cannot be."""
+    stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{scenario.name}"
+    for name in (stem, *(f"{stem}-{k}" for k in range(2, 100))):
+        run = (runs / name).absolute()
+        try:
+            run.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ParameterError(
+                f"runs: {runs} cannot be written ({error.strerror}); name another folder with --runs"
+            ) from None
+        return run
+    raise ParameterError(f"runs: found a hundred runs of this second in {runs}, expected fewer")
+
+
+@contextmanager
+def _sigterm_as_interrupt() -> Iterator[None]:
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def fly_over_topics(scenario: Scenario, run: Path, progress: Progress) -> str:
+    """Fly in real time as separate processes and record the bag into `run`. Returns the outcome.
+
+    "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence naming the process that ended early.
+    """
+    from flight_bringup.node import Monitor  # noqa: PLC0415 - loads rclpy, which no other command needs
+
+    units = shown_units(scenario)
+    start_time = round(time.time() + START_LEAD, 3)
+    outputs = scenario.controller.outputs
+    try:
+        with (
+            _sigterm_as_interrupt(),
+            Flight(scenario.path, run, start_time) as flight,
+            Monitor(outputs, nanoseconds(start_time)) as monitor,
+        ):
+            shown = "starting"
+            while (t := monitor.flight_time()) < scenario.flight.duration:
+                if (sentence := flight.ended_early()) is not None:
+                    return sentence
+                if (seen := monitor.newest()) is not None:
+                    errors = ", ".join(
+                        f"{name} {value * units[name].factor:+.2f}" for name, value in zip(outputs, seen.e, strict=True)
+                    )
+                    shown = f"{seen.mode.name}  e: {errors}"
+                progress(max(t, 0.0), shown)
+                time.sleep(POLL_PERIOD)
+    except KeyboardInterrupt:
+        return "interrupted"
+    return "completed"
+
+
+def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
+    """Fly in one process without ROS, as fast as it goes, and write the bag into `run`. Returns the outcome."""
+    tape = simulate(scenario, lambda t: progress(t, "in one process"))
+    write_run(tape, run, scenario.path)
+    return "completed"
+
+
+def conclude(scenario: Scenario, run: Path, outcome: str) -> Flown:
+    """Read the bag back, write summary.json and report.html beside it, point runs/latest at the run."""
+    recorded = read_run(run)
+    tape = _until(recorded.tape, scenario.flight.duration)
+    summary = summarise(scenario, tape, outcome)
+    (run / "scenario.yaml").write_bytes(recorded.scenario or scenario.path.read_bytes())
+    (run / "summary.json").write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_report(run / "report.html", scenario, tape, summary)
+    _point_latest(run)
+    return Flown(run, next(iter(sorted(run.glob("*.mcap")))), run / "report.html", summary)
+
+
+def _until(tape: Tape, duration: float) -> Tape:
+    """The tape between t = 0 and the scenario's end: what the processes did while they were being ended is no flight."""
+    end_ns = tape.start_ns + nanoseconds(duration)
+    signals = {}
+    for name, signal_ in tape.signals.items():
+        keep = (signal_.stamp_ns >= tape.start_ns) & (signal_.stamp_ns <= end_ns)
+        signals[name] = type(signal_)(signal_.stamp_ns[keep], signal_.names, signal_.values[keep])
+    return Tape(signals, tape.start_ns, tape.notes)
+
+
+def _point_latest(run: Path) -> None:
+    latest = run.parent / "latest"
+    fresh = run.parent / f".latest-{os.getpid()}"
+    fresh.symlink_to(run.name)
+    fresh.replace(latest)

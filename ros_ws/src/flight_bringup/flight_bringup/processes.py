@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The processes of a flight: started together, watched, ended together; none outlives the command."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from flight_bringup.graph import NODES, READY, RECORDER, NodeSpec, parameters
+from flight_core.parameters import ParameterError
+
+STOP_TIMEOUT = 2.5  # s for all processes together; a node ends within 0.2 s
+READY_TIMEOUT = 20.0  # s
+
+
+def _end_with_parent() -> list[str]:
+    """Prefix of a command that is to end when this process is killed; util-linux, empty where that is missing."""
+    setpriv = shutil.which("setpriv")
+    return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
+
+
+class NodeProcess:
+    """One node as a process of its own, its output kept in a file and in the last lines."""
+
+    def __init__(self, node: NodeSpec, scenario_file: Path, told: dict[str, str | float], log: Path) -> None:
+        self.node = node
+        self.lines: deque[str] = deque(maxlen=20)
+        self.ready = threading.Event()
+        command = [*_end_with_parent(), sys.executable, "-m", node.module, "--ros-args", "--params-file", str(scenario_file)]
+        for name, value in told.items():
+            command += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, and quotes what needs it
+        self._log = log.open("w", encoding="utf-8")
+        self.popen = subprocess.Popen(  # noqa: S603 - our own interpreter and modules
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            process_group=0,  # Ctrl-C reaches the command alone, which then ends the nodes in order
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        if self.popen.stdout is None:
+            return
+        for line in self.popen.stdout:
+            self.lines.append(line.rstrip())
+            self._log.write(line)
+            self._log.flush()
+            if READY in line:
+                self.ready.set()
+
+    def finish(self) -> int:
+        """Collect what is left of the output; the exit status."""
+        status = self.popen.wait()
+        self._reader.join(timeout=1.0)
+        self._log.close()
+        return status
+
+
+class Flight:
+    """All processes of one flight. A context manager: leaving it ends them, the recorder last."""
+
+    def __init__(self, scenario_file: Path, run: Path, start_time: float) -> None:
+        self._told = {node: parameters(node, scenario_file, run, start_time) for node in NODES}
+        self._scenario_file, self._run = scenario_file, run
+        self.processes: list[NodeProcess] = []
+
+    def __enter__(self) -> Self:
+        try:
+            recorder = self._start(RECORDER)
+            deadline = time.monotonic() + READY_TIMEOUT
+            while not recorder.ready.wait(0.02):
+                self._require_running()
+                if time.monotonic() > deadline:
+                    raise ParameterError(
+                        f"recorder: not ready after {READY_TIMEOUT:g} s; its output is in {self._log(RECORDER)}"
+                    )
+            for node in NODES:
+                if node is not RECORDER:
+                    self._start(node)
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.stop()
+
+    def _log(self, node: NodeSpec) -> Path:
+        return self._run / "log" / f"{node.executable}.log"
+
+    def _start(self, node: NodeSpec) -> NodeProcess:
+        log = self._log(node)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        process = NodeProcess(node, self._scenario_file, self._told[node], log)
+        self.processes.append(process)
+        return process
+
+    def ended_early(self) -> str | None:
+        """A sentence for the first process that has ended by itself, None while all run."""
+        for process in self.processes:
+            if (status := process.popen.poll()) is not None:
+                process.finish()
+                last = next((line for line in reversed(process.lines) if line.strip()), "no output")
+                return f"{process.node.executable} ended with status {status}: {last.removeprefix('error: ')}"
+        return None
+
+    def _require_running(self) -> None:
+        if (sentence := self.ended_early()) is not None:
+            raise ParameterError(sentence)
+
+    def stop(self) -> None:
+        """End all processes: the recorder after the others, SIGKILL for what does not end in time."""
+        deadline = time.monotonic() + STOP_TIMEOUT
+        others = [process for process in self.processes if process.node is not RECORDER]
+        recorders = [process for process in self.processes if process.node is RECORDER]
+        for group in (others, recorders):
+            for process in group:
+                if process.popen.poll() is None:
+                    process.popen.send_signal(signal.SIGINT)
+            for process in group:
+                try:
+                    process.popen.wait(max(deadline - time.monotonic(), 0.2))
+                except subprocess.TimeoutExpired:
+                    process.popen.kill()
+                process.finish()
+        self.processes = []
