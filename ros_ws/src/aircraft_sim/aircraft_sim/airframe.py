@@ -16,7 +16,7 @@ from flight_core.vectors import FloatArray
 
 LIBRARY = Path(str(files("aircraft_sim"))) / "airframes"
 
-Unit = Literal["rad", "deg", "rad/s", "deg/s", "m/s", "1", "%"]
+Unit = Literal["rad", "deg", "crad", "rad/s", "deg/s", "crad/s", "m/s", "ft/s", "1", "%"]
 Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1), BeforeValidator(as_tuple)]
 
 

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from aircraft_sim.params import AircraftParameters
 from flight_core.parameters import Parameters, Positive, require
-from flight_core.rates import divide, period_ns
+from flight_core.rates import period_ns
 from flight_core.scenario import read_sections
 from flight_recorder.params import RecorderParameters
 from reference_model.params import ReferenceModelParameters
@@ -84,5 +84,6 @@ def _check_together(scenario: Scenario) -> None:
             f"the channels of the airframe {airframe.name} in any order: {', '.join(expected)}",
         )
     control_ns = period_ns(controller.rate, "controller.rate")
-    divide(control_ns, period_ns(scenario.aircraft.rate, "aircraft.rate"), "1 / aircraft.rate", "1 / controller.rate")
-    divide(control_ns, period_ns(reference.rate, "reference_model.rate"), "1 / reference_model.rate", "1 / controller.rate")
+    for key, rate in (("aircraft.rate", scenario.aircraft.rate), ("reference_model.rate", reference.rate)):
+        divides = control_ns % period_ns(rate, key) == 0
+        require(divides, key, f"{rate:g} Hz", f"a whole multiple of controller.rate ({controller.rate:g} Hz)")

@@ -15,22 +15,15 @@ from rich.table import Table
 
 from flight_analysis.bag_reader import read_run
 from flight_analysis.report import write_report
-from flight_analysis.scenario import Scenario, load_scenario
+from flight_analysis.scenario import load_scenario
 from flight_analysis.summary import Shown, shown_units, summarise
 from flight_bringup import fly as flying
-from flight_bringup.graph import scenarios, share
+from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError, require
 
 BAD_INPUT, ENDED_EARLY, INTERRUPTED = 2, 3, 130
 
 app = typer.Typer(help="Fly, record and analyse RISE dynamic inversion.", no_args_is_help=True, add_completion=False)
-
-
-def find_scenario(name: str) -> Scenario:
-    """A scenario by its name in the stack, or by the path of a file ending in .yaml. Raises ParameterError."""
-    path = Path(name) if name.endswith(".yaml") else share() / "config" / f"{name}.yaml"
-    require(path.is_file(), "scenario", f"{name!r}", f"one of {', '.join(scenarios())}, or the path of a scenario file (.yaml)")
-    return load_scenario(path.absolute())
 
 
 @app.command()
@@ -63,14 +56,20 @@ def fly(
         outcome = method(chosen, run, progress)
         if outcome == "completed":
             progress(chosen.flight.duration, outcome)
-    flown = flying.conclude(chosen, run, outcome)
+    status = {"completed": 0, "interrupted": INTERRUPTED}.get(outcome, ENDED_EARLY)
+    try:
+        flown = flying.conclude(chosen, run, outcome)
+    except ParameterError as error:
+        if status == 0:
+            raise
+        print(f"error: {outcome} before anything was flown ({error})", file=sys.stderr)
+        raise typer.Exit(status) from None
     if as_json:
         print(json.dumps(flown.summary))
     else:
         show(Console(), flown.summary, shown_units(chosen))
         print(f"outcome: {outcome}\nlog:     {_short(flown.mcap)}\nreport:  {_short(flown.report)}")
-    if outcome != "completed":
-        raise typer.Exit(INTERRUPTED if outcome == "interrupted" else ENDED_EARLY)
+    raise typer.Exit(status)
 
 
 @app.command()

@@ -57,15 +57,17 @@ def new_run(scenario: Scenario, runs: Path) -> Path:
 
 
 @contextmanager
-def _sigterm_as_interrupt() -> Iterator[None]:
+def _signals_as_interrupt() -> Iterator[None]:
+    # SIGINT too: a shell starts background commands with it ignored, and then Python leaves it so.
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def fly_over_topics(scenario: Scenario, run: Path, progress: Progress) -> str:
@@ -80,7 +82,7 @@ def fly_over_topics(scenario: Scenario, run: Path, progress: Progress) -> str:
     outputs = scenario.controller.outputs
     try:
         with (
-            _sigterm_as_interrupt(),
+            _signals_as_interrupt(),
             Flight(scenario.path, run, start_time) as flight,
             Monitor(outputs, nanoseconds(start_time)) as monitor,
         ):

@@ -31,18 +31,6 @@ START_LEAD = 3.0  # s from the first process to t = 0; four processes on two bus
 READY = "recording to"  # what the recorder says when it is ready
 
 
-def share() -> Path:
-    """The folder with `config/` and `launch/`: share/flight_bringup of an installed workspace, else the source tree."""
-    package = Path(__file__).resolve().parent
-    installed = package.parents[3] / "share" / "flight_bringup"
-    return installed if installed.is_dir() else package.parent
-
-
-def scenarios() -> list[str]:
-    """Names of the scenarios that come with the stack."""
-    return sorted(path.stem for path in (share() / "config").glob("*.yaml"))
-
-
 def parameters(node: NodeSpec, scenario_file: Path, run: Path, start_time: float) -> dict[str, str | float]:
     """What a node is told beside its section of the scenario."""
     if node is RECORDER:

@@ -111,6 +111,8 @@ class Flight:
         for process in self.processes:
             if (status := process.popen.poll()) is not None:
                 process.finish()
+                if status < 0:
+                    return f"{process.node.executable} was killed by {signal.Signals(-status).name}"
                 last = next((line for line in reversed(process.lines) if line.strip()), "no output")
                 return f"{process.node.executable} ended with status {status}: {last.removeprefix('error: ')}"
         return None

@@ -31,7 +31,8 @@ class Parameters(BaseModel):
         try:
             return cls.model_validate(dict(values))
         except ValidationError as error:
-            first, *others = error.errors()
+            # A mistyped key is reported before the key that is missing because of it.
+            first, *others = sorted(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
             more = f" (and {len(others)} more)" if others else ""
             raise ParameterError(_sentence(cls, where, first) + more) from None
 
@@ -96,7 +97,9 @@ def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
         return f"{key}: missing, expected {meaning}"
     if kind == "value_error":
         return f"{key}.{error['ctx']['error']}"  # raised by `require`: the rest of the key and the sentence
-    expected = error["msg"].removeprefix("Input should be ").removeprefix("a valid ")
+    expected = (
+        "a list of values" if kind == "tuple_type" else error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
+    )
     return f"{key}: found {found!r}, expected {expected}"
 
 

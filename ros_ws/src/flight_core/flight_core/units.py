@@ -10,6 +10,17 @@ GRAVITY = 9.81
 """Standard gravity as the airframes round it, m/s^2."""
 
 SI_PER_UNIT: Mapping[str, float] = MappingProxyType(
-    {"rad": 1.0, "deg": math.pi / 180.0, "rad/s": 1.0, "deg/s": math.pi / 180.0, "m/s": 1.0, "1": 1.0, "%": 0.01}
+    {
+        "rad": 1.0,
+        "deg": math.pi / 180.0,
+        "crad": 0.01,
+        "rad/s": 1.0,
+        "deg/s": math.pi / 180.0,
+        "crad/s": 0.01,
+        "m/s": 1.0,
+        "ft/s": 0.3048,  # exact: the international foot of 1959
+        "1": 1.0,
+        "%": 0.01,
+    }
 )
 """How much of the SI unit (rad, rad/s, m/s, 1) one of each unit is: value_SI = value * SI_PER_UNIT[unit]."""

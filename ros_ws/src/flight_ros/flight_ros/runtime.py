@@ -6,18 +6,19 @@ import gc
 import os
 import signal
 import sys
-import threading
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
+from types import FrameType
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
@@ -32,6 +33,9 @@ from flight_ros.ticker import Tick, Ticker
 from flight_ros.topics import DIAGNOSTICS, LISTEN, PUBLISH, Topic
 
 P = TypeVar("P", bound=Parameters)
+
+# What rclpy raises for arguments and parameter files that it cannot read.
+REFUSALS = (ParameterException, _rclpy.RCLError, _rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError)
 
 NICE_PAUSE = 0.02  # s, the longest sleep, so that a signal or a service call is not left waiting
 
@@ -153,22 +157,31 @@ class FlightNode(Node, Generic[P]):
         self._diagnostics.publish(message)
 
 
+class _Stop:
+    """Set by a signal handler. No lock: an Event's would hang for ever when a second signal comes inside the first handler."""
+
+    requested = False
+
+    def request(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+
+
 def run(make_node: Callable[[], FlightNode[Any]]) -> None:
     """Run a node until SIGINT or SIGTERM, then leave with exit status 0; 2 for bad parameters, 1 for a fault.
 
     Ticks run on the monotonic clock in the main thread; what comes over topics is taken at the tick. The executor serves
     parameters and services, after ticks and without ever waiting.
     """
-    stop = threading.Event()
+    stop = _Stop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, stop.request)
     try:
         transport.prepare()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
     except ParameterError as error:
         sys.exit(_refuse(str(error)))
-    except (InvalidParameterTypeException, rclpy.exceptions.ParameterException, rclpy._rclpy_pybind11.RCLError) as error:
+    except REFUSALS as error:
         sys.exit(_refuse(" ".join(str(error).split())))
     try:
         if sockets := transport.open_to_network():
@@ -189,7 +202,7 @@ def _refuse(sentence: str) -> int:
     return 2
 
 
-def _loop(node: FlightNode[Any], stop: threading.Event) -> None:
+def _loop(node: FlightNode[Any], stop: _Stop) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     start_ns = node.start_ns() or time.time_ns()
@@ -199,7 +212,7 @@ def _loop(node: FlightNode[Any], stop: threading.Event) -> None:
     gc.collect()
     gc.freeze()  # a collection then takes microseconds, not tens of milliseconds
     serve_ns = report_ns = time.monotonic_ns()
-    while not stop.is_set():
+    while not stop.requested:
         pause = ticker.remaining()
         if pause > 0:
             time.sleep(min(pause, NICE_PAUSE))

@@ -1,0 +1,149 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the theorem asks of an airframe, checked on its matrices: Remark 1 and Assumptions 1 and 3 as a table.
+
+Assumption 2 (f is C1, f and f_dot bounded) needs no check here: gusts and sine terms are C1 and bounded by the file's
+schema, and their rates are bounded as long as the angular rates are.
+"""
+
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eig, eigvals
+
+from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
+from flight_core.vectors import FloatArray
+from rise_di_controller.decomposition import (
+    DecompositionError,
+    Pairing,
+    coupling,
+    leading_minors,
+    search,
+    signs,
+)
+
+ComplexArray = NDArray[np.complex128]
+
+FASTEST_ZERO = 1e4
+"""1/s. Zeros beyond it are the pencil's infinite ones: they are double, so rounding may bring them in, but to no less than
+about 1e7 (the inverse root of 2e-16). The fastest finite one in the library is 7.2."""
+
+ORIGIN = 1e-6
+"""1/s. Real parts below it are zero: rounding leaves 1e-14, and a mode this slow takes 11 days."""
+
+UNCONTROLLABLE = 1e-9
+"""Singular values below this part of the largest are zero: rounding leaves 1e-15, published figures have five digits."""
+
+
+class ZeroDynamics(StrEnum):
+    """Where the invariant zeros lie: what Assumption 3 comes down to."""
+
+    STABLE = "stable"  # all in the open left half plane
+    MARGINAL = "marginal"  # some on the imaginary axis: angles that integrate the rates, to be bounded by an outer loop
+    UNSTABLE = "unstable"  # one in the right half plane: outside the theorem
+
+
+class AirframeFacts(NamedTuple):
+    """What the theorem asks of an airframe, in SI: a row of the table."""
+
+    name: str
+    n: int
+    m: int
+    poles: ComplexArray  # (n,) eigenvalues of A, 1/s
+    zeros: ComplexArray  # finite invariant zeros of (A, B, C), 1/s: n - m of them where Omega is nonsingular
+    Omega: FloatArray  # (m, m) C B
+    minors: FloatArray  # (m,) leading minors of Omega
+    D: FloatArray | None  # (m,) diagonal of D, None where a minor is zero or nearly so
+    coupling: float | None  # max abs(U - I) in inputs of unit response, None with D
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    pairing: Pairing | None  # the smallest change that gives D = I
+    zero_dynamics: ZeroDynamics
+    controllable: bool  # Assumption 1
+
+    @property
+    def in_theorem(self) -> bool:
+        """Whether what can be checked holds: Assumption 1, D exists (10)-(11), no zero in the right half plane."""
+        return self.controllable and self.D is not None and self.zero_dynamics is not ZeroDynamics.UNSTABLE
+
+    @property
+    def remedy(self) -> str:
+        """What gives D = I, for people: "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none"."""
+        if self.pairing is None:
+            return "none"
+        outputs, inputs, input_signs, _ = self.pairing
+        in_place = outputs == inputs == tuple(range(self.m))
+        pairs = ", ".join(f"{self.outputs[i]}-{self.inputs[j]}" for i, j in zip(outputs, inputs, strict=True))
+        flips = ", ".join(self.inputs[j] for j, sign in zip(inputs, input_signs, strict=True) if sign < 0)
+        steps = ([] if in_place else [f"pair {pairs}"]) + ([f"flip {flips}"] if flips else [])
+        return ", ".join(steps) or "none needed"
+
+
+def airframe_facts(airframe: Airframe) -> AirframeFacts:
+    """Check what the theorem asks of an airframe: poles, zeros, Omega = C B with its D, Assumptions 1 and 3; SI.
+
+    Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu, Zergeroglu. Zeros are of the linear
+    part (A, B, C): f, where the file has one, is left out. A published A may have gravity in it.
+    """
+    A, B, C = airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_c()
+    Omega = C @ B
+    zeros = invariant_zeros(A, B, C)
+    try:
+        D, largest = signs(Omega), coupling(Omega)
+    except DecompositionError:
+        D, largest = None, None
+    return AirframeFacts(
+        name=airframe.name,
+        n=len(A),
+        m=len(Omega),
+        poles=np.array(eigvals(A), dtype=np.complex128),
+        zeros=zeros,
+        Omega=Omega,
+        minors=leading_minors(Omega),
+        D=D,
+        coupling=largest,
+        outputs=airframe.outputs,
+        inputs=tuple(airframe.inputs),
+        pairing=search(Omega),
+        zero_dynamics=zero_dynamics(zeros),
+        controllable=controllable(A, B),
+    )
+
+
+def library() -> list[AirframeFacts]:
+    """Facts of every airframe of the library, by name. Raises ParameterError for a file that does not fit."""
+    return [airframe_facts(load_airframe(file.stem)) for file in sorted(LIBRARY.glob("*.yaml"))]
+
+
+def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
+    """Finite s, 1/s, at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank, by real part.
+
+    Shapes: A (n, n), B (n, m), C (m, n); n - m zeros where C B is nonsingular. They are the poles of what is left of the
+    aircraft when y is held at zero. Source: H. H. Rosenbrock, "State-Space and Multivariable Theory", 1970.
+    """
+    n, m = B.shape
+    pencil = np.block([[A, B], [C, np.zeros((m, m))]])
+    weights = np.diag(np.concatenate([np.ones(n), np.zeros(m)]))
+    numerators, denominators = eig(pencil, weights, right=False, homogeneous_eigvals=True)
+    finite = np.abs(numerators) < FASTEST_ZERO * np.abs(denominators)
+    return np.sort_complex(numerators[finite] / denominators[finite])
+
+
+def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
+    """Where the zeros lie, 1/s, shape (n - m,): right half plane, imaginary axis (within ORIGIN) or left half plane."""
+    rightmost = float(np.max(zeros.real, initial=-np.inf))
+    if rightmost > ORIGIN:
+        return ZeroDynamics.UNSTABLE
+    return ZeroDynamics.MARGINAL if rightmost >= -ORIGIN else ZeroDynamics.STABLE
+
+
+def controllable(A: FloatArray, B: FloatArray) -> bool:
+    """Assumption 1 by the test of Popov, Belevitch and Hautus: rank [A - s I, B] = n at every eigenvalue s of A.
+
+    Shapes: A (n, n), B (n, m).
+    """
+    n = len(A)
+    modes = (np.hstack([A - s * np.eye(n), B]) for s in eigvals(A))
+    return all(int(np.linalg.matrix_rank(mode, rtol=UNCONTROLLABLE)) == n for mode in modes)

@@ -1,0 +1,27 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The scenarios that come with the stack, and how a name finds its file."""
+
+from pathlib import Path
+
+from flight_analysis.scenario import Scenario, load_scenario
+from flight_core.parameters import require
+
+
+def share() -> Path:
+    """The folder with `config/` and `launch/`: share/flight_bringup of an installed workspace, else the source tree."""
+    package = Path(__file__).resolve().parent
+    installed = package.parents[3] / "share" / "flight_bringup"
+    return installed if installed.is_dir() else package.parent
+
+
+def scenarios() -> list[str]:
+    """Names of the scenarios that come with the stack."""
+    return sorted(path.stem for path in (share() / "config").glob("*.yaml"))
+
+
+def find_scenario(name: str) -> Scenario:
+    """A scenario by its name in the stack, or by the path of a file ending in .yaml. Raises ParameterError."""
+    path = Path(name) if name.endswith(".yaml") else share() / "config" / f"{name}.yaml"
+    require(path.is_file(), "scenario", f"{name!r}", f"one of {', '.join(scenarios())}, or the path of a scenario file (.yaml)")
+    return load_scenario(path.absolute())

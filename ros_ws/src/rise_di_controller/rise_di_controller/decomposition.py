@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Omega = C B = S D U, equations (10)-(11): what the law has to know of the aircraft is D, and this finds it.
+
+D depends on the order of the channels, on which input drives which output and on the sign of each input, so it is
+validated together with them. U says how good the pairing is: beta and K of channel i grow with abs(U_ij), j > i.
+"""
+
+import math
+from itertools import groupby, permutations, product
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+
+NEARLY_ZERO = 1e-9
+"""Minor k is nearly zero if changing every entry of Omega by this part of its size could turn the sign of
+Delta_k / Delta_(k-1), to first order. Rounding alone is 2e-16 times the growth of the elimination, so this leaves room
+for a growth of 1e6; published and identified figures are six orders of magnitude coarser still."""
+
+_EQUILIBRATIONS = 10  # each halves the spread of the exponents: 10 bring a spread of 1e300 below a factor of 2
+
+
+class DecompositionError(ParameterError):
+    """A matrix without S D U, with the number of the first minor that is zero or nearly zero (None: not even square)."""
+
+    def __init__(self, sentence: str, minor: int | None = None) -> None:
+        super().__init__(sentence)
+        self.minor = minor
+
+
+class SDU(NamedTuple):
+    """Factors of Omega = S diag(D) U, equations (10)-(11)."""
+
+    S: FloatArray  # (m, m) symmetric positive definite, units of y_dot
+    D: FloatArray  # (m,) diagonal of D, +1 or -1
+    U: FloatArray  # (m, m) upper triangular with a diagonal of ones
+
+
+class Pairing(NamedTuple):
+    """A choice of channels with D = I: Omega[outputs][:, inputs] * signs, channel k of the law is row and column k."""
+
+    outputs: tuple[int, ...]  # row of Omega for each channel
+    inputs: tuple[int, ...]  # column of Omega for each channel
+    signs: tuple[int, ...]  # +1, or -1 where the input is to be flipped, for each channel
+    U: FloatArray  # (m, m) of the rearranged matrix in inputs of unit response
+
+
+class _Elimination(NamedTuple):
+    """Omega = L diag(p) W with L unit lower, W unit upper triangular."""
+
+    L: FloatArray
+    p: FloatArray
+    W: FloatArray
+    L_inverse: FloatArray
+
+
+def decompose(Omega: FloatArray) -> SDU:
+    """S, D and U of Omega, shape (m, m), by elimination without pivoting; unique.
+
+        Omega = L diag(p) W,  p_k = Delta_k / Delta_(k-1),  Delta_k the leading minors, Delta_0 = 1
+        S = L diag(abs(p)) L',  D = sign(p),  U = D L^-T D W
+
+    Raises DecompositionError if Omega is not square or not finite, or if a leading minor is zero or nearly so.
+    Source: equations (10)-(11) of Tanyer, Tatlicioglu, Zergeroglu; existence as in A. S. Morse, "A Gain Matrix
+    Decomposition and Some of Its Applications", Systems & Control Letters 21, 1993.
+    """
+    L, p, W, L_inverse = _eliminate(Omega)
+    D = np.sign(p)
+    S = (L * np.abs(p)) @ L.T
+    return SDU((S + S.T) / 2.0, D, (D[:, None] * L_inverse.T * D) @ W + 0.0)  # no -0.0
+
+
+def signs(Omega: FloatArray) -> FloatArray:
+    """D of Omega, shape (m,): D_k = sign(Delta_k / Delta_(k-1)). Raises DecompositionError as `decompose` does."""
+    return np.sign(_eliminate(Omega).p)
+
+
+def leading_minors(Omega: FloatArray) -> FloatArray:
+    """Determinants Delta_k of the first k rows and columns, k = 1 .. m, shape (m,); zeros are answered, not refused.
+
+    Raises DecompositionError if Omega is not square or not finite.
+    """
+    matrix = _square(Omega)
+    return np.array([np.linalg.det(matrix[:k, :k]) for k in range(1, len(matrix) + 1)])
+
+
+def unit_diagonal(Omega: FloatArray) -> FloatArray:
+    """Omega in inputs scaled to unit response, v_i = abs(Omega_ii) u_i: Omega_ij / abs(Omega_jj), shape (m, m).
+
+    Raises DecompositionError if Omega is not square or not finite, or if an output does not respond to its own input.
+    """
+    matrix = _square(Omega)
+    diagonal = np.abs(np.diag(matrix))
+    if not diagonal.all():
+        i = int(np.flatnonzero(diagonal == 0.0)[0])
+        raise DecompositionError(f"Omega: found Omega_{i + 1}{i + 1} = 0, expected outputs that respond to their own inputs")
+    return matrix / diagonal
+
+
+def coupling(Omega: FloatArray) -> float:
+    """How far U is from I in inputs of unit response: max abs(U - I) of `unit_diagonal(Omega)`; large is a bad pairing.
+
+    Infinite where an output does not respond to its own input. It depends on the units of y, not on those of u, nor on
+    their signs. Raises DecompositionError as `decompose` does.
+    """
+    signs(Omega)
+    return _excess(decompose(unit_diagonal(Omega)).U) if np.diag(Omega).all() else math.inf
+
+
+def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
+    """Find the smallest change of the channels that gives D = I, or None where there is none.
+
+    Tried are all orders of the outputs with all orders of the inputs; each admits one choice of input signs, namely D,
+    for flipping input k flips D_k alone. Preferred are, in this order: outputs that keep their inputs, outputs that
+    keep their places, inputs that keep their signs, the smallest max abs(U - I) in inputs of unit response. Orders with
+    a zero on the diagonal, or with max abs(U - I) above `largest_U`, do not count: so a bad pairing can be refused.
+
+    The number of orders is (m!)^2: 576 for four channels, 518 400 for six.
+    Raises DecompositionError if Omega is not square or not finite.
+    """
+    matrix = _square(Omega)
+    places = range(len(matrix))
+
+    def change(order: tuple[tuple[int, ...], tuple[int, ...]]) -> tuple[int, int]:
+        outputs, inputs = order
+        repaired = sum(i != j for i, j in zip(outputs, inputs, strict=True))
+        moved = sum(i != k for i, k in zip(outputs, places, strict=True))
+        return repaired, moved
+
+    orders = sorted(product(permutations(places), permutations(places)), key=change)
+    for _, alike in groupby(orders, key=change):
+        found = [pairing for order in alike if (pairing := _paired(matrix, *order)) is not None]
+        within = [pairing for pairing in found if _excess(pairing.U) <= largest_U]
+        if within:
+            return min(within, key=lambda pairing: (pairing.signs.count(-1), _excess(pairing.U)))
+    return None
+
+
+def _paired(matrix: FloatArray, outputs: tuple[int, ...], inputs: tuple[int, ...]) -> Pairing | None:
+    try:
+        factors = decompose(unit_diagonal(matrix[np.ix_(outputs, inputs)]))
+    except DecompositionError:
+        return None
+    U = factors.D[:, None] * factors.U * factors.D + 0.0  # Omega D = S D U D = S I (D U D)
+    return Pairing(outputs, inputs, tuple(int(sign) for sign in factors.D), U)
+
+
+def _excess(U: FloatArray) -> float:
+    return float(np.max(np.abs(U - np.eye(len(U)))))
+
+
+def _square(Omega: FloatArray) -> FloatArray:
+    matrix = np.array(Omega, dtype=np.float64)
+    if matrix.ndim != 2 or len(set(matrix.shape)) != 1 or matrix.size == 0:
+        raise DecompositionError(f"Omega: found shape {matrix.shape}, expected as many outputs as inputs, (m, m)")
+    if not np.isfinite(matrix).all():
+        raise DecompositionError(f"Omega: found {matrix.tolist()}, expected finite values")
+    return matrix
+
+
+def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Sizes (m,) and (m,) of rows and columns: the largest abs(Omega_ij) / (rows_i columns_j) is 1 in each row and column.
+
+    They follow a change of the units of any channel, so what is small beside them is small in whatever units. A row or
+    column of zeros keeps the size 1. Source: D. Ruiz, "A Scaling Algorithm to Equilibrate Both Rows and Columns Norms in
+    Matrices", RAL-TR-2001-034.
+    """
+    rows = np.ones(len(matrix))
+    columns = np.ones(len(matrix))
+    for _ in range(_EQUILIBRATIONS):
+        scaled = np.abs(matrix) / rows[:, None] / columns
+        row, column = scaled.max(axis=1), scaled.max(axis=0)
+        rows *= np.sqrt(np.where(row > 0.0, row, 1.0))
+        columns *= np.sqrt(np.where(column > 0.0, column, 1.0))
+    return rows, columns
+
+
+def _eliminate(Omega: FloatArray) -> _Elimination:
+    """Omega = L diag(p) W without pivoting; p_k = (L^-1)_k Omega (W^-1)_k, which is what tells how sure its sign is."""
+    rest = _square(Omega)
+    m = len(rest)
+    rows, columns = _sizes(rest)
+    L, W, L_inverse, W_inverse = np.eye(m), np.eye(m), np.eye(m), np.eye(m)
+    p = np.zeros(m)
+    for k in range(m):
+        p[k] = rest[k, k]
+        largest = (np.abs(L_inverse[k]) @ rows) * (columns @ np.abs(W_inverse[:, k]))
+        if abs(p[k]) <= NEARLY_ZERO * largest:
+            raise DecompositionError(
+                f"Omega: found leading minor {k + 1} zero or nearly so (pivot {p[k]:.3g} beside {largest:.3g}), expected "
+                "leading minors away from zero: another order or pairing of the channels may have them",
+                minor=k + 1,
+            )
+        L[k + 1 :, k] = rest[k + 1 :, k] / p[k]
+        W[k, k + 1 :] = rest[k, k + 1 :] / p[k]
+        rest[k + 1 :, k + 1 :] -= np.outer(L[k + 1 :, k], rest[k, k + 1 :])
+        L_inverse[k + 1 :] -= np.outer(L[k + 1 :, k], L_inverse[k])
+        W_inverse[:, k + 1 :] -= np.outer(W_inverse[:, k], W[k, k + 1 :])
+    return _Elimination(L, p, W, L_inverse)
