@@ -174,7 +174,7 @@ def lemma_2(plant: Plant, flown: Evidence, params: LawParams) -> float:
 
 def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
     """integral_0^t of a sampled signal by the trapezoid rule, 0 at the first sample, shape of the signal: (N,) or (N, m)."""
-    return np.asarray(cumulative_trapezoid(signal, t, axis=0, initial=0.0))
+    return np.asarray(cumulative_trapezoid(signal, t, axis=0, initial=0))
 
 
 def largest_rise(signal: FloatArray) -> float:
@@ -204,7 +204,7 @@ def example(dt: float, duration: float) -> Example:
 
     def f(t: float, x: FloatArray) -> FloatArray:
         pushes = [np.sin(0.9 * t), np.cos(0.7 * t), 0.0, 0.0]
-        return np.array([0.3, 0.4, 0.2, 0.1]) * np.sin(x[[2, 0, 3, 1]]) + pushes
+        return np.asarray(np.array([0.3, 0.4, 0.2, 0.1]) * np.sin(x[[2, 0, 3, 1]]) + pushes)
 
     t = dt * np.arange(round(duration / dt) + 1)
     y_m = np.column_stack([0.5 * np.sin(t), 0.4 * np.sin(0.6 * t + 1.0)])

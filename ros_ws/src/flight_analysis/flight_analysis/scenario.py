@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scenario: the validated parameters of every node that one file holds, checked against each other."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field
 
@@ -34,13 +36,18 @@ class Scenario:
     controller: ControllerParameters
     recorder: RecorderParameters
 
-    def with_duration(self, duration: float) -> "Scenario":
-        """The same flight, shorter or longer. Raises ParameterError unless the duration is positive."""
-        return replace(self, flight=FlightParameters.validate_mapping({"duration": duration}, "flight"))
+    def vary(self, **sections: Mapping[str, Any]) -> "Scenario":
+        """The same scenario with some parameters of some sections replaced: vary(controller={"rate": 200.0}).
 
-    def without_gusts(self) -> "Scenario":
-        """The same flight in calm air."""
-        return replace(self, aircraft=self.aircraft.model_copy(update={"gusts": {}}))
+        Everything is checked again. Raises ParameterError.
+        """
+        changed = {
+            name: SCHEMAS[name].validate_mapping(getattr(self, name).model_dump() | changes, name)
+            for name, changes in sections.items()
+        }
+        varied = replace(self, **changed)
+        _check_together(varied)
+        return varied
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
         """From when to when each gust blows, s: entry to entry + 2 H / V0."""

@@ -42,7 +42,7 @@ def fly(
     """
     chosen = find_scenario(scenario)
     if duration is not None:
-        chosen = chosen.with_duration(duration)
+        chosen = chosen.vary(flight={"duration": duration})
     run = flying.new_run(chosen, runs)
     console = Console(stderr=True, quiet=as_json)
     columns = (TextColumn("{task.fields[clock]}"), BarColumn(), TextColumn("{task.fields[shown]}"))

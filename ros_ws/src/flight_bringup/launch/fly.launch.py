@@ -9,16 +9,17 @@ scenario's duration, and ends early when any of its nodes does.
 import time
 from pathlib import Path
 
-from flight_bringup.fly import new_run
-from flight_bringup.graph import NODES, READY, RECORDER, START_LEAD, parameters
-from flight_bringup.scenarios import find_scenario, scenarios
-from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, RegisterEventHandler, Shutdown, TimerAction
 from launch.event_handlers import OnProcessIO
 from launch.events.process import ProcessIO
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+
+from flight_bringup.fly import new_run
+from flight_bringup.graph import NODES, READY, RECORDER, START_LEAD, parameters
+from flight_bringup.scenarios import find_scenario, scenarios
+from launch import LaunchContext, LaunchDescription
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -41,7 +42,7 @@ def generate_launch_description() -> LaunchDescription:
 def _fly(context: LaunchContext) -> list[Action]:
     scenario = find_scenario(LaunchConfiguration("scenario").perform(context))
     if duration := LaunchConfiguration("duration").perform(context):
-        scenario = scenario.with_duration(float(duration))
+        scenario = scenario.vary(flight={"duration": float(duration)})
     run = new_run(scenario, Path(LaunchConfiguration("runs").perform(context)))
     start_time = round(time.time() + START_LEAD, 3)
     nodes = {

@@ -45,6 +45,7 @@ def as_tuple(value: object) -> object:
 # Sequences of a YAML file or a ROS message arrive as lists or arrays; a frozen set keeps tuples.
 Numbers = Annotated[tuple[float, ...], Field(min_length=1), BeforeValidator(as_tuple)]
 Positives = Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1), BeforeValidator(as_tuple)]
+NonNegatives = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1), BeforeValidator(as_tuple)]
 Names = Annotated[tuple[str, ...], Field(min_length=1), BeforeValidator(as_tuple)]
 Signs = Annotated[tuple[int, ...], Field(min_length=1), BeforeValidator(as_tuple)]
 Positive = Annotated[float, Field(gt=0)]

@@ -15,6 +15,7 @@ class Sign(IntEnum):
 
     LITERAL = 0
     IMPLICIT = 1
+    SOFT = 2
 
 
 class LawParams(NamedTuple):
@@ -30,6 +31,7 @@ class LawParams(NamedTuple):
     D: Array  # (m,) diagonal of D, +1 or -1
     input_scale: Array  # (m,) u per scaled input: units of u s / units of y
     omega: Array  # (m,) abs(Omega_ii) in scaled inputs, over-estimated by 1.5 to 2; used by Sign.IMPLICIT alone
+    eps: Array  # (m,) half-width of the softened sign, units of y, > 0; used by Sign.SOFT alone
     sign: Sign
 
 
@@ -64,10 +66,11 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
         LITERAL:   u from Pi as it stands, then Pi += dt beta sgn(e)      (21) by forward Euler
         IMPLICIT:  Pi += dt beta s first, s = clip(e_hat / (dt^2 omega beta), -1, 1)
                    e_hat = e + (e - e_p) - dt omega K ((e - e_p) + Lambda dt (e + e_p) / 2)
+        SOFT:      Pi += dt beta s first, s = clip(e / eps, -1, 1)
         u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi)         (20)
 
     e_hat is e one tick ahead if Pi stays, and s the element of Sgn(e one tick ahead) that makes the prediction consistent:
-    backward Euler of (21), whose error falls with dt^2 and which does not chatter. u is the deviation from the input
+    backward Euler of (21), whose error falls with dt^2 and which does not chatter. SOFT is for loops with lag. u is the deviation from the input
     at engagement. sgn(0) = 0. dt > 0.
 
     Shapes: y, y_m, u (m,), dt (). Units: SI and radians; u in the units that input_scale gives it.
@@ -81,10 +84,14 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
         applied = state.Pi
         Pi = state.Pi + dt * params.beta * xp.sign(e)
     else:
-        change = e - state.e
-        e_hat = e + change - dt * params.omega * params.K * (change + params.Lambda * increment)
+        if params.sign is Sign.IMPLICIT:
+            change = e - state.e
+            e_hat = e + change - dt * params.omega * params.K * (change + params.Lambda * increment)
+            s = e_hat / (dt * dt * params.omega * params.beta)
+        else:
+            s = e / params.eps
         one = xp.ones_like(e)
-        s = xp.minimum(xp.maximum(e_hat / (dt * dt * params.omega * params.beta), -one), one)
+        s = xp.minimum(xp.maximum(s, -one), one)
         applied = Pi = state.Pi + dt * params.beta * s
     v = -params.D * (params.K * (e - state.e_0 + params.Lambda * integral_e) + applied)
     return LawState(state.e_0, e, integral_e, Pi), params.input_scale * v

@@ -24,6 +24,7 @@ class ControllerNode(FlightNode[ControllerParameters]):
     def __init__(self) -> None:
         super().__init__("controller", ControllerParameters)
         self._law, self._guard = self.parameters.law(), self.parameters.guard()
+        self.get_logger().info(self.parameters.sampled_sign()[1])
         self._names = internals.names(self.parameters.outputs)
         self._state = guard.start(len(self.parameters.inputs))
         self._y: deque[Sample] = deque(maxlen=1)

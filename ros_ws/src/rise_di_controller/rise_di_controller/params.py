@@ -7,8 +7,19 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from flight_core.parameters import Names, Parameters, Positive, Positives, Signs, as_tuple, require, require_length
+from flight_core.parameters import (
+    Names,
+    NonNegatives,
+    Parameters,
+    Positive,
+    Positives,
+    Signs,
+    as_tuple,
+    require,
+    require_length,
+)
 from flight_core.rates import nanoseconds, period_ns
+from flight_core.vectors import FloatArray
 from rise_di_controller.guard import GuardParams
 from rise_di_controller.law import LawParams, Sign, gain
 
@@ -28,7 +39,12 @@ class ControllerParameters(Parameters):
     D: Signs = Field(description="the diagonal of D (11), +1 or -1")
     input_scale: Positives = Field(description="how much u changes y_dot by one, diagonal: 1 / abs(Omega_ii)")
     omega: Positives = Field(description="abs(Omega_ii) in scaled inputs, over-estimated by 1.5 to 2 (implicit sign)")
-    sign: Literal["literal", "implicit"] = Field(description="how the sign of (21) is sampled")
+    sign: Literal["auto", "literal", "implicit", "soft"] = Field(
+        description="how the sign of (21) is sampled; auto: implicit where lag and delay are below half a period, else soft"
+    )
+    lag: NonNegatives = Field(description="time constants of the actuators, s, one a channel; 0 where there is none")
+    delay: Annotated[float, Field(ge=0)] = Field(description="pure delay from y to the actuators, beyond sampling, s")
+    softening: Positive = Field(description="width of the softened sign in total lags; above 1 the loop is stable, 3 is usual")
     max_age: Positive = Field(description="the age beyond which y or y_m is stale, s")
 
     @model_validator(mode="after")
@@ -36,7 +52,7 @@ class ControllerParameters(Parameters):
         period_ns(self.rate, "rate")
         require_length("inputs", self.inputs, self.outputs)
         require_length("k_d", self.k_d, self.outputs[:-1])
-        for key in ("Lambda", "beta", "D", "input_scale", "omega"):
+        for key in ("Lambda", "beta", "D", "input_scale", "omega", "lag"):
             require_length(key, getattr(self, key), self.outputs)
         for i, sign in enumerate(self.D):
             require(sign in (-1, 1), f"D[{i}]", sign, "+1 or -1")
@@ -44,15 +60,30 @@ class ControllerParameters(Parameters):
 
     def law(self) -> LawParams:
         """The arrays of the law."""
+        K = gain(np.array(self.k_g), np.array(self.k_d, dtype=np.float64))
         return LawParams(
-            K=gain(np.array(self.k_g), np.array(self.k_d, dtype=np.float64)),
+            K=K,
             Lambda=np.array(self.Lambda),
             beta=np.array(self.beta),
             D=np.array(self.D, dtype=np.float64),
             input_scale=np.array(self.input_scale),
             omega=np.array(self.omega),
-            sign=Sign[self.sign.upper()],
+            eps=np.array(self.beta) / K * self.softening * self.total_lag(),
+            sign=self.sampled_sign()[0],
         )
+
+    def total_lag(self) -> FloatArray:
+        """Lag from y to the actuators by channel, shape (m,), s: actuator + 1.5 period (sampling and hold) + delay."""
+        return np.array(self.lag) + 1.5 / self.rate + self.delay
+
+    def sampled_sign(self) -> tuple[Sign, str]:
+        """How the sign is sampled, and why, as a sentence."""
+        if self.sign != "auto":
+            return Sign[self.sign.upper()], f"{self.sign} sign, as asked for"
+        lag, half = max(self.lag) + self.delay, 0.5 / self.rate
+        if lag < half:
+            return Sign.IMPLICIT, f"implicit sign, because lag and delay of {lag:g} s are below half a period ({half:g} s)"
+        return Sign.SOFT, f"softened sign, because lag and delay of {lag:g} s reach half a period ({half:g} s)"
 
     def guard(self) -> GuardParams:
         """Period and age limit."""

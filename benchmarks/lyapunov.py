@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Draws docs/images/lyapunov.svg: V1, V2, e and r of the small example, with (29), (30) met by beta and broken by it.
+
+python benchmarks/lyapunov.py
+"""
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from flight_analysis.lyapunov import Evidence, evidence, example, fly, lemma_2
+
+IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "lyapunov.svg"
+DT, DURATION = 0.01, 60.0  # s
+TOO_SMALL = 0.05
+COLOURS = ("#1f6f8b", "#c8553d")
+
+
+def flights() -> dict[str, Evidence]:
+    """The same flight under beta and under 0.05 beta, both with the constant zeta_b that carries the first."""
+    case = example(DT, DURATION)
+    found = {}
+    zeta_b = 0.0
+    for factor in (1.0, TOO_SMALL):
+        params = case.params._replace(beta=factor * case.params.beta)
+        flight = fly(case.plant, case.y_m, DT, params, case.x_0)
+        zeta_b = zeta_b or lemma_2(case.plant, evidence(case.plant, flight, params), params)
+        found[f"beta = ({', '.join(f'{b:g}' for b in params.beta)})"] = evidence(case.plant, flight, params, zeta_b)
+    return found
+
+
+def draw(found: dict[str, Evidence]) -> Figure:
+    """Four panels over time, a line a gain set: V1 and the norms of e and r on log scales, V2 on a linear one."""
+    figure = Figure(figsize=(9.0, 5.6), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True)
+    for (name, flown), colour in zip(found.items(), COLOURS, strict=True):
+        lines = (flown.V1, flown.V2, np.linalg.norm(flown.e, axis=1), np.linalg.norm(flown.r, axis=1))
+        for axis, line in zip(axes.flat, lines, strict=True):
+            axis.plot(flown.t, line, color=colour, linewidth=1.2, label=name)
+    for axis, title in zip(axes.flat, ("V1 (31)", "V2 = V1 + P (48)", "|e| (3)", "|r| (4)"), strict=True):
+        axis.set_title(title, fontsize=10, loc="left")
+        axis.grid(color="#dddddd", linewidth=0.6)
+        axis.spines[["top", "right"]].set_visible(False)
+        if not title.startswith("V2"):
+            axis.set_yscale("log")
+    axes[0, 1].axhline(0.0, color="black", linewidth=0.8)
+    for axis in axes[1]:
+        axis.set_xlabel("t in s")
+    axes[0, 1].legend(frameon=False, fontsize=9)
+    return figure
+
+
+def main() -> None:
+    """Fly both gain sets, draw, and say the figures that the theory page states."""
+    mpl.rcParams["svg.hashsalt"] = "lyapunov"  # the same file from the same flight
+    found = flights()
+    IMAGE.parent.mkdir(parents=True, exist_ok=True)
+    draw(found).savefig(IMAGE, metadata={"Date": None})
+    for name, flown in found.items():
+        late = flown.t > 20.0
+        e, r = (np.max(np.linalg.norm(signal[late], axis=1)) for signal in (flown.e, flown.r))
+        print(
+            f"{name}: V2 {flown.V2[0]:.2f} -> {flown.V2[-1]:.2f}, P >= {flown.P.min():.2f}, past 20 s |e| {e:.2g}, |r| {r:.2g}"
+        )
+
+
+if __name__ == "__main__":
+    main()

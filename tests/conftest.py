@@ -1,0 +1,16 @@
+"""What all tests share: the default scenario."""
+
+from pathlib import Path
+
+import pytest
+
+from flight_analysis.scenario import Scenario
+from flight_bringup.scenarios import find_scenario
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def osprey_gust() -> Scenario:
+    """The default scenario."""
+    return find_scenario("osprey_gust")

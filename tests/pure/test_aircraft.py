@@ -1,0 +1,126 @@
+"""The simulated aircraft against exact solutions."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from aircraft_sim import dynamics, truth
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.disturbance import Gusts, one_minus_cosine
+from aircraft_sim.dynamics import Aircraft
+from aircraft_sim.params import AircraftParameters
+from aircraft_sim.plant import advance
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
+
+MS = 1_000_000
+
+
+def osprey(**gusts: dict[str, float]) -> Aircraft:
+    values = {"airframe": "osprey", "rate": 500.0, "step": 0.002, "gusts": gusts}
+    return AircraftParameters.validate_mapping(values, "aircraft").load()[1]
+
+
+def linear(aircraft: Aircraft) -> Aircraft:
+    return aircraft._replace(gravity=np.zeros_like(aircraft.gravity))
+
+
+def test_without_f_the_plant_follows_the_matrix_exponential() -> None:
+    # x(t) = exp([[A, B], [0, 0]] t) [x0; u] exactly for a held u. Runge-Kutta with 2 ms and poles up to 13 rad/s leaves
+    # (0.026)^5 / 120 a step, about 1e-9 over a second.
+    aircraft = linear(osprey())
+    x_0, u = np.linspace(-0.1, 0.1, 8), np.array([0.02, 0.1, -0.01, 0.03])
+    block = np.block([[aircraft.A, aircraft.B], [np.zeros((4, 12))]])
+    exact = (expm(block * 1.0) @ np.concatenate([x_0, u]))[:8]
+    flown = advance(0, x_0, u, NANOSECONDS, 2 * MS, aircraft)
+    assert flown == pytest.approx(exact, abs=1e-8)
+
+
+def test_halving_the_step_divides_the_integration_error_by_sixteen() -> None:
+    aircraft = osprey()
+    x_0, u = np.linspace(-0.2, 0.2, 8), np.zeros(4)
+    finest = advance(0, x_0, u, NANOSECONDS, MS // 4, aircraft)
+    errors = [np.abs(advance(0, x_0, u, NANOSECONDS, step, aircraft) - finest).max() for step in (20 * MS, 10 * MS)]
+    assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.15)  # fourth order
+
+
+def test_the_plant_agrees_with_an_adaptive_integrator_through_a_gust() -> None:
+    aircraft = osprey(vertical={"start": 0.2, "speed": 10.12, "length": 15.24})
+    u = np.array([0.01, 0.0, 0.02, 0.0])
+    reference = solve_ivp(
+        lambda t, x: dynamics.x_dot(t, x, u, aircraft),
+        (0.0, 2.0),
+        np.zeros(8),
+        method="DOP853",
+        rtol=1e-11,
+        atol=1e-12,
+        max_step=0.01,
+    )
+    flown = advance(0, np.zeros(8), u, 2 * NANOSECONDS, 2 * MS, aircraft)
+    # The gust's second derivative jumps at its ends, which costs Runge-Kutta an order there.
+    assert flown == pytest.approx(reference.y[:, -1], abs=1e-6)
+
+
+def test_gust_peaks_at_its_speed_half_way_and_is_zero_outside() -> None:
+    gusts = Gusts(np.array([40.0]), np.array([10.12]), np.array([15.24]))
+    speed = np.array(25.0)
+    at = {t: float(one_minus_cosine(t, gusts, speed)[0]) for t in (0.0, 40.0, 40.0 + 15.24 / 25, 40.0 + 2 * 15.24 / 25, 99.0)}
+    # w = U/2 (1 - cos(pi s / H)): U at s = H, 0 at s = 0 and 2H
+    assert list(at.values()) == pytest.approx([0.0, 0.0, 10.12, 0.0, 0.0], abs=1e-12)
+
+
+@given(speed=st.floats(-20, 20), length=st.floats(1, 100), t=st.floats(0, 100))
+def test_gust_stays_between_zero_and_its_speed_with_bounded_derivative(speed: float, length: float, t: float) -> None:
+    gusts = Gusts(np.array([10.0]), np.array([speed]), np.array([length]))
+    w = [float(one_minus_cosine(t + dt, gusts, np.array(25.0))[0]) for dt in (0.0, 1e-4)]
+    assert min(0.0, speed) - 1e-12 <= w[0] <= max(0.0, speed) + 1e-12
+    # abs(w_dot) <= U/2 pi V0 / H
+    assert abs(w[1] - w[0]) <= 1e-4 * abs(speed) / 2 * math.pi * 25.0 / length + 1e-12
+
+
+def test_a_gust_of_speed_zero_is_exactly_no_gust() -> None:
+    calm, zero = osprey(), osprey(vertical={"start": 0.0, "speed": 0.0, "length": 15.24})
+    x = np.linspace(-0.1, 0.1, 8)
+    assert (dynamics.f(0.5, x, zero) == dynamics.f(0.5, x, calm)).all()
+
+
+def test_gravity_and_lateral_coupling_enter_as_published() -> None:
+    x = np.zeros(8)
+    x[3], x[7] = 0.1, -0.2  # theta, phi
+    f = dynamics.f(0.0, x, osprey())
+    # V_dot gets -9.81 sin(theta), beta_dot +0.39 sin(phi): MacKunis et al. 2010
+    assert f == pytest.approx([-9.81 * math.sin(0.1), 0, 0, 0, 0.39 * math.sin(-0.2), 0, 0, 0], abs=1e-15)
+
+
+def test_inputs_of_the_airframe_are_converted_to_si_once() -> None:
+    airframe = load_airframe("osprey")
+    B = airframe.matrix_b()
+    # 0.98 rad/s^2 per degree of elevator; 0.06 m/s^2 per percent of thrust
+    assert B[2, 0] == pytest.approx(0.98 * 180 / math.pi)
+    assert B[0, 1] == pytest.approx(6.0)
+
+
+def test_truth_holds_the_state_the_disturbance_and_the_gusts() -> None:
+    values = {
+        "airframe": "osprey",
+        "rate": 500.0,
+        "step": 0.002,
+        "gusts": {"vertical": {"start": 0.0, "speed": 2.0, "length": 10.0}},
+    }
+    parameters = AircraftParameters.validate_mapping(values, "aircraft")
+    airframe, aircraft = parameters.load()
+    names = truth.names(airframe, parameters)
+    shown = dict(zip(names, truth.values(400 * MS, np.arange(8.0) / 100, aircraft), strict=True))
+    assert shown["x.phi"] == 0.07
+    assert shown["gust.vertical"] == pytest.approx(2.0)  # s = 25 0.4 = H
+    assert shown["f.V"] == pytest.approx(-9.81 * math.sin(0.03) - 11.1 * 2.0 / 25)
+
+
+def test_a_step_that_does_not_divide_the_time_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"step: found 0\.003 s, expected a whole fraction of the duration \(0\.01 s\)"):
+        advance(0, np.zeros(8), np.zeros(4), 10 * MS, 3 * MS, osprey())

@@ -1,0 +1,287 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Omega = S D U: the factors, what D depends on, what is refused, and which pairing of channels gives D = I."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from aircraft_sim.airframe import load_airframe
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+from rise_di_controller.decomposition import (
+    SDU,
+    DecompositionError,
+    coupling,
+    decompose,
+    leading_minors,
+    search,
+    signs,
+    unit_diagonal,
+)
+
+EPSILON = float(np.finfo(np.float64).eps)
+
+SIZES = st.integers(1, 5)
+ENTRIES = st.floats(-10.0, 10.0).filter(lambda value: abs(value) > 0.01)
+
+
+@st.composite
+def matrices(draw: st.DrawFn) -> FloatArray:
+    m = draw(SIZES)
+    return draw(arrays(np.float64, (m, m), elements=ENTRIES))
+
+
+@st.composite
+def factors(draw: st.DrawFn) -> SDU:
+    m = draw(SIZES)
+    root = draw(arrays(np.float64, (m, m), elements=st.floats(-2.0, 2.0)))
+    D = draw(arrays(np.float64, m, elements=st.sampled_from([-1.0, 1.0])))
+    U = np.eye(m) + np.triu(draw(arrays(np.float64, (m, m), elements=st.floats(-2.0, 2.0))), 1)
+    return SDU(root @ root.T + np.eye(m), D, U)
+
+
+def product(sdu: SDU) -> FloatArray:
+    return sdu.S @ np.diag(sdu.D) @ sdu.U
+
+
+def decomposed(Omega: FloatArray) -> SDU:
+    """Leave out the examples that have no S D U."""
+    try:
+        return decompose(Omega)
+    except DecompositionError:
+        assume(False)
+        raise
+
+
+def osprey() -> FloatArray:
+    """Omega of the osprey in the units of its file: rad/s and m/s per deg and %."""
+    airframe = load_airframe("osprey")
+    B: FloatArray = np.array(airframe.B)
+    return airframe.matrix_c() @ B
+
+
+@given(matrices())
+def test_the_factors_have_the_shapes_that_the_paper_asks_for(Omega: FloatArray) -> None:
+    S, D, U = decomposed(Omega)
+    assert np.array_equal(S, S.T)
+    # A Cholesky factor exists for positive definite matrices alone; the shift is the rounding of the entries of S.
+    np.linalg.cholesky(S + EPSILON * len(S) * np.diag(np.diag(S)))
+    assert set(D) <= {-1.0, 1.0}
+    assert np.array_equal(U, np.triu(U))
+    assert np.array_equal(np.diag(U), np.ones(len(U)))
+
+
+@given(matrices())
+def test_the_product_of_the_factors_is_omega_to_machine_precision(Omega: FloatArray) -> None:
+    sdu = decomposed(Omega)
+    residual = np.linalg.norm(product(sdu) - Omega)
+    # 1.0 was the largest of 20 000 random matrices of up to 6 channels with entries over 6 decades; times 10.
+    assert residual <= 10.0 * len(Omega) * EPSILON * np.linalg.norm(sdu.S) * np.linalg.norm(sdu.U)
+
+
+@given(factors())
+def test_factors_put_together_come_back_as_they_are_unique(known: SDU) -> None:
+    found = decompose(product(known))
+    # S has eigenvalues in [1, 101]: its rounding is amplified by far less than 1e6, which 1e-10 leaves room for.
+    np.testing.assert_allclose(found.S, known.S, rtol=1e-10, atol=1e-10 * float(np.max(known.S)))
+    np.testing.assert_array_equal(found.D, known.D)
+    np.testing.assert_allclose(found.U, known.U, atol=1e-10 * float(np.max(known.S)))
+
+
+@given(matrices())
+def test_d_is_the_sign_of_the_ratios_of_leading_minors(Omega: FloatArray) -> None:
+    D = decomposed(Omega).D
+    minors = leading_minors(Omega)
+    np.testing.assert_array_equal(D, np.sign(minors / np.concatenate([[1.0], minors[:-1]])))
+    np.testing.assert_array_equal(D, signs(Omega))
+
+
+@given(matrices(), st.data())
+def test_flipping_an_input_flips_its_own_d_alone(Omega: FloatArray, data: st.DataObject) -> None:
+    D = decomposed(Omega).D
+    k = data.draw(st.integers(0, len(Omega) - 1))
+    flip = np.where(np.arange(len(Omega)) == k, -1.0, 1.0)
+    np.testing.assert_array_equal(signs(Omega * flip), D * flip)
+
+
+@given(matrices(), st.data())
+def test_units_of_inputs_and_outputs_do_not_change_d(Omega: FloatArray, data: st.DataObject) -> None:
+    # Clear of the limit of 1e-9: its distance is measured in equilibrated units, which other units move by a factor.
+    D = decomposed(Omega).D
+    assume(all(abs(minor) > 1e-6 for minor in leading_minors(Omega)))
+    units = arrays(np.float64, len(Omega), elements=st.sampled_from([1e-3, 0.01, 0.3048, 1.0, 57.3, 1e4]))
+    np.testing.assert_array_equal(signs(data.draw(units)[:, None] * Omega * data.draw(units)), D)
+
+
+@given(matrices(), st.data())
+def test_coupling_depends_on_neither_units_nor_signs_of_the_inputs(Omega: FloatArray, data: st.DataObject) -> None:
+    decomposed(Omega)
+    assume(all(abs(minor) > 1e-6 for minor in leading_minors(Omega)))
+    units = data.draw(arrays(np.float64, len(Omega), elements=st.sampled_from([-57.3, -1.0, 0.01, 1.0, 8.0])))
+    assert coupling(Omega * units) == pytest.approx(coupling(Omega), rel=1e-6, abs=1e-9)
+
+
+@given(matrices())
+@settings(max_examples=30)  # up to 14 400 orders of five channels
+def test_what_search_finds_has_d_equal_to_one_and_the_u_it_says(Omega: FloatArray) -> None:
+    pairing = search(Omega)
+    assume(pairing is not None)
+    assert pairing is not None
+    outputs, inputs, input_signs, U = pairing
+    rearranged = Omega[np.ix_(outputs, inputs)] * np.array(input_signs)
+    np.testing.assert_array_equal(signs(rearranged), np.ones(len(Omega)))
+    np.testing.assert_allclose(decompose(unit_diagonal(rearranged)).U, U, atol=1e-9 * float(np.max(np.abs(U))))
+
+
+@given(matrices())
+def test_where_omega_has_s_d_u_flipping_inputs_by_d_is_the_whole_change(Omega: FloatArray) -> None:
+    D = decomposed(Omega).D
+    pairing = search(Omega)
+    assert pairing is not None
+    assert pairing.outputs == pairing.inputs == tuple(range(len(Omega)))
+    assert pairing.signs == tuple(D)
+
+
+def test_a_diagonal_omega_is_its_own_s() -> None:
+    S, D, U = decompose(np.diag([2.0, -3.0]))
+    np.testing.assert_array_equal(S, np.diag([2.0, 3.0]))
+    np.testing.assert_array_equal(D, [1.0, -1.0])
+    np.testing.assert_array_equal(U, np.eye(2))
+
+
+def test_a_positive_diagonal_does_not_make_d_one() -> None:
+    # By hand: L = [[1, 0], [2, 1]], p = (1, -3), W = [[1, 2], [0, 1]]; S = L |p| L', U = D L^-T D W.
+    S, D, U = decompose(np.array([[1.0, 2.0], [2.0, 1.0]]))
+    np.testing.assert_array_equal(S, [[1.0, 2.0], [2.0, 7.0]])
+    np.testing.assert_array_equal(D, [1.0, -1.0])
+    np.testing.assert_array_equal(U, [[1.0, 4.0], [0.0, 1.0]])
+
+
+def test_a_nonsingular_omega_without_s_d_u_is_refused_by_the_number_of_its_minor() -> None:
+    with pytest.raises(DecompositionError, match=r"^Omega: found leading minor 1 zero .*, expected .*") as caught:
+        decompose(np.array([[0.0, 1.0], [1.0, 0.0]]))
+    assert caught.value.minor == 1
+    assert isinstance(caught.value, ParameterError)
+
+
+@pytest.mark.parametrize(
+    ("Omega", "minor"),
+    [
+        ([[0.0, 0.0], [0.0, 0.0]], 1),
+        ([[1e-17, 1.0], [1.0, 0.0]], 1),  # a zero that rounding filled in
+        ([[1.0, 1.0], [1.0, 1.0]], 2),
+        ([[1.0, 1.0], [1.0, 1.0 + 1e-12]], 2),
+        ([[1.0, 0.1, 0.0], [0.1, 0.01, 1.0], [0.0, 1.0, 1.0]], 2),  # 0.1 * 0.1 is not 0.01 in floating point
+        ([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]], 3),
+    ],
+)
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_a_minor_that_is_zero_up_to_rounding_is_refused_in_any_unit(Omega: list[list[float]], minor: int, unit: float) -> None:
+    units = unit ** np.arange(len(Omega))
+    with pytest.raises(DecompositionError) as caught:
+        signs(units[:, None] * np.array(Omega) / units[::-1])
+    assert caught.value.minor == minor
+
+
+def test_a_minor_that_is_small_in_its_units_alone_is_not_refused() -> None:
+    np.testing.assert_array_equal(signs(np.diag([1e-200, 1e200])), [1.0, 1.0])
+
+
+def test_a_minor_of_one_part_in_a_million_still_has_a_sign() -> None:
+    # Published derivatives have two to five digits: what is told apart by a sixth digit must not be refused.
+    np.testing.assert_array_equal(signs(np.array([[1.0, 1.0], [1.0, 1.0 - 1e-6]])), [1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("Omega", "sentence"),
+    [
+        (np.ones((1, 3)), r"Omega: found shape \(1, 3\), expected as many outputs as inputs"),
+        (np.ones(3), r"Omega: found shape \(3,\), expected as many outputs as inputs"),
+        (np.ones((0, 0)), r"Omega: found shape \(0, 0\), expected as many outputs as inputs"),
+        (np.array([[math.nan]]), r"Omega: found \[\[nan\]\], expected finite values"),
+        (np.array([[1.0, 0.0], [0.0, math.inf]]), r"Omega: found .*inf.*, expected finite values"),
+    ],
+)
+def test_what_is_not_a_square_of_numbers_is_refused(Omega: FloatArray, sentence: str) -> None:
+    for function in (decompose, signs, leading_minors, unit_diagonal, coupling, search):
+        with pytest.raises(DecompositionError, match=sentence):
+            function(Omega)
+
+
+def test_leading_minors_answers_zeros() -> None:
+    np.testing.assert_array_equal(leading_minors(np.array([[0.0, 1.0], [1.0, 0.0]])), [0.0, -1.0])
+
+
+def test_the_osprey_has_d_equal_to_one_and_hardly_any_coupling() -> None:
+    # Channels q, V, p, r and elevator, thrust, aileron, rudder, positive as the airframe file says.
+    np.testing.assert_array_equal(signs(osprey()), [1.0, 1.0, 1.0, 1.0])
+    assert coupling(osprey()) == pytest.approx(0.058, abs=5e-4)
+
+
+def test_textbook_elevator_sign_flips_the_first_d() -> None:
+    trailing_edge_down = osprey() * np.array([-1.0, 1.0, 1.0, 1.0])
+    np.testing.assert_array_equal(signs(trailing_edge_down), [-1.0, 1.0, 1.0, 1.0])
+    pairing = search(trailing_edge_down)
+    assert pairing is not None
+    assert pairing.signs == (-1, 1, 1, 1)
+
+
+def test_rudder_paired_with_roll_rate_flips_a_d_and_makes_u_large() -> None:
+    swapped = osprey()[:, [0, 1, 3, 2]]
+    _, D, U = decompose(swapped)
+    np.testing.assert_array_equal(D, [1.0, 1.0, -1.0, 1.0])
+    # By hand, on the block [[-0.02, 1.5], [0.17, -0.09]]: W_12 = -75, L_21 = -8.5, U_12 = W_12 + L_21.
+    assert U[2, 3] == pytest.approx(-83.5, abs=1e-9)
+
+
+def test_search_flips_a_bad_pairing_unless_told_how_large_u_may_be() -> None:
+    swapped = osprey()[:, [0, 1, 3, 2]]
+    flipped = search(swapped)
+    assert flipped is not None
+    assert flipped.inputs == (0, 1, 2, 3)
+    assert flipped.signs == (1, 1, -1, 1)
+    repaired = search(swapped, largest_U=1.0)
+    assert repaired is not None
+    assert repaired.outputs == (0, 1, 2, 3)
+    assert repaired.inputs == (0, 1, 3, 2)
+    assert repaired.signs == (1, 1, 1, 1)
+    assert float(np.max(np.abs(repaired.U - np.eye(4)))) == pytest.approx(0.058, abs=5e-4)
+
+
+def test_search_pairs_anew_where_no_signs_help() -> None:
+    pairing = search(np.array([[0.0, 1.0], [1.0, 0.0]]))
+    assert pairing is not None
+    assert pairing.outputs == (0, 1)
+    assert pairing.inputs == (1, 0)
+    assert pairing.signs == (1, 1)
+
+
+@pytest.mark.parametrize(("near", "far", "inputs"), [(1.0, 0.1, (1, 2, 0)), (0.1, 1.0, (2, 0, 1))])
+def test_search_prefers_the_smaller_u_among_equal_changes(near: float, far: float, inputs: tuple[int, ...]) -> None:
+    # No output responds to its own input, so all three are paired anew, one way round or the other.
+    pairing = search(np.array([[0.0, near, far], [far, 0.0, near], [near, far, 0.0]]))
+    assert pairing is not None
+    assert pairing.inputs == inputs
+    assert float(np.max(np.abs(pairing.U - np.eye(3)))) < 0.2  # the other way round it is above 1
+
+
+def test_search_finds_nothing_for_a_singular_omega() -> None:
+    assert search(np.array([[1.0, 2.0], [2.0, 4.0]])) is None
+
+
+def test_coupling_is_infinite_where_an_output_ignores_its_own_input() -> None:
+    assert coupling(np.array([[1.0, 1.0], [1.0, 0.0]])) == math.inf
+    with pytest.raises(DecompositionError, match="found Omega_22 = 0"):
+        unit_diagonal(np.array([[1.0, 1.0], [1.0, 0.0]]))
+
+
+def test_fifty_percent_on_every_entry_never_changes_d_of_the_osprey() -> None:
+    generator = np.random.default_rng(20101)
+    Omega = osprey()
+    for _ in range(1000):  # 5000 give none either; 90 % gives 2 to 4 in 10 000
+        np.testing.assert_array_equal(signs(Omega * generator.uniform(0.5, 1.5, Omega.shape)), np.ones(4))

@@ -1,0 +1,588 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+# ruff: noqa: D102, N802 - functions bear the paper's symbols, which say what they are
+"""The paper, equation by equation, on a random plant; then each of its slips, shown to be one, and its repair.
+
+The closed loop here is the paper's continuous one, (1), (2), (20), (21), integrated to 1e-10: it exists to check the paper.
+The law that flies is `rise_di_controller.law`, and the last test of the first part ties the two together.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise, product
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from aircraft_sim import dynamics
+from aircraft_sim.params import AircraftParameters, Gust
+from flight_analysis.lyapunov import Plant, decay, evidence, example, fly
+from flight_core.units import GRAVITY
+from flight_core.vectors import FloatArray
+from reference_model.command import Profile, command
+from reference_model.model import Model, output, second_order, step
+from rise_di_controller.decomposition import DecompositionError, decompose
+from rise_di_controller.law import LawParams, Sign, gain
+
+EXACT = 1e-11  # rounding in sums of some hundred terms of size 1 to 100
+DIFFERENCED = 1e-5  # central differences over 1 ms of a solution good to 1e-10; measured below 1e-6
+
+# ---------------------------------------------------------------------------------------------------------------------
+# A random plant under the continuous law
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+class Problem(NamedTuple):
+    """A plant (1) with f = W sin(G x + omega t), a model (2) with u_m = a sin(nu t + 1), and gains."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    W: FloatArray
+    G: FloatArray
+    omega: FloatArray
+    A_m: FloatArray
+    B_m: FloatArray
+    nu: FloatArray
+    S: FloatArray
+    D: FloatArray
+    U: FloatArray
+    K: FloatArray
+    Lambda: FloatArray
+    beta: FloatArray
+
+    def f(self, t: float, x: FloatArray) -> FloatArray:
+        return self.W @ np.sin(self.G @ x + self.omega * t)
+
+    def f_dot(self, t: float, x: FloatArray, x_dot: FloatArray) -> FloatArray:
+        return self.W @ (np.cos(self.G @ x + self.omega * t) * (self.G @ x_dot + self.omega))
+
+    def u_m(self, t: float) -> FloatArray:
+        return np.asarray(0.3 * np.sin(self.nu * t + 1.0))
+
+    def u_m_dot(self, t: float) -> FloatArray:
+        return np.asarray(0.3 * self.nu * np.cos(self.nu * t + 1.0))
+
+
+def law_of(p: Problem) -> LawParams:
+    """The problem's gains as the law takes them, its inputs unscaled."""
+    one = np.ones(len(p.D))
+    return example(1.0, 1.0).params._replace(K=p.K, Lambda=p.Lambda, beta=p.beta, D=p.D, input_scale=one, omega=one)
+
+
+def random_problem(seed: int, n: int = 6, m: int = 3) -> Problem:
+    """Omega = S D U by choice: B = C^+ Omega plus what C does not see. A and A_m are shifted until they are Hurwitz."""
+    rng = np.random.default_rng(seed)
+
+    def hurwitz() -> FloatArray:
+        matrix = rng.normal(size=(n, n))
+        return np.asarray(matrix - (np.linalg.eigvals(matrix).real.max() + 0.5) * np.eye(n))
+
+    C = rng.normal(size=(m, n))
+    root = rng.normal(size=(m, m))
+    S = root @ root.T + np.eye(m)
+    D = np.array([1.0, -1.0, 1.0])
+    U = np.eye(m) + np.triu(rng.normal(size=(m, m)), 1)
+    unseen = np.eye(n) - np.linalg.pinv(C) @ C
+    return Problem(
+        A=hurwitz(),
+        B=np.linalg.pinv(C) @ (S * D) @ U + unseen @ rng.normal(size=(n, m)),
+        C=C,
+        W=0.3 * rng.normal(size=(n, n)),
+        G=rng.normal(size=(n, n)),
+        omega=rng.uniform(0.5, 2.0, size=n),
+        A_m=hurwitz(),
+        B_m=rng.normal(size=(n, m)),
+        nu=rng.uniform(0.5, 2.0, size=m),
+        S=S,
+        D=D,
+        U=U,
+        K=gain(np.array(1.0), np.array([3.0, 1.5])),
+        Lambda=np.array([1.0, 0.7, 1.3]),
+        beta=np.array([1.1, 0.8, 0.6]),
+    )
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The closed loop (1), (2), (20), (21) over a stretch in which no e_i changes sign, and its signals at an instant."""
+
+    p: Problem
+    e_0: FloatArray
+    solution: Callable[[float], FloatArray]  # t -> [x, x_m, integral of e, Pi]
+
+    @cached_property
+    def M(self) -> FloatArray:
+        return np.asarray(np.linalg.inv(self.p.S), dtype=np.float64)
+
+    def unpack(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        n, m = self.p.B.shape
+        x, x_m, integral_e, Pi = np.split(np.asarray(self.solution(t)), [n, 2 * n, 2 * n + m])
+        return x, x_m, integral_e, Pi
+
+    def e(self, t: float) -> FloatArray:
+        """Equation (3)."""
+        x, x_m, _, _ = self.unpack(t)
+        return np.asarray(self.p.C @ x - self.p.C @ x_m)
+
+    def u(self, t: float) -> FloatArray:
+        """Equation (20)."""
+        _, _, integral_e, Pi = self.unpack(t)
+        return -self.p.D * (self.p.K * (self.e(t) - self.e_0 + self.p.Lambda * integral_e)) - self.p.D * Pi
+
+    def x_dot(self, t: float) -> FloatArray:
+        x, _, _, _ = self.unpack(t)
+        return np.asarray(self.p.A @ x + self.p.f(t, x) + self.p.B @ self.u(t))
+
+    def x_m_dot(self, t: float) -> FloatArray:
+        return np.asarray(self.p.A_m @ self.unpack(t)[1] + self.p.B_m @ self.p.u_m(t))
+
+    def e_dot(self, t: float) -> FloatArray:
+        return np.asarray(self.p.C @ (self.x_dot(t) - self.x_m_dot(t)))
+
+    def r(self, t: float) -> FloatArray:
+        """Equation (4)."""
+        return self.e_dot(t) + self.p.Lambda * self.e(t)
+
+    def z(self, t: float) -> FloatArray:
+        return np.concatenate([self.e(t), self.r(t)])
+
+    def u_dot(self, t: float) -> FloatArray:
+        """Equation (23)."""
+        return -self.p.D * self.p.K * self.r(t) - self.p.D * self.p.beta * np.sign(self.e(t))
+
+    def f_dot(self, t: float) -> FloatArray:
+        return self.p.f_dot(t, self.unpack(t)[0], self.x_dot(t))
+
+    def r_dot(self, t: float) -> FloatArray:
+        """Equation (12)."""
+        p = self.p
+        plant = p.C @ p.A @ self.x_dot(t) + p.C @ self.f_dot(t) + p.C @ p.B @ self.u_dot(t)
+        model = p.C @ p.A_m @ self.x_m_dot(t) + p.C @ p.B_m @ p.u_m_dot(t)
+        return np.asarray(plant - model + p.Lambda * self.e_dot(t))
+
+    def N(self, t: float) -> FloatArray:
+        """Equation (15)."""
+        p = self.p
+        plant = p.C @ p.A @ self.x_dot(t) + p.C @ self.f_dot(t)
+        model = p.C @ p.A_m @ self.x_m_dot(t) + p.C @ p.B_m @ p.u_m_dot(t)
+        return np.asarray(self.M @ (plant - model + p.Lambda * self.e_dot(t)) + self.e(t))
+
+    def split(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Equations (17), (18) with x_urho = 0, so c1 = 0 in (7): N_d and N~ without, and the term they differ about.
+
+        x_o = C^+ C x is what the outputs show, x_u the rest, likewise for the model. The term is -M C A_m x_mu_dot.
+        """
+        p = self.p
+        shown = np.linalg.pinv(p.C) @ p.C
+        x_dot, x_m_dot = self.x_dot(t), self.x_m_dot(t)
+        x_mo_dot = shown @ x_m_dot
+        steady = p.C @ p.A @ (x_mo_dot + x_dot - shown @ x_dot) + p.C @ self.f_dot(t)
+        N_d = self.M @ (steady - p.C @ p.A_m @ x_mo_dot - p.C @ p.B_m @ p.u_m_dot(t))
+        N_tilde = self.M @ (p.C @ p.A @ (shown @ x_dot - x_mo_dot) + p.Lambda * self.e_dot(t)) + self.e(t)
+        return N_d, N_tilde, -self.M @ p.C @ p.A_m @ (x_m_dot - x_mo_dot)
+
+    def DUD(self) -> FloatArray:
+        return self.p.D[:, None] * self.p.U * self.p.D
+
+    def V1(self, t: float) -> float:
+        """Equation (31)."""
+        e, r = self.e(t), self.r(t)
+        return float(e @ e + r @ self.M @ r) / 2.0
+
+
+def run(p: Problem, x_0: FloatArray, x_m0: FloatArray, duration: float) -> Loop:
+    """Integrate the closed loop."""
+    n, m = p.B.shape
+    e_0 = p.C @ (x_0 - x_m0)
+
+    def w_dot(t: float, w: FloatArray) -> FloatArray:
+        x, x_m, integral_e, Pi = np.split(w, [n, 2 * n, 2 * n + m])
+        e = p.C @ (x - x_m)
+        u = -p.D * (p.K * (e - e_0 + p.Lambda * integral_e)) - p.D * Pi
+        x_dot = p.A @ x + p.f(t, x) + p.B @ u
+        return np.concatenate([x_dot, p.A_m @ x_m + p.B_m @ p.u_m(t), e, p.beta * np.sign(e)])
+
+    start = np.concatenate([x_0, x_m0, np.zeros(2 * m)])
+    stretch = (0.0, duration)
+    solved = solve_ivp(w_dot, stretch, start, method="DOP853", rtol=1e-10, atol=1e-10, max_step=0.005, dense_output=True)
+    assert solved.sol is not None
+    return Loop(p, e_0, solved.sol)
+
+
+X_0 = np.array([1.0, -0.5, 0.8, 0.3, -0.7, 0.6])
+DURATION = 0.3
+INSTANTS = np.linspace(0.02, DURATION - 0.02, 7)
+
+
+@pytest.fixture(scope="module", params=[4, 5, 6])
+def loop(request: pytest.FixtureRequest) -> Loop:
+    found = run(random_problem(request.param), X_0, np.zeros(6), DURATION)
+    signs = {tuple(np.sign(found.e(float(t)))) for t in np.linspace(0.0, DURATION, 50)}
+    assert len(signs) == 1  # differences across a jump of Sgn(e) would mean nothing
+    return found
+
+
+def differenced(signal: Callable[[float], FloatArray | float], t: float, h: float = 1e-3) -> FloatArray:
+    """The derivative of a signal by the fourth-order central difference."""
+    s = [np.asarray(signal(t + k * h)) for k in (-2, -1, 1, 2)]
+    return np.asarray((s[0] - 8.0 * s[1] + 8.0 * s[2] - s[3]) / (12.0 * h))
+
+
+def close(a: FloatArray | float, b: FloatArray | float, tolerance: float) -> bool:
+    """Whether two values agree, relative to their size where that is above one."""
+    return bool(np.max(np.abs(np.asarray(a) - b)) < tolerance * max(1.0, float(np.max(np.abs(b)))))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What is right
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_e_dot_and_so_r_of_4_are_the_derivative_of_3(loop: Loop) -> None:
+    for t in INSTANTS:
+        assert close(loop.e_dot(t), differenced(loop.e, t), DIFFERENCED)
+
+
+def test_r_of_10_in_terms_of_the_plant_is_r_of_4(loop: Loop) -> None:
+    p = loop.p
+    for t in INSTANTS:
+        x, x_m, _, _ = loop.unpack(t)
+        driven = (p.S * p.D) @ p.U @ loop.u(t)  # Omega u, Omega = S D U (11)
+        r = p.C @ p.A @ x + p.C @ p.f(t, x) + driven - p.C @ (p.A_m @ x_m + p.B_m @ p.u_m(t)) + p.Lambda * loop.e(t)
+        assert close(r, loop.r(t), EXACT)
+
+
+def test_decomposition_finds_the_factors_that_made_the_plant(loop: Loop) -> None:
+    S, D, U = decompose(loop.p.C @ loop.p.B)
+    assert close(S, loop.p.S, EXACT)
+    assert close(D, loop.p.D, EXACT)
+    assert close(U, loop.p.U, EXACT)
+
+
+def test_r_dot_of_12_is_the_derivative_of_r(loop: Loop) -> None:
+    for t in INSTANTS:
+        assert close(loop.r_dot(t), differenced(loop.r, t), DIFFERENCED)
+
+
+def test_13_to_15_put_the_input_into_the_form_D_U_u_dot(loop: Loop) -> None:
+    for t in INSTANTS:
+        assert close(loop.M @ loop.r_dot(t), loop.N(t) - loop.e(t) + loop.p.D * (loop.p.U @ loop.u_dot(t)), EXACT)
+
+
+def test_16_to_18_N_is_N_d_plus_N_tilde(loop: Loop) -> None:
+    for t in INSTANTS:
+        N_d, N_tilde, term = loop.split(t)
+        assert close(N_d + N_tilde + term, loop.N(t), EXACT)
+
+
+def test_23_is_the_derivative_of_20_with_21(loop: Loop) -> None:
+    for t in INSTANTS:
+        assert close(loop.u_dot(t), differenced(loop.u, t), DIFFERENCED)
+
+
+def test_closed_loop_24(loop: Loop) -> None:
+    p = loop.p
+    for t in INSTANTS:
+        N_d, N_tilde, term = loop.split(t)
+        e, r = loop.e(t), loop.r(t)
+        switched = loop.DUD() @ (p.beta * np.sign(e))
+        coupled = p.D * ((p.U - np.eye(3)) @ (p.D * p.K * r))
+        right = N_d + N_tilde + term - e - switched - coupled - p.K * r
+        assert close(right, loop.M @ loop.r_dot(t), EXACT)
+        assert close(right, loop.M @ differenced(loop.r, t), DIFFERENCED)
+
+
+def test_25_and_26_give_Phi_without_its_last_entry(loop: Loop) -> None:
+    p = loop.p
+    for t in INSTANTS:
+        r = loop.r(t)
+        Phi = [p.D[i] * sum(p.D[j] * p.K[j] * p.U[i, j] * r[j] for j in range(i + 1, 3)) for i in range(2)]
+        assert close(np.array([*Phi, 0.0]), p.D * ((p.U - np.eye(3)) @ (p.D * p.K * r)), EXACT)
+
+
+def test_27_bounds_Phi_where_zeta_U_bounds_every_entry_of_U() -> None:
+    # abs(Phi_i) <= zeta_U sum_(j>i) k_j abs(r_j); with zeta_U a tenth below the largest abs(U_ij), r along that j breaks it.
+    p = random_problem(4)
+    above = np.triu(p.U, 1)
+    zeta_U = np.max(np.abs(above))
+    i, j = np.argwhere(np.abs(above) == zeta_U)[0]
+    for r in (np.eye(3)[j], *np.random.default_rng(1).normal(size=(100, 3))):
+        Phi = p.D * (above @ (p.D * p.K * r))
+        later = np.array([np.sum((p.K * np.abs(r))[k + 1 :]) for k in range(3)])
+        assert np.all(np.abs(Phi) <= zeta_U * later * (1.0 + EXACT))
+    assert np.abs(p.D * (above @ (p.D * p.K * np.eye(3)[j])))[i] > 0.9 * zeta_U * p.K[j]
+
+
+def test_V1_dot_of_32_has_the_gain_22_as_three_squares(loop: Loop) -> None:
+    p = loop.p
+    k_g, k_d = 1.0, np.array([3.0, 1.5, 0.0])
+    for t in INSTANTS:
+        N_d, N_tilde, term = loop.split(t)
+        e, r = loop.e(t), loop.r(t)
+        coupled = p.D * ((p.U - np.eye(3)) @ (p.D * p.K * r))
+        uncertain = r @ (N_d + N_tilde + term - loop.DUD() @ (p.beta * np.sign(e)) - coupled)
+        V1_dot = -e @ (p.Lambda * e) - r @ r - k_g * r @ r - k_d @ r**2 + uncertain
+        assert close(V1_dot, e @ loop.e_dot(t) + r @ loop.M @ loop.r_dot(t), EXACT)
+        assert close(V1_dot, differenced(loop.V1, t), DIFFERENCED)
+
+
+def test_V2_dot_is_a_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> None:
+    # The sum of (32) and -L (46): what `flight_analysis.lyapunov.decay` says, on a plant that module did not choose.
+    p = loop.p
+    Q = decay(Plant(p.A, p.B, p.C, p.f), law_of(p))
+    for t in INSTANTS:
+        N_d, _, term = loop.split(t)
+        L = loop.r(t) @ (N_d + term - loop.DUD() @ (p.beta * np.sign(loop.e(t))))
+        assert close(differenced(loop.V1, t) - L, -loop.z(t) @ Q @ loop.z(t), DIFFERENCED)
+
+
+@pytest.mark.parametrize("sign", [Sign.LITERAL, Sign.IMPLICIT])
+def test_the_law_that_flies_tends_to_20_with_its_period(loop: Loop, sign: Sign) -> None:
+    # First order, for u is held over a period: halving it halves the distance (measured 1.9 to 2.1).
+    p = loop.p
+    params = law_of(p)._replace(sign=sign)
+    distance = []
+    for ticks in (60, 120, 240):
+        dt = DURATION / ticks
+        y_m = np.array([p.C @ loop.unpack(k * dt)[1] for k in range(ticks + 1)])
+        flight = fly(Plant(p.A, p.B, p.C, p.f), y_m, dt, params, X_0)
+        distance.append(float(np.max(np.abs(flight.x[-1] - loop.unpack(DURATION)[0]))))
+    assert all(1.7 < before / after < 2.3 for before, after in pairwise(distance))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# What is not, and what repairs it
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def at_rest() -> Loop:
+    """The instant t = 0 of a loop with z = 0: y on y_m, and f such that y_dot is on y_m_dot with u = 0."""
+    p = random_problem(4)
+    x_m = np.array([0.4, -0.8, 0.5, 0.9, -0.3, 0.7])
+    x = x_m + (np.eye(6) - np.linalg.pinv(p.C) @ p.C) @ np.array([1.0, 2.0, -1.0, 0.5, 0.3, -0.6])
+    wave = np.sin(p.G @ x)
+    missing = p.C @ (p.A_m @ x_m + p.B_m @ p.u_m(0.0) - p.A @ x - p.W @ wave)
+    p = p._replace(W=p.W + np.outer(np.linalg.pinv(p.C) @ missing, wave) / (wave @ wave))
+    return Loop(p, np.zeros(3), lambda _: np.concatenate([x, x_m, np.zeros(6)]))
+
+
+def test_at_rest_N_d_is_minus_D_U_times_the_slew_of_the_ideal_input() -> None:
+    # u* = Omega^-1 (y_m_dot - C A x - C f) keeps e = 0; its slew along the flight it makes is what beta has to beat.
+    loop = at_rest()
+    p = loop.p
+    x_0, x_m0, _, _ = loop.unpack(0.0)
+
+    def ideal(t: float, x: FloatArray, x_m: FloatArray) -> FloatArray:
+        wanted = p.C @ (p.A_m @ x_m + p.B_m @ p.u_m(t) - p.A @ x - p.f(t, x))
+        return np.asarray(np.linalg.solve(p.C @ p.B, wanted))
+
+    def w_dot(t: float, w: FloatArray) -> FloatArray:
+        x, x_m = np.split(w, 2)
+        return np.concatenate([p.A @ x + p.f(t, x) + p.B @ ideal(t, x, x_m), p.A_m @ x_m + p.B_m @ p.u_m(t)])
+
+    def u_star(t: float) -> FloatArray:
+        reached = solve_ivp(w_dot, (0.0, t), np.concatenate([x_0, x_m0]), method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+        return ideal(t, *np.split(reached, 2))
+
+    N_d, _, term = loop.split(0.0)
+    assert close(N_d + term, -p.D * (p.U @ differenced(u_star, 0.0)), DIFFERENCED)
+
+
+def test_N_tilde_as_written_in_18_does_not_vanish_with_z_so_that_19_is_false() -> None:
+    loop = at_rest()
+    assert np.linalg.norm(loop.z(0.0)) < 1e-12
+    _, N_tilde, term = loop.split(0.0)
+    assert np.linalg.norm(N_tilde + term) > 1.0  # while rho norm(z) is 0
+
+
+def test_N_tilde_vanishes_with_z_once_the_reference_term_is_moved_to_N_d(loop: Loop) -> None:
+    _, N_tilde, _ = at_rest().split(0.0)
+    assert np.linalg.norm(N_tilde) < 1e-12
+    p = loop.p  # and off rest it is linear in z, so that (19) holds with a constant rho
+    G = loop.M @ (p.C @ p.A @ np.linalg.pinv(p.C) + np.diag(p.Lambda))
+    rho = np.linalg.norm(np.hstack([np.eye(3) - G * p.Lambda, G]), 2)
+    for t in INSTANTS:
+        _, N_tilde, _ = loop.split(t)
+        assert close(N_tilde, G @ (loop.r(t) - p.Lambda * loop.e(t)) + loop.e(t), EXACT)
+        assert np.linalg.norm(N_tilde) <= rho * np.linalg.norm(loop.z(t))
+
+
+def test_the_bound_in_30_has_two_indices_for_each_row_sums_its_own_entries_of_U() -> None:
+    # Psi = (D U D - I) beta Sgn(e): over all signs its i-th entry reaches sum_(j>i) abs(U_ij) beta_j, and never more.
+    p = random_problem(4)
+    DUD = p.D[:, None] * p.U * p.D
+    Psi = np.array([(DUD - np.eye(3)) @ (p.beta * np.array(signs)) for signs in product((-1.0, 1.0), repeat=3)])
+    assert close(np.max(Psi, axis=0), np.triu(np.abs(p.U), 1) @ p.beta, EXACT)
+
+
+def coupled_flight(beta: FloatArray) -> float:
+    """The largest e past 6 s with U_12 = 3 in the small example and K_1 raised as step 3 asks for that U_12."""
+    case = example(0.0025, 15.0)
+    S, D = decompose(case.plant.C @ case.plant.B)[:2]
+    U = np.array([[1.0, 3.0], [0.0, 1.0]])
+    plant = case.plant._replace(B=np.vstack([S * D @ U, 0.1 * np.eye(2)]))
+    params = case.params._replace(K=np.array([60.0, 4.0]), omega=2.0 * np.abs(np.diag(S * D @ U)), beta=beta)
+    assert np.linalg.eigvalsh(decay(plant, params)).min() > 0.0
+    found = evidence(plant, fly(plant, case.y_m, 0.0025, params, case.x_0), params)
+    assert np.all(np.max(np.abs(found.N_d), axis=0) < [2.0, 2.0])
+    return float(np.max(np.abs(found.e[found.t > 6.0])))
+
+
+def test_beta_that_counts_row_j_of_U_in_place_of_entry_ij_does_not_track() -> None:
+    # The last row of U has nothing beyond its one, so that reading asks for beta_1 >= zeta_Nd,1 alone.
+    assert coupled_flight(np.array([2.1, 2.1])) > 5e-3  # measured 1.3e-2, whatever the period
+
+
+def test_beta_that_counts_entry_ij_of_U_tracks() -> None:
+    assert coupled_flight(np.array([2.1 + 3.0 * 2.1, 2.1])) < 1e-3  # measured 2.4e-4, falling with dt^2
+
+
+def lemma_1_ratio(T: float) -> float:
+    """The ratio of the integrals of abs(e_dot) and abs(e) over 1..T for e = sin(t^2)/t, in s = t^2, 8 midpoints a radian."""
+    ds = (T * T - 1.0) / round(8 * T * T)
+    s = np.arange(1.0 + ds / 2.0, T * T, ds)
+    e, e_dot = np.sin(s) / np.sqrt(s), 2.0 * np.cos(s) - np.sin(s) / s
+    weight = 1.0 / np.sqrt(s)  # dt = ds / (2 t)
+    return float(np.sum(np.abs(e_dot) * weight) / np.sum(np.abs(e) * weight))
+
+
+def test_40_fails_for_a_bounded_e_that_tends_to_zero_with_a_bounded_derivative() -> None:
+    # (40) keeps the ratio below gamma_2 + (gamma_1 + sup abs(e)) / integral abs(e), which falls with T. For e = sin(t^2)/t,
+    # abs(e_dot) <= 3, it grows like T / log T, so no gamma_1, gamma_2 do.
+    assert [lemma_1_ratio(T) for T in (10.0, 100.0, 1000.0)] == pytest.approx([7.3, 41.8, 283.8], rel=0.01)
+
+
+def test_gamma_2_of_the_sampled_law_with_the_literal_sign_grows_as_the_period_falls() -> None:
+    # Chatter shrinks with dt but not its slope as fast: (29) with this gamma_2 asks for a beta that grows without bound.
+    ratios = []
+    for dt in (0.02, 0.01, 0.005, 0.0025):
+        case = example(dt, 10.0)
+        params = case.params._replace(sign=Sign.LITERAL)
+        found = evidence(case.plant, fly(case.plant, case.y_m, dt, params, case.x_0), params)
+        late = found.t > 5.0
+        ratios.append(np.sum(np.abs(found.e_dot[late]), axis=0) / np.sum(np.abs(found.e[late]), axis=0))
+    assert all(np.all(after > 1.2 * before) for before, after in pairwise(ratios))
+
+
+def test_with_U_the_identity_the_classical_condition_keeps_P_positive_without_lemma_1() -> None:
+    # beta_i > sup abs(N_d,i) + sup abs(N_d,i_dot) / Lambda_i and zeta_b = sum beta_i abs(e_i(0)) - e(0)' N_d(0).
+    case = example(0.005, 15.0)
+    S, D = decompose(case.plant.C @ case.plant.B)[:2]
+    plant = case.plant._replace(B=np.vstack([S * D, 0.1 * np.eye(2)]))
+    params = case.params._replace(beta=np.array([6.0, 6.0]))
+    found = evidence(plant, fly(plant, case.y_m, 0.005, params, case.x_0), params)
+    settled = found.t > 0.02  # the two ends of a second difference are of lower order
+    N_d_dot = np.gradient(found.N_d[settled], found.t[settled], axis=0)
+    needed = np.max(np.abs(found.N_d), axis=0) + np.percentile(np.abs(N_d_dot), 99, axis=0) / params.Lambda
+    assert np.all(params.beta > needed)
+    zeta_b = params.beta @ np.abs(found.e[0]) - found.e[0] @ found.N_d[0]
+    assert np.min(zeta_b + found.P) > 0.0
+
+
+def test_a_matrix_without_a_leading_minor_has_no_decomposition_though_it_can_be_inverted() -> None:
+    # (S D U)_11 = S_11 d_1 is never zero, so no choice of S, D, U gives [[0, 1], [1, 0]].
+    with pytest.raises(DecompositionError, match="leading minor 1"):
+        decompose(np.array([[0.0, 1.0], [1.0, 0.0]]))
+    S, D, U = decompose(np.array([[1.0, 0.0], [0.0, 1.0]]))  # the same channels, paired the other way round
+    assert np.array_equal(S, np.eye(2))
+    assert np.array_equal(D, [1.0, 1.0])
+    assert np.array_equal(U, np.eye(2))
+
+
+def hidden_state(pole: float) -> tuple[float, float]:
+    """The largest x_2 and the last e of x_1_dot = x_2 + u, x_2_dot = pole x_2 + x_1, y = x_1 on sin t: its zero is `pole`."""
+    plant = Plant(np.array([[0.0, 1.0], [1.0, pole]]), np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]]), lambda *_: np.zeros(2))
+    one = np.ones(1)
+    params = example(1.0, 1.0).params._replace(K=8.0 * one, Lambda=one, beta=5.0 * one, D=one, input_scale=one, omega=2.0 * one)
+    t = 0.01 * np.arange(1501)
+    flight = fly(plant, np.sin(t)[:, None], 0.01, params, np.zeros(2))
+    return float(np.max(np.abs(flight.x[:, 1]))), float(abs(flight.x[-1, 0] - np.sin(t[-1])))
+
+
+def test_an_unstable_zero_leaves_a_state_unbounded_and_then_the_error() -> None:
+    # Assumption 3 asks for it in other words. Omega = 1 and the gains are the same; only the hidden state runs away.
+    state, e = hidden_state(1.0)
+    assert state > 1e4
+    assert e > 1.0
+
+
+def test_a_stable_zero_leaves_that_state_bounded() -> None:
+    state, e = hidden_state(-1.0)
+    assert state < 2.0
+    assert e < 1e-3
+
+
+def test_a_servo_between_u_and_the_plant_takes_away_Omega() -> None:
+    # x_s_dot = (u - x_s) / tau drives the plant: relative degree 2, C B = 0, and (10)-(11) have nothing to decompose.
+    p = random_problem(4)
+    B = np.vstack([np.zeros((6, 3)), np.eye(3) / 0.02])
+    with pytest.raises(DecompositionError, match="leading minor 1"):
+        decompose(np.hstack([p.C, np.zeros((3, 3))]) @ B)
+
+
+def osprey(gust: float = 0.0) -> dynamics.Aircraft:
+    """The airframe, in a vertical gust of this speed at t = 0."""
+    gusts = {"vertical": Gust(start=0.0, speed=gust, length=15.24)}
+    return AircraftParameters(airframe="osprey", rate=100.0, step=0.01, gusts=gusts).load()[1]
+
+
+V, ALPHA, Q, THETA = range(4)
+
+
+def gravity_slope(q: float) -> float:
+    """The V part of f_dot in level flight at the pitch rate q: the difference of f over 1 us of theta_dot = q."""
+    aircraft, x = osprey(), np.zeros(8)
+    x[THETA] = 1e-6 * q
+    return float(dynamics.f(0.0, x, aircraft)[V] / 1e-6)
+
+
+def test_f_dot_of_gravity_grows_with_the_pitch_rate_so_that_assumption_2_presumes_a_bounded_flight() -> None:
+    assert [gravity_slope(q) for q in (1.0, 10.0, 100.0)] == pytest.approx([-GRAVITY, -10.0 * GRAVITY, -100.0 * GRAVITY])
+
+
+def test_f_dot_of_gravity_is_bounded_by_z_once_the_part_with_q_minus_q_m_is_in_N_tilde() -> None:
+    q_m = 0.1
+    for e_q in (-10.0, -0.1, 0.1, 10.0):
+        assert abs(gravity_slope(q_m + e_q) - gravity_slope(q_m)) <= GRAVITY * abs(e_q) * (1.0 + 1e-6)
+
+
+def test_bound_7_cannot_hold_at_every_instant_for_alpha_leaves_trim_in_a_gust_while_e_is_zero() -> None:
+    # Outputs held on trim by the ideal input, x_m = 0: z = 0, yet alpha rises to 21.1 deg, so x_u <= c1 norm(z) is false.
+    aircraft = osprey(gust=10.12)
+    C, B = aircraft.C, aircraft.B
+    held = np.eye(8) - B @ np.linalg.solve(C @ B, C)
+
+    def x_dot(t: float, x: FloatArray) -> FloatArray:
+        return np.asarray(held @ (aircraft.A @ x + dynamics.f(t, x, aircraft)))
+
+    x = solve_ivp(x_dot, (0.0, 2.0), np.zeros(8), max_step=0.005, rtol=1e-8, atol=1e-10).y
+    assert np.max(np.abs(C @ x)) < 1e-9
+    assert np.degrees(np.max(np.abs(x[ALPHA]))) == pytest.approx(21.1, abs=0.1)
+
+
+def largest_y_m_ddot(model: Model, rise: float) -> float:
+    """The peak of abs(y_m_ddot) where the command climbs to one within `rise` seconds, by second differences."""
+    one, none = np.ones((1, 1)), np.zeros(1)
+    climb = Profile(0.0 * one, 9.0 * one, one, np.array(rise), none, none + 1.0, none, none, none)
+    dt, x_m, y_m = rise / 5.0, np.zeros(len(model.A_m)), [0.0]
+    for k in range(round(0.5 / dt)):
+        x_m = step(k * dt, x_m, lambda t: command(t, climb), dt, model)
+        y_m.append(float(output(x_m, model)[0]))
+    return float(np.max(np.abs(np.diff(y_m, 2)))) / dt**2
+
+
+def test_a_step_command_through_a_first_order_model_makes_N_d_unbounded() -> None:
+    # y_m_ddot holds C B_m u_m_dot = 4 / rise: ten times the beta for a tenth of the rise, and no beta for a step.
+    first_order = Model(np.array([[-4.0]]), np.array([[4.0]]), np.array([[1.0]]))
+    peaks = [largest_y_m_ddot(first_order, rise) for rise in (0.1, 0.01, 0.001)]
+    assert peaks == pytest.approx([40.0, 400.0, 4000.0], rel=0.1)  # measured 37, 396, 3997
+
+
+def test_a_second_order_model_keeps_N_d_bounded_whatever_the_step() -> None:
+    # C B_m = 0, and y_m_ddot <= omega^2 = 16.
+    model = second_order(np.array([4.0]), np.array([0.9]))
+    assert all(largest_y_m_ddot(model, rise) < 16.1 for rise in (0.1, 0.01, 0.001))

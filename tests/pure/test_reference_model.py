@@ -1,0 +1,93 @@
+"""The reference model and its commands against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.signal import StateSpace, lsim
+
+from flight_core.vectors import FloatArray
+from reference_model import model
+from reference_model.command import command
+from reference_model.params import ReferenceModelParameters
+
+
+def parameters(**changes: object) -> ReferenceModelParameters:
+    values = {
+        "rate": 500.0,
+        "outputs": ["q", "p", "r"],
+        "second_order": {"natural_frequency": [4.0, 5.0, 4.0], "damping": [0.9, 0.9, 1.0]},
+        "rise": 0.1,
+    }
+    return ReferenceModelParameters.validate_mapping(values | changes, "reference_model")
+
+
+PULSES = {
+    "q": {"start": [1.0, 3.0], "stop": [2.0, 4.0], "value": [0.1, -0.2]},
+    "p": {"start": [1.0], "stop": [2.5], "value": [0.4]},
+}
+
+
+def test_a_pulse_rises_holds_and_falls_over_its_edges() -> None:
+    profile = parameters(pulses=PULSES).profile()
+    at = [float(command(t, profile)[0]) for t in (0.9, 1.0, 1.05, 1.1, 1.9, 2.05, 2.2, 3.5, 9.0)]
+    assert at == pytest.approx([0.0, 0.0, 0.05, 0.1, 0.1, 0.05, 0.0, -0.2, 0.0], abs=1e-12)
+
+
+@given(t=st.floats(0, 10), dt=st.floats(1e-6, 1e-3))
+def test_commands_have_a_bounded_derivative(t: float, dt: float) -> None:
+    # Equation (2) asks for u_m_dot bounded: a pulse's edge is value / rise, two edges never overlap here.
+    profile = parameters(pulses=PULSES).profile()
+    change = np.abs(command(t + dt, profile) - command(t, profile))
+    assert (change <= np.array([0.2, 0.4, 0.0]) / 0.1 * dt + 1e-12).all()
+
+
+def test_a_coordinated_turn_follows_the_integral_of_the_bank_rate() -> None:
+    turn = {"bank_rate": "p", "turn_rate": "r", "speed": 25.0}
+    sines = {"p": {"amplitude": 0.3, "frequency": 2.0, "phase": 0.4}}
+    profile = parameters(pulses=PULSES, sines=sines, coordinated_turn=turn).profile()
+    for t in (0.7, 1.05, 2.0, 5.0):
+        bank, _ = quad(
+            lambda s: float(command(s, profile)[1]), 0.0, t, points=[1.0, 1.1, 2.5, 2.6] if t > 2.6 else None, limit=200
+        )
+        # r = g / V0 sin(phi): the turn rate at which lift has no sideways rest
+        assert float(command(t, profile)[2]) == pytest.approx(9.81 / 25.0 * math.sin(bank), abs=1e-8)
+
+
+def simulate(params: ReferenceModelParameters, duration: float, dt: float) -> FloatArray:
+    matrices, profile = params.model(), params.profile()
+    x_m = np.zeros(len(matrices.A_m))
+    outputs = [model.output(x_m, matrices)]
+    for k in range(round(duration / dt)):
+        x_m = model.step(k * dt, x_m, lambda t: command(t, profile), dt, matrices)
+        outputs.append(model.output(x_m, matrices))
+    return np.array(outputs)
+
+
+def test_equation_2_agrees_with_an_exact_linear_simulation() -> None:
+    params = parameters(pulses=PULSES)
+    matrices, profile = params.model(), params.profile()
+    t = np.arange(0, 3001) * 0.002
+    u_m = np.array([command(s, profile) for s in t])  # piecewise linear with knots on the grid: lsim is exact for it
+    _, exact, _ = lsim(StateSpace(matrices.A_m, matrices.B_m, matrices.C, np.zeros((3, 3))), u_m, t)
+    assert simulate(params, 6.0, 0.002) == pytest.approx(exact, abs=1e-9)
+
+
+def test_a_long_pulse_ends_at_its_value() -> None:
+    # Unit static gain: y_m -> u_m; exp(-0.9 4 10) is below 1e-15.
+    params = parameters(pulses={"q": {"start": [0.0], "stop": [100.0], "value": [0.1]}})
+    assert simulate(params, 10.0, 0.01)[-1] == pytest.approx([0.1, 0.0, 0.0], abs=1e-9)
+
+
+def test_the_general_form_and_the_second_order_form_are_the_same_model() -> None:
+    same = {
+        "states": ["q", "q_rate", "p", "p_rate", "r", "r_rate"],
+        "A_m": parameters().model().A_m.ravel().tolist(),
+        "B_m": parameters().model().B_m.ravel().tolist(),
+    }
+    general = parameters(second_order=None, linear=same).model()
+    for mine, theirs in zip(general, parameters().model(), strict=True):
+        assert (mine == theirs).all()
