@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
 """What all tests share: the default scenario."""
 
 from pathlib import Path

@@ -9,20 +9,30 @@ decides is P: it stays above zero, and so V2 bounds e and r, only where (29), (3
 
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-import flight_bringup
-from flight_analysis.lyapunov import Evidence, Example, decay, evidence, example, fly, integral, largest_rise, lemma_2, of_tape
-from flight_analysis.scenario import Scenario, load_scenario
+from flight_analysis.lyapunov import (
+    Evidence,
+    Example,
+    Plant,
+    decay,
+    evidence,
+    example,
+    fly,
+    integral,
+    largest_rise,
+    lemma_2,
+    of_tape,
+)
+from flight_analysis.scenario import Scenario
 from flight_analysis.simulate import simulate
+from flight_bringup.scenarios import find_scenario
 from rise_di_controller.decomposition import decompose
 from rise_di_controller.law import LawParams, Sign
 
-OSPREY = Path(flight_bringup.__file__).resolve().parents[1] / "config" / "osprey_gust.yaml"
 PERIODS = (0.02, 0.01, 0.005, 0.0025)
 TOO_SMALL = 0.05  # times beta: 0.25 and 0.15, where (29), (30) ask for 1.7 and 1.7
 
@@ -34,22 +44,20 @@ def flown(dt: float, duration: float, **gains: Any) -> tuple[Example, LawParams,
     return case, params, evidence(case.plant, fly(case.plant, case.y_m, dt, params, case.x_0), params)
 
 
-def osprey(rate: float, beta_factor: float = 1.0) -> tuple[Scenario, Evidence]:
-    """Twelve seconds of the scenario at another rate of the law, both gusts moved into them."""
-    scenario = load_scenario(OSPREY)
-    gusts = {
-        name: gust.model_copy(update={"start": {"lateral": 4.0, "vertical": 8.0}[name]})
-        for name, gust in scenario.aircraft.gusts.items()
-    }
-    beta = tuple(beta_factor * value for value in scenario.controller.beta)
-    scenario = replace(
-        scenario,
-        aircraft=scenario.aircraft.model_copy(update={"rate": rate, "step": 0.0025, "gusts": gusts}),
-        reference_model=scenario.reference_model.model_copy(update={"rate": rate}),
-        controller=scenario.controller.model_copy(update={"rate": rate, "beta": beta}),
-    ).vary(flight={"duration": 12.0})
+def osprey(rate: float, beta_factor: float = 1.0, duration: float = 12.0) -> tuple[Scenario, Plant, Evidence]:
+    """The default scenario at another rate of the law, with both gusts in its first twelve seconds."""
+    scenario = find_scenario("osprey_gust")
+    starts = {"lateral": 4.0, "vertical": 8.0}
+    gusts = {name: gust.model_dump() | {"start": starts[name]} for name, gust in scenario.aircraft.gusts.items()}
+    beta = [beta_factor * value for value in scenario.controller.beta]
+    scenario = scenario.vary(
+        flight={"duration": duration},
+        aircraft={"rate": rate, "step": 0.0025, "gusts": gusts},
+        reference_model={"rate": rate},
+        controller={"rate": rate, "beta": beta, "sign": "implicit"},
+    )
     plant, flight = of_tape(scenario, simulate(scenario))
-    return scenario, evidence(plant, flight, scenario.controller.law())
+    return scenario, plant, evidence(plant, flight, scenario.controller.law())
 
 
 def tail(signal: np.ndarray[Any, Any], t: np.ndarray[Any, Any], after: float) -> float:
@@ -134,7 +142,7 @@ def test_the_literal_sign_lets_V2_rise_by_a_chatter_that_fades_with_the_period()
 
 def test_along_the_osprey_V2_rises_by_a_sampling_term_only() -> None:
     # Engaged in trim, e(0) = 0: V2 has nothing to lose, all it does is sampling. Measured 2.0e-3, 5.0e-4, 7.9e-5.
-    rises = [largest_rise(osprey(rate)[1].V2) for rate in (100.0, 200.0, 400.0)]
+    rises = [largest_rise(osprey(rate)[2].V2) for rate in (100.0, 200.0, 400.0)]
     assert rises[0] < 4e-3
     assert all(before / after > 3.0 for before, after in pairwise(rises))
 
@@ -142,8 +150,7 @@ def test_along_the_osprey_V2_rises_by_a_sampling_term_only() -> None:
 def test_along_the_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> None:
     # In the implicit sign's layer s = e / (dt^2 omega beta), and D U D beta s = N_d: so e = dt^2 omega (D U D)^-1 N_d.
     for rate in (100.0, 200.0):
-        scenario, found = osprey(rate)
-        plant, _ = of_tape(scenario.vary(flight={"duration": 0.1}), simulate(scenario.with_duration(0.1)))
+        scenario, plant, found = osprey(rate)
         _, D, U = decompose(plant.C @ plant.B)
         needed = np.max(np.abs(np.linalg.solve(D[:, None] * U * D, found.N_d.T)), axis=1)
         predicted = np.array(scenario.controller.omega) * needed / rate**2
@@ -151,18 +158,17 @@ def test_along_the_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> Non
 
 
 def test_along_the_osprey_P_needs_beta_above_the_largest_N_d() -> None:
-    scenario, good = osprey(200.0)
+    scenario, _, good = osprey(200.0)
     beta = np.array(scenario.controller.beta)
     assert np.all(np.max(np.abs(good.N_d), axis=0) < beta)  # q, p, r, V: 23.8, 0.9, 7.4, 7.2 against 29.4, 22.5, 10.2, 7.8
     assert good.P.min() > -1e-6  # measured -3e-9 with zeta_b = beta e(0) = 0
-    _, bad = osprey(200.0, beta_factor=0.1)
+    _, _, bad = osprey(200.0, beta_factor=0.1)
     assert bad.P[-1] < -10.0  # measured -12.3
     assert np.max(np.abs(bad.e[:, 0])) > 100.0 * np.max(np.abs(good.e[:, 0]))  # pitch rate: 0.14 against 5.9e-4 rad/s
 
 
 def test_the_osprey_flies_with_gains_below_what_steps_2_and_3_ask_for() -> None:
-    scenario = load_scenario(OSPREY).vary(flight={"duration": 0.1})
-    plant, _ = of_tape(scenario, simulate(scenario))
+    scenario, plant, _ = osprey(100.0, duration=0.1)
     law = scenario.controller.law()
     assert np.linalg.eigvalsh(decay(plant, law)).min() < -7.0  # measured -7.8
     raised = law._replace(K=np.array([30.0, 50.0, 18.0, 4.0]), Lambda=np.array([1.0, 1.0, 1.0, 0.5]))
@@ -170,7 +176,7 @@ def test_the_osprey_flies_with_gains_below_what_steps_2_and_3_ask_for() -> None:
 
 
 def test_a_tape_without_truth_at_the_ticks_is_refused() -> None:
-    scenario = load_scenario(OSPREY).vary(flight={"duration": 0.1})
+    scenario = find_scenario("osprey_gust").vary(flight={"duration": 0.1})
     tape = simulate(scenario)
     truth = tape["truth"]
     short = replace(tape, signals={**tape.signals, "truth": replace(truth, stamp_ns=truth.stamp_ns + 1)})

@@ -524,6 +524,27 @@ def test_a_servo_between_u_and_the_plant_takes_away_Omega() -> None:
         decompose(np.hstack([p.C, np.zeros((3, 3))]) @ B)
 
 
+def behind_a_servo(T_eps: float) -> float:
+    """The largest e over eps in the last of 10 s: y_dot = u behind a servo of 20 ms, softened sign, e(0) = eps / 2."""
+    tau, one, dt = 0.02, np.ones(1), 0.0005
+    plant = Plant(
+        np.array([[0.0, 1.0], [0.0, -1.0 / tau]]), np.array([[0.0], [1.0 / tau]]), np.eye(1, 2), lambda *_: np.zeros(2)
+    )
+    K, beta = 10.0 * one, 3.0 * one
+    eps = beta / K * T_eps
+    params = example(dt, 1.0).params._replace(
+        K=K, Lambda=one, beta=beta, D=one, input_scale=one, omega=one, eps=eps, sign=Sign.SOFT
+    )
+    flight = fly(plant, np.zeros((20001, 1)), dt, params, np.array([eps[0] / 2.0, 0.0]))
+    return float(np.max(np.abs(flight.x[-2000:, 0])) / eps[0])
+
+
+def test_the_softened_sign_rests_behind_a_servo_where_routh_says_so() -> None:
+    # Lambda + 1/T_eps < 1/tau, so T_eps > 20.4 ms at Lambda = 1, and somewhat more for the lag of sampling, 0.75 ms.
+    assert behind_a_servo(0.8 * 0.0204) > 0.5  # measured 1.5: a limit cycle, for growth ends where s saturates
+    assert behind_a_servo(1.2 * 0.0204) < 0.01  # measured 8e-4, on its way to zero
+
+
 def osprey(gust: float = 0.0) -> dynamics.Aircraft:
     """The airframe, in a vertical gust of this speed at t = 0."""
     gusts = {"vertical": Gust(start=0.0, speed=gust, length=15.24)}

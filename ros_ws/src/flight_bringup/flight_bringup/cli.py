@@ -13,17 +13,19 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
-from flight_analysis.bag_reader import read_run
-from flight_analysis.report import write_report
-from flight_analysis.scenario import load_scenario
-from flight_analysis.summary import Shown, shown_units, summarise
+from flight_analysis.summary import Shown, shown_units
 from flight_bringup import fly as flying
 from flight_bringup.scenarios import find_scenario
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import ParameterError
 
 BAD_INPUT, ENDED_EARLY, INTERRUPTED = 2, 3, 130
 
-app = typer.Typer(help="Fly, record and analyse RISE dynamic inversion.", no_args_is_help=True, add_completion=False)
+app = typer.Typer(
+    help="Fly, record and analyse RISE dynamic inversion.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
 
 
 @app.command()
@@ -58,7 +60,7 @@ def fly(
             progress(chosen.flight.duration, outcome)
     status = {"completed": 0, "interrupted": INTERRUPTED}.get(outcome, ENDED_EARLY)
     try:
-        flown = flying.conclude(chosen, run, outcome)
+        flown = flying.conclude(run, outcome)
     except ParameterError as error:
         if status == 0:
             raise
@@ -67,7 +69,7 @@ def fly(
     if as_json:
         print(json.dumps(flown.summary))
     else:
-        show(Console(), flown.summary, shown_units(chosen))
+        show(Console(), flown.summary, shown_units(flown.scenario))
         print(f"outcome: {outcome}\nlog:     {_short(flown.mcap)}\nreport:  {_short(flown.report)}")
     raise typer.Exit(status)
 
@@ -75,21 +77,16 @@ def fly(
 @app.command()
 def report(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> None:
     """Write the report of a recorded run again, and print its table."""
-    recorded = read_run(run)
-    require(recorded.scenario is not None, str(run), "a log without its scenario", "a run that was flown from a scenario")
-    stored = run / "scenario.yaml"
-    stored.write_bytes(recorded.scenario or b"")
-    chosen = load_scenario(stored)
-    summary = summarise(chosen, recorded.tape, "read from its log")
-    write_report(run / "report.html", chosen, recorded.tape, summary)
-    show(Console(), summary, shown_units(chosen))
-    print(f"report: {_short(run / 'report.html')}")
+    flown = flying.conclude(run)
+    show(Console(), flown.summary, shown_units(flown.scenario))
+    print(f"outcome: {flown.summary['outcome']}\nreport:  {_short(flown.report)}")
 
 
 def show(console: Console, summary: dict[str, Any], units: dict[str, Shown]) -> None:
     """Print the tables of a summary."""
     parts = ("whole", "calm", "gust")
-    table = Table(title=f"Tracking error, {summary['duration']:.1f} s flown", title_justify="left", box=box.SIMPLE_HEAD)
+    title = f"Tracking error ({summary['error']}), {summary['duration']:.1f} s flown"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     table.add_column("channel", no_wrap=True)
     for part in parts:
         table.add_column(f"{part}\nrms", justify="right", no_wrap=True)

@@ -8,6 +8,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
@@ -16,10 +17,9 @@ from typing import Any, NamedTuple
 from flight_analysis.bag_reader import read_run
 from flight_analysis.bag_writer import write_run
 from flight_analysis.report import write_report
-from flight_analysis.scenario import Scenario
+from flight_analysis.scenario import Scenario, load_scenario
 from flight_analysis.simulate import simulate
 from flight_analysis.summary import shown_units, summarise
-from flight_bringup.graph import START_LEAD
 from flight_bringup.processes import Flight
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
@@ -33,7 +33,7 @@ Progress = Callable[[float, str], None]  # flight time in s, and what to show be
 class Flown(NamedTuple):
     """A flight that has ended, however."""
 
-    run: Path
+    scenario: Scenario
     mcap: Path
     report: Path
     summary: dict[str, Any]
@@ -49,9 +49,7 @@ def new_run(scenario: Scenario, runs: Path) -> Path:
         except FileExistsError:
             continue
         except OSError as error:
-            raise ParameterError(
-                f"runs: {runs} cannot be written ({error.strerror}); name another folder with --runs"
-            ) from None
+            raise ParameterError(f"runs: {runs} cannot be written ({error.strerror}), expected a folder that can") from None
         return run
     raise ParameterError(f"runs: found a hundred runs of this second in {runs}, expected fewer")
 
@@ -78,13 +76,12 @@ def fly_over_topics(scenario: Scenario, run: Path, progress: Progress) -> str:
     from flight_bringup.node import Monitor  # noqa: PLC0415 - loads rclpy, which no other command needs
 
     units = shown_units(scenario)
-    start_time = round(time.time() + START_LEAD, 3)
     outputs = scenario.controller.outputs
     try:
         with (
             _signals_as_interrupt(),
-            Flight(scenario.path, run, start_time) as flight,
-            Monitor(outputs, nanoseconds(start_time)) as monitor,
+            Flight(scenario.path, run) as flight,
+            Monitor(outputs, nanoseconds(flight.start_time)) as monitor,
         ):
             shown = "starting"
             while (t := monitor.flight_time()) < scenario.flight.duration:
@@ -109,26 +106,36 @@ def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
     return "completed"
 
 
-def conclude(scenario: Scenario, run: Path, outcome: str) -> Flown:
-    """Read the bag back, write summary.json and report.html beside it, point runs/latest at the run."""
+def conclude(run: Path, outcome: str | None = None) -> Flown:
+    """Read the bag back, write its scenario, summary.json and report.html beside it, point runs/latest at the run.
+
+    Without an outcome, that of the run's summary is kept: the report of an old run is written again. Raises ParameterError
+    where the log cannot be read, or holds no scenario.
+    """
     recorded = read_run(run)
-    tape = _until(recorded.tape, scenario.flight.duration)
+    run = run.resolve()  # runs/latest is a link
+    if recorded.scenario is None:
+        raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
+    stored, kept = run / recorded.scenario.name, run / "summary.json"
+    stored.write_bytes(recorded.scenario.content)
+    scenario = load_scenario(stored)
+    if outcome is None:
+        before = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else {}
+        outcome = str(before.get("outcome", "ended as its log does"))
+    tape = _until_last_input(recorded.tape)
     summary = summarise(scenario, tape, outcome)
-    (run / "scenario.yaml").write_bytes(recorded.scenario or scenario.path.read_bytes())
-    (run / "summary.json").write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    kept.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     write_report(run / "report.html", scenario, tape, summary)
     _point_latest(run)
-    return Flown(run, next(iter(sorted(run.glob("*.mcap")))), run / "report.html", summary)
+    return Flown(scenario, next(iter(sorted(run.glob("*.mcap")))), run / "report.html", summary)
 
 
-def _until(tape: Tape, duration: float) -> Tape:
-    """The tape between t = 0 and the scenario's end: what the processes did while they were being ended is no flight."""
-    end_ns = tape.start_ns + nanoseconds(duration)
-    signals = {}
-    for name, signal_ in tape.signals.items():
-        keep = (signal_.stamp_ns >= tape.start_ns) & (signal_.stamp_ns <= end_ns)
-        signals[name] = type(signal_)(signal_.stamp_ns[keep], signal_.names, signal_.values[keep])
-    return Tape(signals, tape.start_ns, tape.notes)
+def _until_last_input(tape: Tape) -> Tape:
+    """The tape up to the controller's last u: what the aircraft does while the processes are being ended is no flight."""
+    if "u" not in tape:
+        return tape
+    end_ns = tape["u"].stamp_ns[-1]
+    return replace(tape, signals={name: signal_.until(end_ns) for name, signal_ in tape.signals.items()})
 
 
 def _point_latest(run: Path) -> None:

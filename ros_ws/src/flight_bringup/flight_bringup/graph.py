@@ -26,13 +26,23 @@ CONTROLLER = NodeSpec("rise_di_controller", "controller")
 # The recorder starts first and stops last, so that the whole flight is in the log.
 NODES = (RECORDER, AIRCRAFT, REFERENCE_MODEL, CONTROLLER)
 
-START_LEAD = 3.0  # s from the first process to t = 0; four processes on two busy cores are heard within 2 s
 
 READY = "recording to"  # what the recorder says when it is ready
 
 
-def parameters(node: NodeSpec, scenario_file: Path, run: Path, start_time: float) -> dict[str, str | float]:
-    """What a node is told beside its section of the scenario."""
-    if node is RECORDER:
-        return {"directory": str(run), "scenario_file": str(scenario_file), "start_time": start_time}
+def start_lead(recorder_startup: float) -> float:
+    """Time to leave from starting the other nodes to t = 0, s, given how long the recorder took to be ready.
+
+    Half a second for them to find each other, and twice that long, as three processes start at once on two cores.
+    """
+    return 0.5 + 2.0 * recorder_startup
+
+
+def recorder_parameters(scenario_file: Path, run: Path) -> dict[str, str | float]:
+    """What the recorder is told beside its section of the scenario."""
+    return {"directory": str(run), "scenario_file": str(scenario_file)}
+
+
+def parameters(node: NodeSpec, start_time: float) -> dict[str, str | float]:
+    """What another node is told beside its section: the instant of t = 0, which the controller need not know."""
     return {} if node is CONTROLLER else {"start_time": start_time}

@@ -3,6 +3,7 @@
 """The processes of a flight: started together, watched, ended together; none outlives the command."""
 
 import json
+import math
 import shutil
 import signal
 import subprocess
@@ -14,14 +15,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from flight_bringup.graph import NODES, READY, RECORDER, NodeSpec, parameters
+from flight_bringup.graph import NODES, READY, RECORDER, NodeSpec, parameters, recorder_parameters, start_lead
 from flight_core.parameters import ParameterError
 
 STOP_TIMEOUT = 2.5  # s for all processes together; a node ends within 0.2 s
 READY_TIMEOUT = 20.0  # s
 
 
-def _end_with_parent() -> list[str]:
+def end_with_parent() -> list[str]:
     """Prefix of a command that is to end when this process is killed; util-linux, empty where that is missing."""
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
@@ -34,7 +35,7 @@ class NodeProcess:
         self.node = node
         self.lines: deque[str] = deque(maxlen=20)
         self.ready = threading.Event()
-        command = [*_end_with_parent(), sys.executable, "-m", node.module, "--ros-args", "--params-file", str(scenario_file)]
+        command = [*end_with_parent(), sys.executable, "-m", node.module, "--ros-args", "--params-file", str(scenario_file)]
         for name, value in told.items():
             command += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, and quotes what needs it
         self._log = log.open("w", encoding="utf-8")
@@ -70,24 +71,25 @@ class NodeProcess:
 class Flight:
     """All processes of one flight. A context manager: leaving it ends them, the recorder last."""
 
-    def __init__(self, scenario_file: Path, run: Path, start_time: float) -> None:
-        self._told = {node: parameters(node, scenario_file, run, start_time) for node in NODES}
+    def __init__(self, scenario_file: Path, run: Path) -> None:
         self._scenario_file, self._run = scenario_file, run
         self.processes: list[NodeProcess] = []
+        self.start_time = math.inf  # system time of t = 0, s; set once the recorder is ready
 
     def __enter__(self) -> Self:
         try:
-            recorder = self._start(RECORDER)
-            deadline = time.monotonic() + READY_TIMEOUT
+            begin = time.monotonic()
+            recorder = self._start(RECORDER, recorder_parameters(self._scenario_file, self._run))
             while not recorder.ready.wait(0.02):
                 self._require_running()
-                if time.monotonic() > deadline:
+                if time.monotonic() > begin + READY_TIMEOUT:
                     raise ParameterError(
                         f"recorder: not ready after {READY_TIMEOUT:g} s; its output is in {self._log(RECORDER)}"
                     )
+            self.start_time = round(time.time() + start_lead(time.monotonic() - begin), 3)
             for node in NODES:
                 if node is not RECORDER:
-                    self._start(node)
+                    self._start(node, parameters(node, self.start_time))
         except BaseException:
             self.stop()
             raise
@@ -99,10 +101,10 @@ class Flight:
     def _log(self, node: NodeSpec) -> Path:
         return self._run / "log" / f"{node.executable}.log"
 
-    def _start(self, node: NodeSpec) -> NodeProcess:
+    def _start(self, node: NodeSpec, told: dict[str, str | float]) -> NodeProcess:
         log = self._log(node)
         log.parent.mkdir(parents=True, exist_ok=True)
-        process = NodeProcess(node, self._scenario_file, self._told[node], log)
+        process = NodeProcess(node, self._scenario_file, told, log)
         self.processes.append(process)
         return process
 
@@ -129,7 +131,7 @@ class Flight:
         for group in (others, recorders):
             for process in group:
                 if process.popen.poll() is None:
-                    process.popen.send_signal(signal.SIGINT)
+                    process.popen.terminate()  # not SIGINT, which is a traceback while Python still imports
             for process in group:
                 try:
                     process.popen.wait(max(deadline - time.monotonic(), 0.2))

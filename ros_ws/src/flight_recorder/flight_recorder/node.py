@@ -18,7 +18,7 @@ from flight_recorder.params import RecorderParameters
 from flight_ros.inbox import Inbox
 from flight_ros.runtime import FlightNode, run
 from flight_ros.ticker import Tick
-from flight_ros.topics import FLIGHT, PUBLISH, RECORD, Topic
+from flight_ros.topics import FLIGHT, PUBLISH, RECORD, RECORD_FOREIGN, Topic
 
 FLUSH_PERIOD = 0.1  # s, what a killed recorder loses at most
 
@@ -39,7 +39,6 @@ class RecorderNode(FlightNode[RecorderParameters]):
             raise ParameterError(f"recorder.directory: {directory} cannot be written ({error.strerror})") from None
         if scenario is not None:
             self._bag.attach(scenario.name, "application/yaml", scenario.read_bytes(), time.time_ns())
-        self._bag.note("rise_di", {"start_ns": str(nanoseconds(self.parameters.start_time))})
         self._recorded = [self._record(topic) for topic in FLIGHT]
         self._last_sequence: dict[str, int] = {}
         self.lost: Counter[str] = Counter()
@@ -55,7 +54,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
         return path
 
     def _record(self, topic: Topic) -> Inbox:
-        inbox = self.inbox(topic, RECORD, raw=True)
+        inbox = self.inbox(topic, RECORD_FOREIGN if topic.foreign else RECORD, raw=True)
         type_name = f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
         self._bag.add_topic(inbox.name, type_name, _qos_yaml(PUBLISH))
         return inbox
@@ -73,8 +72,8 @@ class RecorderNode(FlightNode[RecorderParameters]):
             self._bag.flush()
 
     def _count_gap(self, inbox: Inbox, sequence: int) -> None:
-        # Every node publishes on /diagnostics, so its sequences interleave and tell nothing.
-        if inbox.topic.name.startswith("/"):
+        # Several nodes may publish on a foreign topic: their sequences interleave and tell nothing.
+        if inbox.topic.foreign:
             return
         gap = sequence - self._last_sequence.get(inbox.name, sequence - 1) - 1
         self._last_sequence[inbox.name] = sequence

@@ -15,4 +15,3 @@ class RecorderParameters(Parameters):
     rate: Annotated[float, Field(ge=5, le=1000)] = Field(description="how often the topics are emptied to the file, Hz")
     directory: str = Field(default="", description="the folder of the bag; empty makes runs/<UTC stamp>-recording")
     scenario_file: str = Field(default="", description="a scenario file to store inside the log")
-    start_time: float = Field(default=0.0, ge=0, description="system time of t = 0 of the flight, s since the epoch")

@@ -37,6 +37,8 @@ P = TypeVar("P", bound=Parameters)
 # What rclpy raises for arguments and parameter files that it cannot read.
 REFUSALS = (ParameterException, _rclpy.RCLError, _rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError)
 
+WAIT_BEFORE_SAYING_NS = NANOSECONDS  # topics of processes that start together are a moment apart
+
 NICE_PAUSE = 0.02  # s, the longest sleep, so that a signal or a service call is not left waiting
 
 
@@ -49,6 +51,7 @@ class FlightNode(Node, Generic[P]):
         self.instance = f"{self.get_fully_qualified_name()}#{os.getpid()}"
         self.rejected: Counter[str] = Counter()
         self._inboxes: list[Inbox] = []
+        self._say_waiting_ns: dict[str, int] = {}
         self._diagnostics = self.publisher(DIAGNOSTICS)
         self._periods: list[int] = []
         self._compute: list[int] = []
@@ -94,10 +97,15 @@ class FlightNode(Node, Generic[P]):
         self.get_logger().warning(f"{inbox.name}: sample refused: {sentence}", throttle_duration_sec=2.0)
 
     def waiting_for(self, inbox: Inbox) -> None:
-        """Say, at most once in 2 s, that nothing comes on a topic, and who is there."""
+        """Called while nothing comes on a topic: says so after a second, then every 2 s, and who is there."""
+        now_ns = time.monotonic_ns()
+        say_ns = self._say_waiting_ns.setdefault(inbox.name, now_ns + WAIT_BEFORE_SAYING_NS)
+        if now_ns < say_ns:
+            return
+        self._say_waiting_ns[inbox.name] = now_ns + 2 * NANOSECONDS
         count = self.count_publishers(inbox.name)
         who = f"{count} publishers but no sample yet" if count else "no publisher there"
-        self.get_logger().warning(f"waiting for {inbox.name}: {who}", throttle_duration_sec=2.0)
+        self.get_logger().warning(f"waiting for {inbox.name}: {who}")
 
     # What the loop does
 

@@ -5,15 +5,18 @@
 from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 
-# Publishers are reliable, so that a recorder loses nothing; depth covers 0.5 s at 1 kHz of a reader that is held up.
-PUBLISH = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE)
+# Publishers are reliable and keep their last samples, so that a recorder that is matched a moment late, or held up, loses
+# nothing; the depth covers half a second at 1 kHz.
+PUBLISH = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Control loops want the newest samples and never a retransmission. The depth covers the samples between two ticks
 # that are needed to bring y_m to the stamp of y.
 LISTEN = QoSProfile(depth=16, reliability=ReliabilityPolicy.BEST_EFFORT)
-RECORD = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+RECORD = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# For topics that others publish, whose kept samples cannot be counted on.
+RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Topic(NamedTuple):
@@ -21,14 +24,15 @@ class Topic(NamedTuple):
 
     name: str
     type: type
+    foreign: bool = False  # published by others than this stack's nodes
 
 
 Y = Topic("y", JointState)
 Y_M = Topic("y_m", JointState)
 U = Topic("u", JointState)
-U_M = Topic("u_m", JointState)
+U_M = Topic("u_m", JointState, foreign=True)
 INTERNALS = Topic("internals", JointState)
 TRUTH = Topic("truth", JointState)
-DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray)
+DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, foreign=True)
 
 FLIGHT = (Y, Y_M, U, U_M, INTERNALS, TRUTH, DIAGNOSTICS)

@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di airframes`: what the theorem asks of an airframe, for every airframe of the library."""
+
+import json
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from flight_analysis.airframe_table import AirframeFacts, ComplexArray, library
+
+
+def airframes(
+    as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON, nothing else.")] = False,
+) -> None:
+    """Show the airframes of the library: poles, zeros, the minors of Omega = C B, D as published and what gives D = I."""
+    facts = library()
+    if as_json:
+        print(json.dumps([_plain(one) for one in facts]))
+        return
+    table = Table(title="Airframes", title_justify="left", box=box.SIMPLE_HEAD, show_lines=True)
+    for heading in ("airframe", "n, m", "poles (1/s)", "zeros (1/s)", "zero\ndynamics", "minors", "D", "for D = I", "coupling"):
+        table.add_column(heading, overflow="fold")
+    for one in facts:
+        table.add_row(
+            one.name,
+            f"{one.n}, {one.m}",
+            _shown(one.poles),
+            _shown(one.zeros),
+            one.zero_dynamics,
+            "  ".join(f"{minor:.3g}" for minor in one.minors),
+            "none" if one.D is None else " ".join(f"{int(sign):+d}" for sign in one.D),
+            one.remedy,
+            "-" if one.coupling is None else f"{one.coupling:.3g}",
+        )
+    console = Console()
+    console.print(table)
+    outside = [one.name for one in facts if not one.in_theorem]
+    console.print(f"Outside the theorem: {', '.join(outside) or 'none'}. Minors in SI units; coupling is max abs(U - I).")
+
+
+def _shown(roots: ComplexArray) -> str:
+    """Roots for people: conjugate pairs once, what is zero to rounding as 0."""
+    shown = []
+    for root in roots:
+        real, imaginary = (0.0 if abs(part) < 1e-6 else float(part) for part in (root.real, root.imag))
+        if imaginary >= 0.0:
+            shown.append(f"{real:.3g}" + (f"+-{imaginary:.3g}j" if imaginary else ""))
+    return "  ".join(shown)
+
+
+def _plain(one: AirframeFacts) -> dict[str, Any]:
+    return {
+        "name": one.name,
+        "n": one.n,
+        "m": one.m,
+        "poles": [[root.real, root.imag] for root in one.poles],
+        "zeros": [[root.real, root.imag] for root in one.zeros],
+        "zero_dynamics": str(one.zero_dynamics),
+        "minors": one.minors.tolist(),
+        "D": None if one.D is None else [int(sign) for sign in one.D],
+        "for_D_I": one.remedy,
+        "coupling": one.coupling,
+        "controllable": one.controllable,
+        "in_theorem": one.in_theorem,
+    }

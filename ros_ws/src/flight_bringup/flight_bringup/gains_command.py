@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di gains`: Theorem 1 and the engineering procedure side by side, and a scenario's gain set judged by both."""
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from aircraft_sim.airframe import Airframe, load_airframe
+from flight_analysis.gain_selection import Answer, Study, as_yaml, check_gains, manoeuvre, select_gains, setting_of, study
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError, require
+from rise_di_controller.gains import Condition, failing
+
+CONDITION_FAILS = 1
+
+
+def gains(
+    airframe: Annotated[str, typer.Argument(help="Name of an airframe, or path of an airframe file (.yaml).")],
+    uncertainty: Annotated[float, typer.Option(help="Part by which every entry of A and B may be off.")] = 0.3,
+    scenario: Annotated[str, typer.Option(help="Scenario whose commands, gusts and loop to select for.")] = "osprey_servo",
+    rate: Annotated[float | None, typer.Option(help="Rate of the law in Hz, in place of the scenario's.")] = None,
+    lag: Annotated[str | None, typer.Option(help="Lags of the actuators in s, in the airframe's order: 0.02,0.1")] = None,
+    delay: Annotated[float | None, typer.Option(help="Pure delay in s, in place of the scenario's.")] = None,
+    inputs: Annotated[str | None, typer.Option(help="What drives each output, in the airframe's order: rudder,aileron")] = None,
+    gamma_2: Annotated[float, typer.Option(help="gamma_2 of Lemma 1 in 1/s: stated, for nothing bounds it.")] = 0.0,
+    samples: Annotated[
+        int, typer.Option(min=0, help="How many uncertain airframes to bound the theorem's figures with.")
+    ] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain airframes.")] = 1,
+    write: Annotated[Path | None, typer.Option(help="File to write the engineering gains to, as a scenario has them.")] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Judge the gain set of the scenario instead of selecting one.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
+) -> None:
+    """Select gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on both.
+
+    Exit status: 0, or with --check 1 where a condition of the loop fails, 2 bad input.
+    """
+    chosen, flown = find_scenario(scenario), load_airframe(airframe)
+    setting = setting_of(chosen, gamma_2)._replace(inputs=tuple(inputs.split(",")) if inputs else ())
+    if rate is not None:
+        setting = setting._replace(rate=rate)
+    if delay is not None:
+        setting = setting._replace(delay=delay)
+    if lag is not None:
+        setting = setting._replace(lag=_lags(lag, flown))
+    if check:
+        require(write is None, "--write", "it beside --check", "one of them: --check selects nothing to write")
+        changed = rate is not None or delay is not None or lag is not None or inputs is not None
+        require(not changed, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
+        known, named = chosen.controller.outputs, f"airframe {flown.name}"
+        require(sorted(known) == sorted(flown.outputs), named, ", ".join(flown.outputs), f"the outputs {', '.join(known)}")
+    console = Console(quiet=as_json)
+    with console.status("following the reference on uncertain airframes"):
+        found = study(flown, manoeuvre(chosen, flown), uncertainty, samples, seed)
+        if check:
+            names, answers, text = ("scenario",), (check_gains(chosen, found, gamma_2),), None
+        else:
+            selection = select_gains(found, setting)
+            names, answers = ("theorem", "engineering"), (selection.theorem, selection.engineering)
+            text = as_yaml(selection)
+    if write is not None and text is not None:
+        _write(write, text)
+    if as_json:
+        print(json.dumps(_plain(found, dict(zip(names, answers, strict=True)), seed)))
+    else:
+        _show(console, found, dict(zip(names, answers, strict=True)))
+        if write is not None:
+            console.print(f"gains: {write}")
+    if check and failing(answers[0].loop):
+        raise typer.Exit(CONDITION_FAILS)
+
+
+def _lags(text: str, airframe: Airframe) -> dict[str, float]:
+    """Lags by input from "0.02,0.1", or from one value for all. Raises ParameterError."""
+    names = list(airframe.inputs)
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ParameterError(f"--lag: found {text!r}, expected seconds separated by commas") from None
+    values = values * len(names) if len(values) == 1 else values
+    require(len(values) == len(names), "--lag", f"{len(values)} values", f"one for all or one for each of {', '.join(names)}")
+    return dict(zip(names, values, strict=True))
+
+
+def _write(path: Path, text: str) -> None:
+    header = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
+    try:
+        path.write_text(header + text, encoding="utf-8")
+    except OSError as error:
+        raise ParameterError(f"--write: found {path}, expected a file that can be written ({error.strerror})") from None
+
+
+def _show(console: Console, found: Study, answers: dict[str, Answer]) -> None:
+    first = next(iter(answers.values()))
+    outputs = first.controller.outputs
+    samples = len(found.A) - 1
+    title = f"Gains for {found.airframe.name}, entries of A and B +-{100 * found.uncertainty:g} % ({samples} samples)"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    table.add_column("channel", no_wrap=True)
+    for name in answers:
+        for heading in (f"{name}\nK (1/s)", "\nLambda (1/s)", "\nbeta"):
+            table.add_column(heading, justify="right")
+    for i, (output, name) in enumerate(zip(outputs, first.controller.inputs, strict=True)):
+        cells = []
+        for answer in answers.values():
+            params = answer.controller.law()
+            cells += [f"{params.K[i]:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i]:.4g}"]
+        table.add_row(f"{output} by {name}", *cells)
+    console.print(table)
+    for name, answer in answers.items():
+        console.print(f"{name}: {_margin(answer)}", highlight=False)
+
+    table = Table(title="Conditions (margin: above 1 holds)", title_justify="left", box=box.SIMPLE_HEAD)
+    table.add_column("condition")
+    for name in answers:
+        for heading in (f"{name}\nfound", "\nexpected", "\nmargin"):
+            table.add_column(heading, justify="right", no_wrap=True)
+    for part in ("theorem", "loop"):
+        for row in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
+            cells = [cell for condition in row for cell in _cells(condition)]
+            where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
+            shown = where.pop() if len(where) == 1 else None
+            estimate = " (estimate)" if row[0].estimate else ""
+            table.add_row(row[0].name + (f" of {shown}" if shown else "") + estimate, *cells)
+        table.add_section()
+    console.print(table)
+    console.print(f"(estimate): with gamma_2 = {first.bounds.gamma_2[0]:g} 1/s as stated; nothing bounds it.", highlight=False)
+    for name, answer in answers.items():
+        failed = answer.failing
+        console.print(f"{name}: {'every condition holds' if not failed else f'{len(failed)} conditions fail'}")
+        if len(answers) == 1:
+            for condition in failed:
+                console.print(f"  {condition.sentence(outputs)}", highlight=False)
+
+
+def _margin(answer: Answer) -> str:
+    if answer.delay_margin is None:
+        return "no linear loop (literal sign)"
+    if answer.delay_margin == 0.0:
+        return "predicted delay margin none: the linear loop is unstable with this lag"
+    each = zip(answer.controller.outputs, answer.channel_margins, strict=True)
+    alone = ", ".join(f"{output} {_milliseconds(margin)}" for output, margin in each)
+    return f"predicted delay margin {_milliseconds(answer.delay_margin)}; in one channel alone: {alone}"
+
+
+def _milliseconds(margin: float) -> str:
+    return f"{1e3 * margin:.0f} ms" if math.isfinite(margin) else "over 500 ms"
+
+
+def _cells(condition: Condition) -> tuple[str, str, str]:
+    margin = "" if math.isnan(condition.margin) else f"{condition.margin:.3g}"
+    shown = margin if condition.holds else f"[red]{margin} fails[/red]"
+    return f"{condition.found:.4g}", f"{'>=' if condition.at_least else '<='} {condition.bound:.4g}", shown.strip()
+
+
+def _plain(found: Study, answers: dict[str, Answer], seed: int) -> dict[str, Any]:
+    inputs = list(found.airframe.inputs)
+    return {
+        "airframe": found.airframe.name,
+        "uncertainty": found.uncertainty,
+        "samples": len(found.A) - 1,
+        "seed": seed,
+        "slew": dict(zip(inputs, found.slew.tolist(), strict=True)),
+        "slew_calm": dict(zip(inputs, found.slew_calm.tolist(), strict=True)),
+    } | {
+        name: {
+            "controller": answer.controller.model_dump(exclude_none=True),
+            "delay_margin": _number(answer.delay_margin),
+            "channel_margins": [_number(margin) for margin in answer.channel_margins],
+            "bounds": {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")}
+            | {"rho": answer.bounds.rho},
+            "conditions": [
+                {
+                    "name": condition.name,
+                    "part": part,
+                    "channel": None if condition.channel is None else answer.controller.outputs[condition.channel],
+                    "found": _number(condition.found),
+                    "at_least" if condition.at_least else "at_most": _number(condition.bound),
+                    "margin": _number(condition.margin),
+                    "holds": condition.holds,
+                    "estimate": condition.estimate,
+                }
+                for part in ("theorem", "loop")
+                for condition in getattr(answer, part)
+            ],
+        }
+        for name, answer in answers.items()
+    }
+
+
+def _number(value: float | None) -> float | None:
+    # JSON has neither NaN nor infinity.
+    return value if value is not None and math.isfinite(value) else None

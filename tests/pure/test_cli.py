@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: exit status, sentences, files."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flight_analysis.scenario import Scenario
+
+
+def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "flight_bringup.cli", *arguments]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    where = tmp_path_factory.mktemp("fly")
+    return where, rise_di("fly", "osprey_gust", "--in-process", "--duration", "4", cwd=where)
+
+
+def test_a_flight_ends_with_table_log_and_report(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    where, shown = flown
+    assert shown.returncode == 0, shown.stderr
+    run = (where / "runs" / "latest").resolve()
+    assert {path.name for path in run.iterdir()} == {
+        "metadata.yaml", "report.html", "osprey_gust.yaml", "summary.json", f"{run.name}_0.mcap",
+    }  # fmt: skip
+    assert "q (mrad/s)" in shown.stdout
+    assert f"runs/{run.name}/report.html" in shown.stdout
+    assert "Traceback" not in shown.stderr
+
+
+def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    summary = json.loads((flown[0] / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["scenario"], summary["outcome"], summary["duration"]) == ("osprey_gust", "completed", 4.0)
+    assert summary["errors"]["q"]["gust"] == {"rms": None, "max": None}  # the gusts come later
+    assert 0 < summary["errors"]["q"]["calm"]["rms"] < 1e-3
+    assert (summary["ticks"]["ticks"], summary["ticks"]["missed"]) == (401, 0)
+
+
+def test_the_report_is_one_page_that_needs_no_network(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    page = (flown[0] / "runs" / "latest" / "report.html").read_text(encoding="utf-8")
+    assert 'src="http' not in page
+    assert page.index("Tracking error") < page.index("Output y over the reference y_m")
+
+
+def test_a_report_can_be_written_again(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    run = flown[0] / "runs" / "latest"
+    (run / "report.html").unlink()
+    shown = rise_di("report", str(run), cwd=flown[0])
+    assert shown.returncode == 0, shown.stderr
+    assert (run / "report.html").is_file()
+
+
+def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
+    shown = rise_di("fly", "--in-process", "--duration", "1", "--json", cwd=tmp_path)
+    assert json.loads(shown.stdout)["duration"] == 1.0
+    assert shown.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["fly", "nowhere"], "error: scenario: found 'nowhere', expected one of"),
+        (["fly", "--duration", "-1"], "error: flight.duration: found -1.0, expected greater than 0"),
+        (["fly", "--in-process", "--runs", "/proc/none"], "error: runs: /proc/none cannot be written"),
+        (["report", "nowhere"], "error: nowhere: found no .mcap file"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_status_2(arguments: list[str], sentence: str, tmp_path: Path) -> None:
+    shown = rise_di(*arguments, cwd=tmp_path)
+    assert shown.returncode == 2
+    assert shown.stderr.startswith(sentence)
+    assert len(shown.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_names_every_option(tmp_path: Path) -> None:
+    shown = rise_di("fly", "--help", cwd=tmp_path)
+    for option in ("--duration", "--in-process", "--runs", "--json"):
+        assert option in shown.stdout
+
+
+def test_a_scenario_file_may_lie_anywhere(tmp_path: Path, osprey_gust: Scenario) -> None:
+    (tmp_path / "mine.yaml").write_bytes(osprey_gust.path.read_bytes())
+    assert rise_di("fly", "mine.yaml", "--in-process", "--duration", "1", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "runs" / "latest").resolve().name.endswith("-mine")

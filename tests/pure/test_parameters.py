@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Bad parameters: one sentence that names the key, what was found and what is expected."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flight_analysis.scenario import Scenario, load_scenario
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError, flatten, nest
+from flight_core.rates import divide, period_ns
+
+# What is changed in the default scenario's text -> the sentence that must come of it.
+BAD = {
+    ("k_g: 1.0", "k_g: -1.0"): "controller.k_g: found -1.0, expected greater than 0",
+    ("k_g: 1.0", "k_g: true"): "controller.k_g: found True, expected a number",
+    ("    beta:", "    betta:"): "controller.betta: unknown key, expected beta perhaps, or another of D, Lambda,",
+    ("    Lambda: [5.0, 5.0, 3.0, 0.5]", "    #"): "controller.Lambda: missing, expected the diagonal of Lambda (4), 1/s",
+    ("D: [1, 1, 1, 1]", "D: [1, 1, 2, 1]"): "controller.D[2]: found 2, expected +1 or -1",
+    ("D: [1, 1, 1, 1]", "D: [1, 1, 1]"): "controller.D: found 3 values, expected 4, one for each of q, p, r, V",
+    ("D: [1, 1, 1, 1]", "D: 1"): "controller.D: found 1, expected a list of values",
+    ("k_d: [16.0, 16.0, 7.0]", "k_d: [16.0, .nan, 7.0]"): "controller.k_d[1]: found nan, expected a finite number",
+    ("k_d: [16.0, 16.0, 7.0]", "k_d: [16.0, 16.0]"): "controller.k_d: found 2 values, expected 3, one for each of q, p, r",
+    (
+        "damping: [0.9, 1.0,",
+        "damping: [0.9, -1.0,",
+    ): "second_order.damping: found an eigenvalue of A_m with real part",
+    ("rate: 100.0                # Hz\n    outputs", "rate: 300.0\n    outputs"): (
+        "controller.rate: found 300 Hz, expected a rate whose period is a whole number of nanoseconds"
+    ),
+    ("rate: 500.0                # Hz, y and truth", "rate: 250.0"): (
+        "aircraft.rate: found 250 Hz, expected a whole multiple of controller.rate (100 Hz)"
+    ),
+    ("step: 0.002", "step: 0.003"): "aircraft.step: found 0.003 s, expected a whole fraction of 1 / rate (0.002 s)",
+    ("airframe: osprey", "airframe: ospray"): "aircraft.airframe: found 'ospray', expected one of",
+    ("[q, p, r, V]", "[q, p, r, W]"): "controller.outputs: found q, p, r, W, expected the channels of the airframe osprey",
+    ("rudder, thrust]", "rudder, flaps]"): "controller.inputs: found elevator, aileron, rudder, flaps, expected the channels",
+    ("sign: auto", "sign: smooth"): "controller.sign: found 'smooth', expected 'auto', 'literal', 'implicit' or 'soft'",
+    (
+        "vertical: {start",
+        "upward: {start",
+    ): "gusts: found 'upward', expected one the airframe osprey knows: vertical, lateral",
+    ("length: 15.24}   #", "length: 0.0}   #"): "aircraft.gusts.vertical.length: found 0.0, expected greater than 0",
+    ("stop: [4.0, 8.0", "stop: [1.0, 8.0"): "reference_model.pulses.q.stop[0]: found 1.0, expected later than start[0] = 2 s",
+    ("rise: 0.1", "rise: 0.0"): "reference_model.rise: found 0.0, expected greater than 0",
+    (
+        "bank_rate: p",
+        "bank_rate: roll",
+    ): "coordinated_turn.bank_rate: found channel 'roll', expected one of q, V, p, r",
+    ("duration: 60.0", "duration: long"): "flight.duration: found 'long', expected a number",
+    ("/**/recorder", "/**/recoder"): "bad.yaml: recoder: found a section, expected only flight, aircraft,",
+    (
+        "/**/recorder:\n  ros__parameters:",
+        "/**/recorder:\n  parameters:",
+    ): "recorder: found no mapping under ros__parameters",
+    ("duration: 60.0", "duration: [60.0"): "bad.yaml: not valid YAML",
+}
+
+
+@pytest.mark.parametrize(("change", "sentence"), BAD.items(), ids=[change[1].strip() for change in BAD])
+def test_bad_scenario_is_one_sentence(change: tuple[str, str], sentence: str, osprey_gust: Scenario, tmp_path: Path) -> None:
+    text = osprey_gust.path.read_text(encoding="utf-8")
+    assert text.count(change[0]) >= 1, f"the scenario no longer holds {change[0]!r}"
+    bad = tmp_path / "bad.yaml"
+    bad.write_text(text.replace(*change, 1), encoding="utf-8")
+    with pytest.raises(ParameterError) as refused:
+        load_scenario(bad)
+    said = str(refused.value)
+    assert sentence in said
+    assert "\n" not in said
+
+
+def test_an_integer_may_stand_for_a_number(osprey_gust: Scenario) -> None:
+    assert osprey_gust.vary(controller={"k_g": 1, "Lambda": [5, 5, 3, 1]}).controller.Lambda == (5.0, 5.0, 3.0, 1.0)
+
+
+def test_an_unknown_scenario_is_told_which_there_are() -> None:
+    with pytest.raises(ParameterError, match=r"scenario: found 'osprey', expected one of .*osprey_gust.*, or the path"):
+        find_scenario("osprey")
+
+
+def test_every_scenario_that_ships_is_valid() -> None:
+    directory = find_scenario("osprey_gust").path.parent
+    assert [load_scenario(path).name for path in sorted(directory.glob("*.yaml"))]
+
+
+NAMES = st.text(st.characters(categories=["Ll"]), min_size=1, max_size=4)
+TREES = st.recursive(st.integers(), lambda children: st.dictionaries(NAMES, children, min_size=1, max_size=3), max_leaves=10)
+
+
+@given(tree=st.dictionaries(NAMES, TREES, min_size=1, max_size=3))
+def test_nesting_undoes_flattening(tree: dict[str, object]) -> None:
+    assert nest(dict(flatten(tree))) == tree
+
+
+def test_a_name_cannot_be_a_value_and_a_group() -> None:
+    for flat in ({"a": 1, "a.b": 2}, {"a.b": 2, "a": 1}):
+        with pytest.raises(ParameterError, match="both a value and a group"):
+            nest(flat)
+
+
+def test_periods_are_whole_nanoseconds() -> None:
+    assert [period_ns(rate, "rate") for rate in (1.0, 100.0, 500.0, 1000.0, 62.5)] == [
+        10**9,
+        10**7,
+        2 * 10**6,
+        10**6,
+        16 * 10**6,
+    ]
+    for rate in (3.0, 300.0, 999.0):
+        with pytest.raises(ParameterError, match=f"rate: found {rate:g} Hz"):
+            period_ns(rate, "rate")
+
+
+def test_dividing_counts_the_parts() -> None:
+    assert divide(10, 2, "step", "it") == 5
+    with pytest.raises(ParameterError, match="step"):
+        divide(10, 0, "step", "it")

@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Each node alone: its refusals, its patience, its end."""
+
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from tests.ros.conftest import Start
+
+from flight_analysis.scenario import Scenario
+
+NODES = {
+    "aircraft_sim": "aircraft",
+    "reference_model": "reference_model",
+    "rise_di_controller": "controller",
+    "flight_recorder": "recorder",
+}
+
+
+@pytest.mark.parametrize("package", NODES)
+def test_a_node_without_parameters_says_what_is_missing_and_ends_with_status_2(package: str, start: Start) -> None:
+    node = start(f"{package}.node")
+    assert node.end() == 2
+    assert len(node.lines) == 1
+    assert node.lines[0].startswith("error: ")
+    assert "missing, expected" in node.lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["-p", "k_g:=-1.0"], "error: controller.k_g: found -1.0, expected greater than 0"),
+        (["-p", "max_agee:=1.0"], "error: controller.max_agee: unknown key, expected max_age perhaps"),
+        (["-p", "beta:=[1.0,2.0]"], "error: controller.beta: found 2 values, expected 4, one for each of q, p, r, V"),
+        (["-p", "D:=[1,1,1,0]"], "error: controller.D[3]: found 0, expected +1 or -1"),
+        (["--params-file", "nowhere.yaml"], "error: failed to initialize rcl: Couldn't parse params file"),
+    ],
+)
+def test_a_bad_parameter_is_one_sentence(arguments: list[str], sentence: str, start: Start, osprey_gust: Scenario) -> None:
+    node = start("rise_di_controller.node", "--ros-args", "--params-file", str(osprey_gust.path), *arguments)
+    assert node.end() == 2
+    assert any(line.startswith(sentence) for line in node.lines), node.output
+    assert "Traceback" not in node.output
+
+
+@pytest.mark.parametrize(("package", "waits_for"), [("rise_di_controller", "/y"), ("aircraft_sim", "/u")])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_node_without_its_peer_says_so_keeps_waiting_and_ends_cleanly(
+    package: str, waits_for: str, number: signal.Signals, start: Start, osprey_gust: Scenario
+) -> None:
+    node = start(f"{package}.node", "--ros-args", "--params-file", str(osprey_gust.path))
+    node.wait_for(f"waiting for {waits_for}: no publisher there")
+    assert node.popen.poll() is None
+    node.popen.send_signal(number)
+    assert node.end(5.0) == 0
+    assert "Traceback" not in node.output
+
+
+def test_a_storm_of_signals_ends_a_node_as_one_does(start: Start, osprey_gust: Scenario) -> None:
+    # A lock taken in the handler would hang here: the second signal comes while the first is handled.
+    node = start("aircraft_sim.node", "--ros-args", "--params-file", str(osprey_gust.path))
+    node.wait_for("waiting for /u")
+    for _ in range(50):
+        node.popen.send_signal(signal.SIGTERM)
+        node.popen.send_signal(signal.SIGINT)
+    assert node.end(5.0) == 0
+
+
+def test_a_missing_transport_profile_is_refused_before_anything_starts(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/nowhere/profile.xml")
+    node = start("aircraft_sim.node")
+    assert node.end() == 2
+    assert node.lines[0].startswith("error: FASTRTPS_DEFAULT_PROFILES_FILE: /nowhere/profile.xml cannot be read")
+
+
+def test_a_recorder_that_cannot_write_says_where(start: Start, osprey_gust: Scenario) -> None:
+    arguments = ("--params-file", str(osprey_gust.path), "-p", "directory:=/proc/nowhere")
+    node = start("flight_recorder.node", "--ros-args", *arguments)
+    assert node.end() == 2
+    assert "recorder.directory: /proc/nowhere cannot be written" in node.output
+
+
+@pytest.mark.parametrize(("package", "executable"), NODES.items())
+def test_installed_executable_runs(package: str, executable: str) -> None:
+    script = Path(__file__).resolve().parents[2] / "ros_ws" / "install" / package / "lib" / package / executable
+    shown = subprocess.run([script], capture_output=True, text=True, timeout=60, check=False)
+    assert shown.returncode == 2
+    assert f"error: {executable}." in shown.stderr
