@@ -49,6 +49,7 @@ NonNegatives = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_le
 Names = Annotated[tuple[str, ...], Field(min_length=1), BeforeValidator(as_tuple)]
 Signs = Annotated[tuple[int, ...], Field(min_length=1), BeforeValidator(as_tuple)]
 Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
 
 
 def require(condition: bool, key: str, found: object, expected: str) -> None:

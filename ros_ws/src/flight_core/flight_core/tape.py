@@ -29,6 +29,11 @@ class Signal:
             raise KeyError(f"no channel {name} among {', '.join(self.names)}")
         return self.values[:, self.names.index(name)]
 
+    def until(self, end_ns: int) -> "Signal":
+        """The samples up to and including an instant."""
+        keep = self.stamp_ns <= end_ns
+        return Signal(self.stamp_ns[keep], self.names, self.values[keep])
+
     def group(self, prefix: str) -> "Signal":
         """The channels called "prefix.name", as a signal with channels "name"."""
         columns = [i for i, name in enumerate(self.names) if name.startswith(prefix + ".")]

@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from flight_core.parameters import Parameters, flatten, nest
 
@@ -14,27 +15,38 @@ P = TypeVar("P", bound=Parameters)
 NOT_OURS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
 
-def read_parameters(node: Node, schema: type[P]) -> P:
+def read_parameters(node: Node, schema: type[P], tunable: frozenset[str]) -> P:
     """Validate the overrides of a node made with automatically_declare_parameters_from_overrides.
 
-    Afterwards every parameter of the set is declared, read-only, with its description. Raises ParameterError.
+    Afterwards every parameter of the set is declared, with its description; read-only unless `tunable`. Raises ParameterError.
     """
-    given = {
-        name: _plain(parameter.value)
-        for name, parameter in node.get_parameters_by_prefix("").items()
-        if name.split(".")[0] not in NOT_OURS
-    }
-    parameters = schema.validate_mapping(nest(given), node.get_name())
+    parameters = schema.validate_mapping(nest(_given(node)), node.get_name())
     descriptions = dict(_descriptions(schema))
     for name, value in flatten(parameters.model_dump()):
+        group = name.split(".")[0]
+        # dynamic_typing: the set decides about types, and takes an integer where a number is meant
         descriptor = ParameterDescriptor(
-            description=descriptions.get(name.split(".")[0], ""), read_only=True, dynamic_typing=True
+            description=descriptions.get(group, ""), read_only=group not in tunable, dynamic_typing=True
         )
         if node.has_parameter(name):
             node.set_descriptor(name, descriptor)
         elif value != ():
             node.declare_parameter(name, value, descriptor)
     return parameters
+
+
+def changed(node: Node, parameters: P, changes: list[Parameter]) -> P:
+    """The set with some parameters changed, checked as a whole. Raises ParameterError."""
+    ours = {change.name: _plain(change.value) for change in changes if change.name.split(".")[0] not in NOT_OURS}
+    return type(parameters).validate_mapping(nest(_given(node) | ours), node.get_name())
+
+
+def _given(node: Node) -> dict[str, Any]:
+    return {
+        name: _plain(parameter.value)
+        for name, parameter in node.get_parameters_by_prefix("").items()
+        if name.split(".")[0] not in NOT_OURS
+    }
 
 
 def _plain(value: Any) -> Any:

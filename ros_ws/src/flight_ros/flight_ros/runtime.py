@@ -16,10 +16,12 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.signals import SignalHandlerOptions
@@ -28,7 +30,7 @@ from flight_core.parameters import ParameterError, Parameters
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_ros import transport
 from flight_ros.inbox import Inbox
-from flight_ros.parameters import read_parameters
+from flight_ros.parameters import changed, read_parameters
 from flight_ros.ticker import Tick, Ticker
 from flight_ros.topics import DIAGNOSTICS, LISTEN, PUBLISH, Topic
 
@@ -45,9 +47,11 @@ NICE_PAUSE = 0.02  # s, the longest sleep, so that a signal or a service call is
 class FlightNode(Node, Generic[P]):
     """A node that works at fixed ticks. A subclass says at which rate, and what one tick does."""
 
-    def __init__(self, name: str, schema: type[P]) -> None:
-        super().__init__(name, automatically_declare_parameters_from_overrides=True)
-        self.parameters = read_parameters(self, schema)
+    def __init__(self, name: str, schema: type[P], tunable: frozenset[str] = frozenset()) -> None:
+        Node.__init__(self, name, automatically_declare_parameters_from_overrides=True)
+        self.parameters = read_parameters(self, schema, tunable)
+        if tunable:
+            self.add_on_set_parameters_callback(self._change_parameters)
         self.instance = f"{self.get_fully_qualified_name()}#{os.getpid()}"
         self.rejected: Counter[str] = Counter()
         self._inboxes: list[Inbox] = []
@@ -79,6 +83,9 @@ class FlightNode(Node, Generic[P]):
     def close(self) -> None:
         """Called once when the node ends, whatever ended it."""
 
+    def on_parameters(self, parameters: P) -> None:
+        """Called with a set that was accepted in flight, before it becomes `self.parameters`."""
+
     # What a subclass uses
 
     def publisher(self, topic: Topic) -> Publisher:
@@ -106,6 +113,20 @@ class FlightNode(Node, Generic[P]):
         count = self.count_publishers(inbox.name)
         who = f"{count} publishers but no sample yet" if count else "no publisher there"
         self.get_logger().warning(f"waiting for {inbox.name}: {who}")
+
+    def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
+        """Accept a change of tunable parameters as a whole, or refuse it with a sentence and leave everything as it was."""
+        try:
+            parameters = changed(self, self.parameters, changes)
+        except ParameterError as error:
+            self.get_logger().warning(f"parameters refused: {error}")
+            return SetParametersResult(successful=False, reason=str(error))
+        self.on_parameters(parameters)
+        for change in changes:
+            old = self.get_parameter_or(change.name).value
+            self.get_logger().info(f"{change.name}: {old} -> {change.value}")
+        self.parameters = parameters
+        return SetParametersResult(successful=True)
 
     # What the loop does
 
@@ -229,7 +250,10 @@ def _loop(node: FlightNode[Any], stop: _Stop) -> None:
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
             serve_ns = now_ns + nanoseconds(NICE_PAUSE)
-            executor.spin_once(timeout_sec=0)
+            try:
+                executor.spin_once(timeout_sec=0)
+            except Exception as error:  # a service request that rclpy cannot serve, such as an invalid lifecycle transition
+                node.get_logger().error(f"request refused: {' '.join(str(error).split())}")
         if now_ns >= report_ns:
             report_ns = now_ns + NANOSECONDS
             node.publish_diagnostics()

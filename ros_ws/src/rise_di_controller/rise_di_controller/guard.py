@@ -1,24 +1,30 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What stands around the law: freshness of its inputs, engagement, and the time step it is given. Pure, like the law."""
+"""What stands around the law: limits and anti-windup, freshness of its inputs, engagement. Pure, like the law."""
 
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
+from array_api_compat import array_namespace
 
+from flight_core.freshness import fade
 from flight_core.rates import seconds
-from flight_core.vectors import FloatArray
-from rise_di_controller.law import LawParams, LawState, engage, step
+from flight_core.vectors import Array, FloatArray
+from rise_di_controller import law as rise
+from rise_di_controller.law import LawParams, LawState
 
 
 class Mode(IntEnum):
     """What the controller is doing; published as a number in `internals`."""
 
-    WAITING = 0  # y or y_m has not come yet
+    WAITING = 0  # y or y_m has not come yet; nothing is commanded
     ENGAGED = 1  # the law flies
     HOLD = 2  # y or y_m is stale: u is held and nothing is integrated
+    RAMP = 3  # stale for longer: u goes to trim
+    TRIM = 4  # u is at trim
+    INACTIVE = 5  # deactivated: u is held or goes to trim
 
 
 class Sample(NamedTuple):
@@ -28,15 +34,27 @@ class Sample(NamedTuple):
     value: FloatArray
 
 
+class Limits(NamedTuple):
+    """What may be commanded, deviations from trim in units of u; infinite where there is no limit."""
+
+    lower: Array  # (m,)
+    upper: Array  # (m,)
+    rate: Array  # (m,) per s
+
+
 class GuardParams(NamedTuple):
-    """Times in ns."""
+    """Times in ns, and the limits."""
 
     period_ns: int  # of the controller's ticks
     max_age_ns: int  # beyond which a sample is stale
+    hold_ns: int  # for how long u is held then
+    ramp_ns: int  # and how long it takes to trim
+    deactivation_holds: bool  # whether u is held when deactivated, else it ramps to trim
+    limits: Limits
 
 
-# A measured dt is used as it is between these multiples of the period: a lost tick is integrated in full, and
-# neither a burst nor a long gap can kick the sign term (pains of sampled controllers; lost ticks up to 3 in a row).
+# A measured dt is used as it is between these multiples of the period: lost ticks (up to two in a row) are integrated in
+# full, and neither a burst nor a long gap can kick the sign term.
 DT_RANGE = (0.2, 3.0)
 
 
@@ -46,13 +64,18 @@ class ControllerState(NamedTuple):
     mode: Mode
     law: LawState | None  # None until engaged
     y: Sample | None  # the newest y used
-    u: FloatArray
+    y_m: FloatArray | None  # the reference at its stamp
+    u: FloatArray  # commanded, after limits
+    u_free: FloatArray  # before limits
+    u_trim: FloatArray  # u at engagement, to which the law adds
+    lost_ns: int  # when the inputs were lost, or the controller deactivated
+    u_lost: FloatArray  # u at that instant
 
 
 class Used(NamedTuple):
     """What one tick of the controller used, for the log: recomputing the tick from it gives u to the last bit."""
 
-    stamp_ns: int  # of y, and so of u
+    stamp_ns: int  # of y, and so of u; of the tick where no y is used
     y: FloatArray
     y_m: FloatArray  # brought to the stamp of y
     y_m_offset: float  # stamp of the newest y_m used minus stamp of y, s
@@ -61,7 +84,8 @@ class Used(NamedTuple):
 
 def start(m: int) -> ControllerState:
     """The state before the first sample: u = 0."""
-    return ControllerState(Mode.WAITING, None, None, np.zeros(m))
+    zero = np.zeros(m)
+    return ControllerState(Mode.WAITING, None, None, None, zero, zero, zero, 0, zero)
 
 
 def align(samples: Sequence[Sample], stamp_ns: int, reach_ns: int) -> FloatArray | None:
@@ -89,32 +113,85 @@ def align(samples: Sequence[Sample], stamp_ns: int, reach_ns: int) -> FloatArray
     return before.value + fraction * (after.value - before.value)
 
 
+def limit(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
+    """U held inside [lower, upper] and within rate dt of the u before, shape (m,); u itself, to the last bit, where inside."""
+    xp = array_namespace(u)
+    reach = limits.rate * dt
+    low = xp.minimum(xp.maximum(limits.lower, u_before - reach), limits.upper)
+    high = xp.maximum(xp.minimum(limits.upper, u_before + reach), limits.lower)
+    return xp.minimum(xp.maximum(u, low), high)
+
+
+def guarded_step(
+    state: LawState, y: Array, y_m: Array, dt: Array, u_trim: Array, u_before: Array, law: LawParams, limits: Limits
+) -> tuple[LawState, Array, Array]:
+    """One tick of the law inside its limits: (law state, u before limits, u commanded), all shape (m,).
+
+    The law takes its step. Where u_trim + u is beyond a limit of magnitude or rate, the increment of an integral (of
+    integral_e and of Pi, each by itself) that moves u further beyond is taken back; one that moves it inwards stays.
+    Without saturation every bit is that of the law alone. Theorem 1 does not speak of limits.
+    """
+    xp = array_namespace(y)
+    after, u = rise.step(state, y, y_m, dt, law)
+    beyond = u_trim + u - limit(u_trim + u, u_before, dt, limits)
+    outward_integral = -law.D * (after.integral_e - state.integral_e) * beyond > 0
+    outward_Pi = -law.D * (after.Pi - state.Pi) * beyond > 0
+    after = after._replace(
+        integral_e=xp.where(outward_integral, state.integral_e, after.integral_e),
+        Pi=xp.where(outward_Pi, state.Pi, after.Pi),
+    )
+    u_free = u_trim + rise.control(state, after, law)
+    return after, u_free, limit(u_free, u_before, dt, limits)
+
+
 def tick(
-    state: ControllerState, now_ns: int, y: Sample | None, y_m: Sequence[Sample], guard: GuardParams, law: LawParams
+    state: ControllerState,
+    now_ns: int,
+    y: Sample | None,
+    y_m: Sequence[Sample],
+    guard: GuardParams,
+    law: LawParams,
+    active: bool = True,
 ) -> tuple[ControllerState, Used | None]:
     """One tick of the controller: (state, now, y, y_m) -> (state, what was used), u in state.u.
 
-    WAITING until y and a y_m at its instant are fresh, then e_0 is latched with u = 0 (ENGAGED); each further sample is one
-    step of the law with the measured dt, held inside DT_RANGE periods. Stale samples: HOLD, u kept, nothing integrated; the
-    law goes on when they are fresh again. No new y: nothing changes. None is returned where y was not used.
+    Fresh inputs engage it, at any time, with e_0 = e, both integrals 0 and u_trim = u as it was: u does not jump. Each
+    further sample is one step of the law with the measured dt, held inside DT_RANGE periods; without a new y nothing changes.
+    Stale inputs: HOLD (u kept, nothing integrated), then RAMP to trim, then TRIM; fresh ones engage it again. Not `active`:
+    INACTIVE, u held or ramped to trim as the parameters say. None is returned where nothing is to be published.
 
     Arguments: `y` the newest sample, `y_m` the last ones with increasing stamps; both in the law's order.
     """
     reference = None
     if y is not None and y_m and now_ns - y.stamp_ns <= guard.max_age_ns and now_ns - y_m[-1].stamp_ns <= guard.max_age_ns:
         reference = align(y_m, y.stamp_ns, guard.period_ns)
-    if y is None or reference is None:
-        mode = Mode.WAITING if state.law is None else Mode.HOLD
-        return state._replace(mode=mode), None
-    if state.y is not None and y.stamp_ns <= state.y.stamp_ns:
-        return state._replace(mode=Mode.ENGAGED), None
-    dt = 0.0
-    u = state.u
-    if state.law is None or state.y is None:
-        law_state = engage(y.value, reference)
-    else:
-        nominal = seconds(guard.period_ns)
-        dt = min(max(seconds(y.stamp_ns - state.y.stamp_ns), DT_RANGE[0] * nominal), DT_RANGE[1] * nominal)
-        law_state, u = step(state.law, y.value, reference, dt, law)
-    used = Used(y.stamp_ns, y.value, reference, seconds(y_m[-1].stamp_ns - y.stamp_ns), dt)
-    return ControllerState(Mode.ENGAGED, law_state, y, u), used
+    if not active or y is None or reference is None:
+        return _without_inputs(state, now_ns, guard, active)
+    offset = seconds(y_m[-1].stamp_ns - y.stamp_ns)
+    if state.law is None or state.y is None or state.mode is not Mode.ENGAGED:
+        engaged = state._replace(
+            mode=Mode.ENGAGED, law=rise.engage(y.value, reference), y=y, y_m=reference, u_trim=state.u, u_free=state.u
+        )
+        return engaged, Used(y.stamp_ns, y.value, reference, offset, 0.0)
+    if y.stamp_ns <= state.y.stamp_ns:
+        return state, None
+    nominal = seconds(guard.period_ns)
+    dt = min(max(seconds(y.stamp_ns - state.y.stamp_ns), DT_RANGE[0] * nominal), DT_RANGE[1] * nominal)
+    law_state, u_free, u = guarded_step(state.law, y.value, reference, dt, state.u_trim, state.u, law, guard.limits)
+    flown = state._replace(law=law_state, y=y, y_m=reference, u=u, u_free=u_free)
+    return flown, Used(y.stamp_ns, y.value, reference, offset, dt)
+
+
+def _without_inputs(
+    state: ControllerState, now_ns: int, guard: GuardParams, active: bool
+) -> tuple[ControllerState, Used | None]:
+    if state.y is None or state.y_m is None:
+        return state._replace(mode=Mode.WAITING if active else Mode.INACTIVE), None
+    if state.mode is Mode.ENGAGED or (state.mode is Mode.INACTIVE) == active:
+        state = state._replace(lost_ns=now_ns, u_lost=state.u)
+    hold_ns = guard.hold_ns if active else 0
+    share = 1.0 if not active and guard.deactivation_holds else fade(now_ns - state.lost_ns, hold_ns, guard.ramp_ns)
+    mode = {1.0: Mode.HOLD, 0.0: Mode.TRIM}.get(share, Mode.RAMP) if active else Mode.INACTIVE
+    u = state.u_lost if share == 1.0 else share * state.u_lost
+    state = state._replace(mode=mode, u=u, u_free=u)
+    return state, Used(now_ns, state.y.value, state.y_m, 0.0, 0.0) if state.y is not None and state.y_m is not None else None

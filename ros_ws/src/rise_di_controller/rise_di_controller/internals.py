@@ -3,28 +3,43 @@
 """The controller's log: one named vector a tick, enough to recompute u without anything else but the parameters."""
 
 from collections.abc import Sequence
+from enum import IntEnum
 
 import numpy as np
 
 from flight_core.vectors import FloatArray
-from rise_di_controller.guard import ControllerState, Used
+from rise_di_controller.guard import ControllerState, Limits, Used
 
 SCALARS = ("mode", "dt", "y_m_offset", "late", "age")
-GROUPS = ("y", "y_m", "e", "integral_e", "Pi")
+OUTPUT_GROUPS = ("y", "y_m", "e", "integral_e", "Pi")
+INPUT_GROUPS = ("u_free", "u", "u_trim", "limited")
 
 
-def names(outputs: Sequence[str]) -> tuple[str, ...]:
-    """Channel names of `internals`: the scalars, then "group.output" for each group.
+class Limited(IntEnum):
+    """What held an input back in a tick; published as a number in `internals`."""
 
-    mode (Mode), dt (s), y_m_offset (s), late (s, the tick after its deadline), age (s, of y at the tick); y and y_m as used,
-    e = y - y_m, integral_e (units s), Pi (scaled input).
+    NO = 0
+    MAGNITUDE = 1
+    RATE = 2
+
+
+def names(outputs: Sequence[str], inputs: Sequence[str]) -> tuple[str, ...]:
+    """Channel names of `internals`: the scalars, then "group.output" and "group.input".
+
+    mode (guard.Mode), dt (s), y_m_offset (s), late (s, the tick after its deadline), age (s, of y at the tick); y and y_m as
+    used, e = y - y_m, integral_e (units s), Pi (scaled input); u before (u_free) and after limits, u_trim, limited (Limited).
     """
-    return (*SCALARS, *(f"{group}.{output}" for group in GROUPS for output in outputs))
+    by_output = (f"{group}.{name}" for group in OUTPUT_GROUPS for name in outputs)
+    by_input = (f"{group}.{name}" for group in INPUT_GROUPS for name in inputs)
+    return (*SCALARS, *by_output, *by_input)
 
 
-def values(state: ControllerState, used: Used, late: float, age: float) -> FloatArray:
+def values(state: ControllerState, used: Used, limits: Limits, late: float, age: float) -> FloatArray:
     """Values of `internals` in the order of `names`. Raises ValueError for a state that was never engaged."""
     if state.law is None:
         raise ValueError("internals of a controller that was never engaged")
     scalars = np.array([float(state.mode), used.dt, used.y_m_offset, late, age])
-    return np.concatenate([scalars, used.y, used.y_m, state.law.e, state.law.integral_e, state.law.Pi])
+    inside = (state.u_free >= limits.lower) & (state.u_free <= limits.upper)
+    limited = np.where(state.u == state.u_free, Limited.NO, np.where(inside, Limited.RATE, Limited.MAGNITUDE))
+    by_output = (used.y, used.y_m, state.law.e, state.law.integral_e, state.law.Pi)
+    return np.concatenate([scalars, *by_output, state.u_free, state.u, state.u_trim, limited])

@@ -30,7 +30,7 @@ class LawParams(NamedTuple):
     beta: Array  # (m,) diagonal of beta, units of y / s^2
     D: Array  # (m,) diagonal of D, +1 or -1
     input_scale: Array  # (m,) u per scaled input: units of u s / units of y
-    omega: Array  # (m,) abs(Omega_ii) in scaled inputs, over-estimated by 1.5 to 2; used by Sign.IMPLICIT alone
+    omega: Array  # (m,) abs(Omega_ii) in scaled inputs, or an over-estimate; used by Sign.IMPLICIT alone
     eps: Array  # (m,) half-width of the softened sign, units of y, > 0; used by Sign.SOFT alone
     sign: Sign
 
@@ -70,8 +70,8 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
         u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi)         (20)
 
     e_hat is e one tick ahead if Pi stays, and s the element of Sgn(e one tick ahead) that makes the prediction consistent:
-    backward Euler of (21), whose error falls with dt^2 and which does not chatter. SOFT is for loops with lag. u is the deviation from the input
-    at engagement. sgn(0) = 0. dt > 0.
+    backward Euler of (21), whose error falls with dt^2 and which does not chatter. SOFT is for loops with lag. u is the
+    deviation from the input at engagement. sgn(0) = 0. dt > 0.
 
     Shapes: y, y_m, u (m,), dt (). Units: SI and radians; u in the units that input_scale gives it.
     Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see docs/theory.md.
@@ -81,7 +81,6 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
     increment = dt * (e + state.e) / 2.0
     integral_e = state.integral_e + increment
     if params.sign is Sign.LITERAL:
-        applied = state.Pi
         Pi = state.Pi + dt * params.beta * xp.sign(e)
     else:
         if params.sign is Sign.IMPLICIT:
@@ -92,6 +91,27 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
             s = e / params.eps
         one = xp.ones_like(e)
         s = xp.minimum(xp.maximum(s, -one), one)
-        applied = Pi = state.Pi + dt * params.beta * s
-    v = -params.D * (params.K * (e - state.e_0 + params.Lambda * integral_e) + applied)
-    return LawState(state.e_0, e, integral_e, Pi), params.input_scale * v
+        Pi = state.Pi + dt * params.beta * s
+    after = LawState(state.e_0, e, integral_e, Pi)
+    return after, control(state, after, params)
+
+
+def control(before: LawState, after: LawState, params: LawParams) -> Array:
+    """Equation (20), shape (m,): u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi).
+
+    e and the integral are those after the tick; Pi is that before it with the literal sign (used, then updated), else that
+    after it. Units of u.
+    """
+    Pi = before.Pi if params.sign is Sign.LITERAL else after.Pi
+    return params.input_scale * (-params.D * (params.K * (after.e - after.e_0 + params.Lambda * after.integral_e) + Pi))
+
+
+def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
+    """Take new parameters without a jump of u: Pi absorbs what the linear term would jump by.
+
+    Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e), D, input_scale, K, Lambda the new ones, u from the old ones.
+    The other states stay. Equation (23) then goes on from the same u with the new gains.
+    """
+    u = control(state, state, old)
+    Pi = -new.D * u / new.input_scale - new.K * (state.e - state.e_0 + new.Lambda * state.integral_e)
+    return state._replace(Pi=Pi)

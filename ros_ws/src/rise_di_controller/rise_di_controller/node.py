@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's node: the law at a fixed rate, y and y_m in, u and internals out."""
+"""The controller's node: the law at a fixed rate, y and y_m in, u and internals out, as a lifecycle node."""
 
 from collections import deque
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from flight_core.rates import seconds
 from flight_core.vectors import ChannelError
@@ -15,22 +16,75 @@ from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, LISTEN, Y_M, U, Y
 from rise_di_controller import guard, internals
 from rise_di_controller.guard import Mode, Sample
+from rise_di_controller.law import retune
 from rise_di_controller.params import ControllerParameters
 
+# What may be changed in flight: gains and guards. What decides the sign or the meaning of a channel may not.
+TUNABLE = frozenset(
+    (
+        "k_g",
+        "k_d",
+        "Lambda",
+        "beta",
+        "omega",
+        "sign",
+        "lag",
+        "delay",
+        "softening",
+        "max_age",
+        "hold",
+        "ramp",
+        "lower",
+        "upper",
+        "slew",
+    )
+)
 
-class ControllerNode(FlightNode[ControllerParameters]):
+
+class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
     """Takes the newest y and the last y_m at each tick, steps the law, publishes u with the stamp of y."""
 
     def __init__(self) -> None:
-        super().__init__("controller", ControllerParameters)
+        FlightNode.__init__(self, "controller", ControllerParameters, TUNABLE)
+        LifecycleNodeMixin.__init__(self)
+        self._active = False
         self._law, self._guard = self.parameters.law(), self.parameters.guard()
-        self.get_logger().info(self.parameters.sampled_sign()[1])
-        self._names = internals.names(self.parameters.outputs)
+        self._names = internals.names(self.parameters.outputs, self.parameters.inputs)
         self._state = guard.start(len(self.parameters.inputs))
         self._y: deque[Sample] = deque(maxlen=1)
         self._y_m: deque[Sample] = deque(maxlen=LISTEN.depth)
         self._y_inbox, self._y_m_inbox = self.inbox(Y), self.inbox(Y_M)
         self._u_publisher, self._internals_publisher = self.publisher(U), self.publisher(INTERNALS)
+        if self.parameters.autostart:
+            self.trigger_configure()
+            self.trigger_activate()
+        else:
+            self.get_logger().info("unconfigured: waiting to be configured and activated (autostart is false)")
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """The parameters were checked as a whole when they were set; the law starts anew from them."""
+        self._state = guard.start(len(self.parameters.inputs))
+        self.get_logger().info(self.parameters.sampled_sign()[1])
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """From the next fresh y and y_m on the law flies."""
+        self._active = True
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """The law stops; u is held or goes to trim, as `on_deactivate` says."""
+        self._active = False
+        return TransitionCallbackReturn.SUCCESS
+
+    on_shutdown = on_deactivate
+
+    def on_parameters(self, parameters: ControllerParameters) -> None:
+        """Take a new set, between two ticks, all at once and without a jump of u."""
+        law = parameters.law()
+        if self._state.law is not None:
+            self._state = self._state._replace(law=retune(self._state.law, self._law, law))
+        self._law, self._guard = law, parameters.guard()
 
     def period_ns(self) -> int:
         return self._guard.period_ns
@@ -41,16 +95,16 @@ class ControllerNode(FlightNode[ControllerParameters]):
         self._collect(self._y_m_inbox, self._y_m)
         y = self._y[-1] if self._y else None
         before = self._state.mode
-        self._state, used = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law)
+        self._state, used = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, self._active)
         if self._state.mode is not before:
             self.get_logger().info(f"{before.name} -> {self._state.mode.name}")
-        if self._state.mode is not Mode.ENGAGED:
+        if self._active and self._state.mode is not Mode.ENGAGED:
             self._say_what_is_missing(now_ns)
         if used is None:
             return
         late, age = seconds(tick.late_ns), seconds(now_ns - used.stamp_ns)
         self._u_publisher.publish(to_message(used.stamp_ns, self.parameters.inputs, self._state.u, self.instance))
-        values = internals.values(self._state, used, late, age)
+        values = internals.values(self._state, used, self._guard.limits, late, age)
         self._internals_publisher.publish(to_message(used.stamp_ns, self._names, values, self.instance))
 
     def _collect(self, inbox: Inbox, samples: deque[Sample]) -> None:
@@ -72,7 +126,12 @@ class ControllerNode(FlightNode[ControllerParameters]):
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         level = DiagnosticStatus.OK if self._state.mode is Mode.ENGAGED else DiagnosticStatus.WARN
-        return level, self._state.mode.name, {}
+        ages = {
+            f"age of {inbox.topic.name} (s)": f"{seconds(self.get_clock().now().nanoseconds - samples[-1].stamp_ns):.4f}"
+            for inbox, samples in ((self._y_inbox, self._y), (self._y_m_inbox, self._y_m))
+            if samples
+        }
+        return level, self._state.mode.name, {"mode": self._state.mode.name, "sign": self._law.sign.name, **ages}
 
 
 def main() -> None:

@@ -9,7 +9,9 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from flight_core.parameters import (
     Names,
+    NonNegative,
     NonNegatives,
+    Numbers,
     Parameters,
     Positive,
     Positives,
@@ -20,7 +22,7 @@ from flight_core.parameters import (
 )
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.vectors import FloatArray
-from rise_di_controller.guard import GuardParams
+from rise_di_controller.guard import GuardParams, Limits
 from rise_di_controller.law import LawParams, Sign, gain
 
 
@@ -38,7 +40,7 @@ class ControllerParameters(Parameters):
     beta: Positives = Field(description="the diagonal of beta (21) in scaled inputs, units of y / s^2")
     D: Signs = Field(description="the diagonal of D (11), +1 or -1")
     input_scale: Positives = Field(description="how much u changes y_dot by one, diagonal: 1 / abs(Omega_ii)")
-    omega: Positives = Field(description="abs(Omega_ii) in scaled inputs, over-estimated by 1.5 to 2 (implicit sign)")
+    omega: Positives = Field(description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign)")
     sign: Literal["auto", "literal", "implicit", "soft"] = Field(
         description="how the sign of (21) is sampled; auto: implicit where lag and delay are below half a period, else soft"
     )
@@ -46,6 +48,13 @@ class ControllerParameters(Parameters):
     delay: Annotated[float, Field(ge=0)] = Field(description="pure delay from y to the actuators, beyond sampling, s")
     softening: Positive = Field(description="width of the softened sign in total lags; above 1 the loop is stable, 3 is usual")
     max_age: Positive = Field(description="the age beyond which y or y_m is stale, s")
+    hold: NonNegative = Field(description="how long u is held when y or y_m is stale, s")
+    ramp: NonNegative = Field(description="how long u then takes to trim, s")
+    lower: Numbers | None = Field(default=None, description="lower limits of u from trim, units of u; none where absent")
+    upper: Numbers | None = Field(default=None, description="upper limits of u from trim, units of u; none where absent")
+    slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s; none where absent")
+    on_deactivate: Literal["trim", "hold"] = Field(default="trim", description="where u goes when deactivated")
+    autostart: bool = Field(default=True, description="configure and activate at start, without waiting to be told")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -54,6 +63,10 @@ class ControllerParameters(Parameters):
         require_length("k_d", self.k_d, self.outputs[:-1])
         for key in ("Lambda", "beta", "D", "input_scale", "omega", "lag"):
             require_length(key, getattr(self, key), self.outputs)
+        for key in ("lower", "upper", "slew"):
+            require_length(key, getattr(self, key) or self.inputs, self.inputs)
+        for i, (low, high) in enumerate(zip(self.lower or (), self.upper or (), strict=False)):
+            require(low < high, f"lower[{i}]", low, f"less than upper[{i}] = {high:g}")
         for i, sign in enumerate(self.D):
             require(sign in (-1, 1), f"D[{i}]", sign, "+1 or -1")
         return self
@@ -86,5 +99,17 @@ class ControllerParameters(Parameters):
         return Sign.SOFT, f"softened sign, because lag and delay of {lag:g} s reach half a period ({half:g} s)"
 
     def guard(self) -> GuardParams:
-        """Period and age limit."""
-        return GuardParams(period_ns(self.rate, "rate"), nanoseconds(self.max_age))
+        """Period, freshness and limits."""
+        none = (np.inf,) * len(self.inputs)
+        return GuardParams(
+            period_ns=period_ns(self.rate, "rate"),
+            max_age_ns=nanoseconds(self.max_age),
+            hold_ns=nanoseconds(self.hold),
+            ramp_ns=nanoseconds(self.ramp),
+            deactivation_holds=self.on_deactivate == "hold",
+            limits=Limits(
+                -np.array(none) if self.lower is None else np.array(self.lower),
+                np.array(self.upper or none),
+                np.array(self.slew or none),
+            ),
+        )
