@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
 """The simulated aircraft against exact solutions."""
 
 import math
@@ -14,16 +16,28 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.disturbance import Gusts, one_minus_cosine
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.plant import advance
+from aircraft_sim.plant import AircraftState, Plant, advance
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
+from flight_core.vectors import FloatArray
 
 MS = 1_000_000
 
 
 def osprey(**gusts: dict[str, float]) -> Aircraft:
+    return plant(**gusts).aircraft
+
+
+def plant(**gusts: dict[str, float]) -> Plant:
     values = {"airframe": "osprey", "rate": 500.0, "step": 0.002, "gusts": gusts}
-    return AircraftParameters.validate_mapping(values, "aircraft").load()[1]
+    return AircraftParameters.validate_mapping(values, "aircraft").plant()
+
+
+def flown(x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, aircraft: Aircraft) -> FloatArray:
+    """State x after a time under a held u, with ideal actuators."""
+    parts = plant()._replace(aircraft=aircraft, step_ns=step_ns)
+    end = advance(0, AircraftState(x, np.zeros_like(u)), u, duration_ns, parts)
+    return np.asarray(end.x)
 
 
 def linear(aircraft: Aircraft) -> Aircraft:
@@ -37,15 +51,14 @@ def test_without_f_the_plant_follows_the_matrix_exponential() -> None:
     x_0, u = np.linspace(-0.1, 0.1, 8), np.array([0.02, 0.1, -0.01, 0.03])
     block = np.block([[aircraft.A, aircraft.B], [np.zeros((4, 12))]])
     exact = (expm(block * 1.0) @ np.concatenate([x_0, u]))[:8]
-    flown = advance(0, x_0, u, NANOSECONDS, 2 * MS, aircraft)
-    assert flown == pytest.approx(exact, abs=1e-8)
+    assert flown(x_0, u, NANOSECONDS, 2 * MS, aircraft) == pytest.approx(exact, abs=1e-8)
 
 
 def test_halving_the_step_divides_the_integration_error_by_sixteen() -> None:
     aircraft = osprey()
     x_0, u = np.linspace(-0.2, 0.2, 8), np.zeros(4)
-    finest = advance(0, x_0, u, NANOSECONDS, MS // 4, aircraft)
-    errors = [np.abs(advance(0, x_0, u, NANOSECONDS, step, aircraft) - finest).max() for step in (20 * MS, 10 * MS)]
+    finest = flown(x_0, u, NANOSECONDS, MS // 4, aircraft)
+    errors = [np.abs(flown(x_0, u, NANOSECONDS, step, aircraft) - finest).max() for step in (20 * MS, 10 * MS)]
     assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.15)  # fourth order
 
 
@@ -61,9 +74,9 @@ def test_the_plant_agrees_with_an_adaptive_integrator_through_a_gust() -> None:
         atol=1e-12,
         max_step=0.01,
     )
-    flown = advance(0, np.zeros(8), u, 2 * NANOSECONDS, 2 * MS, aircraft)
+    end = flown(np.zeros(8), u, 2 * NANOSECONDS, 2 * MS, aircraft)
     # The gust's second derivative jumps at its ends, which costs Runge-Kutta an order there.
-    assert flown == pytest.approx(reference.y[:, -1], abs=1e-6)
+    assert end == pytest.approx(reference.y[:, -1], abs=1e-6)
 
 
 def test_gust_peaks_at_its_speed_half_way_and_is_zero_outside() -> None:
@@ -105,7 +118,7 @@ def test_inputs_of_the_airframe_are_converted_to_si_once() -> None:
     assert B[0, 1] == pytest.approx(6.0)
 
 
-def test_truth_holds_the_state_the_disturbance_and_the_gusts() -> None:
+def test_truth_holds_the_state_the_disturbance_the_actuators_and_the_noise() -> None:
     values = {
         "airframe": "osprey",
         "rate": 500.0,
@@ -115,12 +128,15 @@ def test_truth_holds_the_state_the_disturbance_and_the_gusts() -> None:
     parameters = AircraftParameters.validate_mapping(values, "aircraft")
     airframe, aircraft = parameters.load()
     names = truth.names(airframe, parameters)
-    shown = dict(zip(names, truth.values(400 * MS, np.arange(8.0) / 100, aircraft), strict=True))
+    state = AircraftState(np.arange(8.0) / 100, np.array([0.1, 0.2, 0.3, 0.4]))
+    noise = np.array([1e-3, 2e-3, 3e-3, 4e-3])
+    shown = dict(zip(names, truth.values(400 * MS, state, noise, aircraft), strict=True))
     assert shown["x.phi"] == 0.07
     assert shown["gust.vertical"] == pytest.approx(2.0)  # s = 25 0.4 = H
+    assert (shown["actuator.thrust"], shown["noise.V"]) == (0.2, 2e-3)
     assert shown["f.V"] == pytest.approx(-9.81 * math.sin(0.03) - 11.1 * 2.0 / 25)
 
 
 def test_a_step_that_does_not_divide_the_time_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"step: found 0\.003 s, expected a whole fraction of the duration \(0\.01 s\)"):
-        advance(0, np.zeros(8), np.zeros(4), 10 * MS, 3 * MS, osprey())
+        flown(np.zeros(8), np.zeros(4), 10 * MS, 3 * MS, osprey())

@@ -8,17 +8,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flight_analysis.scenario import Scenario
+from flight_bringup.scenarios import find_scenario
+from flight_core.vectors import FloatArray
 from rise_di_controller import guard, internals
-from rise_di_controller.guard import ControllerState, Mode, Sample, align
-from rise_di_controller.law import engage, step
+from rise_di_controller.guard import ControllerState, Limits, Mode, Sample, align
+from rise_di_controller.law import LawParams, LawState, Sign, control, engage, retune, step
 from rise_di_controller.params import ControllerParameters
 
 MS = 1_000_000
+PARAMS = find_scenario("osprey_gust").controller
 
 
 @pytest.fixture
-def params(osprey_gust: Scenario) -> ControllerParameters:
-    return osprey_gust.controller
+def params() -> ControllerParameters:
+    return PARAMS
 
 
 def sample(ms: float, value: float = 0.0) -> Sample:
@@ -98,18 +101,168 @@ def test_a_sample_seen_before_changes_nothing(params: ControllerParameters) -> N
     assert states[2].law is states[1].law
 
 
-def test_stale_samples_hold_the_input_and_freeze_the_integrals(params: ControllerParameters) -> None:
-    y, y_m = sample(10, 1.0), [sample(10)]
-    states = fly(params, (0, sample(0, 1.0), [sample(0)]), (10, y, y_m), (111, y, y_m), (120, sample(120, 1.0), [sample(120)]))
-    assert [state.mode for state in states] == [Mode.ENGAGED, Mode.ENGAGED, Mode.HOLD, Mode.ENGAGED]
-    assert states[2].u is states[1].u
-    assert states[2].law is states[1].law
+def test_stale_samples_hold_then_ramp_to_trim_and_fresh_ones_engage_again_without_a_jump(osprey_gust: Scenario) -> None:
+    params = osprey_gust.vary(controller={"max_age": 0.1, "hold": 0.2, "ramp": 0.4}).controller
+    y, y_m = sample(10, 1.1), [sample(10)]
+    states = fly(
+        params,
+        (0, sample(0, 1.0), [sample(0)]),
+        (10, y, y_m),
+        (120, y, y_m),  # 110 ms old: lost from here
+        (320, y, y_m),  # 200 ms after
+        (520, y, y_m),  # 400 ms after: half way down the ramp
+        (600, sample(600, 1.3), [sample(600)]),
+        (610, sample(610, 1.3), [sample(610)]),
+        (1800, y, y_m),
+        (2500, y, y_m),
+    )
+    assert [state.mode.name for state in states] == [
+        "ENGAGED",
+        "ENGAGED",
+        "HOLD",
+        "HOLD",
+        "RAMP",
+        "ENGAGED",
+        "ENGAGED",
+        "HOLD",
+        "TRIM",
+    ]
+    held = states[1].u
+    assert (held != 0).all()
+    assert (states[3].u == held).all()
+    assert states[3].law is states[1].law  # nothing is integrated
+    assert states[4].u == pytest.approx(0.5 * held)
+    assert (states[5].u == states[4].u).all()  # engaged again: no jump at all
+    assert (states[5].u_trim == states[4].u).all()
+    law_state = states[5].law
+    assert law_state is not None
+    assert law_state.e_0.tolist() == [1.3] * 4
+    assert (law_state.integral_e == 0).all()
+    assert (states[8].u == 0).all()
+
+
+@pytest.mark.parametrize("policy", ["trim", "hold"])
+def test_deactivation_lets_go_of_the_input_as_the_policy_says(policy: str, osprey_gust: Scenario) -> None:
+    params = osprey_gust.vary(controller={"ramp": 0.4, "on_deactivate": policy}).controller
+    state = guard.start(4)
+    seen = []
+    for ms, active in ((0, True), (10, True), (20, False), (220, False), (620, False), (630, True)):
+        now = sample(ms, 1.0 + ms / 100)
+        state, _ = guard.tick(state, ms * MS, now, [sample(ms)], params.guard(), params.law(), active)
+        seen.append(state)
+    assert [state.mode.name for state in seen] == ["ENGAGED", "ENGAGED", "INACTIVE", "INACTIVE", "INACTIVE", "ENGAGED"]
+    share = [1.0, 1.0, 1.0] if policy == "hold" else [1.0, 0.5, 0.0]
+    for state, expected in zip(seen[2:5], share, strict=True):
+        assert state.u == pytest.approx(expected * seen[1].u)
+    assert (seen[5].u == seen[4].u).all()  # and it engages again from there
+
+
+def test_a_controller_that_never_flew_commands_nothing_when_inactive(params: ControllerParameters) -> None:
+    state, used = guard.tick(guard.start(4), 0, sample(0, 1.0), [sample(0)], params.guard(), params.law(), active=False)
+    assert (state.mode, used) == (Mode.INACTIVE, None)
+
+
+@given(instants=st.lists(st.tuples(st.integers(1, 400), st.booleans(), st.floats(-1, 1)), min_size=2, max_size=40))
+def test_the_input_never_jumps_but_by_a_step_of_the_law(instants: list[tuple[int, bool, float]]) -> None:
+    # Whatever comes and goes: between two ticks u changes by the law's step, by the ramp, or not at all.
+    state, now_ns = guard.start(4), 0
+    y, y_m = sample(0, 0.0), [sample(0)]
+    for wait_ms, fresh, value in instants:
+        now_ns += wait_ms * MS
+        if fresh:
+            y, y_m = Sample(now_ns, np.full(4, value)), [Sample(now_ns, np.zeros(4))]
+        before = state
+        state, _ = guard.tick(state, now_ns, y, y_m, PARAMS.guard(), PARAMS.law())
+        if state.mode is Mode.ENGAGED and before.mode is not Mode.ENGAGED:
+            assert (state.u == before.u).all()
+        elif state.mode in {Mode.HOLD, Mode.RAMP, Mode.TRIM}:
+            assert (np.abs(state.u) <= np.abs(before.u)).all()
+
+
+NO_LIMITS = Limits(np.full(2, -np.inf), np.full(2, np.inf), np.full(2, np.inf))
+TWO = LawParams(
+    K=np.array([5.0, 2.0]),
+    Lambda=np.array([2.0, 1.0]),
+    beta=np.array([3.0, 1.0]),
+    D=np.array([1.0, -1.0]),
+    input_scale=np.array([0.5, 2.0]),
+    omega=np.array([1.0, 1.0]),
+    eps=np.array([0.1, 0.2]),
+    sign=Sign.IMPLICIT,
+)
+VALUES = st.floats(-10, 10)
+PAIRS = st.tuples(VALUES, VALUES).map(np.array)
+STATES = st.builds(LawState, PAIRS, PAIRS, PAIRS, PAIRS)
+
+
+@pytest.mark.parametrize("sign", list(Sign))
+@given(state=STATES, y=PAIRS)
+def test_inside_its_limits_the_guarded_law_is_the_law_to_the_last_bit(sign: Sign, state: LawState, y: FloatArray) -> None:
+    law = TWO._replace(sign=sign)
+    zero, dt = np.zeros(2), np.array(0.01)
+    after, u = step(state, y, zero, dt, law)
+    guarded, u_free, limited = guard.guarded_step(state, y, zero, dt, zero, u, law, NO_LIMITS)
+    assert limited.tobytes() == u_free.tobytes() == (zero + u).tobytes()
+    assert [part.tobytes() for part in guarded] == [part.tobytes() for part in after]
+
+
+@given(u=PAIRS, before=PAIRS, bound=st.floats(0.1, 5), rate=st.floats(0.1, 100))
+def test_limits_are_kept_and_nothing_inside_them_is_touched(
+    u: FloatArray, before: FloatArray, bound: float, rate: float
+) -> None:
+    limits = Limits(np.full(2, -bound), np.full(2, bound), np.full(2, rate))
+    before = np.clip(before, -bound, bound)
+    limited = guard.limit(u, before, np.array(0.01), limits)
+    assert (np.abs(limited) <= bound).all()
+    assert (np.abs(limited - before) <= rate * 0.01 + 1e-12).all()
+    inside = (np.abs(u) <= bound) & (np.abs(u - before) <= rate * 0.01)
+    assert (limited[inside] == u[inside]).all()
+
+
+def test_an_input_outside_its_limits_comes_back_inside_them() -> None:
+    limits = Limits(np.full(2, -1.0), np.full(2, 1.0), np.full(2, 10.0))
+    assert guard.limit(np.array([5.0, -5.0]), np.array([3.0, -3.0]), np.array(0.01), limits).tolist() == [1.0, -1.0]
+
+
+@given(state=STATES, y=PAIRS, trim=PAIRS)
+def test_integrals_stop_only_in_the_direction_that_worsens_saturation(state: LawState, y: FloatArray, trim: FloatArray) -> None:
+    limits = Limits(np.full(2, -1.0), np.full(2, 1.0), np.full(2, np.inf))
+    zero, dt = np.zeros(2), np.array(0.01)
+    free, u = step(state, y, zero, dt, TWO)
+    guarded, _, _ = guard.guarded_step(state, y, zero, dt, trim, zero, TWO, limits)
+    beyond = np.sign(trim + u - np.clip(trim + u, -1.0, 1.0))
+    for part, taken, given_up in (
+        ("integral_e", guarded.integral_e, free.integral_e),
+        ("Pi", guarded.Pi, free.Pi),
+    ):
+        old = getattr(state, part)
+        outward = -TWO.D * (given_up - old) * beyond > 0
+        assert (taken == np.where(outward, old, given_up)).all(), part
+
+
+@given(state=STATES, k=st.floats(0.5, 50), Lambda=st.floats(0.1, 10), scale=st.floats(0.1, 10))
+def test_new_gains_leave_the_input_where_it_was(state: LawState, k: float, Lambda: float, scale: float) -> None:
+    new = TWO._replace(K=TWO.K * k, Lambda=TWO.Lambda * Lambda, input_scale=TWO.input_scale * scale, beta=TWO.beta * 2)
+    retuned = retune(state, TWO, new)
+    before, after = control(state, state, TWO), control(retuned, retuned, new)
+    # u is a sum of terms of this size, each rounded once or twice
+    size = np.abs(new.input_scale) * (
+        new.K * (np.abs(state.e - state.e_0) + new.Lambda * np.abs(state.integral_e)) + np.abs(state.Pi)
+    )
+    assert (np.abs(after - before) <= 1e-12 * np.maximum(size, 1.0)).all()
+    assert (retuned.e, retuned.e_0, retuned.integral_e) == (state.e, state.e_0, state.integral_e)
 
 
 def test_internals_are_named_after_the_outputs(params: ControllerParameters) -> None:
     state, used = guard.tick(guard.start(4), 0, sample(0, 1.5), [sample(0, 0.5)], params.guard(), params.law())
     assert used is not None
-    shown = dict(zip(internals.names(params.outputs), internals.values(state, used, late=1e-4, age=2e-3), strict=True))
+    shown = dict(
+        zip(
+            internals.names(params.outputs, params.inputs),
+            internals.values(state, used, params.guard().limits, 1e-4, 2e-3),
+            strict=True,
+        )
+    )
     assert shown["mode"] == Mode.ENGAGED
     assert (shown["late"], shown["age"], shown["dt"]) == (1e-4, 2e-3, 0.0)
     assert (shown["y.V"], shown["y_m.V"], shown["e.V"], shown["Pi.V"]) == (1.5, 0.5, 1.0, 0.0)

@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
 """Mathematics never imports ROS: shown by walking the imports of every source file."""
 
 import ast

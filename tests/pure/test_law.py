@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
 """The law's step, pinned by numbers worked by hand and by closed forms."""
 
 import numpy as np

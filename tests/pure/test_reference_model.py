@@ -1,3 +1,5 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
 """The reference model and its commands against closed forms."""
 
 import math

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A peer for a node under test: publishes y and y_m, listens to everything the controller says, calls its services."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
+
+from flight_ros import transport
+from flight_ros.messages import to_message
+from flight_ros.topics import PUBLISH
+
+OUTPUTS = ("q", "V", "p", "r")
+
+
+class Peer:
+    """Event-driven: `until` spins until a condition holds."""
+
+    def __init__(self, context: Context, listen: tuple[str, ...]) -> None:
+        self.node = Node("peer", context=context)
+        self._executor = SingleThreadedExecutor(context=context)
+        self._executor.add_node(self.node)
+        self.heard: dict[str, list[Any]] = {topic: [] for topic in listen}
+        for topic, messages in self.heard.items():
+            kind = DiagnosticArray if topic == "/diagnostics" else JointState
+            self.node.create_subscription(kind, topic, messages.append, QoSProfile(depth=100))
+        self._publishers = {name: self.node.create_publisher(JointState, name, PUBLISH) for name in ("y", "y_m")}
+
+    def until(self, condition: Callable[[], object], timeout: float = 20.0, each: Callable[[], None] | None = None) -> None:
+        """Spin until the condition holds; `each` is called every 5 ms."""
+        deadline = time.monotonic() + timeout
+        while not condition():
+            assert time.monotonic() < deadline, f"not within {timeout} s"
+            self._executor.spin_once(timeout_sec=0.005)
+            if each is not None:
+                each()
+
+    def send(self, y: float = 0.0, y_m: float = 0.0) -> None:
+        """One sample of y and y_m, all channels alike, stamped now."""
+        now_ns = time.time_ns()
+        for name, value in (("y_m", y_m), ("y", y)):
+            self._publishers[name].publish(to_message(now_ns, OUTPUTS, np.full(4, value), "peer"))
+
+    def publish(self, topic: str, message: JointState) -> None:
+        """Any message on y or y_m."""
+        self._publishers[topic].publish(message)
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        """Call a service and wait for its answer."""
+        client = self.node.create_client(kind, name)
+        self.until(client.service_is_ready)
+        future = client.call_async(request)
+        self.until(future.done)
+        return future.result()
+
+    def modes(self) -> list[int]:
+        """The modes in `internals`, repeats left out."""
+        modes = [int(message.position[message.name.index("mode")]) for message in self.heard["internals"]]
+        return [mode for index, mode in enumerate(modes) if index == 0 or modes[index - 1] != mode]
+
+    def u(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """All inputs heard, shape (N, m)."""
+        return np.array([message.position for message in self.heard["u"]])
+
+
+@contextmanager
+def peer(listen: tuple[str, ...] = ("u", "internals", "/diagnostics")) -> Iterator[Peer]:
+    """A peer in a context of its own, that listens to these topics."""
+    transport.prepare()
+    context = Context()
+    rclpy.init(context=context)
+    made = Peer(context, listen)
+    try:
+        yield made
+    finally:
+        made.node.destroy_node()
+        context.try_shutdown()

@@ -1,0 +1,206 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The controller's node among peers that fail: engagement, stale and bad samples, parameters and transitions in flight."""
+
+import math
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from tests.ros.conftest import Process, Start
+from tests.ros.peer import OUTPUTS, Peer, peer
+
+from flight_analysis.scenario import Scenario
+from flight_ros.messages import to_message
+from rise_di_controller.guard import Mode
+
+
+@pytest.fixture
+def someone() -> Iterator[Peer]:
+    with peer() as made:
+        yield made
+
+
+def controller(start: Start, scenario: Scenario, *arguments: str) -> Process:
+    return start("rise_di_controller.node", "--ros-args", "--params-file", str(scenario.path), *arguments)
+
+
+def engage(someone: Peer, y: float = 0.01) -> None:
+    someone.until(lambda: Mode.ENGAGED in someone.modes() and len(someone.heard["u"]) > 20, each=lambda: someone.send(y))
+
+
+def set_parameters(someone: Peer, **values: object) -> tuple[bool, str]:
+    kinds = {float: ("double_value", ParameterType.PARAMETER_DOUBLE), str: ("string_value", ParameterType.PARAMETER_STRING)}
+    request = SetParametersAtomically.Request()
+    for name, value in values.items():
+        if isinstance(value, list):
+            integers = all(isinstance(item, int) for item in value)
+            field, kind = (
+                ("integer_array_value", ParameterType.PARAMETER_INTEGER_ARRAY)
+                if integers
+                else ("double_array_value", ParameterType.PARAMETER_DOUBLE_ARRAY)
+            )
+        else:
+            field, kind = kinds[type(value)]
+        request.parameters.append(Parameter(name=name, value=ParameterValue(type=kind, **{field: value})))
+    result = someone.call(SetParametersAtomically, "controller/set_parameters_atomically", request).result
+    return result.successful, result.reason
+
+
+def test_engages_without_a_jump_from_zero(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+    controller(start, osprey_gust)
+    engage(someone)
+    assert (someone.u()[0] == 0).all()
+    first = someone.heard["internals"][0]
+    assert first.position[first.name.index("e.q")] == 0.01
+
+
+def test_stale_inputs_are_held_ramped_to_trim_and_engaged_again(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+    controller(start, osprey_gust, "-p", "hold:=0.1", "-p", "ramp:=0.2")
+    engage(someone)
+    someone.until(lambda: someone.modes()[-1] == Mode.TRIM)  # nothing is sent any more
+    assert [Mode(mode) for mode in someone.modes()] == [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.TRIM]
+    u = someone.u()
+    assert (u[-1] == 0).all()
+    # on the ramp no step is larger than that of a 10 ms tick, twice as much where the machine was late
+    biggest = np.abs(u).max(axis=0)
+    ramp = np.abs(np.diff(u[-25:], axis=0)).max(axis=0)
+    assert (ramp <= biggest * 0.01 / 0.2 * 4).all()
+    someone.until(lambda: someone.modes()[-1] == Mode.ENGAGED, each=lambda: someone.send(0.05))
+    engaged = next(m for m in reversed(someone.heard["internals"]) if m.position[m.name.index("dt")] == 0.0)
+    assert engaged.position[engaged.name.index("u.elevator")] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "message", "reason"),
+    [
+        ("not a number", to_message(0, OUTPUTS, np.array([math.nan, 0.0, 0.0, 0.0]), "bad"), "y: finite"),
+        ("wrong names", to_message(0, ("q", "V", "p", "x"), np.zeros(4), "bad"), "y: name"),
+        ("wrong length", JointState(name=list(OUTPUTS), position=[1.0]), "y: length"),
+        ("an old stamp", to_message(1, OUTPUTS, np.full(4, 99.0), "bad"), "y: order"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_bad_sample_is_refused_counted_and_never_used(
+    name: str, message: JointState, reason: str, start: Start, osprey_gust: Scenario, someone: Peer
+) -> None:
+    controller(start, osprey_gust)
+    engage(someone)
+
+    def send_both() -> None:
+        someone.send(0.01)
+        someone.publish("y", message)
+
+    def counted() -> bool:
+        values = [v for array in someone.heard["/diagnostics"] for status in array.status for v in status.values]
+        return any(value.key == f"refused {reason}" and int(value.value) > 0 for value in values)
+
+    someone.until(counted, each=send_both)
+    assert someone.modes()[-1] == Mode.ENGAGED
+    used = [m.position[m.name.index("y.q")] for m in someone.heard["internals"]]
+    assert set(used) == {0.01}
+
+
+def test_gains_change_in_flight_without_a_jump(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+    process = controller(start, osprey_gust, "-p", "sign:=soft")
+    engage(someone)
+    for _ in range(20):  # between y samples u stands still, so a jump at the change would stand out
+        someone.send(0.011)
+    count = len(someone.heard["u"])
+    someone.until(lambda: len(someone.heard["u"]) > count, each=lambda: someone.send(0.011))
+    accepted = set_parameters(someone, k_g=3.0, Lambda=[1, 1, 1, 1], beta=[10.0, 10.0, 10.0, 5.0])
+    assert accepted == (True, "")
+    process.wait_for("k_g: 1.0 -> 3.0")
+    count = len(someone.heard["u"])
+    someone.until(lambda: len(someone.heard["u"]) > count + 5, each=lambda: someone.send(0.011))
+    # With e = 0.01 the law moves u by K Lambda e dt + beta dt in a tick; the old gains would have jumped by K e.
+    u = someone.u()
+    law = osprey_gust.vary(controller={"k_g": 3.0}).controller.law()
+    step = law.input_scale * (law.K * law.Lambda * 0.011 + law.beta) * 0.03 + law.input_scale * law.K * 0.001
+    assert (np.abs(np.diff(u, axis=0)) <= step + 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"k_g": -1.0}, "controller.k_g: found -1.0, expected greater than 0"),
+        ({"beta": [1.0, math.nan, 1.0, 1.0]}, "controller.beta[1]: found nan, expected a finite number"),
+        ({"beta": [1.0, 2.0]}, "controller.beta: found 2 values, expected 4, one for each of q, p, r, V"),
+        ({"k_g": 2.0, "sign": "smooth"}, "controller.sign: found 'smooth', expected"),
+        ({"rate": 200.0}, "read-only"),
+        ({"D": [-1, 1, 1, 1]}, "read-only"),
+        ({"k_gg": 1.0}, "undeclared parameter"),
+    ],
+)
+def test_a_bad_change_is_refused_with_its_reason_and_leaves_all_as_it_was(
+    changes: dict[str, object], sentence: str, start: Start, osprey_gust: Scenario, someone: Peer
+) -> None:
+    controller(start, osprey_gust)
+    engage(someone)
+    successful, reason = set_parameters(someone, **changes)
+    assert not successful
+    assert sentence in reason
+    request = GetParameters.Request(names=["k_g", "rate"])
+    kept = someone.call(GetParameters, "controller/get_parameters", request).values
+    assert [value.double_value for value in kept] == [1.0, 100.0]
+    count = len(someone.heard["u"])
+    someone.until(lambda: len(someone.heard["u"]) > count + 5, each=lambda: someone.send(0.01))
+
+
+def transition(someone: Peer, number: int) -> bool:
+    request = ChangeState.Request(transition=Transition(id=number))
+    return bool(someone.call(ChangeState, "controller/change_state", request).success)
+
+
+def test_waits_to_be_configured_and_activated_when_autostart_is_off(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+    process = controller(start, osprey_gust, "-p", "autostart:=false")
+    process.wait_for("waiting to be configured")
+    assert someone.call(GetState, "controller/get_state", GetState.Request()).current_state.label == "unconfigured"
+    assert transition(someone, Transition.TRANSITION_CONFIGURE)
+    assert someone.heard["u"] == []
+    assert transition(someone, Transition.TRANSITION_ACTIVATE)
+    engage(someone)
+    assert transition(someone, Transition.TRANSITION_DEACTIVATE)
+    someone.until(lambda: someone.modes()[-1] == Mode.INACTIVE, each=lambda: someone.send(0.01))
+
+
+def test_an_invalid_transition_does_not_end_the_node(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+    process = controller(start, osprey_gust)
+    engage(someone)
+    client = someone.node.create_client(ChangeState, "controller/change_state")
+    someone.until(client.service_is_ready)
+    client.call_async(ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE)))
+    someone.until(lambda: any("request refused" in line for line in process.lines), each=lambda: someone.send(0.01))
+    count = len(someone.heard["u"])
+    someone.until(lambda: len(someone.heard["u"]) > count + 20, each=lambda: someone.send(0.01))
+
+
+def test_a_peer_of_another_type_or_quality_of_service_is_named(start: Start, osprey_gust: Scenario) -> None:
+    with peer(listen=()) as someone:
+        _check_that_unfitting_peers_are_named(start, osprey_gust, someone)
+
+
+def _check_that_unfitting_peers_are_named(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+    process = start("aircraft_sim.node", "--ros-args", "--params-file", str(osprey_gust.path))
+    someone.node.create_publisher(Float64MultiArray, "u", QoSProfile(depth=1))
+    process.wait_for("/u: /peer publishes std_msgs/msg/Float64MultiArray, expected sensor_msgs/msg/JointState")
+    recorder = start("flight_recorder.node", "--ros-args", "--params-file", str(osprey_gust.path))
+    someone.node.create_publisher(JointState, "truth", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    recorder.wait_for("/truth: quality of service of /peer does not fit")
+
+
+def test_the_rate_is_kept_over_seconds(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+    controller(start, osprey_gust)
+    engage(someone)
+    begin, count = time.monotonic(), len(someone.heard["u"])
+    someone.until(lambda: time.monotonic() - begin > 3.0, each=lambda: someone.send(0.01))
+    # absolute deadlines: 100 Hz on the mean; the margin is for what is under way at both ends and a tick that found no new y
+    assert 285 <= len(someone.heard["u"]) - count <= 305
