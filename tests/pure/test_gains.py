@@ -192,6 +192,14 @@ def test_uncertain_airframes_keep_what_is_kinematic() -> None:
         selection.uncertain(airframe, 1.5, 1, seed=1)
 
 
+def test_an_airframe_with_an_unstable_zero_is_refused(osprey_gust: Scenario) -> None:
+    osprey = load_airframe("osprey")
+    rows = [list(row) for row in osprey.A]
+    rows[osprey.index("beta")][osprey.index("beta")] = 0.69  # the zero at -0.69 1/s is that entry
+    with pytest.raises(ParameterError, match=r"^airframe osprey: found a zero at 0\.69 1/s, expected none in the right"):
+        selection.study(osprey.model_copy(update={"A": rows}), selection.manoeuvre(osprey_gust, osprey))
+
+
 # The engineering procedure
 
 

@@ -101,7 +101,8 @@ def test_the_law_is_odd_in_the_error(sign: Sign, errors: list[float]) -> None:
 @given(e=st.lists(st.floats(-1, 1), min_size=2, max_size=2))
 def test_channels_do_not_mix(e: list[float]) -> None:
     # K, Lambda, beta and D are diagonal: the first channel of two flies as if it were alone.
-    both = LawParams(*(np.repeat(field, 2) for field in one_channel(Sign.IMPLICIT)[:-1]), sign=Sign.IMPLICIT)  # type: ignore[misc]
+    alone = one_channel(Sign.IMPLICIT)
+    both = alone._replace(**{name: np.repeat(getattr(alone, name), 2) for name in alone._fields if name != "sign"})
     zero = np.zeros(2)
     _, u = step(engage(zero, zero), np.array(e), zero, np.array(DT), both)
     assert u[0] == fly(one_channel(Sign.IMPLICIT), [0.0, e[0]])[0]

@@ -588,7 +588,7 @@ def test_bound_7_cannot_hold_at_every_instant_for_alpha_leaves_trim_in_a_gust_wh
 def largest_y_m_ddot(model: Model, rise: float) -> float:
     """The peak of abs(y_m_ddot) where the command climbs to one within `rise` seconds, by second differences."""
     one, none = np.ones((1, 1)), np.zeros(1)
-    climb = Profile(0.0 * one, 9.0 * one, one, np.array(rise), none, none + 1.0, none, none, none)
+    climb = Profile(0.0 * one, one, np.array(rise), none, none + 1.0, none, none, none)
     dt, x_m, y_m = rise / 5.0, np.zeros(len(model.A_m)), [0.0]
     for k in range(round(0.5 / dt)):
         x_m = step(k * dt, x_m, lambda t: command(t, climb), dt, model)

@@ -73,8 +73,10 @@ def test_equation_2_agrees_with_an_exact_linear_simulation() -> None:
     params = parameters(pulses=PULSES)
     matrices, profile = params.model(), params.profile()
     t = np.arange(0, 3001) * 0.002
-    u_m = np.array([command(s, profile) for s in t])  # piecewise linear with knots on the grid: lsim is exact for it
-    _, exact, _ = lsim(StateSpace(matrices.A_m, matrices.B_m, matrices.C, np.zeros((3, 3))), u_m, t)
+    u_m: FloatArray = np.array(
+        [command(s, profile) for s in t]
+    )  # piecewise linear with knots on the grid: lsim is exact for it
+    _, exact, _ = lsim(StateSpace(matrices.A_m, matrices.B_m, matrices.C, np.zeros((3, 3))), u_m, t)  # type: ignore[call-overload]
     assert simulate(params, 6.0, 0.002) == pytest.approx(exact, abs=1e-9)
 
 

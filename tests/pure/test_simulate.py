@@ -26,7 +26,7 @@ def rms(osprey_gust: Scenario) -> Rms:
 
     @cache
     def fly(
-        *, rate: float = 100.0, sign: str = "auto", gusts: bool = True, below_slew: bool = False, duration: float = 60.0
+        *, rate: float = 100.0, sign: str = "implicit", gusts: bool = True, below_slew: bool = False, duration: float = 60.0
     ) -> FloatArray:
         scenario = osprey_gust.vary(
             flight={"duration": duration},

@@ -5,9 +5,9 @@
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from aircraft_sim import dynamics, truth
+from aircraft_sim import plant, truth
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.plant import advance
+from aircraft_sim.sensors import Underway, transmit
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.vectors import ChannelError
 from flight_ros.messages import from_message, to_message
@@ -17,14 +17,16 @@ from flight_ros.topics import TRUTH, U, Y
 
 
 class AircraftNode(FlightNode[AircraftParameters]):
-    """At tick k: x from t(k-1) to t(k) under the u held since then, y(k) and truth out, then the newest u is taken."""
+    """At tick k: the state from t(k-1) to t(k) under the u held since then, y and truth out, then the newest u is taken."""
 
     def __init__(self) -> None:
         super().__init__("aircraft", AircraftParameters)
-        self._airframe, self._aircraft = self.parameters.load()
+        self._airframe, _ = self.parameters.load()
+        self._plant = self.parameters.plant()
         self._period_ns = period_ns(self.parameters.rate, "rate")
         self._truth_names = truth.names(self._airframe, self.parameters)
-        self._x = np.zeros(len(self._airframe.states))
+        self._state = plant.start(self._plant)
+        self._underway: Underway = ()
         self._u = np.zeros(len(self._airframe.inputs))
         self._u_from: str | None = None
         self._u_inbox = self.inbox(U)
@@ -38,10 +40,12 @@ class AircraftNode(FlightNode[AircraftParameters]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         before_ns, t_ns = tick.previous * self._period_ns, tick.number * self._period_ns
-        self._x = advance(before_ns, self._x, self._u, t_ns - before_ns, self.parameters.step_ns, self._aircraft)
-        y = dynamics.y(self._x, self._aircraft)
-        self._y_publisher.publish(to_message(now_ns, self._airframe.outputs, y, self.instance))
-        values = truth.values(t_ns, self._x, self._aircraft)
+        self._state = plant.advance(before_ns, self._state, self._u, t_ns - before_ns, self._plant)
+        measured = plant.measure(tick.number, self._state, self._plant)
+        self._underway, arrived = transmit(self._underway, now_ns, measured.y, self._plant.sensors)
+        for sample in arrived:
+            self._y_publisher.publish(to_message(sample.stamp_ns, self._airframe.outputs, sample.y, self.instance))
+        values = truth.values(t_ns, self._state, measured.noise, self._plant.aircraft)
         self._truth_publisher.publish(to_message(now_ns, self._truth_names, values, self.instance))
         self._take_u()
 

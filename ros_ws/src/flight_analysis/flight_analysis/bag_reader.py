@@ -2,28 +2,39 @@
 # SPDX-License-Identifier: Apache-2.0
 """MCAP bag -> Tape, without ROS: also from a file that was never finished."""
 
+import struct
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import zstandard
 from mcap.exceptions import McapError
-from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 from rosbags.typesys import Stores, get_typestore
 
 from flight_core.parameters import ParameterError
-from flight_core.rates import NANOSECONDS
+from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
+# What reading raises where a file was cut: between records, inside one, inside a compressed chunk.
+UNFINISHED = (McapError, struct.error, zstandard.ZstdError)
 JOINT_STATE = "sensor_msgs/msg/JointState"
+
+
+class StoredFile(NamedTuple):
+    """A file stored inside the log, as it was."""
+
+    name: str
+    content: bytes
 
 
 class Run(NamedTuple):
     """What a recorded run holds."""
 
     tape: Tape
-    scenario: bytes | None  # the scenario file stored inside, as it was
+    scenario: StoredFile | None
 
 
 class _Rows:
@@ -52,7 +63,7 @@ def read_run(run: Path) -> Run:
     store = get_typestore(Stores.ROS2_JAZZY)
     topics: dict[str, _Rows] = {}
     notes: list[str] = []
-    start_ns, scenario = 0, None
+    scenario: StoredFile | None = None
     for file in files:
         vector_channels: dict[int, str] = {}
         schemas: dict[int, str] = {}
@@ -71,15 +82,20 @@ def read_run(run: Path) -> Run:
                             rows.values.append(message.position)
                         else:
                             rows.refused += 1
-                    elif isinstance(record, Metadata) and record.name == "rise_di":
-                        start_ns = int(record.metadata["start_ns"])
                     elif isinstance(record, Attachment) and record.media_type == "application/yaml":
-                        scenario = record.data
-            except McapError as error:
+                        scenario = StoredFile(Path(record.name).name, record.data)
+            except UNFINISHED as error:
                 notes.append(f"{file.name} has no end ({type(error).__name__}): read up to its last whole chunk")
     if not topics:
         raise ParameterError(f"{run}: found no sample on any topic, expected a recorded flight")
     notes += [f"{name}: {rows.refused} samples with other names refused" for name, rows in topics.items() if rows.refused]
     signals = {name: rows.signal() for name, rows in topics.items()}
-    first_ns = min(int(signal.stamp_ns[0]) for signal in signals.values() if len(signal.stamp_ns))
-    return Run(Tape(signals, start_ns or first_ns, tuple(notes)), scenario)
+    return Run(Tape(signals, _start_ns(signals), tuple(notes)), scenario)
+
+
+def _start_ns(signals: dict[str, Signal]) -> int:
+    """Stamp of flight time 0: what `truth` says, else the first sample of all."""
+    truth = signals.get("truth")
+    if truth is not None and "t" in truth.names:
+        return int(truth.stamp_ns[0]) - nanoseconds(float(truth["t"][0]))
+    return min(int(signal.stamp_ns[0]) for signal in signals.values())

@@ -29,7 +29,6 @@ def write_run(tape: Tape, directory: Path, scenario_file: Path) -> Path:
     signals = list(tape.signals.items())
     with BagWriter(directory) as bag:
         bag.attach(scenario_file.name, "application/yaml", scenario_file.read_bytes(), tape.start_ns)
-        bag.note("rise_di", {"start_ns": str(tape.start_ns)})
         for name, _ in signals:
             bag.add_topic(f"/{name}", JOINT_STATE, "")
         none = signals[0][1].values[0][:0]

@@ -36,8 +36,34 @@ class TickFigures(NamedTuple):
 
 
 def tracking_error(tape: Tape) -> Signal:
-    """E = y - y_m at every y whose stamp y_m has too or spans (linear between samples), shape (N, m), channels of y."""
-    y, y_m = tape["y"], tape["y_m"]
+    """E = y - y_m at every y whose stamp y_m has too or spans (linear between samples), shape (N, m), channels of y.
+
+    It is the error that the law sees: the sensors' noise is part of it.
+    """
+    return _minus_reference(tape["y"], tape["y_m"])
+
+
+def true_error(tape: Tape) -> Signal | None:
+    """C x - y_m at every sample of `truth` that y_m has too or spans, shape (N, m), channels of y.
+
+    It is the error that the aircraft makes, without the sensors' own, and also at samples that were lost. None where the tape
+    has no "x.output" in `truth` for each channel of y; only a simulation knows it.
+    """
+    if "truth" not in tape:
+        return None
+    x, names = tape["truth"].group("x"), tape["y"].names
+    if not set(names) <= set(x.names):
+        return None
+    return _minus_reference(Signal(x.stamp_ns, names, np.column_stack([x[name] for name in names])), tape["y_m"])
+
+
+def known_error(tape: Tape) -> tuple[str, Signal]:
+    """The best error that a tape knows, after what it is called: "true error", else "measured error"."""
+    error = true_error(tape)
+    return ("measured error", tracking_error(tape)) if error is None else ("true error", error)
+
+
+def _minus_reference(y: Signal, y_m: Signal) -> Signal:
     if len(y.stamp_ns) == 0 or len(y_m.stamp_ns) == 0:
         return Signal(np.zeros(0, dtype=np.int64), y.names, np.zeros((0, len(y.names))))
     inside = (y.stamp_ns >= y_m.stamp_ns[0]) & (y.stamp_ns <= y_m.stamp_ns[-1])
@@ -64,8 +90,8 @@ def error_figures(errors: FloatArray) -> ErrorFigures:
 
 
 def error_table(tape: Tape, gusts: Windows, settle: float = 1.0) -> dict[str, dict[str, ErrorFigures]]:
-    """Figures by channel and part of the flight: "whole", "calm", "gust" (the gusts and `settle` seconds after each)."""
-    error = tracking_error(tape)
+    """Figures of `known_error` by channel and part: "whole", "calm", "gust" (the gusts and `settle` seconds after each)."""
+    _, error = known_error(tape)
     t = (error.stamp_ns - tape.start_ns) / 1e9
     gust = in_windows(t, gusts, settle)
     parts = {"whole": np.ones(len(t), dtype=bool), "calm": ~gust, "gust": gust}

@@ -131,7 +131,8 @@ def _error_table(summary: dict[str, Any], units: dict[str, Shown]) -> str:
         unit, factor = units[channel]
         cells = "".join(f"<td>{_cell(figures[part][key], factor)}</td>" for part in parts for key in ("rms", "max"))
         rows.append(f"<tr><td>{escape(channel)} ({escape(unit)})</td>{cells}</tr>")
-    return f"<table><caption>Tracking error</caption><tr><th>channel</th>{head}</tr>{''.join(rows)}</table>"
+    caption = f"Tracking error ({escape(summary['error'])})"
+    return f"<table><caption>{caption}</caption><tr><th>channel</th>{head}</tr>{''.join(rows)}</table>"
 
 
 def _tick_table(summary: dict[str, Any]) -> str:

@@ -37,11 +37,11 @@ class Scenario:
     recorder: RecorderParameters
 
     def vary(self, **sections: Mapping[str, Any]) -> "Scenario":
-        """The same scenario with some parameters of some sections replaced: vary(controller={"rate": 200.0}).
+        """Replace some parameters of some sections, as in scenario.vary(controller={"rate": 200.0}).
 
         Everything is checked again. Raises ParameterError.
         """
-        changed = {
+        changed: dict[str, Any] = {
             name: SCHEMAS[name].validate_mapping(getattr(self, name).model_dump() | changes, name)
             for name, changes in sections.items()
         }

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from aircraft_sim import dynamics, truth
-from aircraft_sim.plant import advance
+from aircraft_sim import plant, truth
+from aircraft_sim.sensors import Underway, transmit
 from flight_analysis.scenario import Scenario
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.tape import Signal, Tape
@@ -42,9 +42,10 @@ class _Track:
 def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None) -> Tape:
     """Fly a scenario and return its tape; `progress` is told the flight time once a simulated second.
 
-    At each instant: the aircraft's y, the reference's y_m, then the controller's u, which the aircraft holds until the next.
+    At each instant: the aircraft's y that arrives, the reference's y_m, then the controller's u, which the aircraft holds until
+    the next. A sample that was lost is not on the tape; one that came late is, at the instant it belongs to.
     """
-    airframe, aircraft = scenario.aircraft.load()
+    (airframe, _), hardware = scenario.aircraft.load(), scenario.aircraft.plant()
     reference, profile = scenario.reference_model.model(), scenario.reference_model.profile()
     law, limits = scenario.controller.law(), scenario.controller.guard()
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
@@ -58,20 +59,26 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
         "y": _Track(airframe.outputs),
         "y_m": _Track(scenario.reference_model.outputs),
         "u": _Track(inputs),
-        "internals": _Track(internals.names(outputs)),
+        "internals": _Track(internals.names(outputs, inputs)),
         "truth": _Track(truth.names(airframe, scenario.aircraft)),
     }
-    x, x_m = np.zeros(len(airframe.states)), zero_state(reference)
+    aircraft, x_m = plant.start(hardware), zero_state(reference)
     state = guard.start(len(inputs))
+    y: Sample | None = None
+    underway: Underway = ()
     y_m_samples: deque[Sample] = deque(maxlen=KEPT_REFERENCES)
     u = select(list(airframe.inputs), inputs, state.u)
     base_ns = int(np.gcd(aircraft_ns, reference_ns))
     end_ns = nanoseconds(scenario.flight.duration)
     for t_ns in range(0, end_ns + 1, base_ns):
         if t_ns % aircraft_ns == 0:
-            x = advance(t_ns - aircraft_ns, x, u, aircraft_ns, scenario.aircraft.step_ns, aircraft) if t_ns else x
-            tracks["y"].add(t_ns, dynamics.y(x, aircraft))
-            tracks["truth"].add(t_ns, truth.values(t_ns, x, aircraft))
+            aircraft = plant.advance(t_ns - aircraft_ns, aircraft, u, aircraft_ns, hardware) if t_ns else aircraft
+            measured = plant.measure(t_ns // aircraft_ns, aircraft, hardware)
+            underway, arrived = transmit(underway, t_ns, measured.y, hardware.sensors)
+            for sample in arrived:
+                tracks["y"].add(sample.stamp_ns, sample.y)
+                y = Sample(sample.stamp_ns, select(outputs, airframe.outputs, sample.y))
+            tracks["truth"].add(t_ns, truth.values(t_ns, aircraft, measured.noise, hardware.aircraft))
         if t_ns % reference_ns == 0:
             before = seconds(t_ns - reference_ns)
             x_m = model.step(before, x_m, commanded, seconds(reference_ns), reference) if t_ns else x_m
@@ -79,12 +86,12 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
             tracks["y_m"].add(t_ns, y_m)
             y_m_samples.append(Sample(t_ns, select(outputs, scenario.reference_model.outputs, y_m)))
         if t_ns % limits.period_ns == 0:
-            y = Sample(t_ns, select(outputs, airframe.outputs, tracks["y"].rows[-1]))
             state, used = guard.tick(state, t_ns, y, list(y_m_samples), limits, law)
             if used is not None:
                 u = select(list(airframe.inputs), inputs, state.u)
-                tracks["u"].add(t_ns, state.u)
-                tracks["internals"].add(t_ns, internals.values(state, used, late=0.0, age=0.0))
+                tracks["u"].add(used.stamp_ns, state.u)
+                age = seconds(t_ns - used.stamp_ns)
+                tracks["internals"].add(used.stamp_ns, internals.values(state, used, limits.limits, late=0.0, age=age))
         if progress is not None and t_ns % 1_000_000_000 == 0:
             progress(seconds(t_ns))
     return Tape({name: track.signal() for name, track in tracks.items()})

@@ -5,8 +5,9 @@
 import math
 from typing import Any, NamedTuple
 
-from flight_analysis.metrics import error_table, tick_figures
+from flight_analysis.metrics import error_table, known_error, tick_figures
 from flight_analysis.scenario import Scenario
+from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape
 from flight_core.units import SI_PER_UNIT
@@ -22,12 +23,17 @@ class Shown(NamedTuple):
 def shown_units(scenario: Scenario) -> dict[str, Shown]:
     """Units for tables and pictures by channel of y and u: angular rates in mrad/s, inputs as the airframe file has them."""
     airframe, _ = scenario.aircraft.load()
-    units = {name: Shown("mrad/s", 1e3) if unit == "rad/s" else Shown(unit, 1.0) for name, unit in airframe.states.items()}
+    units = {
+        name: Shown("mrad/s", 1e3) if unit == "rad/s" else Shown(unit, 1.0 / SI_PER_UNIT[unit])
+        for name, unit in airframe.states.items()
+    }
     return units | {name: Shown(i.unit, 1.0 / SI_PER_UNIT[i.unit]) for name, i in airframe.inputs.items()}
 
 
 def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
-    """Outcome, duration flown, errors by channel and part of the flight (SI), ticks, notes; ready for JSON."""
+    """Outcome, duration flown, errors (which, and by channel and part of the flight, SI), ticks, notes; ready for JSON."""
+    for topic in ("y", "y_m"):
+        require(topic in tape, "the log", f"no sample of {topic}", "a flight with y and y_m")
     errors = error_table(tape, scenario.gust_windows())
     ticks = tick_figures(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
     flown = float(tape.time("y")[-1]) if "y" in tape and len(tape["y"].stamp_ns) else 0.0
@@ -35,6 +41,7 @@ def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
         "scenario": scenario.name,
         "outcome": outcome,
         "duration": flown,
+        "error": known_error(tape)[0],
         "errors": {
             channel: {
                 part: {key: _number(value) for key, value in figures._asdict().items()} for part, figures in parts.items()

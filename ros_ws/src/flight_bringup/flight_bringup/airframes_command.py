@@ -21,25 +21,31 @@ def airframes(
     if as_json:
         print(json.dumps([_plain(one) for one in facts]))
         return
-    table = Table(title="Airframes", title_justify="left", box=box.SIMPLE_HEAD, show_lines=True)
-    for heading in ("airframe", "n, m", "poles (1/s)", "zeros (1/s)", "zero\ndynamics", "minors", "D", "for D = I", "coupling"):
-        table.add_column(heading, overflow="fold")
+    console = Console()
+    signs = _table("Signs and pairing", ("airframe", "n, m", "D", "for D = I", "coupling", "zeros"))
     for one in facts:
-        table.add_row(
+        signs.add_row(
             one.name,
             f"{one.n}, {one.m}",
-            _shown(one.poles),
-            _shown(one.zeros),
-            one.zero_dynamics,
-            "  ".join(f"{minor:.3g}" for minor in one.minors),
             "none" if one.D is None else " ".join(f"{int(sign):+d}" for sign in one.D),
             one.remedy,
             "-" if one.coupling is None else f"{one.coupling:.3g}",
+            one.zero_dynamics,
         )
-    console = Console()
-    console.print(table)
+    console.print(signs)
+    roots = _table("Poles and zeros in 1/s, leading minors of C B in SI", ("airframe", "poles", "zeros", "minors"))
+    for one in facts:
+        roots.add_row(one.name, _shown(one.poles), _shown(one.zeros), "  ".join(f"{minor:.3g}" for minor in one.minors))
+    console.print(roots)
     outside = [one.name for one in facts if not one.in_theorem]
-    console.print(f"Outside the theorem: {', '.join(outside) or 'none'}. Minors in SI units; coupling is max abs(U - I).")
+    console.print(f"Outside the theorem: {', '.join(outside) or 'none'}. Coupling is max abs(U - I).")
+
+
+def _table(title: str, headings: tuple[str, ...]) -> Table:
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in headings:
+        table.add_column(heading, no_wrap=heading in {"n, m", "D", "for D = I", "coupling", "zeros"}, overflow="fold")
+    return table
 
 
 def _shown(roots: ComplexArray) -> str:

@@ -15,6 +15,8 @@ from rich.table import Table
 
 from flight_analysis.summary import Shown, shown_units
 from flight_bringup import fly as flying
+from flight_bringup.airframes_command import airframes
+from flight_bringup.gains_command import gains
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 
@@ -80,6 +82,10 @@ def report(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> Non
     flown = flying.conclude(run)
     show(Console(), flown.summary, shown_units(flown.scenario))
     print(f"outcome: {flown.summary['outcome']}\nreport:  {_short(flown.report)}")
+
+
+app.command()(gains)
+app.command()(airframes)
 
 
 def show(console: Console, summary: dict[str, Any], units: dict[str, Shown]) -> None:

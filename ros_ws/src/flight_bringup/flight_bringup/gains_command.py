@@ -62,20 +62,19 @@ def gains(
     with console.status("following the reference on uncertain airframes"):
         found = study(flown, manoeuvre(chosen, flown), uncertainty, samples, seed)
         if check:
-            names, answers, text = ("scenario",), (check_gains(chosen, found, gamma_2),), None
+            answers, text = {"scenario": check_gains(chosen, found, gamma_2)}, None
         else:
             selection = select_gains(found, setting)
-            names, answers = ("theorem", "engineering"), (selection.theorem, selection.engineering)
-            text = as_yaml(selection)
+            answers, text = {"theorem": selection.theorem, "engineering": selection.engineering}, as_yaml(selection)
     if write is not None and text is not None:
         _write(write, text)
     if as_json:
-        print(json.dumps(_plain(found, dict(zip(names, answers, strict=True)), seed)))
+        print(json.dumps(_plain(found, answers, seed)))
     else:
-        _show(console, found, dict(zip(names, answers, strict=True)))
+        _show(console, found, answers)
         if write is not None:
             console.print(f"gains: {write}")
-    if check and failing(answers[0].loop):
+    if check and failing(answers["scenario"].loop):
         raise typer.Exit(CONDITION_FAILS)
 
 
@@ -103,43 +102,51 @@ def _show(console: Console, found: Study, answers: dict[str, Answer]) -> None:
     first = next(iter(answers.values()))
     outputs = first.controller.outputs
     samples = len(found.A) - 1
-    title = f"Gains for {found.airframe.name}, entries of A and B +-{100 * found.uncertainty:g} % ({samples} samples)"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    title = f"Gains for {found.airframe.name}, A and B +-{100 * found.uncertainty:g} % ({samples} samples); K, Lambda in 1/s"
+    table = _table(title)
     table.add_column("channel", no_wrap=True)
     for name in answers:
-        for heading in (f"{name}\nK (1/s)", "\nLambda (1/s)", "\nbeta"):
-            table.add_column(heading, justify="right")
+        for heading in (f"{name}\nK", "\nLambda", "\nbeta"):
+            table.add_column(heading, justify="right", no_wrap=True)
     for i, (output, name) in enumerate(zip(outputs, first.controller.inputs, strict=True)):
-        cells = []
+        row = [f"{output} by {name}"]
         for answer in answers.values():
             params = answer.controller.law()
-            cells += [f"{params.K[i]:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i]:.4g}"]
-        table.add_row(f"{output} by {name}", *cells)
+            row += [f"{params.K[i]:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i]:.4g}"]
+        table.add_row(*row)
     console.print(table)
     for name, answer in answers.items():
-        console.print(f"{name}: {_margin(answer)}", highlight=False)
+        console.print(f"{name}: {_margin(answer)}", highlight=False, soft_wrap=True)
 
-    table = Table(title="Conditions (margin: above 1 holds)", title_justify="left", box=box.SIMPLE_HEAD)
-    table.add_column("condition")
-    for name in answers:
-        for heading in (f"{name}\nfound", "\nexpected", "\nmargin"):
-            table.add_column(heading, justify="right", no_wrap=True)
-    for part in ("theorem", "loop"):
-        for row in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
-            cells = [cell for condition in row for cell in _cells(condition)]
-            where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
-            shown = where.pop() if len(where) == 1 else None
-            estimate = " (estimate)" if row[0].estimate else ""
-            table.add_row(row[0].name + (f" of {shown}" if shown else "") + estimate, *cells)
-        table.add_section()
-    console.print(table)
-    console.print(f"(estimate): with gamma_2 = {first.bounds.gamma_2[0]:g} 1/s as stated; nothing bounds it.", highlight=False)
+    for part, heading in (("theorem", "Theorem 1"), ("loop", "The loop")):
+        table = _table(f"\n{heading}")
+        table.add_column("condition")
+        for name in answers:
+            table.add_column(f"{name}\nfound and bound", justify="right", no_wrap=True)
+            table.add_column("\nmargin", justify="right", no_wrap=True)
+        for row_ in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
+            table.add_row(_named(row_, outputs), *(cell for condition in row_ for cell in _cells(condition)))
+        console.print(table)
+    gamma_2 = first.bounds.gamma_2[0]
+    console.print(
+        f"margin: above 1 holds, ! fails; ~ estimate, for gamma_2 = {gamma_2:g} 1/s is stated, not bounded", soft_wrap=True
+    )
     for name, answer in answers.items():
         failed = answer.failing
-        console.print(f"{name}: {'every condition holds' if not failed else f'{len(failed)} conditions fail'}")
-        if len(answers) == 1:
-            for condition in failed:
-                console.print(f"  {condition.sentence(outputs)}", highlight=False)
+        console.print(f"{name}: {'every condition holds' if not failed else f'{len(failed)} conditions fail'}", highlight=False)
+        for condition in failed if len(answers) == 1 else ():
+            console.print(f"  {condition.sentence(outputs)}", highlight=False)
+
+
+def _table(title: str) -> Table:
+    return Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+
+
+def _named(row: tuple[Condition, ...], outputs: tuple[str, ...]) -> str:
+    """Name of a row; the channel where all agree on it, since the largest term of step 3 may be in another one for each."""
+    where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
+    channel = where.pop() if len(where) == 1 else None
+    return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
 
 
 def _margin(answer: Answer) -> str:
@@ -156,10 +163,10 @@ def _milliseconds(margin: float) -> str:
     return f"{1e3 * margin:.0f} ms" if math.isfinite(margin) else "over 500 ms"
 
 
-def _cells(condition: Condition) -> tuple[str, str, str]:
-    margin = "" if math.isnan(condition.margin) else f"{condition.margin:.3g}"
-    shown = margin if condition.holds else f"[red]{margin} fails[/red]"
-    return f"{condition.found:.4g}", f"{'>=' if condition.at_least else '<='} {condition.bound:.4g}", shown.strip()
+def _cells(condition: Condition) -> tuple[str, str]:
+    margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
+    side = ">=" if condition.at_least else "<="
+    return f"{condition.found:.4g} {side} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
 
 
 def _plain(found: Study, answers: dict[str, Answer], seed: int) -> dict[str, Any]:

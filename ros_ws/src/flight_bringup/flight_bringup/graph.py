@@ -23,26 +23,24 @@ AIRCRAFT = NodeSpec("aircraft_sim", "aircraft")
 REFERENCE_MODEL = NodeSpec("reference_model", "reference_model")
 CONTROLLER = NodeSpec("rise_di_controller", "controller")
 
-# The recorder starts first and stops last, so that the whole flight is in the log.
-NODES = (RECORDER, AIRCRAFT, REFERENCE_MODEL, CONTROLLER)
+# These start first, and say that they are ready before the others start: the whole flight is then in the log, and the
+# aircraft is never without its controller. The recorder ends last.
+FIRST = (RECORDER, CONTROLLER)
+THEN = (AIRCRAFT, REFERENCE_MODEL)
+
+READY = "]: ready"  # what a node says in its log when its loop begins
 
 
-READY = "recording to"  # what the recorder says when it is ready
+def start_lead(startup: float) -> float:
+    """Time to leave from starting the second two nodes to t = 0, s, given how long the first two took to be ready.
 
-
-def start_lead(recorder_startup: float) -> float:
-    """Time to leave from starting the other nodes to t = 0, s, given how long the recorder took to be ready.
-
-    Half a second for them to find each other, and twice that long, as three processes start at once on two cores.
+    As long again, half of that for a machine that got busier, and half a second for the nodes to find each other.
     """
-    return 0.5 + 2.0 * recorder_startup
+    return 0.5 + 1.5 * startup
 
 
-def recorder_parameters(scenario_file: Path, run: Path) -> dict[str, str | float]:
-    """What the recorder is told beside its section of the scenario."""
-    return {"directory": str(run), "scenario_file": str(scenario_file)}
-
-
-def parameters(node: NodeSpec, start_time: float) -> dict[str, str | float]:
-    """What another node is told beside its section: the instant of t = 0, which the controller need not know."""
-    return {} if node is CONTROLLER else {"start_time": start_time}
+def parameters(node: NodeSpec, scenario_file: Path, run: Path, start_time: float) -> dict[str, str | float]:
+    """What a node is told beside its section of the scenario; those that start first are not told the instant of t = 0."""
+    if node is RECORDER:
+        return {"directory": str(run), "scenario_file": str(scenario_file)}
+    return {"start_time": start_time} if node in THEN else {}

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from flight_bringup.graph import NODES, READY, RECORDER, NodeSpec, parameters, recorder_parameters, start_lead
+from flight_bringup.graph import FIRST, READY, RECORDER, THEN, NodeSpec, parameters, start_lead
 from flight_core.parameters import ParameterError
 
 STOP_TIMEOUT = 2.5  # s for all processes together; a node ends within 0.2 s
@@ -69,27 +69,24 @@ class NodeProcess:
 
 
 class Flight:
-    """All processes of one flight. A context manager: leaving it ends them, the recorder last."""
+    """All processes of one flight. A context manager: leaving it ends them."""
 
     def __init__(self, scenario_file: Path, run: Path) -> None:
         self._scenario_file, self._run = scenario_file, run
         self.processes: list[NodeProcess] = []
-        self.start_time = math.inf  # system time of t = 0, s; set once the recorder is ready
+        self.start_time = math.inf  # system time of t = 0, s; set once the first nodes are ready
 
     def __enter__(self) -> Self:
         try:
             begin = time.monotonic()
-            recorder = self._start(RECORDER, recorder_parameters(self._scenario_file, self._run))
-            while not recorder.ready.wait(0.02):
+            first = [self._start(node) for node in FIRST]
+            while not all(process.ready.wait(0.02) for process in first):
                 self._require_running()
                 if time.monotonic() > begin + READY_TIMEOUT:
-                    raise ParameterError(
-                        f"recorder: not ready after {READY_TIMEOUT:g} s; its output is in {self._log(RECORDER)}"
-                    )
+                    raise ParameterError(f"not ready after {READY_TIMEOUT:g} s; see the logs in {self._run / 'log'}")
             self.start_time = round(time.time() + start_lead(time.monotonic() - begin), 3)
-            for node in NODES:
-                if node is not RECORDER:
-                    self._start(node, parameters(node, self.start_time))
+            for node in THEN:
+                self._start(node)
         except BaseException:
             self.stop()
             raise
@@ -98,12 +95,10 @@ class Flight:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.stop()
 
-    def _log(self, node: NodeSpec) -> Path:
-        return self._run / "log" / f"{node.executable}.log"
-
-    def _start(self, node: NodeSpec, told: dict[str, str | float]) -> NodeProcess:
-        log = self._log(node)
+    def _start(self, node: NodeSpec) -> NodeProcess:
+        log = self._run / "log" / f"{node.executable}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
+        told = parameters(node, self._scenario_file, self._run, self.start_time)
         process = NodeProcess(node, self._scenario_file, told, log)
         self.processes.append(process)
         return process
@@ -124,11 +119,11 @@ class Flight:
             raise ParameterError(sentence)
 
     def stop(self) -> None:
-        """End all processes: the recorder after the others, SIGKILL for what does not end in time."""
+        """End all processes, the recorder after the others; SIGKILL for what does not end in time."""
         deadline = time.monotonic() + STOP_TIMEOUT
         others = [process for process in self.processes if process.node is not RECORDER]
-        recorders = [process for process in self.processes if process.node is RECORDER]
-        for group in (others, recorders):
+        recorder = [process for process in self.processes if process.node is RECORDER]
+        for group in (others, recorder):
             for process in group:
                 if process.popen.poll() is None:
                     process.popen.terminate()  # not SIGINT, which is a traceback while Python still imports

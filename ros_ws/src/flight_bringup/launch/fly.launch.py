@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_gust.
 
-The same graph and the same scenario file as `rise-di fly`. The flight begins once the recorder is ready and ends after the
-scenario's duration. It ends early, with exit status 1, when any of its nodes does.
+The same graph and the same scenario file as `rise-di fly`. The flight begins once recorder and controller are ready and ends
+after the scenario's duration. It ends early, with exit status 1, when any of its nodes does.
 """
 
+import math
 import shlex
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import yaml
@@ -19,7 +21,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from flight_bringup.fly import new_run
-from flight_bringup.graph import NODES, READY, RECORDER, NodeSpec, parameters, recorder_parameters, start_lead
+from flight_bringup.graph import FIRST, READY, THEN, NodeSpec, parameters, start_lead
 from flight_bringup.processes import end_with_parent
 from flight_bringup.scenarios import find_scenario, scenarios
 from launch import LaunchContext, LaunchDescription
@@ -51,36 +53,43 @@ def _fly(context: LaunchContext) -> list[Action]:
     # launch leaves its processes running when it is itself ended by anything but SIGINT.
     context.launch_configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
 
-    def process(node: NodeSpec, told: dict[str, str | float]) -> Node:
+    def process(node: NodeSpec, start_time: float = math.inf) -> Node:
         return Node(
             package=node.package,
             executable=node.executable,
             exec_name=node.executable,  # else the log names each process by its prefix
             namespace=LaunchConfiguration("namespace"),
-            parameters=[str(scenario.path), told],
+            parameters=[str(scenario.path), parameters(node, scenario.path, run, start_time)],
             output="screen",
             on_exit=_require_flown,
         )
 
-    recorder = process(RECORDER, recorder_parameters(scenario.path, run))
     flown = [
         LogInfo(msg=f"flown; now: ros2 run flight_bringup rise-di report {shlex.quote(str(run))}"),
         Shutdown(reason="flown to its end"),
     ]
-    started = False
+    first = {node: process(node) for node in FIRST}
+    waiting = set(FIRST)
 
-    def when_ready(event: ProcessIO) -> list[Action] | None:
-        nonlocal started
-        if started or READY not in event.text.decode(errors="replace"):
-            return None
-        started = True
-        lead = start_lead(time.monotonic() - begin)
-        start_time = round(time.time() + lead, 3)
-        rest = [process(node, parameters(node, start_time)) for node in NODES if node is not RECORDER]
-        return [*rest, TimerAction(period=lead + scenario.flight.duration, actions=flown)]
+    def when_ready(node: NodeSpec) -> Callable[[ProcessIO], list[Action] | None]:
+        def handle(event: ProcessIO) -> list[Action] | None:
+            if node not in waiting or READY not in event.text.decode(errors="replace"):
+                return None
+            waiting.remove(node)
+            if waiting:
+                return None
+            lead = start_lead(time.monotonic() - begin)
+            start_time = round(time.time() + lead, 3)
+            end = TimerAction(period=lead + scenario.flight.duration, actions=flown)
+            return [*(process(other, start_time) for other in THEN), end]
 
-    ready = OnProcessIO(target_action=recorder, on_stdout=when_ready, on_stderr=when_ready)
-    return [RegisterEventHandler(ready), recorder]
+        return handle
+
+    handlers = [
+        RegisterEventHandler(OnProcessIO(target_action=action, on_stdout=when_ready(node), on_stderr=when_ready(node)))
+        for node, action in first.items()
+    ]
+    return [*handlers, *first.values()]
 
 
 def _require_flown(event: ProcessExited, context: LaunchContext) -> None:

@@ -22,8 +22,6 @@ from flight_ros.topics import FLIGHT, PUBLISH, RECORD, RECORD_FOREIGN, Topic
 
 FLUSH_PERIOD = 0.1  # s, what a killed recorder loses at most
 
-READY = "recording to"
-
 
 class RecorderNode(FlightNode[RecorderParameters]):
     """Takes all that has arrived at each tick and appends it to the bag."""
@@ -43,7 +41,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
         self._last_sequence: dict[str, int] = {}
         self.lost: Counter[str] = Counter()
         self._flushed_ns = time.monotonic_ns()
-        self.get_logger().info(f"{READY} {self._bag.path}")
+        self.get_logger().info(f"recording to {self._bag.path}")
 
     def _scenario(self) -> Path | None:
         if not self.parameters.scenario_file:
@@ -85,7 +83,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
         counts: dict[str, object] = {f"messages {name}": channel.count for name, channel in self._bag.channels.items()}
         lost: dict[str, object] = {f"lost {name}": count for name, count in self.lost.items()}
         level = DiagnosticStatus.WARN if lost else DiagnosticStatus.OK
-        return level, f"{READY} {self._bag.path}", counts | lost
+        return level, f"recording to {self._bag.path}", counts | lost
 
     def close(self) -> None:
         for inbox in self._recorded:

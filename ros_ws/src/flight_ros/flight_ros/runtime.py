@@ -240,6 +240,7 @@ def _loop(node: FlightNode[Any], stop: _Stop) -> None:
         node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
     gc.collect()
     gc.freeze()  # a collection then takes microseconds, not tens of milliseconds
+    node.get_logger().info("ready")
     serve_ns = report_ns = time.monotonic_ns()
     while not stop.requested:
         pause = ticker.remaining()

@@ -119,22 +119,22 @@ class ReferenceModelParameters(Parameters):
         return Model(np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C)
 
     def profile(self) -> Profile:
-        """The commands u_m(t) as arrays over the outputs, shorter lists of pulses padded with pulses of height 0."""
+        """The commands u_m(t) as arrays over the outputs: two edges a pulse, shorter lists padded with edges of height 0."""
         m = len(self.outputs)
-        longest = max((len(pulses.start) for pulses in self.pulses.values()), default=1)
-        start, stop, value = np.zeros((m, longest)), np.ones((m, longest)), np.zeros((m, longest))
+        most = 2 * max((len(pulses.start) for pulses in self.pulses.values()), default=0)
+        time, change = np.zeros((m, most)), np.zeros((m, most))
         for name, pulses in self.pulses.items():
-            row, count = self.outputs.index(name), len(pulses.start)
-            start[row, :count], stop[row, :count], value[row, :count] = pulses.start, pulses.stop, pulses.value
+            row, count = self.outputs.index(name), 2 * len(pulses.start)
+            time[row, :count] = (*pulses.start, *pulses.stop)
+            change[row, :count] = (*pulses.value, *(-value for value in pulses.value))
         sines = [self.sines.get(name) for name in self.outputs]
         bank_rate, turn_rate = np.zeros(m), np.zeros(m)
         if (turn := self.coordinated_turn) is not None:
             bank_rate[self.outputs.index(turn.bank_rate)] = 1.0
             turn_rate[self.outputs.index(turn.turn_rate)] = GRAVITY / turn.speed
         return Profile(
-            start,
-            stop,
-            value,
+            time,
+            change,
             np.array(self.rise),
             np.array([0.0 if sine is None else sine.amplitude for sine in sines]),
             np.array([1.0 if sine is None else sine.frequency for sine in sines]),

@@ -404,13 +404,13 @@ def is_stable(plant: LinearPlant, params: LawParams, loop: Loop, extra: FloatArr
 def delay_margin(plant: LinearPlant, params: LawParams, loop: Loop, channel: int | None = None) -> float:
     """Pure delay beyond loop.delay, s, at which the linear loop turns unstable, in all channels or in one of them.
 
-    0 where it is unstable already, infinite where it bears half a second. Looked for in steps of a quarter period, then
+    0 where it is unstable already, infinite where it bears half a second. Looked for in steps of half a period, then
     halved down to 0.1 ms. Raises ParameterError for the literal sign.
     """
     delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
     if not is_stable(plant, params, loop, 0.0 * delayed):
         return 0.0
-    lower, stride = 0.0, loop.period / 4.0
+    lower, stride = 0.0, loop.period / 2.0
     while is_stable(plant, params, loop, (lower + stride) * delayed):
         lower += stride
         if lower > MOST_DELAY:

@@ -1,0 +1,73 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What one tick costs: the law, the guarded law and the whole tick, beside a bare NumPy multiply-add of the same size.
+
+.venv/bin/python benchmarks/law.py
+"""
+
+import gc
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from flight_analysis.scenario import load_scenario
+from rise_di_controller import guard
+from rise_di_controller.guard import Sample
+from rise_di_controller.law import engage, step
+
+SCENARIO = Path(__file__).resolve().parents[1] / "ros_ws/src/flight_bringup/config/osprey_gust.yaml"
+REPEATS = 20_000
+
+
+def percentiles(action: Callable[[int], object]) -> tuple[float, float, float]:
+    """Median, 99.9th percentile and maximum of one call in us, after a warm-up."""
+    for k in range(500):
+        action(k)
+    gc.collect()
+    gc.freeze()
+    took = np.empty(REPEATS)
+    for k in range(REPEATS):
+        begin = time.perf_counter_ns()
+        action(k)
+        took[k] = (time.perf_counter_ns() - begin) * 1e-3
+    return float(np.median(took)), float(np.percentile(took, 99.9)), float(took.max())
+
+
+def main() -> None:
+    """Measure and print."""
+    controller = load_scenario(SCENARIO).controller
+    law, limits = controller.law(), controller.guard()
+    rng = np.random.default_rng(1)
+    y, y_m = rng.normal(size=(REPEATS, 4)) * 0.01, np.zeros(4)
+    dt, zero = 0.01, np.zeros(4)
+    law_state = engage(y[0], y_m)
+    engaged, _ = guard.tick(guard.start(4), 0, Sample(0, y[0]), [Sample(0, y_m)], limits, law)
+
+    def guarded(k: int) -> object:
+        return guard.guarded_step(law_state, y[k], y_m, dt, zero, zero, law, limits.limits)
+
+    def whole_tick(k: int) -> object:
+        stamp_ns = limits.period_ns
+        return guard.tick(engaged, stamp_ns, Sample(stamp_ns, y[k]), [Sample(0, y_m), Sample(stamp_ns, y_m)], limits, law)
+
+    measured = {
+        "NumPy a * x + b, the floor": percentiles(lambda k: law.K * y[k] + y_m),
+        "law.step": percentiles(lambda k: step(law_state, y[k], y_m, dt, law)),
+        "guard.guarded_step": percentiles(guarded),
+        "guard.tick": percentiles(whole_tick),
+    }
+    floor = measured["NumPy a * x + b, the floor"][0]
+    table = Table(title=f"One tick of four channels, {REPEATS} times, us", title_justify="left")
+    for column in ("", "median", "99.9 %", "max", "median / floor"):
+        table.add_column(column, justify="left" if column == "" else "right")
+    for name, (median, high, most) in measured.items():
+        table.add_row(name, f"{median:.1f}", f"{high:.1f}", f"{most:.0f}", f"{median / floor:.1f}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
