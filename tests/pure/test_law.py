@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The law's step, pinned by numbers worked by hand and by closed forms."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -102,7 +104,8 @@ def test_the_law_is_odd_in_the_error(sign: Sign, errors: list[float]) -> None:
 def test_channels_do_not_mix(e: list[float]) -> None:
     # K, Lambda, beta and D are diagonal: the first channel of two flies as if it were alone.
     alone = one_channel(Sign.IMPLICIT)
-    both = alone._replace(**{name: np.repeat(getattr(alone, name), 2) for name in alone._fields if name != "sign"})
+    doubled: dict[str, Any] = {name: np.repeat(getattr(alone, name), 2) for name in alone._fields if name != "sign"}
+    both = alone._replace(**doubled)
     zero = np.zeros(2)
     _, u = step(engage(zero, zero), np.array(e), zero, np.array(DT), both)
     assert u[0] == fly(one_channel(Sign.IMPLICIT), [0.0, e[0]])[0]
