@@ -125,7 +125,9 @@ def sampling_scenario(base: Scenario, world: str, scheme: str, period: float, *,
 def gust_scenario(base: Scenario, rates: Mapping[str, float], period: float, *, gusts: bool) -> Scenario:
     """The scenario osprey_gust with the implicit sign at another beta and period."""
     moved = base.vary(controller={"beta": scaled_beta(base, rates), "sign": "implicit"})
-    return at_period(moved if gusts else moved.vary(aircraft={"gusts": {}}), period)
+    moved = at_period(moved if gusts else moved.vary(aircraft={"gusts": {}}), period)
+    # seen every millisecond, between the ticks too
+    return moved.vary(aircraft={"rate": 1000.0, "step": 0.001}, reference_model={"rate": 1000.0})
 
 
 def cells(values: FloatArray, factor: float = 1.0) -> str:

@@ -12,6 +12,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.vectors import FloatArray
 from rise_di_controller import guard, internals
 from rise_di_controller.guard import ControllerState, Limits, Mode, Sample, align
+from rise_di_controller.internals import Limited
 from rise_di_controller.law import LawParams, LawState, Sign, control, engage, retune, step
 from rise_di_controller.params import ControllerParameters
 
@@ -251,6 +252,22 @@ def test_new_gains_leave_the_input_where_it_was(state: LawState, k: float, Lambd
     )
     assert (np.abs(after - before) <= 1e-12 * np.maximum(size, 1.0)).all()
     assert (retuned.e, retuned.e_0, retuned.integral_e) == (state.e, state.e_0, state.integral_e)
+
+
+def test_internals_hold_the_integrals_and_what_limited_each_input(params: ControllerParameters) -> None:
+    limits = Limits(np.full(4, -1.0), np.full(4, 1.0), np.full(4, np.inf))
+    law_state = LawState(np.zeros(4), np.ones(4), np.full(4, 2.0), np.full(4, 3.0))
+    state = guard.start(4)._replace(
+        law=law_state, u_free=np.array([0.5, 5.0, -5.0, 0.9]), u=np.array([0.5, 1.0, -1.0, 0.7]), u_trim=np.full(4, 0.1)
+    )
+    used = guard.Used(0, np.zeros(4), np.zeros(4), 0.0, 0.01)
+    shown = dict(
+        zip(internals.names(params.outputs, params.inputs), internals.values(state, used, limits, 0.0, 0.0), strict=True)
+    )
+    assert (shown["e.q"], shown["integral_e.q"], shown["Pi.q"]) == (1.0, 2.0, 3.0)
+    assert (shown["u_free.aileron"], shown["u.aileron"], shown["u_trim.aileron"]) == (5.0, 1.0, 0.1)
+    limited = [shown[f"limited.{name}"] for name in params.inputs]
+    assert limited == [Limited.NO, Limited.MAGNITUDE, Limited.MAGNITUDE, Limited.RATE]
 
 
 def test_internals_are_named_after_the_outputs(params: ControllerParameters) -> None:
