@@ -34,7 +34,7 @@ class Peer:
         for topic, messages in self.heard.items():
             kind = DiagnosticArray if topic == "/diagnostics" else JointState
             self.node.create_subscription(kind, topic, messages.append, QoSProfile(depth=100))
-        self._publishers = {name: self.node.create_publisher(JointState, name, PUBLISH) for name in ("y", "y_m")}
+        self._publishers: dict[str, Any] = {}
 
     def until(self, condition: Callable[[], object], timeout: float = 20.0, each: Callable[[], None] | None = None) -> None:
         """Spin until the condition holds; `each` is called every 5 ms."""
@@ -49,10 +49,12 @@ class Peer:
         """One sample of y and y_m, all channels alike, stamped now."""
         now_ns = time.time_ns()
         for name, value in (("y_m", y_m), ("y", y)):
-            self._publishers[name].publish(to_message(now_ns, OUTPUTS, np.full(4, value), "peer"))
+            self.publish(name, to_message(now_ns, OUTPUTS, np.full(4, value), "peer"))
 
     def publish(self, topic: str, message: JointState) -> None:
-        """Any message on y or y_m."""
+        """Any named vector on any topic."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(JointState, topic, PUBLISH)
         self._publishers[topic].publish(message)
 
     def call(self, kind: Any, name: str, request: Any) -> Any:

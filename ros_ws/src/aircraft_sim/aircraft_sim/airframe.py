@@ -92,6 +92,13 @@ class Airframe(Parameters):
             matrix[self.index(term.into), self.index(term.angle)] += term.gain
         return matrix
 
+    def with_matrices(self, A: FloatArray, B: FloatArray) -> Self:
+        """The same airframe with other A, shape (n, n), and B, shape (n, m), SI; its file would hold them in its own units."""
+        state: FloatArray = np.array([SI_PER_UNIT[u] for u in self.states.values()])
+        given: FloatArray = np.array([SI_PER_UNIT[i.unit] for i in self.inputs.values()])
+        values = {"A": (A / state[:, None] * state).tolist(), "B": (B / state[:, None] * given).tolist()}
+        return self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
+
     def gust_direction(self, gust: str) -> FloatArray:
         """What 1 m/s of a gust adds to x_dot, shape (n,). Raises ParameterError for a gust the airframe does not know."""
         require(gust in self.gusts, "gusts", f"{gust!r}", f"one the airframe {self.name} knows: {', '.join(self.gusts)}")

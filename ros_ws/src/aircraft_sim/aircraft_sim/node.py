@@ -29,6 +29,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         self._underway: Underway = ()
         self._u = np.zeros(len(self._airframe.inputs))
         self._u_from: str | None = None
+        self._u_ns = 0  # when the last u came
         self._u_inbox = self.inbox(U)
         self._y_publisher, self._truth_publisher = self.publisher(Y), self.publisher(TRUTH)
 
@@ -40,34 +41,43 @@ class AircraftNode(FlightNode[AircraftParameters]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         before_ns, t_ns = tick.previous * self._period_ns, tick.number * self._period_ns
-        self._state = plant.advance(before_ns, self._state, self._u, t_ns - before_ns, self._plant)
+        share = self.parameters.commanded_share(now_ns - self._u_ns)
+        u = self._u if share == 1.0 else share * self._u
+        self._state = plant.advance(before_ns, self._state, u, t_ns - before_ns, self._plant)
         measured = plant.measure(tick.number, self._state, self._plant)
         self._underway, arrived = transmit(self._underway, now_ns, measured.y, self._plant.sensors)
         for sample in arrived:
             self._y_publisher.publish(to_message(sample.stamp_ns, self._airframe.outputs, sample.y, self.instance))
         values = truth.values(t_ns, self._state, measured.noise, self._plant.aircraft)
         self._truth_publisher.publish(to_message(now_ns, self._truth_names, values, self.instance))
-        self._take_u()
+        self._take_u(now_ns)
 
-    def _take_u(self) -> None:
+    def _take_u(self, now_ns: int) -> None:
         for received in self._u_inbox.take():
-            message = received.message
-            if self._u_from is None:
-                self._u_from = message.header.frame_id
-                self.get_logger().info(f"flown by {self._u_from}")
-            elif message.header.frame_id != self._u_from:
-                self.reject(self._u_inbox, "sender", f"{message.header.frame_id} commands too, beside {self._u_from}")
+            sender = received.message.header.frame_id
+            if sender != self._u_from and not self._silent(now_ns):
+                self.reject(self._u_inbox, "sender", f"{sender} commands too, beside {self._u_from}")
                 continue
             try:
-                self._u = from_message(message, list(self._airframe.inputs)).value
+                self._u = from_message(received.message, list(self._airframe.inputs)).value
             except ChannelError as error:
                 self.reject(self._u_inbox, error.reason, str(error))
-        if self._u_from is None:
+                continue
+            self._u_ns = now_ns
+            if sender != self._u_from:
+                self._u_from = sender
+                self.get_logger().info(f"flown by {sender}")
+        if self._silent(now_ns):
             self.waiting_for(self._u_inbox)
+
+    def _silent(self, now_ns: int) -> bool:
+        return now_ns - self._u_ns > nanoseconds(self.parameters.max_age)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         if self._u_from is None:
             return DiagnosticStatus.WARN, "no u yet, flying in trim", {}
+        if self._silent(self.get_clock().now().nanoseconds):
+            return DiagnosticStatus.ERROR, f"{self._u_from} is silent: its last u is held, then let go to trim", {}
         return DiagnosticStatus.OK, f"flown by {self._u_from}", {}
 
 

@@ -14,7 +14,8 @@ from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.plant import Plant
 from aircraft_sim.sensors import Sensors
-from flight_core.parameters import Parameters, Positive, as_tuple, require, require_length
+from flight_core.freshness import fade
+from flight_core.parameters import NonNegative, Parameters, Positive, as_tuple, require, require_length
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray
 
@@ -63,6 +64,10 @@ class AircraftParameters(Parameters):
     actuators: ActuatorParameters = Field(default=ActuatorParameters(), description="the actuators, ideal where left out")
     sensors: SensorParameters = Field(default=SensorParameters(), description="the sensors, ideal where left out")
 
+    max_age: Positive = Field(default=0.2, description="how long without u until its controller counts as silent, s")
+    hold: NonNegative = Field(default=0.5, description="how long the last u is then held, s")
+    ramp: NonNegative = Field(default=2.0, description="how long it then takes to trim, s")
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         period = period_ns(self.rate, "rate")
@@ -87,6 +92,10 @@ class AircraftParameters(Parameters):
     def step_ns(self) -> int:
         """The integration step in ns."""
         return nanoseconds(self.step)
+
+    def commanded_share(self, silence_ns: int) -> float:
+        """How much of the last u is still commanded after a silence of its controller: `fade` from max_age on."""
+        return fade(silence_ns, nanoseconds(self.max_age + self.hold), nanoseconds(self.ramp))
 
     def load(self) -> tuple[Airframe, Aircraft]:
         """The airframe and the arrays of equation (1) in this disturbance."""
