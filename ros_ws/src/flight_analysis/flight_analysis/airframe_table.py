@@ -23,15 +23,13 @@ from rise_di_controller.decomposition import (
     search,
     signs,
 )
+from rise_di_controller.feedforward import ORIGIN
 
 ComplexArray = NDArray[np.complex128]
 
 FASTEST_ZERO = 1e4
 """1/s. Zeros beyond it are the pencil's infinite ones: they are double, so rounding may bring them in, but to no less than
 about 1e7 (the inverse root of 2e-16). The fastest finite one in the library is 7.2."""
-
-ORIGIN = 1e-6
-"""1/s. Real parts below it are zero: rounding leaves 1e-14, and a mode this slow takes 11 days."""
 
 UNCONTROLLABLE = 1e-9
 """Singular values below this part of the largest are zero: rounding leaves 1e-15, published figures have five digits."""

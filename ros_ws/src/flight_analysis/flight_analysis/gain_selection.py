@@ -19,7 +19,7 @@ from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.params import Gust
-from flight_analysis.airframe_table import ORIGIN, invariant_zeros
+from flight_analysis.airframe_table import invariant_zeros
 from flight_analysis.lyapunov import Plant, decay
 from flight_analysis.scenario import Scenario
 from flight_core.integrators import rk4
@@ -30,9 +30,10 @@ from reference_model.command import command
 from reference_model.params import ReferenceModelParameters, zero_state
 from rise_di_controller import gains as procedure
 from rise_di_controller.decomposition import DecompositionError, coupling, search, signs
+from rise_di_controller.feedforward import ORIGIN
 from rise_di_controller.gains import Bounds, Condition, GainSet, LinearPlant, Loop
 from rise_di_controller.law import LawParams, Sign
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerParameters, FeedforwardParameters
 
 SHARES: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
 """Bandwidth of a channel times the lag of its loop, by output. Yaw leaves room to the dutch roll, speed to the engine."""
@@ -85,6 +86,7 @@ class Setting(NamedTuple):
     factor: float = FACTOR  # beta beside the slew of the ideal control
     shares: Mapping[str, float] = SHARES
     inputs: tuple[str, ...] = ()  # what drives each output of the airframe, in its order; none: as the airframe has it
+    feedforward: bool = False  # whether the airframe as published goes along as the nominal model
 
 
 class Study(NamedTuple):
@@ -379,15 +381,35 @@ def select_gains(found: Study, setting: Setting) -> Selection:
             "sign": "auto",
             "lag": _by_name(setting.lag, channels.inputs, 0.0).tolist(),
             "delay": setting.delay,
+            "feedforward": None,
         }
         values |= {key: [row[known.index(name)] for name in channels.inputs] for key, row in limits.items() if row}
-        return ControllerParameters.validate_mapping(values, "controller")
+        chosen = ControllerParameters.validate_mapping(values, "controller")
+        return with_feedforward(chosen, airframe) if setting.feedforward else chosen
 
     ones = np.ones(len(places))
     bounds, *_ = _bounds(found, places, columns, unit, D, ones, setting.gamma_2)
     literal = controller(procedure.theorem_gains(bounds, ones), ones)
     engineering = controller(*selected)
     return Selection(found, setting, *(judge(found, one, setting) for one in (literal, engineering)))
+
+
+def with_feedforward(controller: ControllerParameters, airframe: Airframe) -> ControllerParameters:
+    """The same controller with the airframe as the nominal model of its feedforward, an extension of the paper.
+
+    lead = lag + delay + half a period, of the controller. Raises ParameterError for an airframe that cannot be its model,
+    such as one with a zero in the right half plane.
+    """
+    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
+    gravity = airframe.matrix_gravity()
+    model = FeedforwardParameters(
+        states=tuple(airframe.states),
+        A=tuple(airframe.matrix_a().ravel().tolist()),
+        B=tuple(airframe.matrix_b()[:, columns].ravel().tolist()),
+        gravity=tuple(gravity.ravel().tolist()) if gravity.any() else None,
+        lead=tuple(lag + controller.delay + 0.5 / controller.rate for lag in controller.lag),
+    )
+    return ControllerParameters.validate_mapping(controller.model_dump() | {"feedforward": model.model_dump()}, "controller")
 
 
 def check_gains(scenario: Scenario, found: Study, gamma_2: float = 0.0) -> Answer:
@@ -537,10 +559,21 @@ def as_yaml(selection: Selection) -> str:
         "/**/controller:",
         "  ros__parameters:",
     ]
-    for key, value in controller.model_dump(exclude_none=True).items():
+    for key, value in controller.model_dump(exclude_none=True, exclude={"feedforward"}).items():
         reason = reasons.get(key, "" if key == "inputs" else ControllerParameters.model_fields[key].description)
         lines.append(f"    {key}: {_flow(value)}" + (f"  # {reason}" if reason else ""))
+    if controller.feedforward is not None:
+        lines += _feedforward_lines(controller.feedforward, found.airframe.name)
     return "\n".join(lines) + "\n"
+
+
+def _feedforward_lines(model: FeedforwardParameters, airframe: str) -> list[str]:
+    lines = [f"    feedforward:  # an extension of the paper: the input of {airframe} along y_m is added; SI, a line a state"]
+    for key, value in model.model_dump(exclude_none=True).items():
+        columns = len(value) if key in {"states", "lead"} else len(value) // len(model.states)
+        rows = [_flow(value[i : i + columns])[1:-1] for i in range(0, len(value), columns)]
+        lines.append(f"      {key}: [" + (",\n" + " " * (9 + len(key))).join(rows) + "]" + ("  # s" if key == "lead" else ""))
+    return lines
 
 
 def _response(answer: Answer, found: Study) -> FloatArray:

@@ -35,6 +35,9 @@ def gains(
     ] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain airframes.")] = 1,
     write: Annotated[Path | None, typer.Option(help="File to write the engineering gains to, as a scenario has them.")] = None,
+    feedforward: Annotated[
+        bool, typer.Option("--feedforward", help="Write the airframe along, as the model of a feedforward (an extension).")
+    ] = False,
     check: Annotated[
         bool, typer.Option("--check", help="Judge the gain set of the scenario instead of selecting one.")
     ] = False,
@@ -45,7 +48,7 @@ def gains(
     Exit status: 0, or with --check 1 where a condition of the loop fails, 2 bad input.
     """
     chosen, flown = find_scenario(scenario), load_airframe(airframe)
-    setting = setting_of(chosen, gamma_2)._replace(inputs=tuple(inputs.split(",")) if inputs else ())
+    setting = setting_of(chosen, gamma_2)._replace(inputs=tuple(inputs.split(",")) if inputs else (), feedforward=feedforward)
     if rate is not None:
         setting = setting._replace(rate=rate)
     if delay is not None:
@@ -53,7 +56,8 @@ def gains(
     if lag is not None:
         setting = setting._replace(lag=_lags(lag, flown))
     if check:
-        require(write is None, "--write", "it beside --check", "one of them: --check selects nothing to write")
+        for option, given in (("--write", write is not None), ("--feedforward", feedforward)):
+            require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
         changed = rate is not None or delay is not None or lag is not None or inputs is not None
         require(not changed, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
         known, named = chosen.controller.outputs, f"airframe {flown.name}"

@@ -21,7 +21,7 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller import law
 from rise_di_controller.decomposition import decompose
-from rise_di_controller.law import LawParams, LawState, Sign
+from rise_di_controller.law import LawParams, LawState, Sign, total_lag
 
 LEAST_K = 1.5
 """1/s. (22) wants K > 1; a slower channel is given this K and inputs of as much less response, which is the same loop."""
@@ -231,8 +231,8 @@ class Loop(NamedTuple):
 
     @property
     def total(self) -> FloatArray:
-        """Lag of the loop: actuator + 1.5 period (sampling and hold) + delay, shape (m,), s."""
-        return np.asarray(self.lag + 1.5 * self.period + self.delay)
+        """Lag of the loop, shape (m,), s."""
+        return np.asarray(total_lag(self.lag, self.delay, self.period))
 
 
 class Selected(NamedTuple):

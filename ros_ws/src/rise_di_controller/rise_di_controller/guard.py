@@ -12,7 +12,9 @@ from array_api_compat import array_namespace
 from flight_core.freshness import fade
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
+from rise_di_controller import feedforward
 from rise_di_controller import law as rise
+from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.law import LawParams, LawState
 
 
@@ -43,7 +45,7 @@ class Limits(NamedTuple):
 
 
 class GuardParams(NamedTuple):
-    """Times in ns, and the limits."""
+    """Times in ns, the limits, and the nominal model of the feedforward."""
 
     period_ns: int  # of the controller's ticks
     max_age_ns: int  # beyond which a sample is stale
@@ -51,6 +53,7 @@ class GuardParams(NamedTuple):
     ramp_ns: int  # and how long it takes to trim
     deactivation_holds: bool  # whether u is held when deactivated, else it ramps to trim
     limits: Limits
+    nominal: Nominal | None = None  # None: no feedforward
 
 
 # A measured dt is used as it is between these multiples of the period: lost ticks are integrated in full (at half of them
@@ -71,6 +74,8 @@ class ControllerState(NamedTuple):
     u_trim: FloatArray  # u at engagement, to which the law adds
     lost_ns: int  # when the inputs were lost, or the controller deactivated
     u_lost: FloatArray  # u at that instant
+    u_ff: FloatArray  # what the feedforward adds, 0 where there is none
+    feedforward: FeedforwardState | None = None
 
 
 class Used(NamedTuple):
@@ -86,7 +91,7 @@ class Used(NamedTuple):
 def start(m: int) -> ControllerState:
     """The state before the first sample: u = 0."""
     zero = np.zeros(m)
-    return ControllerState(Mode.WAITING, None, None, None, zero, zero, zero, 0, zero)
+    return ControllerState(Mode.WAITING, None, None, None, zero, zero, zero, 0, zero, zero)
 
 
 def align(samples: Sequence[Sample], stamp_ns: int, reach_ns: int) -> FloatArray | None:
@@ -157,7 +162,8 @@ def tick(
     """One tick of the controller: (state, now, y, y_m) -> (state, what was used), u in state.u.
 
     Fresh inputs engage it, at any time, with e_0 = e, both integrals 0 and u_trim = u as it was: u does not jump. Each
-    further sample is one step of the law with the measured dt, held inside DT_RANGE periods; without a new y nothing changes.
+    further sample is one step of the law with the measured dt, held inside DT_RANGE periods, from u_trim, or u_trim + u_ff
+    where there is a feedforward; without a new y nothing changes.
     Stale inputs: HOLD (u kept, nothing integrated), then RAMP to trim, then TRIM; fresh ones engage it again. Not `active`:
     INACTIVE, u held or ramped to trim as the parameters say. None is returned where nothing is to be published.
 
@@ -171,15 +177,26 @@ def tick(
     offset = seconds(y_m[-1].stamp_ns - y.stamp_ns)
     if state.law is None or state.y is None or state.mode is not Mode.ENGAGED:
         engaged = state._replace(
-            mode=Mode.ENGAGED, law=rise.engage(y.value, reference), y=y, y_m=reference, u_trim=state.u, u_free=state.u
+            mode=Mode.ENGAGED,
+            law=rise.engage(y.value, reference),
+            y=y,
+            y_m=reference,
+            u_trim=state.u,
+            u_free=state.u,
+            u_ff=np.zeros_like(state.u),
+            feedforward=None if guard.nominal is None else feedforward.start(reference, guard.nominal),
         )
         return engaged, Used(y.stamp_ns, y.value, reference, offset, 0.0)
     if y.stamp_ns <= state.y.stamp_ns:
         return state, None
     nominal = seconds(guard.period_ns)
     dt = min(max(seconds(y.stamp_ns - state.y.stamp_ns), DT_RANGE[0] * nominal), DT_RANGE[1] * nominal)
-    law_state, u_free, u = guarded_step(state.law, y.value, reference, dt, state.u_trim, state.u, law, guard.limits)
-    flown = state._replace(law=law_state, y=y, y_m=reference, u=u, u_free=u_free)
+    u_trim, u_ff, ahead = state.u_trim, state.u_ff, state.feedforward
+    if guard.nominal is not None and ahead is not None:
+        ahead, u_ff = feedforward.step(ahead, reference, dt, guard.nominal)
+        u_trim = u_trim + u_ff
+    law_state, u_free, u = guarded_step(state.law, y.value, reference, dt, u_trim, state.u, law, guard.limits)
+    flown = state._replace(law=law_state, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ahead)
     return flown, Used(y.stamp_ns, y.value, reference, offset, dt)
 
 

@@ -12,7 +12,7 @@ from rise_di_controller.guard import ControllerState, Limits, Used
 
 SCALARS = ("mode", "dt", "y_m_offset", "late", "age")
 OUTPUT_GROUPS = ("y", "y_m", "e", "integral_e", "Pi")
-INPUT_GROUPS = ("u_free", "u", "u_trim", "limited")
+INPUT_GROUPS = ("u_free", "u", "u_trim", "limited", "u_ff")
 
 
 class Limited(IntEnum):
@@ -27,7 +27,8 @@ def names(outputs: Sequence[str], inputs: Sequence[str]) -> tuple[str, ...]:
     """Channel names of `internals`: the scalars, then "group.output" and "group.input".
 
     mode (guard.Mode), dt (s), y_m_offset (s), late (s, the tick after its deadline), age (s, of y at the tick); y and y_m as
-    used, e = y - y_m, integral_e (units s), Pi (scaled input); u before (u_free) and after limits, u_trim, limited (Limited).
+    used, e = y - y_m, integral_e (units s), Pi (scaled input); u before (u_free) and after limits, u_trim, limited (Limited),
+    u_ff (what the feedforward adds to u_trim + the law's u).
     """
     by_output = (f"{group}.{name}" for group in OUTPUT_GROUPS for name in outputs)
     by_input = (f"{group}.{name}" for group in INPUT_GROUPS for name in inputs)
@@ -42,4 +43,4 @@ def values(state: ControllerState, used: Used, limits: Limits, late: float, age:
     inside = (state.u_free >= limits.lower) & (state.u_free <= limits.upper)
     limited = np.where(state.u == state.u_free, Limited.NO, np.where(inside, Limited.RATE, Limited.MAGNITUDE))
     by_output = (used.y, used.y_m, state.law.e, state.law.integral_e, state.law.Pi)
-    return np.concatenate([scalars, *by_output, state.u_free, state.u, state.u_trim, limited])
+    return np.concatenate([scalars, *by_output, state.u_free, state.u, state.u_trim, limited, state.u_ff])

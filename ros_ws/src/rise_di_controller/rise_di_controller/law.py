@@ -50,6 +50,11 @@ def gain(k_g: Array, k_d: Array) -> Array:
     return 1.0 + k_g + xp.concat([k_d, xp.zeros(1, dtype=k_d.dtype)])
 
 
+def total_lag(lag: Array, delay: float, period: float) -> Array:
+    """Lag from y to what the actuators do: actuator + 1.5 period (sampling and hold) + delay, shape of `lag`, s."""
+    return lag + 1.5 * period + delay
+
+
 def engage(y: Array, y_m: Array) -> LawState:
     """State at the instant of engagement: e_0 = y - y_m, integral_e = 0, Pi = 0, so that u = 0 there."""
     xp = array_namespace(y)

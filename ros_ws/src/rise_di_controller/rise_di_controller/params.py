@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the controller, validated once, and the arrays that the law takes."""
 
+from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from flight_core.parameters import (
     NonNegative,
     NonNegatives,
     Numbers,
+    ParameterError,
     Parameters,
     Positive,
     Positives,
@@ -21,9 +23,43 @@ from flight_core.parameters import (
     require_length,
 )
 from flight_core.rates import nanoseconds, period_ns
-from flight_core.vectors import FloatArray
-from rise_di_controller.guard import GuardParams, Limits
-from rise_di_controller.law import LawParams, Sign, gain
+from rise_di_controller.decomposition import DecompositionError, signs
+from rise_di_controller.feedforward import ORIGIN, Nominal, zero_dynamics
+from rise_di_controller.guard import DT_RANGE, GuardParams, Limits
+from rise_di_controller.law import LawParams, Sign, gain, total_lag
+
+LONGEST_STEP = 2.5
+"""A tick of Runge-Kutta times the fastest zero: up to 2.78 it is stable, here with the longest dt that the law is given."""
+
+
+class FeedforwardParameters(Parameters):
+    """The nominal model of the feedforward, an extension of the paper; SI, matrices row by row."""
+
+    states: Names = Field(description="the states of the nominal model, the outputs among them")
+    A: Numbers = Field(description="A, a row a state")
+    B: Numbers = Field(description="B, a row a state, the columns in the order of controller.inputs")
+    gravity: Numbers | None = Field(default=None, description="sine terms, x_dot += gravity sin(x), a row a state")
+    lead: NonNegatives = Field(description="from a tick to the instant its input acts at, s: half a period, delay and lag")
+
+    def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
+        """The arrays of the feedforward. Raises ParameterError for sizes that do not fit, and for a C B with another D."""
+        n, m = len(self.states), len(outputs)
+        for name in outputs:
+            require(self.states.count(name) == 1, "feedforward.states", ", ".join(self.states), f"the output {name} once")
+        for key, columns in (("A", n), ("B", m), ("gravity", n)):
+            values = getattr(self, key)
+            fits = values is None or len(values) == n * columns
+            require(fits, f"feedforward.{key}", f"{len(values or ())} values", f"{n * columns}: {n} rows of {columns}")
+        require_length("feedforward.lead", self.lead, inputs)
+        A, B = np.reshape(self.A, (n, n)), np.reshape(self.B, (n, m))
+        gravity = np.zeros((n, n)) if self.gravity is None else np.reshape(self.gravity, (n, n))
+        C = np.array([[float(state == name) for state in self.states] for name in outputs])
+        try:
+            found = [int(sign) for sign in signs(C @ B)]
+        except DecompositionError as error:
+            raise ParameterError(f"feedforward.B: found a C B without a D ({error}), expected D = {list(D)}") from None
+        require(found == list(D), "feedforward.B", f"a C B with D = {found}", f"D = {list(D)}, that of the controller")
+        return Nominal(A, B, C, gravity, np.linalg.inv(C @ B), np.array(self.lead))
 
 
 class ControllerParameters(Parameters):
@@ -55,6 +91,9 @@ class ControllerParameters(Parameters):
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s; none where absent")
     on_deactivate: Literal["trim", "hold"] = Field(default="trim", description="where u goes when deactivated")
     autostart: bool = Field(default=True, description="configure and activate at start, without waiting to be told")
+    feedforward: FeedforwardParameters | None = Field(
+        default=None, description="an extension of the paper: the input of a nominal model along y_m is added; off where absent"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -69,7 +108,23 @@ class ControllerParameters(Parameters):
             require(low < high, f"lower[{i}]", low, f"less than upper[{i}] = {high:g}")
         for i, sign in enumerate(self.D):
             require(sign in (-1, 1), f"D[{i}]", sign, "+1 or -1")
+        nominal = self.nominal()
+        if nominal is not None:
+            self._check_nominal(nominal)
         return self
+
+    def _check_nominal(self, nominal: Nominal) -> None:
+        zeros = zero_dynamics(nominal)
+        rightmost, fastest = float(np.max(zeros.real, initial=-np.inf)), float(np.max(np.abs(zeros), initial=0.0))
+        stable = "none in the right half plane: along them u_ff grows without bound"
+        require(rightmost <= ORIGIN, "feedforward.A", f"zero dynamics with an eigenvalue at {rightmost:.3g} 1/s", stable)
+        limit = LONGEST_STEP / DT_RANGE[1] * self.rate
+        slow = f"at most {limit:.3g} 1/s, which ticks of {self.rate:g} Hz can follow"
+        require(fastest <= limit, "feedforward.A", f"zero dynamics as fast as {fastest:.3g} 1/s", slow)
+
+    def nominal(self) -> Nominal | None:
+        """The arrays of the feedforward, None where there is none."""
+        return None if self.feedforward is None else self.feedforward.nominal(self.outputs, self.inputs, self.D)
 
     def law(self) -> LawParams:
         """The arrays of the law."""
@@ -81,13 +136,9 @@ class ControllerParameters(Parameters):
             D=np.array(self.D, dtype=np.float64),
             input_scale=np.array(self.input_scale),
             omega=np.array(self.omega),
-            eps=np.array(self.beta) / K * self.softening * self.total_lag(),
+            eps=np.array(self.beta) / K * self.softening * total_lag(np.array(self.lag), self.delay, 1.0 / self.rate),
             sign=self.sampled_sign()[0],
         )
-
-    def total_lag(self) -> FloatArray:
-        """Lag from y to the actuators by channel, shape (m,), s: actuator + 1.5 period (sampling and hold) + delay."""
-        return np.array(self.lag) + 1.5 / self.rate + self.delay
 
     def sampled_sign(self) -> tuple[Sign, str]:
         """How the sign is sampled, and why, as a sentence."""
@@ -99,7 +150,7 @@ class ControllerParameters(Parameters):
         return Sign.SOFT, f"softened sign, because lag and delay of {lag:g} s reach half a period ({half:g} s)"
 
     def guard(self) -> GuardParams:
-        """Period, freshness and limits."""
+        """Period, freshness, limits and the nominal model."""
         none = (np.inf,) * len(self.inputs)
         return GuardParams(
             period_ns=period_ns(self.rate, "rate"),
@@ -112,4 +163,5 @@ class ControllerParameters(Parameters):
                 np.array(self.upper or none),
                 np.array(self.slew or none),
             ),
+            nominal=self.nominal(),
         )
