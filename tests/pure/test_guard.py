@@ -241,6 +241,24 @@ def test_integrals_stop_only_in_the_direction_that_worsens_saturation(state: Law
         assert (taken == np.where(outward, old, given_up)).all(), part
 
 
+@given(state=STATES, y=PAIRS, before=PAIRS)
+def test_beyond_a_rate_limit_integrals_keep_the_share_that_ends_at_it(
+    state: LawState, y: FloatArray, before: FloatArray
+) -> None:
+    limits = Limits(np.full(2, -np.inf), np.full(2, np.inf), np.full(2, 10.0))
+    zero, dt = np.zeros(2), np.array(0.01)
+    free, u = step(state, y, zero, dt, TWO)
+    guarded, u_free, limited = guard.guarded_step(state, y, zero, dt, zero, before, TWO, limits)
+    beyond = u - guard.limit(u, before, dt, limits)
+    for taken, given_up, old in ((guarded.integral_e, free.integral_e, state.integral_e), (guarded.Pi, free.Pi, state.Pi)):
+        inward = -TWO.D * (given_up - old) * beyond <= 0
+        assert (taken == np.where(inward, given_up, taken)).all()
+        assert (np.minimum(old, given_up) - 1e-9 <= taken).all()
+        assert (taken <= np.maximum(old, given_up) + 1e-9).all()
+    # never cut inside the limit: u stays beyond it, or ends at it but for rounding
+    assert ((u_free - limited) * np.sign(beyond) >= -1e-9 * (1.0 + np.abs(u) + np.abs(before))).all()
+
+
 @given(state=STATES, k=st.floats(0.5, 50), Lambda=st.floats(0.1, 10), scale=st.floats(0.1, 10))
 def test_new_gains_leave_the_input_where_it_was(state: LawState, k: float, Lambda: float, scale: float) -> None:
     new = TWO._replace(K=TWO.K * k, Lambda=TWO.Lambda * Lambda, input_scale=TWO.input_scale * scale, beta=TWO.beta * 2)

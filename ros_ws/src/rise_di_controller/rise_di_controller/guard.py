@@ -133,18 +133,29 @@ def guarded_step(
 ) -> tuple[LawState, Array, Array]:
     """One tick of the law inside its limits: (law state, u before limits, u commanded), all shape (m,).
 
-    The law takes its step. Where u_trim + u is beyond a limit of magnitude or rate, the increment of an integral (of
-    integral_e and of Pi, each by itself) that moves u further beyond is taken back; one that moves it inwards stays.
+    The law takes its step. Where u_trim + u is beyond a limit, the increments of the integrals (of integral_e and of Pi, each
+    by itself) that move u further beyond are cut; those that move it inwards stay. Beyond a limit of magnitude they are
+    taken back whole; beyond a limit of rate, which u reaches in the next ticks, they keep the share that ends at it:
+
+        keep = max(1 - abs(beyond) / abs(what the outward increments move u by), 0)
+
     Without saturation every bit is that of the law alone. Theorem 1 does not speak of limits.
     """
     xp = array_namespace(y)
     after, u = rise.step(state, y, y_m, dt, law)
-    beyond = u_trim + u - limit(u_trim + u, u_before, dt, limits)
-    outward_integral = -law.D * (after.integral_e - state.integral_e) * beyond > 0
-    outward_Pi = -law.D * (after.Pi - state.Pi) * beyond > 0
+    total = u_trim + u
+    beyond = total - limit(total, u_before, dt, limits)
+    increment, increment_Pi = after.integral_e - state.integral_e, after.Pi - state.Pi
+    moves = -law.input_scale * law.D * law.K * law.Lambda * increment
+    moves_Pi = -law.input_scale * law.D * increment_Pi
+    outward, outward_Pi = moves * beyond > 0, moves_Pi * beyond > 0
+    none = xp.zeros_like(total)
+    moved = xp.abs(xp.where(outward, moves, none) + xp.where(outward_Pi, moves_Pi, none))
+    keep = xp.maximum(1.0 - xp.abs(beyond) / xp.where(moved > 0, moved, none + 1.0), none)
+    keep = xp.where((total < limits.lower) | (total > limits.upper), none, keep)
     after = after._replace(
-        integral_e=xp.where(outward_integral, state.integral_e, after.integral_e),
-        Pi=xp.where(outward_Pi, state.Pi, after.Pi),
+        integral_e=xp.where(outward, state.integral_e + keep * increment, after.integral_e),
+        Pi=xp.where(outward_Pi, state.Pi + keep * increment_Pi, after.Pi),
     )
     u_free = u_trim + rise.control(state, after, law)
     return after, u_free, limit(u_free, u_before, dt, limits)
