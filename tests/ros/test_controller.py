@@ -86,6 +86,7 @@ def test_stale_inputs_are_held_ramped_to_trim_and_engaged_again(start: Start, os
         ("wrong names", to_message(0, ("q", "V", "p", "x"), np.zeros(4), "bad"), "y: name"),
         ("wrong length", JointState(name=list(OUTPUTS), position=[1.0]), "y: length"),
         ("an old stamp", to_message(1, OUTPUTS, np.full(4, 99.0), "bad"), "y: order"),
+        ("a stamp to come", to_message(time.time_ns() + 3600 * 10**9, OUTPUTS, np.full(4, 99.0), "bad"), "y: future"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -126,6 +127,16 @@ def test_gains_change_in_flight_without_a_jump(start: Start, osprey_gust: Scenar
     law = osprey_gust.vary(controller={"k_g": 3.0}).controller.law()
     step = law.input_scale * (law.K * law.Lambda * 0.011 + law.beta) * 0.03 + law.input_scale * law.K * 0.001
     assert (np.abs(np.diff(u, axis=0)) <= step + 1e-9).all()
+
+
+def test_limits_that_were_not_given_can_be_set_in_flight(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+    controller(start, osprey_gust)
+    engage(someone)
+    assert set_parameters(someone, upper=[0.001, 0.001, 0.001, 0.001]) == (True, "")
+    someone.heard["u"].clear()
+    someone.until(lambda: len(someone.u()) and (someone.u()[-1] == 0.001).all(), each=lambda: someone.send(-0.2))
+    assert someone.u().max() == 0.001
+    assert not set_parameters(someone, upper=[-1.0, 1.0, 1.0, 1.0])[0]  # trim would be outside
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,13 @@ def test_a_missing_transport_profile_is_refused_before_anything_starts(start: St
     assert node.lines[0].startswith("error: FASTRTPS_DEFAULT_PROFILES_FILE: /nowhere/profile.xml cannot be read")
 
 
+@pytest.mark.parametrize("package", ["aircraft_sim", "reference_model"])
+def test_a_start_in_the_past_is_refused_not_caught_up_with(package: str, start: Start, osprey_gust: Scenario) -> None:
+    node = start(f"{package}.node", "--ros-args", "--params-file", str(osprey_gust.path), "-p", "start_time:=1000000.0")
+    assert node.end() == 2
+    assert any("start_time: found an instant" in line for line in node.lines)
+
+
 def test_a_recorder_that_cannot_write_says_where(start: Start, osprey_gust: Scenario) -> None:
     arguments = ("--params-file", str(osprey_gust.path), "-p", "directory:=/proc/nowhere")
     node = start("flight_recorder.node", "--ros-args", *arguments)

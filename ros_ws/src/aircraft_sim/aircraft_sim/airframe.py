@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
-import yaml
 from pydantic import BeforeValidator, Field, model_validator
 
-from flight_core.parameters import Names, Numbers, ParameterError, Parameters, Positive, as_tuple, require
+from flight_core.files import is_file, read_yaml
+from flight_core.parameters import Names, Numbers, Parameters, Positive, as_tuple, require
 from flight_core.units import SI_PER_UNIT
 from flight_core.vectors import FloatArray
 
@@ -112,10 +112,7 @@ def load_airframe(name: str) -> Airframe:
     """An airframe by its name in the library, or by the path of a file. Raises ParameterError."""
     path = Path(name) if name.endswith(".yaml") else LIBRARY / f"{name}.yaml"
     known = ", ".join(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
-    require(path.is_file(), "airframe", f"{name!r}", f"one of {known}, or the path of an airframe file ending in .yaml")
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ParameterError(f"airframe {path}: cannot be read ({' '.join(str(error).split())})") from None
+    require(is_file(path), "airframe", f"{name!r}", f"one of {known}, or the path of an airframe file ending in .yaml")
+    content = read_yaml(path, f"airframe {path}", "an airframe file")
     require(isinstance(content, dict), f"airframe {path}", type(content).__name__, "a mapping")
     return Airframe.validate_mapping(content, f"airframe {name}")

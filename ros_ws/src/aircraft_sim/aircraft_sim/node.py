@@ -8,7 +8,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from aircraft_sim import plant, truth
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.sensors import Underway, transmit
-from flight_core.rates import nanoseconds, period_ns
+from flight_core.outcome import FlightEnded
+from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError
 from flight_ros.messages import from_message, to_message
 from flight_ros.runtime import FlightNode, run
@@ -44,6 +45,8 @@ class AircraftNode(FlightNode[AircraftParameters]):
         share = self.parameters.commanded_share(now_ns - self._u_ns)
         u = self._u if share == 1.0 else share * self._u
         self._state = plant.advance(before_ns, self._state, u, t_ns - before_ns, self._plant)
+        if plant.diverged(self._state):
+            raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
         measured = plant.measure(tick.number, self._state, self._plant)
         self._underway, arrived = transmit(self._underway, now_ns, measured.y, self._plant.sensors)
         for sample in arrived:

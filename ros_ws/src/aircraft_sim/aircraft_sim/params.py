@@ -15,7 +15,7 @@ from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.plant import Plant
 from aircraft_sim.sensors import Sensors
 from flight_core.freshness import fade
-from flight_core.parameters import NonNegative, Parameters, Positive, as_tuple, require, require_length
+from flight_core.parameters import Parameters, Positive, as_tuple, require, require_length
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray
 
@@ -29,7 +29,7 @@ class Gust(Parameters):
 
 
 # One value a channel, or none at all for an ideal one. A limit may be infinite (.inf in YAML): none on that channel.
-NonNegatives = Annotated[tuple[Annotated[float, Field(ge=0)], ...], BeforeValidator(as_tuple)]
+NonNegativesOrNone = Annotated[tuple[Annotated[float, Field(ge=0)], ...], BeforeValidator(as_tuple)]
 Lower = Annotated[tuple[Annotated[float, Field(le=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
 Upper = Annotated[tuple[Annotated[float, Field(ge=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
 Rates = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
@@ -38,7 +38,7 @@ Rates = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...],
 class ActuatorParameters(Parameters):
     """The actuators, one value an input in the airframe's order; a list that is left out is that of ideal ones."""
 
-    lag: NonNegatives = Field(default=(), description="time constants of the first-order response, s, 0 where there is none")
+    lag: NonNegativesOrNone = Field(default=(), description="time constants of the first-order response, s, 0 where there is none")
     lower: Lower = Field(default=(), description="lower end stops, deviations from trim, SI")
     upper: Upper = Field(default=(), description="upper end stops, deviations from trim, SI")
     rate: Rates = Field(default=(), description="rate limits, SI per s")
@@ -47,26 +47,28 @@ class ActuatorParameters(Parameters):
 class SensorParameters(Parameters):
     """The sensors; as they stand by default they are ideal."""
 
-    noise: NonNegatives = Field(default=(), description="standard deviation of the noise per sample, one an output, SI")
-    delay: float = Field(default=0.0, ge=0, description="from a sample's instant to its arrival, s; whole periods of `rate`")
+    noise: NonNegativesOrNone = Field(default=(), description="standard deviation of the noise per sample, one an output, SI")
+    delay: float = Field(default=0.0, ge=0, le=1e6, description="from a sample's instant to its arrival, s; whole periods of `rate`")
     dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is lost")
-    seed: int = Field(default=1, ge=0, description="the seed of noise and losses")
+    seed: int = Field(default=1, ge=0, lt=2**128, description="the seed of noise and losses")
 
 
 class AircraftParameters(Parameters):
     """All parameters of the aircraft's node."""
 
     airframe: str = Field(description="the name of an airframe of the library, or the path of an airframe file")
-    rate: Annotated[float, Field(gt=0, le=1000)] = Field(description="the rate at which y is published and u taken, Hz")
-    step: Positive = Field(description="the integration step, s; a whole fraction of 1 / rate")
-    start_time: float = Field(default=0.0, ge=0, description="system time of t = 0, s since the epoch; 0 starts at once")
+    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y is published and u taken, Hz")
+    step: Annotated[float, Field(gt=0, le=1)] = Field(description="the integration step, s; a whole fraction of 1 / rate")
+    start_time: float = Field(
+        default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
+    )
     gusts: dict[str, Gust] = Field(default={}, description="gusts by their name in the airframe")
     actuators: ActuatorParameters = Field(default=ActuatorParameters(), description="the actuators, ideal where left out")
     sensors: SensorParameters = Field(default=SensorParameters(), description="the sensors, ideal where left out")
 
-    max_age: Positive = Field(default=0.2, description="how long without u until its controller counts as silent, s")
-    hold: NonNegative = Field(default=0.5, description="how long the last u is then held, s")
-    ramp: NonNegative = Field(default=2.0, description="how long it then takes to trim, s")
+    max_age: float = Field(default=0.2, gt=0, le=1e6, description="how long without u until its controller counts as silent, s")
+    hold: float = Field(default=0.5, ge=0, le=1e6, description="how long the last u is then held, s")
+    ramp: float = Field(default=2.0, ge=0, le=1e6, description="how long it then takes to trim, s")
 
     @model_validator(mode="after")
     def _check(self) -> Self:

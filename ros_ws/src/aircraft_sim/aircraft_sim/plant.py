@@ -15,6 +15,9 @@ from flight_core.integrators import rk4
 from flight_core.rates import divide, seconds
 from flight_core.vectors import Array
 
+LARGEST = 1e6
+"""SI. No state of an aircraft comes near it; a diverged loop passes it on its way to infinity."""
+
 
 class Plant(NamedTuple):
     """What flies."""
@@ -63,6 +66,12 @@ def advance(t_ns: int, state: AircraftState, u: Array, duration_ns: int, plant: 
         position = move(position, u, dt, plant.actuators)
         x = rk4(x_dot, seconds(t_ns + k * plant.step_ns), x, position, plant.aircraft, dt)
     return AircraftState(x, position)
+
+
+def diverged(state: AircraftState) -> bool:
+    """Whether a state is beyond anything that flies: not finite, or above LARGEST in any component."""
+    xp = array_namespace(state.x)
+    return not bool(xp.all(xp.abs(state.x) < LARGEST))  # False for NaN too
 
 
 def measure(number: int, state: AircraftState, plant: Plant) -> Measured:

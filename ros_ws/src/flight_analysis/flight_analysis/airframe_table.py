@@ -60,6 +60,7 @@ class AirframeFacts(NamedTuple):
     pairing: Pairing | None  # the smallest change that gives D = I
     zero_dynamics: ZeroDynamics
     controllable: bool  # Assumption 1
+    integrated: tuple[str, ...]  # states that integrate outputs and nothing else: a zero at the origin each
 
     @property
     def in_theorem(self) -> bool:
@@ -107,6 +108,11 @@ def airframe_facts(airframe: Airframe) -> AirframeFacts:
         pairing=search(Omega),
         zero_dynamics=zero_dynamics(zeros),
         controllable=controllable(A, B),
+        integrated=tuple(
+            state
+            for state, row, drive, hidden in zip(airframe.states, A, B, ~C.any(axis=0), strict=True)
+            if hidden and not drive.any() and not row[~C.any(axis=0)].any()
+        ),
     )
 
 

@@ -5,6 +5,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from flight_analysis.bag_reader import JOINT_STATE
@@ -31,7 +32,7 @@ def write_run(tape: Tape, directory: Path, scenario_file: Path) -> Path:
         bag.attach(scenario_file.name, "application/yaml", scenario_file.read_bytes(), tape.start_ns)
         for name, _ in signals:
             bag.add_topic(f"/{name}", JOINT_STATE, "")
-        none = signals[0][1].values[0][:0]
+        none = np.zeros(0)
         for stamp_ns, place, index in rows:
             name, signal = signals[place]
             stamp = time(sec=stamp_ns // NANOSECONDS, nanosec=stamp_ns % NANOSECONDS)

@@ -440,7 +440,7 @@ def judge(found: Study, controller: ControllerParameters, setting: Setting) -> A
     """Every condition on a gain set. Rate, lag and delay are the controller's own; gamma_2 and rate limits of the setting.
 
     Theorem: D and stable zero dynamics as parts of the samples where they hold; (29), (30), steps 2 and 3 with bounds that
-    are the largest over the samples where both hold; "V1_dot (32)" is the least eigenvalue of Q in V1_dot = -z'Qz, over the
+    are the largest over the samples where both hold; "V2_dot" is the least eigenvalue of Q in V2_dot = -z'Qz, over the
     same samples: what steps 2 and 3 are sufficient for. Loop: `check_loop`, and the linear loop: the part of the samples
     where it is stable, and its delay margin on the nominal airframe, which should outlast one lost tick. With the implicit
     sign the linear loop is that inside its width, dt^2 omega beta: what its margin tells is when chatter begins, and no more
@@ -462,7 +462,7 @@ def judge(found: Study, controller: ControllerParameters, setting: Setting) -> A
         Condition("D (11)", None, float(np.mean(holds)), 1.0),
         Condition("zero dynamics", None, float(np.mean(found.stable)), 1.0),
         *procedure.check(gains, bounds),
-        Condition("V1_dot (32)", None, least, 0.0),
+        Condition("V2_dot", None, least, 0.0, strict=True),
     )
     responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
     rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)

@@ -26,7 +26,7 @@ class TickFigures(NamedTuple):
     """How regularly the controller ticked; times in s."""
 
     ticks: int
-    missed: int
+    without_new_y: int  # periods of the controller in which it took no step: no new y had come, or the tick was missed
     period_mean: float
     period_p99: float
     period_max: float
@@ -36,7 +36,7 @@ class TickFigures(NamedTuple):
 
 
 def tracking_error(tape: Tape) -> Signal:
-    """E = y - y_m at every y whose stamp y_m has too or spans (linear between samples), shape (N, m), channels of y.
+    """Error e = y - y_m at every y whose stamp y_m has too or spans (linear between samples), shape (N, m), channels of y.
 
     It is the error that the law sees: the sensors' noise is part of it.
     """
@@ -44,7 +44,7 @@ def tracking_error(tape: Tape) -> Signal:
 
 
 def true_error(tape: Tape) -> Signal | None:
-    """C x - y_m at every sample of `truth` that y_m has too or spans, shape (N, m), channels of y.
+    """True error C x - y_m at every sample of `truth` that y_m has too or spans, shape (N, m), channels of y.
 
     It is the error that the aircraft makes, without the sensors' own, and also at samples that were lost. None where the tape
     has no "x.output" in `truth` for each channel of y; only a simulation knows it.
@@ -83,7 +83,7 @@ def in_windows(t: FloatArray, windows: Windows, settle: float) -> NDArray[np.boo
 
 
 def error_figures(errors: FloatArray) -> ErrorFigures:
-    """sqrt(mean e^2) and max abs(e) of samples of shape (N,); NaN where N = 0."""
+    """Root mean square sqrt(mean e^2) and max abs(e) of samples of shape (N,); NaN where N = 0."""
     if len(errors) == 0:
         return ErrorFigures(float("nan"), float("nan"))
     return ErrorFigures(float(np.sqrt(np.mean(errors**2))), float(np.max(np.abs(errors))))
@@ -101,7 +101,8 @@ def error_table(tape: Tape, gusts: Windows, settle: float = 1.0) -> dict[str, di
 def tick_figures(tape: Tape, period_ns: int) -> TickFigures | None:
     """Figures of the controller's ticks from `internals`, None where there are fewer than two.
 
-    The instant of a tick is its deadline plus "late"; deadlines are told apart by stamp + "age" - "late".
+    The instant of a tick is stamp + "age", which is its deadline plus "late". Only a tick with a new y is in `internals`, so a
+    period without one is counted alike whether y did not come or the tick was missed.
     """
     internals = tape["internals"]
     if len(internals.stamp_ns) < 2:
@@ -112,7 +113,7 @@ def tick_figures(tape: Tape, period_ns: int) -> TickFigures | None:
     elapsed = round(float(instants[-1] - instants[0]) / period_ns)
     return TickFigures(
         ticks=len(instants),
-        missed=max(elapsed + 1 - len(instants), 0),
+        without_new_y=max(elapsed + 1 - len(instants), 0),
         period_mean=seconds(int(periods.mean())),
         period_p99=seconds(int(np.percentile(periods, 99))),
         period_max=seconds(int(periods.max())),

@@ -6,17 +6,20 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import plotly.graph_objects as go
+from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from flight_analysis.metrics import tracking_error
 from flight_analysis.scenario import Scenario
 from flight_analysis.summary import Shown, shown_units
 from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
 
 PLANT, REFERENCE, ERROR = "#123c52", "#f6a85f", "#8b1f4f"
 GUST = "#7f7f7f"
-MOST_POINTS = 6000  # a trace; 100 Hz over a minute
+MOST_POINTS = 6000  # of a trace; 100 Hz over a minute
 
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
@@ -64,9 +67,19 @@ def write_report(path: Path, scenario: Scenario, tape: Tape, summary: dict[str, 
 
 
 def tracking_picture(tape: Tape, units: dict[str, Shown], gusts: dict[str, tuple[float, float]]) -> go.Figure:
-    """Y over y_m for every channel, the gusts marked."""
+    """Picture of y over y_m for every channel, the gusts marked."""
     signals = {"y_m": (tape["y_m"], REFERENCE), "y": (tape["y"], PLANT)}
     return _stack(tape, "Output y over the reference y_m", signals, units, gusts)
+
+
+def drawn_points(values: FloatArray, most: int = MOST_POINTS) -> NDArray[np.int64]:
+    """Places of at most `most` >= 2 samples to draw of values of shape (N,): all, else the smallest and largest of each bin."""
+    if len(values) <= most:
+        return np.arange(len(values))
+    edges = np.linspace(0, len(values), most // 2 + 1).astype(np.int64)
+    bins = zip(edges[:-1], edges[1:], strict=True)
+    extremes = [start + extreme(values[start:stop]) for start, stop in bins for extreme in (np.argmin, np.argmax)]
+    return np.unique(np.array(extremes, dtype=np.int64))
 
 
 def _stack(
@@ -82,7 +95,7 @@ def _stack(
     for row, channel in enumerate(channels, start=1):
         unit, factor = units[channel]
         for label, (signal, colour) in signals.items():
-            keep = slice(None, None, max(1, len(signal.stamp_ns) // MOST_POINTS))
+            keep = drawn_points(signal[channel])
             figure.add_trace(
                 go.Scattergl(
                     x=((signal.stamp_ns - tape.start_ns) / 1e9)[keep],
@@ -143,7 +156,7 @@ def _tick_table(summary: dict[str, Any]) -> str:
         f"<tr><td>{name}</td><td>{value}</td></tr>"
         for name, value in (
             ("ticks", ticks["ticks"]),
-            ("missed", ticks["missed"]),
+            ("periods without a new y", ticks["without_new_y"]),
             ("period mean / p99 / max (ms)", " / ".join(f"{ticks[f'period_{k}'] * 1e3:.3f}" for k in ("mean", "p99", "max"))),
             ("after the deadline p99 / max (ms)", " / ".join(f"{ticks[f'late_{k}'] * 1e3:.3f}" for k in ("p99", "max"))),
             ("age of y p99 (ms)", f"{ticks['age_p99'] * 1e3:.3f}"),

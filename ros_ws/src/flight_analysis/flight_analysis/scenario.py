@@ -5,12 +5,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from aircraft_sim.params import AircraftParameters
-from flight_core.parameters import Parameters, Positive, require
+from flight_core.parameters import Parameters, require
 from flight_core.rates import period_ns
 from flight_core.scenario import read_sections
 from flight_recorder.params import RecorderParameters
@@ -21,7 +21,7 @@ from rise_di_controller.params import ControllerParameters
 class FlightParameters(Parameters):
     """What whoever runs the scenario needs to know."""
 
-    duration: Positive = Field(description="how long to fly, s")
+    duration: Annotated[float, Field(gt=0, le=1e6)] = Field(description="how long to fly, s")
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
         require(topic in tape, "the log", f"no sample of {topic}", "a flight with y and y_m")
     errors = error_table(tape, scenario.gust_windows())
     ticks = tick_figures(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
-    flown = float(tape.time("y")[-1]) if "y" in tape and len(tape["y"].stamp_ns) else 0.0
+    flown = float(tape.time("y")[-1]) if len(tape["y"].stamp_ns) else 0.0
     return {
         "scenario": scenario.name,
         "outcome": outcome,

@@ -13,6 +13,10 @@ from rich.table import Table
 from flight_analysis.airframe_table import AirframeFacts, ComplexArray, library
 
 
+FOLDED = ("poles", "zeros at", "minors")
+"""Columns that take more lines where there is no room."""
+
+
 def airframes(
     as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON, nothing else.")] = False,
 ) -> None:
@@ -22,29 +26,35 @@ def airframes(
         print(json.dumps([_plain(one) for one in facts]))
         return
     console = Console()
-    signs = _table("Signs and pairing", ("airframe", "n, m", "D", "for D = I", "coupling", "zeros"))
+    signs = _table("Signs and pairing", ("airframe", "D", "for D = I", "coupling"))
     for one in facts:
         signs.add_row(
             one.name,
-            f"{one.n}, {one.m}",
-            "none" if one.D is None else " ".join(f"{int(sign):+d}" for sign in one.D),
+            "none" if one.D is None else " ".join("+" if sign > 0 else "-" for sign in one.D),
             one.remedy,
             "-" if one.coupling is None else f"{one.coupling:.3g}",
-            one.zero_dynamics,
         )
     console.print(signs)
-    roots = _table("Poles and zeros in 1/s, leading minors of C B in SI", ("airframe", "poles", "zeros", "minors"))
+    asked = _table("Assumptions 1 and 3", ("airframe", "n, m", "controllable", "zeros", "integrated"))
+    for one in facts:
+        yes = "yes" if one.controllable else "no"
+        asked.add_row(one.name, f"{one.n}, {one.m}", yes, one.zero_dynamics, ", ".join(one.integrated) or "-")
+    console.print(asked)
+    roots = _table("Poles and zeros in 1/s, leading minors of C B in SI", ("airframe", "poles", "zeros at", "minors"))
     for one in facts:
         roots.add_row(one.name, _shown(one.poles), _shown(one.zeros), "  ".join(f"{minor:.3g}" for minor in one.minors))
     console.print(roots)
     outside = [one.name for one in facts if not one.in_theorem]
-    console.print(f"Outside the theorem: {', '.join(outside) or 'none'}. Coupling is max abs(U - I).")
+    console.print(f"Outside the theorem: {', '.join(outside) or 'none'}. Coupling is max abs(U - I).", soft_wrap=True)
+    integrated = ", ".join(dict.fromkeys(state for one in facts for state in one.integrated))
+    if integrated:
+        console.print(f"marginal: {integrated} integrate the outputs and need an outer loop.", soft_wrap=True)
 
 
 def _table(title: str, headings: tuple[str, ...]) -> Table:
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in headings:
-        table.add_column(heading, no_wrap=heading in {"n, m", "D", "for D = I", "coupling", "zeros"}, overflow="fold")
+        table.add_column(heading, no_wrap=heading not in FOLDED, overflow="fold")
     return table
 
 
@@ -65,6 +75,7 @@ def _plain(one: AirframeFacts) -> dict[str, Any]:
         "m": one.m,
         "poles": [[root.real, root.imag] for root in one.poles],
         "zeros": [[root.real, root.imag] for root in one.zeros],
+        "integrated": list(one.integrated),
         "zero_dynamics": str(one.zero_dynamics),
         "minors": one.minors.tolist(),
         "D": None if one.D is None else [int(sign) for sign in one.D],

@@ -2,6 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The `rise-di` command."""
 
+import signal
+
+# Until the command runs, Ctrl-C ends it without a word: the imports below take a second.
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import json
 import sys
 from pathlib import Path
@@ -18,9 +23,11 @@ from flight_bringup import fly as flying
 from flight_bringup.airframes_command import airframes
 from flight_bringup.gains_command import gains
 from flight_bringup.scenarios import find_scenario
+from flight_core import outcome as ends
 from flight_core.parameters import ParameterError
 
 BAD_INPUT, ENDED_EARLY, INTERRUPTED = 2, 3, 130
+STATUS = {ends.COMPLETED: 0, ends.INTERRUPTED: INTERRUPTED}
 
 app = typer.Typer(
     help="Fly, record and analyse RISE dynamic inversion.",
@@ -60,14 +67,16 @@ def fly(
         outcome = method(chosen, run, progress)
         if outcome == "completed":
             progress(chosen.flight.duration, outcome)
-    status = {"completed": 0, "interrupted": INTERRUPTED}.get(outcome, ENDED_EARLY)
+    status = STATUS.get(outcome, ENDED_EARLY)
     try:
         flown = flying.conclude(run, outcome)
-    except ParameterError as error:
+    except ParameterError:
         if status == 0:
             raise
-        print(f"error: {outcome} before anything was flown ({error})", file=sys.stderr)
+        print(f"error: {outcome} before anything was flown; see {_short(run / 'log')}", file=sys.stderr)
         raise typer.Exit(status) from None
+    outcome = flown.summary["outcome"]
+    status = STATUS.get(outcome, ENDED_EARLY)
     if as_json:
         print(json.dumps(flown.summary))
     else:
@@ -103,10 +112,11 @@ def show(console: Console, summary: dict[str, Any], units: dict[str, Shown]) -> 
         table.add_row(f"{channel} ({unit})", *cells)
     console.print(table)
     if (ticks := summary["ticks"]) is not None:
+        ms = {key: f"{value * 1e3:.3f}" for key, value in ticks.items()}
         console.print(
-            f"ticks: {ticks['ticks']}, missed {ticks['missed']}; period mean {ticks['period_mean'] * 1e3:.3f} ms,"
-            f" p99 {ticks['period_p99'] * 1e3:.3f}, max {ticks['period_max'] * 1e3:.3f};"
-            f" late p99 {ticks['late_p99'] * 1e3:.3f} ms, max {ticks['late_max'] * 1e3:.3f}",
+            f"ticks: {ticks['ticks']}, {ticks['without_new_y']} without a new y;"
+            f" period mean {ms['period_mean']} ms, p99 {ms['period_p99']}, max {ms['period_max']};"
+            f" late p99 {ms['late_p99']} ms, max {ms['late_max']}",
             highlight=False,
         )
     for note in summary["notes"]:
@@ -123,6 +133,7 @@ def _short(path: Path) -> str:
 
 def main() -> None:
     """Entry point: bad input is one sentence and exit status 2, Ctrl-C is quiet."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         app()
     except ParameterError as error:

@@ -21,8 +21,8 @@ from flight_analysis.scenario import Scenario, load_scenario
 from flight_analysis.simulate import simulate
 from flight_analysis.summary import shown_units, summarise
 from flight_bringup.processes import Flight
+from flight_core.outcome import COMPLETED, INTERRUPTED
 from flight_core.parameters import ParameterError
-from flight_core.rates import nanoseconds
 from flight_core.tape import Tape
 
 POLL_PERIOD = 0.05  # s, of the progress bar
@@ -80,30 +80,31 @@ def fly_over_topics(scenario: Scenario, run: Path, progress: Progress) -> str:
     try:
         with (
             _signals_as_interrupt(),
-            Flight(scenario.path, run) as flight,
-            Monitor(outputs, nanoseconds(flight.start_time)) as monitor,
+            Monitor(outputs) as monitor,
+            Flight(scenario.path, run, before_start=monitor.require_nobody_flies) as flight,
         ):
             shown = "starting"
-            while (t := monitor.flight_time()) < scenario.flight.duration:
+            while (t := time.time() - flight.start_time) < scenario.flight.duration:
                 if (sentence := flight.ended_early()) is not None:
                     return sentence
                 if (seen := monitor.newest()) is not None:
                     errors = ", ".join(
                         f"{name} {value * units[name].factor:+.2f}" for name, value in zip(outputs, seen.e, strict=True)
                     )
-                    shown = f"{seen.mode.name}  e: {errors}"
+                    shown = f"{seen.mode}  e: {errors}"
                 progress(max(t, 0.0), shown)
                 time.sleep(POLL_PERIOD)
     except KeyboardInterrupt:
-        return "interrupted"
-    return "completed"
+        return INTERRUPTED
+    return COMPLETED
 
 
 def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
     """Fly in one process without ROS, as fast as it goes, and write the bag into `run`. Returns the outcome."""
-    tape = simulate(scenario, lambda t: progress(t, "in one process"))
+    with _signals_as_interrupt():
+        tape = simulate(scenario, lambda t: progress(t, "in one process"))
     write_run(tape, run, scenario.path)
-    return "completed"
+    return tape.outcome
 
 
 def conclude(run: Path, outcome: str | None = None) -> Flown:
@@ -113,21 +114,31 @@ def conclude(run: Path, outcome: str | None = None) -> Flown:
     where the log cannot be read, or holds no scenario.
     """
     recorded = read_run(run)
-    run = run.resolve()  # runs/latest is a link
     if recorded.scenario is None:
         raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
-    stored, kept = run / recorded.scenario.name, run / "summary.json"
-    stored.write_bytes(recorded.scenario.content)
-    scenario = load_scenario(stored)
-    if outcome is None:
-        before = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else {}
-        outcome = str(before.get("outcome", "ended as its log does"))
-    tape = _until_last_input(recorded.tape)
-    summary = summarise(scenario, tape, outcome)
-    kept.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    write_report(run / "report.html", scenario, tape, summary)
-    _point_latest(run)
-    return Flown(scenario, next(iter(sorted(run.glob("*.mcap")))), run / "report.html", summary)
+    run = run.resolve() if run.is_dir() else run.resolve().parent  # runs/latest is a link
+    try:
+        stored, kept = run / recorded.scenario.name, run / "summary.json"
+        stored.write_bytes(recorded.scenario.content)
+        scenario = load_scenario(stored)
+        tape = _until_last_input(recorded.tape)
+        if outcome == COMPLETED and "internals" not in tape:
+            outcome = "the controller never engaged"
+        summary = summarise(scenario, tape, outcome or _outcome_before(kept))
+        kept.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_report(run / "report.html", scenario, tape, summary)
+        if outcome is not None:
+            _point_latest(run)
+    except OSError as error:
+        raise ParameterError(f"{run}: cannot be written ({error.strerror}), expected a folder that can") from None
+    return Flown(scenario, min(run.glob("*.mcap")), run / "report.html", summary)
+
+
+def _outcome_before(summary: Path) -> str:
+    try:
+        return str(json.loads(summary.read_text(encoding="utf-8"))["outcome"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return "ended as its log does"
 
 
 def _until_last_input(tape: Tape) -> Tape:
@@ -139,7 +150,10 @@ def _until_last_input(tape: Tape) -> Tape:
 
 
 def _point_latest(run: Path) -> None:
-    latest = run.parent / "latest"
-    fresh = run.parent / f".latest-{os.getpid()}"
+    latest, fresh = run.parent / "latest", run.parent / f".latest-{os.getpid()}"
     fresh.symlink_to(run.name)
-    fresh.replace(latest)
+    try:
+        fresh.replace(latest)
+    except OSError:
+        fresh.unlink()
+        raise

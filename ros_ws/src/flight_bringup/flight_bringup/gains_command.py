@@ -16,9 +16,16 @@ from aircraft_sim.airframe import Airframe, load_airframe
 from flight_analysis.gain_selection import Answer, Study, as_yaml, check_gains, manoeuvre, select_gains, setting_of, study
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError, require
-from rise_di_controller.gains import Condition, failing
+from rise_di_controller.gains import MOST_DELAY, Condition, failing
 
 CONDITION_FAILS = 1
+SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
+MEANINGS = {
+    "share": "bandwidth times the lag of the loop (actuator, 1.5 periods, delay), in rad: the phase margin is 90 degrees less it",
+    "softening": "width of the softened sign in time, beside the lag of the loop: narrower than that the loop is unstable",
+    "response": "how much one unit of scaled input changes y_dot, abs(Omega_ii) input_scale; bandwidth = K x response",
+}
+"""What the words of the table mean, where its names do not say it."""
 
 
 def gains(
@@ -48,6 +55,9 @@ def gains(
     Exit status: 0, or with --check 1 where a condition of the loop fails, 2 bad input.
     """
     chosen, flown = find_scenario(scenario), load_airframe(airframe)
+    require(rate is None or 1.0 <= rate <= 1000.0, "--rate", rate, "1 to 1000 Hz")
+    require(delay is None or 0.0 <= delay <= MOST_DELAY, "--delay", delay, f"0 to {MOST_DELAY:g} s")
+    require(0.0 <= gamma_2 < math.inf, "--gamma-2", gamma_2, "0 or more, 1/s")
     setting = setting_of(chosen, gamma_2)._replace(inputs=tuple(inputs.split(",")) if inputs else (), feedforward=feedforward)
     if rate is not None:
         setting = setting._replace(rate=rate)
@@ -91,6 +101,7 @@ def _lags(text: str, airframe: Airframe) -> dict[str, float]:
         raise ParameterError(f"--lag: found {text!r}, expected seconds separated by commas") from None
     values = values * len(names) if len(values) == 1 else values
     require(len(values) == len(names), "--lag", f"{len(values)} values", f"one for all or one for each of {', '.join(names)}")
+    require(all(0.0 <= value < math.inf for value in values), "--lag", text, "seconds, 0 or more")
     return dict(zip(names, values, strict=True))
 
 
@@ -106,8 +117,8 @@ def _show(console: Console, found: Study, answers: dict[str, Answer]) -> None:
     first = next(iter(answers.values()))
     outputs = first.controller.outputs
     samples = len(found.A) - 1
-    title = f"Gains for {found.airframe.name}, A and B +-{100 * found.uncertainty:g} % ({samples} samples); K, Lambda in 1/s"
-    table = _table(title)
+    title = f"Gains for {found.airframe.name}, A and B +-{100 * found.uncertainty:g} % ({samples} samples); K, Lambda in 1/s,"
+    table = _table(f"{title} beta in units of y / s^2")
     table.add_column("channel", no_wrap=True)
     for name in answers:
         for heading in (f"{name}\nK", "\nLambda", "\nbeta"):
@@ -135,6 +146,8 @@ def _show(console: Console, found: Study, answers: dict[str, Answer]) -> None:
     console.print(
         f"margin: above 1 holds, ! fails; ~ estimate, for gamma_2 = {gamma_2:g} 1/s is stated, not bounded", soft_wrap=True
     )
+    for word, meaning in MEANINGS.items():
+        console.print(f"{word}: {meaning}", highlight=False, soft_wrap=True)
     for name, answer in answers.items():
         failed = answer.failing
         console.print(f"{name}: {'every condition holds' if not failed else f'{len(failed)} conditions fail'}", highlight=False)
@@ -169,8 +182,7 @@ def _milliseconds(margin: float) -> str:
 
 def _cells(condition: Condition) -> tuple[str, str]:
     margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
-    side = ">=" if condition.at_least else "<="
-    return f"{condition.found:.4g} {side} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
+    return f"{condition.found:.4g} {SIDES[condition.side]} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
 
 
 def _plain(found: Study, answers: dict[str, Answer], seed: int) -> dict[str, Any]:
@@ -195,7 +207,7 @@ def _plain(found: Study, answers: dict[str, Answer], seed: int) -> dict[str, Any
                     "part": part,
                     "channel": None if condition.channel is None else answer.controller.outputs[condition.channel],
                     "found": _number(condition.found),
-                    "at_least" if condition.at_least else "at_most": _number(condition.bound),
+                    condition.side.replace(" ", "_"): _number(condition.bound),
                     "margin": _number(condition.margin),
                     "holds": condition.holds,
                     "estimate": condition.estimate,

@@ -4,6 +4,7 @@
 
 import json
 import math
+import re
 import shutil
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -69,10 +71,13 @@ class NodeProcess:
 
 
 class Flight:
-    """All processes of one flight. A context manager: leaving it ends them."""
+    """All processes of one flight. A context manager: leaving it ends them.
 
-    def __init__(self, scenario_file: Path, run: Path) -> None:
-        self._scenario_file, self._run = scenario_file, run
+    `before_start` is called when the first nodes are ready, before aircraft and reference model start.
+    """
+
+    def __init__(self, scenario_file: Path, run: Path, before_start: Callable[[], None]) -> None:
+        self._scenario_file, self._run, self._before_start = scenario_file, run, before_start
         self.processes: list[NodeProcess] = []
         self.start_time = math.inf  # system time of t = 0, s; set once the first nodes are ready
 
@@ -84,6 +89,7 @@ class Flight:
                 self._require_running()
                 if time.monotonic() > begin + READY_TIMEOUT:
                     raise ParameterError(f"not ready after {READY_TIMEOUT:g} s; see the logs in {self._run / 'log'}")
+            self._before_start()
             self.start_time = round(time.time() + start_lead(time.monotonic() - begin), 3)
             for node in THEN:
                 self._start(node)
@@ -110,8 +116,11 @@ class Flight:
                 process.finish()
                 if status < 0:
                     return f"{process.node.executable} was killed by {signal.Signals(-status).name}"
+                if status == 0:
+                    return f"{process.node.executable} was told to end"
                 last = next((line for line in reversed(process.lines) if line.strip()), "no output")
-                return f"{process.node.executable} ended with status {status}: {last.removeprefix('error: ')}"
+                said = re.sub(r"^(\[[^]]*\] ?)*(: )?|^error: ", "", last)  # without the logger's brackets
+                return f"{process.node.executable} ended with status {status}: {said}"
         return None
 
     def _require_running(self) -> None:
@@ -120,6 +129,8 @@ class Flight:
 
     def stop(self) -> None:
         """End all processes, the recorder after the others; SIGKILL for what does not end in time."""
+        # A second Ctrl-C must not stop the stopping: it lasts STOP_TIMEOUT at most.
+        before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
         deadline = time.monotonic() + STOP_TIMEOUT
         others = [process for process in self.processes if process.node is not RECORDER]
         recorder = [process for process in self.processes if process.node is RECORDER]
@@ -134,3 +145,5 @@ class Flight:
                     process.popen.kill()
                 process.finish()
         self.processes = []
+        for number, handler in before.items():
+            signal.signal(number, handler)

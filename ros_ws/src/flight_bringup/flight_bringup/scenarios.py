@@ -5,6 +5,7 @@
 from pathlib import Path
 
 from flight_analysis.scenario import Scenario, load_scenario
+from flight_core.files import is_file
 from flight_core.parameters import require
 
 
@@ -23,5 +24,5 @@ def scenarios() -> list[str]:
 def find_scenario(name: str) -> Scenario:
     """A scenario by its name in the stack, or by the path of a file ending in .yaml. Raises ParameterError."""
     path = Path(name) if name.endswith(".yaml") else share() / "config" / f"{name}.yaml"
-    require(path.is_file(), "scenario", f"{name!r}", f"one of {', '.join(scenarios())}, or the path of a scenario file (.yaml)")
+    require(is_file(path), "scenario", f"{name!r}", f"one of {', '.join(scenarios())}, or the path of a scenario file (.yaml)")
     return load_scenario(path.absolute())

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validated parameter sets: one declaration a set, one sentence an error.
 
-A set is a frozen pydantic model. `validate` builds it from the nested mapping that a scenario file or a ROS node
+A set is a frozen pydantic model. `validate_mapping` builds it from the nested mapping that a scenario file or a ROS node
 holds, and turns whatever does not fit into a `ParameterError` of one sentence: the key, what was found, what is expected.
 """
 
@@ -38,11 +38,11 @@ class Parameters(BaseModel):
 
 
 def as_tuple(value: object) -> object:
-    """Lists and arrays as tuples; anything else as it is, for the validator behind to refuse."""
+    """A sequence other than a string as a tuple; anything else as it is, for the validator behind to refuse."""
     return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
 
 
-# Sequences of a YAML file or a ROS message arrive as lists or arrays; a frozen set keeps tuples.
+# Sequences of a YAML file or a ROS parameter arrive as lists; a frozen set keeps tuples.
 Numbers = Annotated[tuple[float, ...], Field(min_length=1), BeforeValidator(as_tuple)]
 Positives = Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1), BeforeValidator(as_tuple)]
 NonNegatives = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1), BeforeValidator(as_tuple)]
@@ -88,6 +88,9 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
     location, kind, found = error["loc"], error["type"], error["input"]
+    if kind == "invalid_key" or location[-1:] == ("[key]",):
+        key = ".".join([where, *map(str, location[: -1 if kind == "invalid_key" else -2])])
+        return f"{key}: found the key {found!r}, expected a name"
     key = where + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
     if kind == "extra_forbidden":
         known = sorted(_fields_at(cls, location[:-1]))
@@ -99,6 +102,9 @@ def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
         return f"{key}: missing, expected {meaning}"
     if kind == "value_error":
         return f"{key}.{error['ctx']['error']}"  # raised by `require`: the rest of the key and the sentence
+    if kind == "too_short":
+        least = error["ctx"]["min_length"]
+        return f"{key}: found {error['ctx']['actual_length']} values, expected at least {least} value{'s' * (least > 1)}"
     expected = (
         "a list of values" if kind == "tuple_type" else error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
     )

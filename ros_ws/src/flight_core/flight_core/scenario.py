@@ -10,9 +10,8 @@
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from flight_core.parameters import ParameterError, require
+from flight_core.files import read_yaml
+from flight_core.parameters import require
 
 Sections = dict[str, dict[str, Any]]
 
@@ -20,14 +19,9 @@ Sections = dict[str, dict[str, Any]]
 def read_sections(path: Path, expected: tuple[str, ...]) -> Sections:
     """Sections of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
 
-    Raises ParameterError where the file cannot be read, is not such a file, or lacks or adds a section.
+    Raises ParameterError where the file cannot be read, is not such a file, has a key twice, or lacks or adds a section.
     """
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ParameterError(f"{path}: cannot be read ({error}), expected a scenario file") from None
-    except yaml.YAMLError as error:
-        raise ParameterError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    tree = read_yaml(path, str(path), "a scenario file")
     require(isinstance(tree, dict), str(path), f"{type(tree).__name__}", f"a mapping with {', '.join(expected)}")
     sections: Sections = {}
     for key, content in tree.items():

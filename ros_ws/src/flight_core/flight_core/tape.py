@@ -3,11 +3,12 @@
 """The tape: the one in-memory log of a flight, whatever flew it (in one process, over topics, read from a bag)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flight_core.outcome import COMPLETED
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 
@@ -43,11 +44,12 @@ class Signal:
 
 @dataclass(frozen=True)
 class Tape:
-    """A flight: signals by topic name. `start_ns` is the stamp of flight time t = 0."""
+    """A flight: signals by topic name. `start_ns` is the stamp of flight time t = 0, `outcome` how it ended."""
 
     signals: Mapping[str, Signal]
     start_ns: int = 0
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+    outcome: str = COMPLETED
 
     def __getitem__(self, topic: str) -> Signal:
         """The signal of a topic. Raises KeyError naming the topics there are."""

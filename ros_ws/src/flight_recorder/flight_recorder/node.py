@@ -40,6 +40,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
         self._recorded = [self._record(topic) for topic in FLIGHT]
         self._last_sequence: dict[str, int] = {}
         self.lost: Counter[str] = Counter()
+        self._failed = ""
         self._flushed_ns = time.monotonic_ns()
         self.get_logger().info(f"recording to {self._bag.path}")
 
@@ -61,13 +62,22 @@ class RecorderNode(FlightNode[RecorderParameters]):
         return period_ns(self.parameters.rate, "rate")
 
     def tick(self, tick: Tick, now_ns: int) -> None:
+        if self._failed:
+            return
+        try:
+            self._empty_inboxes()
+            if time.monotonic_ns() - self._flushed_ns > nanoseconds(FLUSH_PERIOD):
+                self._flushed_ns = time.monotonic_ns()
+                self._bag.flush()
+        except OSError as error:  # the flight goes on, and what was written stays readable
+            self._failed = f"recording ended: {self._bag.path} cannot be written ({error.strerror})"
+            self.get_logger().error(self._failed)
+
+    def _empty_inboxes(self) -> None:
         for inbox in self._recorded:
             for received in inbox.take():
                 self._bag.write(inbox.name, received.received_ns, received.sent_ns, received.sequence, received.message)
                 self._count_gap(inbox, received.sequence)
-        if time.monotonic_ns() - self._flushed_ns > nanoseconds(FLUSH_PERIOD):
-            self._flushed_ns = time.monotonic_ns()
-            self._bag.flush()
 
     def _count_gap(self, inbox: Inbox, sequence: int) -> None:
         # Several nodes may publish on a foreign topic: their sequences interleave and tell nothing.
@@ -82,15 +92,18 @@ class RecorderNode(FlightNode[RecorderParameters]):
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         counts: dict[str, object] = {f"messages {name}": channel.count for name, channel in self._bag.channels.items()}
         lost: dict[str, object] = {f"lost {name}": count for name, count in self.lost.items()}
+        if self._failed:
+            return DiagnosticStatus.ERROR, self._failed, counts | lost
         level = DiagnosticStatus.WARN if lost else DiagnosticStatus.OK
         return level, f"recording to {self._bag.path}", counts | lost
 
     def close(self) -> None:
-        for inbox in self._recorded:
-            for received in inbox.take():
-                self._bag.write(inbox.name, received.received_ns, received.sent_ns, received.sequence, received.message)
-        self._bag.note("rise_di_lost", {name: str(count) for name, count in self.lost.items()})
-        self._bag.close()
+        try:
+            self._empty_inboxes()
+            self._bag.note("rise_di_lost", {name: str(count) for name, count in self.lost.items()})
+            self._bag.close()
+        except OSError as error:
+            self.get_logger().error(f"{self._bag.path} has no end: it cannot be written ({error.strerror})")
         total = sum(channel.count for channel in self._bag.channels.values())
         self.get_logger().info(f"{total} messages in {self._bag.path}")
 

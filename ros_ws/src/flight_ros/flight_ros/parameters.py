@@ -32,6 +32,9 @@ def read_parameters(node: Node, schema: type[P], tunable: frozenset[str]) -> P:
             node.set_descriptor(name, descriptor)
         elif value != ():
             node.declare_parameter(name, value, descriptor)
+    for name in tunable:
+        if not node.has_parameter(name):  # an optional one that was not given, but may be in flight
+            node.declare_parameter(name, None, ParameterDescriptor(description=descriptions.get(name, ""), dynamic_typing=True))
     return parameters
 
 
@@ -45,7 +48,7 @@ def _given(node: Node) -> dict[str, Any]:
     return {
         name: _plain(parameter.value)
         for name, parameter in node.get_parameters_by_prefix("").items()
-        if name.split(".")[0] not in NOT_OURS
+        if name.split(".")[0] not in NOT_OURS and parameter.value is not None
     }
 
 

@@ -26,6 +26,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.signals import SignalHandlerOptions
 
+from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, Parameters
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_ros import transport
@@ -36,10 +37,14 @@ from flight_ros.topics import DIAGNOSTICS, LISTEN, PUBLISH, Topic
 
 P = TypeVar("P", bound=Parameters)
 
+ENDED_EARLY = 3  # exit status
+
 # What rclpy raises for arguments and parameter files that it cannot read.
 REFUSALS = (ParameterException, _rclpy.RCLError, _rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError)
 
-WAIT_BEFORE_SAYING_NS = NANOSECONDS  # topics of processes that start together are a moment apart
+WAIT_BEFORE_SAYING_NS = 3 * NANOSECONDS  # processes of one flight start one after the other
+
+OLDEST_START_NS = 10 * NANOSECONDS  # a node that comes late catches up with what it missed, but not with hours
 
 NICE_PAUSE = 0.02  # s, the longest sleep, so that a signal or a service call is not left waiting
 
@@ -55,7 +60,7 @@ class FlightNode(Node, Generic[P]):
         self.instance = f"{self.get_fully_qualified_name()}#{os.getpid()}"
         self.rejected: Counter[str] = Counter()
         self._inboxes: list[Inbox] = []
-        self._say_waiting_ns: dict[str, int] = {}
+        self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to say it next
         self._diagnostics = self.publisher(DIAGNOSTICS)
         self._periods: list[int] = []
         self._compute: list[int] = []
@@ -104,14 +109,16 @@ class FlightNode(Node, Generic[P]):
         self.get_logger().warning(f"{inbox.name}: sample refused: {sentence}", throttle_duration_sec=2.0)
 
     def waiting_for(self, inbox: Inbox) -> None:
-        """Called while nothing comes on a topic: says so after a second, then every 2 s, and who is there."""
+        """Called at each tick while nothing comes on a topic: says so after 3 s, then every 2 s, and who is there."""
         now_ns = time.monotonic_ns()
-        say_ns = self._say_waiting_ns.setdefault(inbox.name, now_ns + WAIT_BEFORE_SAYING_NS)
+        last_ns, say_ns = self._waiting.get(inbox.name, (0, 0))
+        if now_ns - last_ns > NANOSECONDS:  # the first call since it came
+            say_ns = now_ns + WAIT_BEFORE_SAYING_NS
+        self._waiting[inbox.name] = now_ns, say_ns if now_ns < say_ns else now_ns + 2 * NANOSECONDS
         if now_ns < say_ns:
             return
-        self._say_waiting_ns[inbox.name] = now_ns + 2 * NANOSECONDS
         count = self.count_publishers(inbox.name)
-        who = f"{count} publishers but no sample yet" if count else "no publisher there"
+        who = "its publisher sends nothing" if count else "no publisher there"
         self.get_logger().warning(f"waiting for {inbox.name}: {who}")
 
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
@@ -196,7 +203,9 @@ class _Stop:
 
 
 def run(make_node: Callable[[], FlightNode[Any]]) -> None:
-    """Run a node until SIGINT or SIGTERM, then leave with exit status 0; 2 for bad parameters, 1 for a fault.
+    """Run a node until SIGINT or SIGTERM, then leave with exit status 0.
+
+    Otherwise 2 for bad parameters, 3 for a flight that cannot go on, 1 for a fault.
 
     Ticks run on the monotonic clock in the main thread; what comes over topics is taken at the tick. The executor serves
     parameters and services, after ticks and without ever waiting.
@@ -216,6 +225,12 @@ def run(make_node: Callable[[], FlightNode[Any]]) -> None:
         if sockets := transport.open_to_network():
             node.get_logger().error(f"the loopback profile is not in force: sockets open to the network: {', '.join(sockets)}")
         _loop(node, stop)
+    except ParameterError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except FlightEnded as error:
+        node.get_logger().fatal(str(error))
+        sys.exit(ENDED_EARLY)
     except Exception:
         node.get_logger().fatal(f"fault, the node ends: {traceback.format_exc()}")
         sys.exit(1)
@@ -235,6 +250,10 @@ def _loop(node: FlightNode[Any], stop: _Stop) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     start_ns = node.start_ns() or time.time_ns()
+    if (past := time.time_ns() - start_ns) > OLDEST_START_NS:
+        raise ParameterError(
+            f"{node.get_name()}.start_time: found an instant {seconds(past):.0f} s ago, expected one to come, or 0"
+        )
     ticker = Ticker(node.period_ns(), time.monotonic_ns() + start_ns - time.time_ns())
     if (lead := start_ns - time.time_ns()) > nanoseconds(60):
         node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")

@@ -65,8 +65,10 @@ class Linear(Parameters):
 class ReferenceModelParameters(Parameters):
     """All parameters of the reference model's node."""
 
-    rate: Annotated[float, Field(gt=0, le=1000)] = Field(description="the rate at which y_m is published, Hz")
-    start_time: float = Field(default=0.0, ge=0, description="system time of t = 0, s since the epoch; 0 starts at once")
+    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y_m is published, Hz")
+    start_time: float = Field(
+        default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
+    )
     outputs: Names = Field(description="the names of the outputs y_m")
     second_order: SecondOrder | None = Field(default=None, description="the model, one filter a channel")
     linear: Linear | None = Field(default=None, description="the model, as matrices")
@@ -105,7 +107,10 @@ class ReferenceModelParameters(Parameters):
                 require(found == rows * columns, f"linear.{name}", f"{found} values", f"{rows} rows of {columns}")
             for output in self.outputs:
                 require(output in self.linear.states, "linear.states", ", ".join(self.linear.states), f"{output} among them")
-        largest = float(np.linalg.eigvals(self.model().A_m).real.max())
+        with np.errstate(over="ignore"):
+            A_m = self.model().A_m
+        require(bool(np.isfinite(A_m).all()), key, "an A_m that is not finite", "figures whose products are")
+        largest = float(np.linalg.eigvals(A_m).real.max())
         require(largest < 0, key, f"an eigenvalue of A_m with real part {largest:.3g}", "A_m Hurwitz: all of them negative")
 
     def model(self) -> Model:

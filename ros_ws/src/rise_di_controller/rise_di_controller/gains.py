@@ -81,7 +81,7 @@ class Bounds(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """One condition on a gain set: found >= bound, or found <= bound."""
+    """One condition on a gain set: found >= bound, found <= bound, or, where that is strict, found > bound."""
 
     name: str
     channel: int | None  # None: all of them together
@@ -89,16 +89,24 @@ class Condition(NamedTuple):
     bound: float
     at_least: bool = True
     estimate: bool = False  # rests on a figure that nothing bounds: gamma_2
+    strict: bool = False  # found at the bound itself does not meet it
+
+    @property
+    def side(self) -> str:
+        """Where found has to lie, in words: "at least", "at most" or "above" the bound."""
+        return "above" if self.strict else "at least" if self.at_least else "at most"
 
     @property
     def holds(self) -> bool:
         """Whether the gain set meets it."""
+        if self.strict:
+            return self.found > self.bound
         slack = ROUNDING * abs(self.bound)
         return self.found >= self.bound - slack if self.at_least else self.found <= self.bound + slack
 
     @property
     def margin(self) -> float:
-        """By which factor it is met, below 1 where it fails; 0 where nothing could meet it, NaN for at least 0."""
+        """By which factor it is met, below 1 where it fails; 0 where nothing could meet it, NaN for a bound of 0 below it."""
         if self.at_least:
             return self.found / self.bound if self.bound > 0.0 else math.nan
         if self.bound <= 0.0:
@@ -108,8 +116,7 @@ class Condition(NamedTuple):
     def sentence(self, channels: Sequence[str]) -> str:
         """As errors are worded: "beta (30) of q: found 15, expected at least 29.1"; `channels` are the names of y."""
         where = self.name if self.channel is None else f"{self.name} of {channels[self.channel]}"
-        side = "at least" if self.at_least else "at most"
-        return f"{where}: found {self.found:.4g}, expected {side} {self.bound:.4g}"
+        return f"{where}: found {self.found:.4g}, expected {self.side} {self.bound:.4g}"
 
 
 def failing(conditions: Sequence[Condition]) -> tuple[Condition, ...]:

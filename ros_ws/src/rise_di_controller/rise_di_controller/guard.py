@@ -44,6 +44,10 @@ class Limits(NamedTuple):
     rate: Array  # (m,) per s
 
 
+# Reference samples to keep, so that one of the stamp of y is among them: 0.1 s at 1 kHz, more where y_m is slower.
+KEPT_REFERENCES = 100
+
+
 class GuardParams(NamedTuple):
     """Times in ns, the limits, and the nominal model of the feedforward."""
 
@@ -181,7 +185,7 @@ def tick(
     Arguments: `y` the newest sample, `y_m` the last ones with increasing stamps; both in the law's order.
     """
     reference = None
-    if y is not None and y_m and now_ns - y.stamp_ns <= guard.max_age_ns and now_ns - y_m[-1].stamp_ns <= guard.max_age_ns:
+    if y is not None and y_m and max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) <= guard.max_age_ns:
         reference = align(y_m, y.stamp_ns, guard.period_ns)
     if not active or y is None or reference is None:
         return _without_inputs(state, now_ns, guard, active)
@@ -214,13 +218,19 @@ def tick(
 def _without_inputs(
     state: ControllerState, now_ns: int, guard: GuardParams, active: bool
 ) -> tuple[ControllerState, Used | None]:
-    if state.y is None or state.y_m is None:
+    y, y_m = state.y, state.y_m
+    if y is None or y_m is None:
         return state._replace(mode=Mode.WAITING if active else Mode.INACTIVE), None
-    if state.mode is Mode.ENGAGED or (state.mode is Mode.INACTIVE) == active:
+    was_active = state.mode is not Mode.INACTIVE
+    if state.mode is Mode.ENGAGED or was_active != active:
         state = state._replace(lost_ns=now_ns, u_lost=state.u)
     hold_ns = guard.hold_ns if active else 0
     share = 1.0 if not active and guard.deactivation_holds else fade(now_ns - state.lost_ns, hold_ns, guard.ramp_ns)
-    mode = {1.0: Mode.HOLD, 0.0: Mode.TRIM}.get(share, Mode.RAMP) if active else Mode.INACTIVE
+    if not active:
+        mode = Mode.INACTIVE
+    elif share == 1.0:
+        mode = Mode.HOLD
+    else:
+        mode = Mode.RAMP if share > 0.0 else Mode.TRIM
     u = state.u_lost if share == 1.0 else share * state.u_lost
-    state = state._replace(mode=mode, u=u, u_free=u)
-    return state, Used(now_ns, state.y.value, state.y_m, 0.0, 0.0) if state.y is not None and state.y_m is not None else None
+    return state._replace(mode=mode, u=u, u_free=u), Used(now_ns, y.value, y_m, 0.0, 0.0)

@@ -22,7 +22,7 @@ class LawParams(NamedTuple):
     """Parameters of the law over m channels.
 
     The law works in inputs scaled to unit response, v_i = u_i / input_scale_i with abs(Omega_ii) about 1, so that K is a
-    bandwidth in rad/s and beta an acceleration rate in units of y / s^3 times s; the theorem holds for v as it does for u.
+    bandwidth in rad/s and beta an acceleration rate in units of y / s^2; the theorem holds for v as it does for u.
     """
 
     K: Array  # (m,) diagonal of equation (22), 1/s

@@ -13,7 +13,7 @@ from flight_ros.inbox import Inbox
 from flight_ros.messages import from_message, to_message
 from flight_ros.runtime import FlightNode, run
 from flight_ros.ticker import Tick
-from flight_ros.topics import INTERNALS, LISTEN, Y_M, U, Y
+from flight_ros.topics import INTERNALS, Y_M, U, Y
 from rise_di_controller import guard, internals
 from rise_di_controller.guard import Mode, Sample
 from rise_di_controller.law import retune
@@ -52,7 +52,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         self._names = internals.names(self.parameters.outputs, self.parameters.inputs)
         self._state = guard.start(len(self.parameters.inputs))
         self._y: deque[Sample] = deque(maxlen=1)
-        self._y_m: deque[Sample] = deque(maxlen=LISTEN.depth)
+        self._y_m: deque[Sample] = deque(maxlen=guard.KEPT_REFERENCES)
         self._y_inbox, self._y_m_inbox = self.inbox(Y), self.inbox(Y_M)
         self._u_publisher, self._internals_publisher = self.publisher(U), self.publisher(INTERNALS)
         if self.parameters.autostart:
@@ -63,7 +63,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """The parameters were checked as a whole when they were set; the law starts anew from them."""
-        self._state = guard.start(len(self.parameters.inputs))
+        # u stays what it was: a node that is configured again does not jump either
+        self._state = guard.start(len(self.parameters.inputs))._replace(u=self._state.u)
         self.get_logger().info(self.parameters.sampled_sign()[1])
         return TransitionCallbackReturn.SUCCESS
 
@@ -90,9 +91,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         return self._guard.period_ns
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        now_ns = self.get_clock().now().nanoseconds
-        self._collect(self._y_inbox, self._y)
-        self._collect(self._y_m_inbox, self._y_m)
+        now_ns += tick.late_ns
+        self._collect(self._y_inbox, self._y, now_ns)
+        self._collect(self._y_m_inbox, self._y_m, now_ns)
         y = self._y[-1] if self._y else None
         before = self._state.mode
         self._state, used = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, self._active)
@@ -107,22 +108,29 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         values = internals.values(self._state, used, self._guard.limits, late, age)
         self._internals_publisher.publish(to_message(used.stamp_ns, self._names, values, self.instance))
 
-    def _collect(self, inbox: Inbox, samples: deque[Sample]) -> None:
+    def _collect(self, inbox: Inbox, samples: deque[Sample], now_ns: int) -> None:
         for received in inbox.take():
             try:
                 sample = Sample(*from_message(received.message, self.parameters.outputs))
             except ChannelError as error:
                 self.reject(inbox, error.reason, str(error))
                 continue
-            if samples and sample.stamp_ns <= samples[-1].stamp_ns:
+            if sample.stamp_ns > now_ns + self._guard.max_age_ns:
+                self.reject(inbox, "future", f"stamp {seconds(sample.stamp_ns - now_ns):g} s ahead of the clock")
+            elif samples and sample.stamp_ns <= samples[-1].stamp_ns:
                 self.reject(inbox, "order", f"stamp {seconds(sample.stamp_ns - samples[-1].stamp_ns):g} s after the last one")
             else:
                 samples.append(sample)
 
     def _say_what_is_missing(self, now_ns: int) -> None:
+        complete = True
         for inbox, samples in ((self._y_inbox, self._y), (self._y_m_inbox, self._y_m)):
             if not samples or now_ns - samples[-1].stamp_ns > self._guard.max_age_ns:
+                complete = False
                 self.waiting_for(inbox)
+        if complete:
+            pair = f"no {self._y_m_inbox.name} at the stamp of {self._y_inbox.name}"
+            self.get_logger().warning(f"{pair}: is one delayed, or stamped by another clock?", throttle_duration_sec=2.0)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         level = DiagnosticStatus.OK if self._state.mode is Mode.ENGAGED else DiagnosticStatus.WARN

@@ -106,6 +106,10 @@ class ControllerParameters(Parameters):
             require_length(key, getattr(self, key) or self.inputs, self.inputs)
         for i, (low, high) in enumerate(zip(self.lower or (), self.upper or (), strict=False)):
             require(low < high, f"lower[{i}]", low, f"less than upper[{i}] = {high:g}")
+        for i, low in enumerate(self.lower or ()):
+            require(low <= 0, f"lower[{i}]", low, "at most 0, so that trim is inside the limits")
+        for i, high in enumerate(self.upper or ()):
+            require(high >= 0, f"upper[{i}]", high, "at least 0, so that trim is inside the limits")
         for i, sign in enumerate(self.D):
             require(sign in (-1, 1), f"D[{i}]", sign, "+1 or -1")
         nominal = self.nominal()
