@@ -137,11 +137,12 @@ def guarded_step(
 ) -> tuple[LawState, Array, Array]:
     """One tick of the law inside its limits: (law state, u before limits, u commanded), all shape (m,).
 
-    The law takes its step. Where u_trim + u is beyond a limit, the increments of the integrals (of integral_e and of Pi, each
-    by itself) that move u further beyond are cut; those that move it inwards stay. Beyond a limit of magnitude they are
-    taken back whole; beyond a limit of rate, which u reaches in the next ticks, they keep the share that ends at it:
+    The law takes its step. Where u_trim + u is beyond a limit of magnitude or rate, the increments of the integrals (of
+    integral_e and of Pi, each by itself) that move u further beyond are cut; those that move it inwards stay. That of
+    integral_e is taken back; that of Pi, the faster one, keeps the share that ends at the limit, so that u reaches it:
 
-        keep = max(1 - abs(beyond) / abs(what the outward increments move u by), 0)
+        left = max(abs(beyond) - abs(what the increment of integral_e moves u by), 0)
+        Pi+  = Pi + max(1 - left / abs(what the increment of Pi moves u by), 0) times that increment
 
     Without saturation every bit is that of the law alone. Theorem 1 does not speak of limits.
     """
@@ -154,11 +155,11 @@ def guarded_step(
     moves_Pi = -law.input_scale * law.D * increment_Pi
     outward, outward_Pi = moves * beyond > 0, moves_Pi * beyond > 0
     none = xp.zeros_like(total)
-    moved = xp.abs(xp.where(outward, moves, none) + xp.where(outward_Pi, moves_Pi, none))
-    keep = xp.maximum(1.0 - xp.abs(beyond) / xp.where(moved > 0, moved, none + 1.0), none)
-    keep = xp.where((total < limits.lower) | (total > limits.upper), none, keep)
+    left = xp.maximum(xp.abs(beyond) - xp.where(outward, xp.abs(moves), none), none)
+    moved = xp.where(outward_Pi, xp.abs(moves_Pi), none)
+    keep = xp.maximum(1.0 - left / xp.where(moved > 0, moved, none + 1.0), none)
     after = after._replace(
-        integral_e=xp.where(outward, state.integral_e + keep * increment, after.integral_e),
+        integral_e=xp.where(outward, state.integral_e, after.integral_e),
         Pi=xp.where(outward_Pi, state.Pi + keep * increment_Pi, after.Pi),
     )
     u_free = u_trim + rise.control(state, after, law)
