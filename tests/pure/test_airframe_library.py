@@ -135,6 +135,7 @@ def test_every_airframe_is_in_the_theorem_with_zero_dynamics_that_only_an_outer_
     assert np.count_nonzero(np.abs(facts.zeros) < 1e-9) == len(angles)
     assert facts.in_theorem
     assert len(facts.zeros) == facts.n - facts.m > 0
+    assert list(facts.integrated) == angles
 
 
 def test_zeros_of_the_osprey() -> None:

@@ -87,7 +87,35 @@ def test_a_file_without_an_end_is_read_up_to_its_last_whole_chunk(share: float, 
     back = read_run(run).tape
     assert 0 < len(back["y"].stamp_ns) <= len(tape["y"].stamp_ns)
     assert (back["y"].values == tape["y"].values[: len(back["y"].stamp_ns)]).all()
-    assert "has no end" in back.notes[0]
+    assert "is damaged or has no end" in back.notes[0]
+
+
+def test_a_file_with_changed_bytes_is_read_as_far_as_it_goes_or_refused(tape: Tape, run: Path) -> None:
+    file, generator = run / "run_0.mcap", np.random.default_rng(1)
+    whole, read = file.read_bytes(), 0
+    for _ in range(60):
+        damaged = bytearray(whole)
+        for place in generator.integers(0, len(whole), 10):
+            damaged[place] ^= 1 << generator.integers(0, 8)
+        file.write_bytes(damaged)
+        try:
+            back = read_run(run).tape
+        except ParameterError:
+            continue
+        read += "y" in back and "is damaged or has no end" in "".join(back.notes)
+    assert read > 0
+
+
+def test_two_logs_in_a_folder_are_refused(run: Path) -> None:
+    (run / "copy.mcap").write_bytes((run / "run_0.mcap").read_bytes())
+    with pytest.raises(ParameterError, match=r"run: found 2 \.mcap files, expected exactly one"):
+        read_run(run)
+
+
+def test_a_tape_whose_first_signal_has_no_sample_is_written(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
+    empty = {"y": tape["y"].until(-1), "u": tape["u"]}
+    write_run(Tape(empty), tmp_path / "run", osprey_gust.path)
+    assert list(read_run(tmp_path / "run").tape.signals) == ["u"]
 
 
 def test_a_folder_without_a_log_is_refused(tmp_path: Path) -> None:

@@ -40,12 +40,14 @@ def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedPro
     assert (summary["scenario"], summary["outcome"], summary["duration"]) == ("osprey_gust", "completed", 4.0)
     assert summary["errors"]["q"]["gust"] == {"rms": None, "max": None}  # the gusts come later
     assert 0 < summary["errors"]["q"]["calm"]["rms"] < 1e-3
-    assert (summary["ticks"]["ticks"], summary["ticks"]["missed"]) == (401, 0)
+    assert (summary["ticks"]["ticks"], summary["ticks"]["without_new_y"]) == (401, 0)
 
 
 def test_the_report_is_one_page_that_needs_no_network(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     page = (flown[0] / "runs" / "latest" / "report.html").read_text(encoding="utf-8")
     assert 'src="http' not in page
+    assert "gust: from the entry of a gust to 1 s after its end" in page
+    assert "periods without a new y" in page
     assert page.index("Tracking error") < page.index("Output y over the reference y_m")
 
 

@@ -437,6 +437,7 @@ def test_the_command_names_the_conditions_that_a_scenario_fails() -> None:
     shown = CliRunner().invoke(command(), ["gains", "osprey", "--check", "--samples", "2", "--scenario", "osprey_servo"])
     assert shown.exit_code == 1
     assert "beta above slew of q: found 14.7, expected at least 22.8" in shown.stdout
+    assert "beta in units of y / s^2" in " ".join(shown.stdout.split())
 
 
 def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
@@ -469,12 +470,40 @@ def test_a_lag_that_is_no_number_is_refused() -> None:
     assert str(shown.exception) == "--lag: found 'fast', expected seconds separated by commas"
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("--rate", "0", "--rate: found 0.0, expected 1 to 1000 Hz"),
+        ("--rate", "nan", "--rate: found nan, expected 1 to 1000 Hz"),
+        ("--delay", "nan", "--delay: found nan, expected 0 to 0.5 s"),
+        ("--gamma-2", "nan", "--gamma-2: found nan, expected 0 or more, 1/s"),
+        ("--lag", "nan", "--lag: found nan, expected seconds, 0 or more"),
+    ],
+)
+def test_a_loop_that_cannot_be_is_refused(option: str, value: str, expected: str) -> None:
+    shown = CliRunner().invoke(command(), ["gains", "osprey", option, value])
+    assert isinstance(shown.exception, ParameterError)
+    assert str(shown.exception) == expected
+
+
+def test_a_least_eigenvalue_of_zero_is_no_decay() -> None:
+    condition = Condition("V2_dot", None, 0.0, 0.0, strict=True)
+    assert not condition.holds
+    assert condition._replace(found=1e-9).holds
+    assert condition.sentence(()) == "V2_dot: found 0, expected above 0"
+
+
 def test_the_command_lists_the_airframes() -> None:
     shown = CliRunner().invoke(command(), ["airframes", "--json"])
     told = {one["name"]: one for one in json.loads(shown.stdout)}
     assert told["osprey"]["D"] == [1, 1, 1, 1]
     assert told["f16_lateral"]["for_D_I"] == "flip aileron, rudder"
-    assert "Outside the theorem: none" in CliRunner().invoke(command(), ["airframes"]).stdout
+    assert (told["osprey"]["controllable"], told["osprey"]["integrated"]) == (True, ["theta", "phi"])
+    printed = CliRunner(env={"COLUMNS": "80"}).invoke(command(), ["airframes"]).stdout
+    assert "Outside the theorem: none" in printed
+    assert "marginal: phi, theta integrate the outputs and need an outer loop" in printed
+    assert "controllable" in printed
+    assert printed.count("aerosonde_first_edition_lateral ") == 3  # on one line in each table
 
 
 def test_a_manoeuvre_leaves_out_what_an_airframe_does_not_have(osprey_gust: Scenario) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flight_analysis.metrics import error_figures, error_table, in_windows, tick_figures, tracking_error
+from flight_analysis.report import drawn_points
 from flight_core.tape import Signal, Tape
 
 MS = 1_000_000
@@ -53,11 +54,11 @@ def test_calm_and_gust_are_told_apart() -> None:
 
 
 def test_ticks_are_counted_against_their_period() -> None:
-    # Ticks at 0, 10, 20, 40 ms: one missed, mean 13.3 ms; the stamps are those of y, 1 ms older.
+    # Ticks at 0, 10, 20, 40 ms: none at 30, mean 13.3 ms; the stamps are those of y, 1 ms older.
     internals = signal([-1, 9, 19, 39], late=[0.0, 1e-4, 0.0, 3e-4], age=[1e-3] * 4)
     figures = tick_figures(Tape({"internals": internals}, EPOCH), 10 * MS)
     assert figures is not None
-    assert (figures.ticks, figures.missed, figures.period_max, figures.late_max) == (4, 1, 0.02, 3e-4)
+    assert (figures.ticks, figures.without_new_y, figures.period_max, figures.late_max) == (4, 1, 0.02, 3e-4)
     assert figures.period_mean == pytest.approx(0.04 / 3, abs=1e-9)
 
 
@@ -71,3 +72,21 @@ def test_groups_of_channels_lose_their_prefix() -> None:
     assert tape.group("e").values.tolist() == [[1.0, 3.0]]
     with pytest.raises(KeyError, match=r"no channel x among e\.q, Pi\.q, e\.V"):
         tape["x"]
+
+
+def test_a_period_is_without_a_new_y_whether_the_sample_or_the_tick_was_lost() -> None:
+    # Ticks at 0, 10, 30 ms: at 20 ms there was no y to step on, and no tick came late.
+    internals = signal([0, 10, 30], late=[0.0] * 3, age=[0.0] * 3)
+    figures = tick_figures(Tape({"internals": internals}, EPOCH), 10 * MS)
+    assert figures is not None
+    assert (figures.ticks, figures.without_new_y, figures.late_max) == (3, 1, 0.0)
+
+
+def test_what_is_drawn_of_a_long_signal_keeps_its_peaks() -> None:
+    values = np.zeros(11_999)
+    values[[5001, 7003]] = 4.0, -3.0  # one sample each: every second sample would miss both
+    drawn = drawn_points(values, 6000)
+    assert len(drawn) <= 6000
+    assert (np.diff(drawn) > 0).all()
+    assert (values[drawn].max(), values[drawn].min()) == (4.0, -3.0)
+    assert drawn_points(values[:6000], 6000).tolist() == list(range(6000))

@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aircraft_sim.airframe import LIBRARY, load_airframe
 from flight_analysis.scenario import Scenario, load_scenario
 from flight_bringup.scenarios import find_scenario
+from flight_core.files import read_yaml
 from flight_core.parameters import ParameterError, flatten, nest
 from flight_core.rates import divide, period_ns
 
@@ -57,10 +59,32 @@ BAD = {
         "/**/recorder:\n  parameters:",
     ): "recorder: found no mapping under ros__parameters",
     ("duration: 60.0", "duration: [60.0"): "bad.yaml: not valid YAML",
+    ("duration: 60.0", "duration: 2001-99-99"): "bad.yaml: not valid YAML",
+    ("duration: 60.0", "duration: 0b_"): "bad.yaml: not valid YAML",
+    ("duration: 60.0", "duration: " + 5000 * "["): "bad.yaml: not valid YAML",
+    ("duration: 60.0", "duration: 60.0\n    duration: 50.0"): "bad.yaml: not valid YAML (found the key duration twice",
+    ("duration: 60.0", "duration: 1.0e+7"): "flight.duration: found 10000000.0, expected less than or equal to 1000000",
+    ("duration: 60.0", "duration: 60.0\n    2: 60.0"): "flight: found the key 2, expected a name",
+    ("rate: 500.0                # Hz, y and truth", "rate: 0.5"): (
+        "aircraft.rate: found 0.5, expected greater than or equal to 1"
+    ),
+    ("rate: 500.0                # Hz\n    outputs", "rate: 0.5\n    outputs"): (
+        "reference_model.rate: found 0.5, expected greater than or equal to 1"
+    ),
+    ("step: 0.002", "sensors: {seed: 340282366920938463463374607431768211456}\n    step: 0.002"): (
+        "aircraft.sensors.seed: found 340282366920938463463374607431768211456, expected less than"
+    ),
+    ("step: 0.002", "step: 1.0e+308"): "aircraft.step: found 1e+308, expected less than or equal to 1",
+    ("start: [10.0], stop: [30.0], value: [1.5]", "start: [], stop: [30.0], value: [1.5]"): (
+        "reference_model.pulses.V.start: found 0 values, expected at least 1 value"
+    ),
+    ("natural_frequency: [4.0,", "natural_frequency: [1.0e+200,"): (
+        "reference_model.second_order: found an A_m that is not finite, expected frequencies and dampings whose"
+    ),
 }
 
 
-@pytest.mark.parametrize(("change", "sentence"), BAD.items(), ids=[change[1].strip() for change in BAD])
+@pytest.mark.parametrize(("change", "sentence"), BAD.items(), ids=[change[1].strip()[:40] for change in BAD])
 def test_bad_scenario_is_one_sentence(change: tuple[str, str], sentence: str, osprey_gust: Scenario, tmp_path: Path) -> None:
     text = osprey_gust.path.read_text(encoding="utf-8")
     assert text.count(change[0]) >= 1, f"the scenario no longer holds {change[0]!r}"
@@ -80,6 +104,33 @@ def test_an_integer_may_stand_for_a_number(osprey_gust: Scenario) -> None:
 def test_an_unknown_scenario_is_told_which_there_are() -> None:
     with pytest.raises(ParameterError, match=r"scenario: found 'osprey', expected one of .*osprey_gust.*, or the path"):
         find_scenario("osprey")
+
+
+@pytest.mark.parametrize("name", [5000 * "a", 5000 * "a" + ".yaml"])
+def test_a_name_too_long_for_a_file_is_none_that_there_is(name: str) -> None:
+    for find in (find_scenario, load_airframe):
+        with pytest.raises(ParameterError, match=r": found 'aaaa.*, expected one of .*osprey"):
+            find(name)
+
+
+def test_an_airframe_file_that_is_no_yaml_or_has_a_key_twice_is_one_sentence(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.yaml"
+    whole = (LIBRARY / "osprey.yaml").read_text(encoding="utf-8")
+    for text, what in (
+        ("speed: 2001-99-99", "month must be in"),
+        ("speed: 0b_", "invalid literal"),
+        (5000 * "[", "recursion"),
+        (whole + "\nname: other\n", "found the key name twice"),
+    ):
+        bad.write_text(text, encoding="utf-8")
+        with pytest.raises(ParameterError, match=rf"^airframe .*bad\.yaml: not valid YAML \(.*{what}.*\), expected an"):
+            load_airframe(str(bad))
+
+
+def test_a_key_may_stand_in_the_mapping_that_is_merged_and_in_the_one_it_is_merged_into(tmp_path: Path) -> None:
+    file = tmp_path / "merged.yaml"
+    file.write_text("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\n", encoding="utf-8")
+    assert read_yaml(file, "file", "anything")["b"] == {"x": 1, "y": 3}
 
 
 def test_every_scenario_that_ships_is_valid() -> None:

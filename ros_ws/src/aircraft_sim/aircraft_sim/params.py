@@ -38,7 +38,9 @@ Rates = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...],
 class ActuatorParameters(Parameters):
     """The actuators, one value an input in the airframe's order; a list that is left out is that of ideal ones."""
 
-    lag: NonNegativesOrNone = Field(default=(), description="time constants of the first-order response, s, 0 where there is none")
+    lag: NonNegativesOrNone = Field(
+        default=(), description="time constants of the first-order response, s, 0 where there is none"
+    )
     lower: Lower = Field(default=(), description="lower end stops, deviations from trim, SI")
     upper: Upper = Field(default=(), description="upper end stops, deviations from trim, SI")
     rate: Rates = Field(default=(), description="rate limits, SI per s")
@@ -48,9 +50,9 @@ class SensorParameters(Parameters):
     """The sensors; as they stand by default they are ideal."""
 
     noise: NonNegativesOrNone = Field(default=(), description="standard deviation of the noise per sample, one an output, SI")
-    delay: float = Field(default=0.0, ge=0, le=1e6, description="from a sample's instant to its arrival, s; whole periods of `rate`")
+    delay: float = Field(default=0.0, ge=0, le=1e6, description="from its instant to its arrival, s; whole periods of `rate`")
     dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is lost")
-    seed: int = Field(default=1, ge=0, lt=2**128, description="the seed of noise and losses")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise and losses")
 
 
 class AircraftParameters(Parameters):

@@ -87,7 +87,7 @@ def airframe_facts(airframe: Airframe) -> AirframeFacts:
     part (A, B, C): f, where the file has one, is left out. A published A may have gravity in it.
     """
     A, B, C = airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_c()
-    Omega = C @ B
+    Omega, hidden = C @ B, np.logical_not(C.any(axis=0))
     zeros = invariant_zeros(A, B, C)
     try:
         D, largest = signs(Omega), coupling(Omega)
@@ -109,9 +109,7 @@ def airframe_facts(airframe: Airframe) -> AirframeFacts:
         zero_dynamics=zero_dynamics(zeros),
         controllable=controllable(A, B),
         integrated=tuple(
-            state
-            for state, row, drive, hidden in zip(airframe.states, A, B, ~C.any(axis=0), strict=True)
-            if hidden and not drive.any() and not row[~C.any(axis=0)].any()
+            state for i, state in enumerate(airframe.states) if hidden[i] and not B[i].any() and not A[i, hidden].any()
         ),
     )
 

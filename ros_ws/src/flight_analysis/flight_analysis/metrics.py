@@ -14,6 +14,12 @@ from flight_core.vectors import FloatArray
 
 Windows = Mapping[str, tuple[float, float]]
 
+SETTLE = 1.0
+"""s. What a gust leaves behind is counted to it for as long after its end."""
+
+PARTS = f"gust: from the entry of a gust to {SETTLE:g} s after its end; calm: the rest"
+"""What the parts of the tables mean, for people."""
+
 
 class ErrorFigures(NamedTuple):
     """Tracking error of one channel over some samples, in its unit."""
@@ -89,7 +95,7 @@ def error_figures(errors: FloatArray) -> ErrorFigures:
     return ErrorFigures(float(np.sqrt(np.mean(errors**2))), float(np.max(np.abs(errors))))
 
 
-def error_table(tape: Tape, gusts: Windows, settle: float = 1.0) -> dict[str, dict[str, ErrorFigures]]:
+def error_table(tape: Tape, gusts: Windows, settle: float = SETTLE) -> dict[str, dict[str, ErrorFigures]]:
     """Figures of `known_error` by channel and part: "whole", "calm", "gust" (the gusts and `settle` seconds after each)."""
     _, error = known_error(tape)
     t = (error.stamp_ns - tape.start_ns) / 1e9

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report: one page that needs no network, the flight's figures first, then its pictures."""
 
+import itertools
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,9 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from flight_analysis.metrics import tracking_error
+from flight_analysis.metrics import PARTS, tracking_error
 from flight_analysis.scenario import Scenario
-from flight_analysis.summary import Shown, shown_units
+from flight_analysis.summary import PART_NAMES, Shown, error_rows, shown_units
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
@@ -77,7 +78,7 @@ def drawn_points(values: FloatArray, most: int = MOST_POINTS) -> NDArray[np.int6
     if len(values) <= most:
         return np.arange(len(values))
     edges = np.linspace(0, len(values), most // 2 + 1).astype(np.int64)
-    bins = zip(edges[:-1], edges[1:], strict=True)
+    bins = itertools.pairwise(edges)
     extremes = [start + extreme(values[start:stop]) for start, stop in bins for extreme in (np.argmin, np.argmax)]
     return np.unique(np.array(extremes, dtype=np.int64))
 
@@ -137,14 +138,9 @@ def _ticks_picture(tape: Tape) -> go.Figure | None:
 
 
 def _error_table(summary: dict[str, Any], units: dict[str, Shown]) -> str:
-    parts = ("whole", "calm", "gust")
-    head = "".join(f"<th>{part} rms</th><th>{part} max</th>" for part in parts)
-    rows = []
-    for channel, figures in summary["errors"].items():
-        unit, factor = units[channel]
-        cells = "".join(f"<td>{_cell(figures[part][key], factor)}</td>" for part in parts for key in ("rms", "max"))
-        rows.append(f"<tr><td>{escape(channel)} ({escape(unit)})</td>{cells}</tr>")
-    caption = f"Tracking error ({escape(summary['error'])})"
+    head = "".join(f"<th>{part} rms</th><th>{part} max</th>" for part in PART_NAMES)
+    rows = ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in error_rows(summary, units)]
+    caption = f"Tracking error ({escape(summary['error'])}; {PARTS})"
     return f"<table><caption>{caption}</caption><tr><th>channel</th>{head}</tr>{''.join(rows)}</table>"
 
 
@@ -163,7 +159,3 @@ def _tick_table(summary: dict[str, Any]) -> str:
         )
     )
     return f"<table><caption>Ticks of the controller</caption>{rows}</table>"
-
-
-def _cell(value: float | None, factor: float) -> str:
-    return "-" if value is None else f"{value * factor:.3g}"

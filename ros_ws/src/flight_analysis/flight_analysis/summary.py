@@ -12,6 +12,8 @@ from flight_core.rates import period_ns
 from flight_core.tape import Tape
 from flight_core.units import SI_PER_UNIT
 
+PART_NAMES = ("whole", "calm", "gust")
+
 
 class Shown(NamedTuple):
     """A unit for people: value_shown = value_SI * factor."""
@@ -51,6 +53,16 @@ def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
         "ticks": ticks._asdict() if ticks is not None else None,
         "notes": list(tape.notes),
     }
+
+
+def error_rows(summary: dict[str, Any], units: dict[str, Shown]) -> list[list[str]]:
+    """Rows of the error table for people: channel with unit, then rms and max of each of PART_NAMES; "-" for no figure."""
+    rows = []
+    for channel, figures in summary["errors"].items():
+        unit, factor = units[channel]
+        values = [figures[part][key] for part in PART_NAMES for key in ("rms", "max")]
+        rows.append([f"{channel} ({unit})", *("-" if value is None else f"{value * factor:.3g}" for value in values)])
+    return rows
 
 
 def _number(value: float) -> float | None:

@@ -12,7 +12,6 @@ from rich.table import Table
 
 from flight_analysis.airframe_table import AirframeFacts, ComplexArray, library
 
-
 FOLDED = ("poles", "zeros at", "minors")
 """Columns that take more lines where there is no room."""
 

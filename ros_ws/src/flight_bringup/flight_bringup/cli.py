@@ -18,7 +18,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
-from flight_analysis.summary import Shown, shown_units
+from flight_analysis.metrics import PARTS
+from flight_analysis.summary import PART_NAMES, Shown, error_rows, shown_units
 from flight_bringup import fly as flying
 from flight_bringup.airframes_command import airframes
 from flight_bringup.gains_command import gains
@@ -99,18 +100,16 @@ app.command()(airframes)
 
 def show(console: Console, summary: dict[str, Any], units: dict[str, Shown]) -> None:
     """Print the tables of a summary."""
-    parts = ("whole", "calm", "gust")
     title = f"Tracking error ({summary['error']}), {summary['duration']:.1f} s flown"
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     table.add_column("channel", no_wrap=True)
-    for part in parts:
+    for part in PART_NAMES:
         table.add_column(f"{part}\nrms", justify="right", no_wrap=True)
         table.add_column("\nmax", justify="right", no_wrap=True)
-    for channel, figures in summary["errors"].items():
-        unit, factor = units[channel]
-        cells = [_cell(figures[part][key], factor) for part in parts for key in ("rms", "max")]
-        table.add_row(f"{channel} ({unit})", *cells)
+    for row in error_rows(summary, units):
+        table.add_row(*row)
     console.print(table)
+    console.print(PARTS, style="dim")
     if (ticks := summary["ticks"]) is not None:
         ms = {key: f"{value * 1e3:.3f}" for key, value in ticks.items()}
         console.print(
@@ -121,10 +120,6 @@ def show(console: Console, summary: dict[str, Any], units: dict[str, Shown]) -> 
         )
     for note in summary["notes"]:
         console.print(f"note: {note}", highlight=False)
-
-
-def _cell(value: float | None, factor: float) -> str:
-    return "-" if value is None else f"{value * factor:.3g}"
 
 
 def _short(path: Path) -> str:

@@ -21,7 +21,7 @@ from rise_di_controller.gains import MOST_DELAY, Condition, failing
 CONDITION_FAILS = 1
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
-    "share": "bandwidth times the lag of the loop (actuator, 1.5 periods, delay), in rad: the phase margin is 90 degrees less it",
+    "share": "bandwidth times the lag of the loop (actuator, 1.5 periods, delay), in rad what the phase margin lacks of 90 deg",
     "softening": "width of the softened sign in time, beside the lag of the loop: narrower than that the loop is unstable",
     "response": "how much one unit of scaled input changes y_dot, abs(Omega_ii) input_scale; bandwidth = K x response",
 }
@@ -182,7 +182,8 @@ def _milliseconds(margin: float) -> str:
 
 def _cells(condition: Condition) -> tuple[str, str]:
     margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
-    return f"{condition.found:.4g} {SIDES[condition.side]} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
+    side = SIDES[condition.side]
+    return f"{condition.found:.4g} {side} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
 
 
 def _plain(found: Study, answers: dict[str, Answer], seed: int) -> dict[str, Any]:

@@ -32,7 +32,7 @@ class Parameters(BaseModel):
             return cls.model_validate(dict(values))
         except ValidationError as error:
             # A mistyped key is reported before the key that is missing because of it.
-            first, *others = sorted(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
+            first, *others = sorted(error.errors(), key=lambda one: one["type"] not in {"extra_forbidden", "invalid_key"})
             more = f" (and {len(others)} more)" if others else ""
             raise ParameterError(_sentence(cls, where, first) + more) from None
 

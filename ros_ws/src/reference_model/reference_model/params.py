@@ -109,7 +109,8 @@ class ReferenceModelParameters(Parameters):
                 require(output in self.linear.states, "linear.states", ", ".join(self.linear.states), f"{output} among them")
         with np.errstate(over="ignore"):
             A_m = self.model().A_m
-        require(bool(np.isfinite(A_m).all()), key, "an A_m that is not finite", "figures whose products are")
+        finite = bool(np.isfinite(A_m).all())
+        require(finite, "second_order", "an A_m that is not finite", "frequencies and dampings whose products are")
         largest = float(np.linalg.eigvals(A_m).real.max())
         require(largest < 0, key, f"an eigenvalue of A_m with real part {largest:.3g}", "A_m Hurwitz: all of them negative")
 

@@ -10,7 +10,6 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from flight_core.parameters import (
     Names,
-    NonNegative,
     NonNegatives,
     Numbers,
     ParameterError,
@@ -83,9 +82,9 @@ class ControllerParameters(Parameters):
     lag: NonNegatives = Field(description="time constants of the actuators, s, one a channel; 0 where there is none")
     delay: Annotated[float, Field(ge=0)] = Field(description="pure delay from y to the actuators, beyond sampling, s")
     softening: Positive = Field(description="width of the softened sign in total lags; above 1 the loop is stable, 3 is usual")
-    max_age: Positive = Field(description="the age beyond which y or y_m is stale, s")
-    hold: NonNegative = Field(description="how long u is held when y or y_m is stale, s")
-    ramp: NonNegative = Field(description="how long u then takes to trim, s")
+    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(description="the age beyond which y or y_m is stale, s")
+    hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="how long u is held when y or y_m is stale, s")
+    ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(description="how long u then takes to trim, s")
     lower: Numbers | None = Field(default=None, description="lower limits of u from trim, units of u; none where absent")
     upper: Numbers | None = Field(default=None, description="upper limits of u from trim, units of u; none where absent")
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s; none where absent")
