@@ -141,8 +141,9 @@ def guarded_step(
     integral_e and of Pi, each by itself) that move u further beyond are cut; those that move it inwards stay. That of
     integral_e is taken back; that of Pi, the faster one, keeps the share that ends at the limit, so that u reaches it:
 
-        left = max(abs(beyond) - abs(what the increment of integral_e moves u by), 0)
-        Pi+  = Pi + max(1 - left / abs(what the increment of Pi moves u by), 0) times that increment
+        left  = max(abs(beyond) - abs(what the increment of integral_e moves u by), 0)
+        moved = abs(what the increment of Pi moves u by)
+        Pi+   = Pi + max(moved - left, 0) / moved times that increment
 
     Without saturation every bit is that of the law alone. Theorem 1 does not speak of limits.
     """
@@ -157,7 +158,7 @@ def guarded_step(
     none = xp.zeros_like(total)
     left = xp.maximum(xp.abs(beyond) - xp.where(outward, xp.abs(moves), none), none)
     moved = xp.where(outward_Pi, xp.abs(moves_Pi), none)
-    keep = xp.maximum(1.0 - left / xp.where(moved > 0, moved, none + 1.0), none)
+    keep = xp.maximum(moved - left, none) / xp.where(moved > 0, moved, none + 1.0)
     after = after._replace(
         integral_e=xp.where(outward, state.integral_e, after.integral_e),
         Pi=xp.where(outward_Pi, state.Pi + keep * increment_Pi, after.Pi),
