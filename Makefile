@@ -37,7 +37,7 @@ setup: .venv/.workspace
 	  || { echo "error: $$($(PYTHON) --version) found, but the ROS 2 wheels are for 3.11 to 3.13; say make PYTHON=python3.12" >&2; exit 2; }
 	$(PYTHON) -m venv --clear .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
-	$(BIN)/uv pip sync --quiet --python $(BIN)/python requirements.lock
+	$(BIN)/uv pip sync --quiet --compile-bytecode --python $(BIN)/python requirements.lock
 	@touch $@
 
 .venv/.workspace: .venv/.installed $(BUILD_INPUTS)

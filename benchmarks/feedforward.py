@@ -14,13 +14,13 @@ from typing import Annotated
 
 import numpy as np
 import typer
-import yaml
 from benchmarks.sampling import Case, Figures, cells, fly, new_table
 from rich.console import Console
 from rich.progress import track
 
 from aircraft_sim.airframe import Airframe
-from flight_analysis.gain_selection import uncertain, with_feedforward
+from aircraft_sim.uncertainty import as_yaml, uncertain
+from flight_analysis.gain_selection import with_feedforward
 from flight_analysis.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
 
@@ -53,8 +53,7 @@ def around(airframe: Airframe, uncertainty: float, aircraft: int, seed: int, fol
     A, B = uncertain(airframe, uncertainty, aircraft, seed)
     for k in range(1, aircraft + 1):
         path = folder / f"{airframe.name}_{100 * uncertainty:g}_{k}.yaml"
-        content = airframe.with_matrices(A[k], B[k]).model_dump(mode="json")
-        path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        path.write_text(as_yaml(airframe.with_matrices(A[k], B[k])), encoding="utf-8")
         yield str(path)
 
 

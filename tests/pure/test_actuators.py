@@ -52,7 +52,7 @@ def test_an_ideal_actuator_passes_the_command_on_to_the_last_bit(position: float
 
 
 def test_no_lag_is_exact_in_float32_too() -> None:
-    params = Actuators(*(value.astype(np.float32) for value in one()))
+    params = Actuators(*(None if value is None else value.astype(np.float32) for value in one()))
     command = np.array([0.1], dtype=np.float32)
     moved = step(np.zeros(1, dtype=np.float32), command, np.array(0.001, dtype=np.float32), params)
     assert moved.dtype == np.float32
@@ -83,6 +83,77 @@ def test_lag_comes_before_the_rate_limit_and_the_end_stop_last() -> None:
     assert moved == pytest.approx([1.0, 1.0 - math.exp(-1.0), 0.2, 0.2, 0.5, 0.05], abs=1e-15)
     # Close to the command the lag is slower than the limit: 0.1 (1 - 1/e) = 0.063 < 0.2.
     assert step(np.zeros(6), np.full(6, 0.1), np.array(0.1), SIX)[3] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)), abs=1e-15)
+
+
+# Dead zone and faults
+
+
+def test_a_dead_zone_feels_nothing_inside_and_the_rest_beyond() -> None:
+    # felt = c - clip(c, -w, w), w = 0.1
+    params = Actuators(dead_zone=np.array([0.1]))
+    commands = [0.0, 0.05, 0.1, 0.3, -0.1, -0.25]
+    assert positions(commands, 0.01, params) == pytest.approx([0.0, 0.0, 0.0, 0.2, 0.0, -0.15], abs=1e-16)
+
+
+@given(command=st.floats(-1.0, 1.0), further=st.floats(0.0, 1e-3), width=st.floats(0.0, 0.5))
+def test_a_dead_zone_has_no_jump_and_never_turns_a_command_round(command: float, further: float, width: float) -> None:
+    params = Actuators(dead_zone=np.array([width]))
+    felt, more = positions([command, command + further], 0.01, params)
+    assert -1e-15 <= more - felt <= further + 1e-15
+    assert felt * command >= 0.0
+    assert abs(felt) <= abs(command)
+
+
+def test_the_dead_zone_comes_before_the_lag() -> None:
+    params = Actuators(lag=np.array([0.1]), dead_zone=np.array([0.1]))
+    assert positions([0.4], 0.1, params) == pytest.approx([0.3 * (1.0 - math.exp(-1.0))])
+
+
+def flown_positions(times_ms: range, command: float, **actuators: list[float]) -> FloatArray:
+    """Positions of the four actuators at the end of each 10 ms from the given instants on, all four commanded alike."""
+    parts = osprey(10.0, **actuators)
+    state, history = plant.start(parts), []
+    for t in times_ms:
+        state = advance(t * MS, state, np.full(4, command), 10 * MS, parts)
+        history.append(state.position)
+    return np.array(history)
+
+
+def test_a_stuck_surface_stays_where_it_is_from_its_instant_on() -> None:
+    # Lag 20 ms, elevator stuck at 50 ms: it moves as ever up to there, and stays.
+    lag, never = [0.02] * 4, math.inf
+    sound = flown_positions(range(0, 100, 10), 0.2, lag=lag)
+    stuck = flown_positions(range(0, 100, 10), 0.2, lag=lag, stuck_at=[0.05, never, never, never])
+    assert (stuck[:, 1:] == sound[:, 1:]).all()
+    assert (stuck[:5, 0] == sound[:5, 0]).all()
+    assert (stuck[5:, 0] == sound[4, 0]).all()
+    assert stuck[-1, 0] == pytest.approx(0.2 * (1.0 - math.exp(-2.5)))
+
+
+def test_a_surface_stuck_from_the_start_is_in_trim() -> None:
+    assert (flown_positions(range(0, 30, 10), 0.2, stuck_at=[0.0] * 4) == 0.0).all()
+
+
+def test_a_lost_surface_is_in_trim_from_its_instant_on_also_where_it_was_stuck() -> None:
+    never = math.inf
+    lost = flown_positions(range(0, 80, 10), 0.2, lost_at=[0.05, 0.06, never, never], stuck_at=[never, 0.03, 0.03, never])
+    assert lost[:, 0].tolist() == [0.2] * 5 + [0.0] * 3
+    assert lost[:, 1].tolist() == [0.2] * 6 + [0.0] * 2
+    assert lost[:, 2:].tolist() == [[0.2, 0.2]] * 8  # stuck where it was commanded, and sound
+
+
+def test_a_fault_within_a_step_strikes_at_the_next_one() -> None:
+    lost = flown_positions(range(0, 40, 10), 0.2, lost_at=[0.015] * 4)
+    assert lost[:, 0].tolist() == [0.2, 0.2, 0.0, 0.0]
+
+
+def test_a_lost_aileron_leaves_the_aircraft_as_without_it() -> None:
+    # Against matrices without that column: what the actuator shows is what the aircraft feels.
+    parts, u = osprey(lost_at=[math.inf, math.inf, 0.0, math.inf]), np.array([0.01, 0.1, -0.02, 0.03])
+    without = osprey()
+    without = without._replace(aircraft=without.aircraft._replace(B=without.aircraft.B * [1.0, 1.0, 0.0, 1.0]))
+    found, expected = (advance(0, plant.start(one_of), u, 500 * MS, one_of).x for one_of in (parts, without))
+    assert (found == expected).all()
 
 
 @given(
@@ -137,6 +208,10 @@ def test_the_plant_behind_a_lag_leads_its_continuous_model_by_half_a_step() -> N
         ({"upper": [-0.1, 1.0, 1.0, 1.0]}, r"aircraft.actuators.upper\[0\]: found -0.1, expected greater than or equal to 0"),
         ({"lower": [0.1, -1.0, -1.0, -1.0]}, r"aircraft.actuators.lower\[0\]: found 0.1, expected less than or equal to 0"),
         ({"rate": [1.0, math.nan, 1.0, 1.0]}, r"aircraft.actuators.rate\[1\]: found nan, expected greater than 0"),
+        ({"dead_zone": [0.1]}, "aircraft.actuators.dead_zone: found 1 values, expected 4, one for each of elevator, thrust"),
+        ({"dead_zone": [-0.1] * 4}, r"aircraft.actuators.dead_zone\[0\]: found -0.1, expected greater than or equal to 0"),
+        ({"stuck_at": [-1.0] * 4}, r"aircraft.actuators.stuck_at\[0\]: found -1.0, expected greater than or equal to 0"),
+        ({"lost_at": [math.nan] * 4}, r"aircraft.actuators.lost_at\[0\]: found nan, expected greater than or equal to 0"),
         ({"lags": [0.02]}, "aircraft.actuators.lags: unknown key, expected lag perhaps"),
     ],
 )
@@ -147,7 +222,9 @@ def test_actuators_that_do_not_fit_are_refused_by_name(section: dict[str, list[f
 
 
 def test_one_channel_may_have_no_limit() -> None:
-    assert osprey(upper=[0.5, math.inf, 0.5, 0.5]).actuators.upper.tolist() == [0.5, math.inf, 0.5, 0.5]
+    upper = osprey(upper=[0.5, math.inf, 0.5, 0.5]).actuators.upper
+    assert upper is not None
+    assert upper.tolist() == [0.5, math.inf, 0.5, 0.5]
 
 
 # The law flown through servos: scenario osprey_servo, of which noise is left out here.

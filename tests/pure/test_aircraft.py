@@ -3,6 +3,7 @@
 """The simulated aircraft against exact solutions."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,12 +12,13 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from aircraft_sim import dynamics, truth
+from aircraft_sim import actuators, dynamics, truth, turbulence
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.disturbance import Gusts, one_minus_cosine
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.plant import AircraftState, Plant, advance
+from aircraft_sim.plant import AircraftState, Plant, advance, start
+from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
@@ -118,7 +120,7 @@ def test_inputs_of_the_airframe_are_converted_to_si_once() -> None:
     assert B[0, 1] == pytest.approx(6.0)
 
 
-def test_truth_holds_the_state_the_disturbance_the_actuators_and_the_noise() -> None:
+def test_truth_holds_the_state_the_disturbance_and_the_actuators() -> None:
     values = {
         "airframe": "osprey",
         "rate": 500.0,
@@ -126,15 +128,75 @@ def test_truth_holds_the_state_the_disturbance_the_actuators_and_the_noise() -> 
         "gusts": {"vertical": {"start": 0.0, "speed": 2.0, "length": 10.0}},
     }
     parameters = AircraftParameters.validate_mapping(values, "aircraft")
-    airframe, aircraft = parameters.load()
-    names = truth.names(airframe, parameters)
+    names = truth.names(parameters.load()[0])
     state = AircraftState(np.arange(8.0) / 100, np.array([0.1, 0.2, 0.3, 0.4]))
-    noise = np.array([1e-3, 2e-3, 3e-3, 4e-3])
-    shown = dict(zip(names, truth.values(400 * MS, state, noise, aircraft), strict=True))
+    shown = dict(zip(names, truth.values(400 * MS, state, parameters.plant()), strict=True))
     assert shown["x.phi"] == 0.07
     assert shown["gust.vertical"] == pytest.approx(2.0)  # s = 25 0.4 = H
-    assert (shown["actuator.thrust"], shown["noise.V"]) == (0.2, 2e-3)
+    assert shown["gust.lateral"] == shown["gust.longitudinal"] == 0.0  # every axis that the airframe knows
+    assert shown["actuator.thrust"] == 0.2
     assert shown["f.V"] == pytest.approx(-9.81 * math.sin(0.03) - 11.1 * 2.0 / 25)
+
+
+EVERYTHING = {
+    "gusts": {
+        "vertical": {"start": 0.0, "speed": 10.0, "length": 15.0},
+        "lateral": {"start": 0.01, "speed": -4.0, "length": 5.0},
+        "longitudinal": {"start": 0.0, "speed": 3.0, "length": 9.0},
+    },
+    "turbulence": {"altitude": 50.0, "wind": 15.4},
+    "bias": {"q": {"start": 0.01, "value": 0.5, "rise": 0.02}, "V": {"start": 0.0, "value": -1.0, "rise": 0.0}},
+    "sines": {"r": {"amplitude": 0.3, "frequency": 20.0, "phase": 1.0}},
+    "inertial_coupling": 1.0,
+    "actuators": {"lag": [0.02, 0.1, 0.02, 0.02], "dead_zone": [0.001] * 4, "stuck_at": [math.inf, math.inf, 0.3, math.inf]},
+}
+
+
+def test_steps_taken_together_are_runge_kutta_steps_of_equation_1() -> None:
+    # x_dot is the definition; advance takes what depends on time at all instants together. Measured 1e-16 over 20 steps.
+    values = {"airframe": "osprey", "rate": 25.0, "step": 0.002} | EVERYTHING
+    parts = AircraftParameters.validate_mapping(values, "aircraft").plant()
+    air = parts.turbulence
+    assert air is not None
+    u, T = np.array([0.05, 0.1, -0.04, 0.03]), 20
+    state = start(parts)._replace(x=np.linspace(-0.5, 0.5, 8))
+    end = advance(7 * 40 * MS, state, u, 40 * MS, parts)
+
+    x, position, z = state
+    for k, normal in enumerate(turbulence.normals(7 * T, T, air.seed)):
+        t = 0.28 + 0.002 * k
+        moved = actuators.step(position, u, 0.002, parts.actuators)
+        position = actuators.fail(t, position, moved, parts.actuators)
+        x_dot = partial(dynamics.x_dot, turbulence=turbulence.wind(z, air))
+        x = rk4(x_dot, t, x, position, parts.aircraft, 0.002)
+        z = turbulence.step(z, normal, air)
+    assert end.x == pytest.approx(x, rel=1e-13, abs=1e-15)
+    assert (end.position == position).all()
+    assert np.asarray(end.turbulence).tobytes() == np.asarray(z).tobytes()
+
+
+def test_equation_1_is_the_sum_of_its_parts() -> None:
+    aircraft = AircraftParameters.validate_mapping(
+        {"airframe": "osprey", "rate": 25.0, "step": 0.002} | EVERYTHING, "a"
+    ).load()[1]
+    x, u, turbulent = np.linspace(-0.3, 0.3, 8), np.array([0.01, 0.1, 0.02, 0.03]), np.array([0.5, -1.0, 2.0])
+    x_dot = dynamics.x_dot(0.3, x, u, aircraft, turbulent)
+    assert x_dot == pytest.approx(aircraft.A @ x + dynamics.f(0.3, x, aircraft, turbulent) + aircraft.B @ u, abs=1e-14)
+    calm = dynamics.f(0.3, x, aircraft)
+    assert dynamics.f(0.3, x, aircraft, turbulent) - calm == pytest.approx(aircraft.gust_direction @ turbulent, abs=1e-14)
+
+
+def test_states_in_columns_have_the_f_of_each() -> None:
+    aircraft = plant(vertical={"start": 0.0, "speed": 10.0, "length": 15.0}).aircraft
+    coupling = AircraftParameters.validate_mapping(
+        {"airframe": "osprey", "rate": 25.0, "step": 0.002, "inertial_coupling": 1.0}, "aircraft"
+    )
+    together = aircraft._replace(coupling=coupling.load()[1].coupling, gusts=Gusts(*(one[:, None] for one in aircraft.gusts)))
+    alone = together._replace(gusts=aircraft.gusts)
+    columns = np.random.default_rng(1).uniform(-1.0, 1.0, (8, 5))
+    f = dynamics.f(0.3, columns, together)
+    for k in range(5):
+        assert f[:, k] == pytest.approx(dynamics.f(0.3, columns[:, k], alone), abs=1e-14)
 
 
 def test_a_step_that_does_not_divide_the_time_is_refused() -> None:

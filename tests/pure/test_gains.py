@@ -15,6 +15,7 @@ import yaml
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import uncertain
 from flight_analysis import gain_selection as selection
 from flight_analysis.gain_selection import Answer, Channels, Manoeuvre, Setting, Study
 from flight_analysis.scenario import Scenario
@@ -183,13 +184,13 @@ def test_the_ideal_control_is_what_a_tight_loop_settles_to(osprey_gust: Scenario
 
 def test_uncertain_airframes_keep_what_is_kinematic() -> None:
     airframe = load_airframe("osprey")
-    A, B = selection.uncertain(airframe, 0.3, 50, seed=1)
+    A, B = uncertain(airframe, 0.3, 50, seed=1)
     for state in ("theta", "phi"):
         assert (A[:, airframe.index(state)] == airframe.matrix_a()[airframe.index(state)]).all()
     part = B[1:, airframe.index("q"), 0] / B[0, airframe.index("q"), 0] - 1.0
     assert 0.2 < np.abs(part).max() <= 0.3  # fifty uniform draws: the largest is above 0.2 but for 1 in 1e9
     with pytest.raises(ParameterError, match=r"uncertainty: found 1\.5"):
-        selection.uncertain(airframe, 1.5, 1, seed=1)
+        uncertain(airframe, 1.5, 1, seed=1)
 
 
 def test_an_airframe_with_an_unstable_zero_is_refused(osprey_gust: Scenario) -> None:

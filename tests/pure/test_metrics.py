@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from flight_analysis.metrics import error_figures, error_table, in_windows, tick_figures, tracking_error
-from flight_analysis.report import drawn_points
 from flight_core.tape import Signal, Tape
 
 MS = 1_000_000
@@ -80,13 +79,3 @@ def test_a_period_is_without_a_new_y_whether_the_sample_or_the_tick_was_lost() -
     figures = tick_figures(Tape({"internals": internals}, EPOCH), 10 * MS)
     assert figures is not None
     assert (figures.ticks, figures.without_new_y, figures.late_max) == (3, 1, 0.0)
-
-
-def test_what_is_drawn_of_a_long_signal_keeps_its_peaks() -> None:
-    values = np.zeros(11_999)
-    values[[5001, 7003]] = 4.0, -3.0  # one sample each: every second sample would miss both
-    drawn = drawn_points(values, 6000)
-    assert len(drawn) <= 6000
-    assert (np.diff(drawn) > 0).all()
-    assert (values[drawn].max(), values[drawn].min()) == (4.0, -3.0)
-    assert drawn_points(values[:6000], 6000).tolist() == list(range(6000))

@@ -23,7 +23,7 @@ from flight_analysis.lyapunov import Plant, decay, evidence, example, fly
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from reference_model.command import Profile, command
-from reference_model.model import Model, output, second_order, step
+from reference_model.model import Model, output, second_order, step, stepper
 from rise_di_controller.decomposition import DecompositionError, decompose
 from rise_di_controller.law import LawParams, Sign, gain
 
@@ -590,8 +590,9 @@ def largest_y_m_ddot(model: Model, rise: float) -> float:
     one, none = np.ones((1, 1)), np.zeros(1)
     climb = Profile(0.0 * one, one, np.array(rise), none, none + 1.0, none, none, none)
     dt, x_m, y_m = rise / 5.0, np.zeros(len(model.A_m)), [0.0]
+    steps = stepper(dt, model)
     for k in range(round(0.5 / dt)):
-        x_m = step(k * dt, x_m, lambda t: command(t, climb), dt, model)
+        x_m = step(x_m, np.concatenate([command((k + part) * dt, climb) for part in (0.0, 0.5, 1.0)]), steps)
         y_m.append(float(output(x_m, model)[0]))
     return float(np.max(np.abs(np.diff(y_m, 2)))) / dt**2
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.signal import StateSpace, lsim
 
+from flight_core.integrators import rk4
 from flight_core.vectors import FloatArray
 from reference_model import model
 from reference_model.command import command
@@ -61,10 +62,11 @@ def test_a_coordinated_turn_follows_the_integral_of_the_bank_rate() -> None:
 
 def simulate(params: ReferenceModelParameters, duration: float, dt: float) -> FloatArray:
     matrices, profile = params.model(), params.profile()
-    x_m = np.zeros(len(matrices.A_m))
+    x_m, steps = np.zeros(len(matrices.A_m)), model.stepper(dt, matrices)
     outputs = [model.output(x_m, matrices)]
     for k in range(round(duration / dt)):
-        x_m = model.step(k * dt, x_m, lambda t: command(t, profile), dt, matrices)
+        u_m = np.concatenate([command((k + part) * dt, profile) for part in (0.0, 0.5, 1.0)])
+        x_m = model.step(x_m, u_m, steps)
         outputs.append(model.output(x_m, matrices))
     return np.array(outputs)
 
@@ -78,6 +80,20 @@ def test_equation_2_agrees_with_an_exact_linear_simulation() -> None:
     )  # piecewise linear with knots on the grid: lsim is exact for it
     _, exact, _ = lsim(StateSpace(matrices.A_m, matrices.B_m, matrices.C, np.zeros((3, 3))), u_m, t)  # type: ignore[call-overload]
     assert simulate(params, 6.0, 0.002) == pytest.approx(exact, abs=1e-9)
+
+
+def test_a_step_is_one_runge_kutta_step_of_equation_2() -> None:
+    params = parameters(pulses=PULSES)
+    matrices, profile, dt = params.model(), params.profile(), 0.05
+    x_m = np.linspace(-0.2, 0.3, 6)
+
+    def x_dot(t: float, x: FloatArray, _: None, params: model.Model) -> FloatArray:
+        return np.asarray(model.x_m_dot(t, x, command(t, profile), params))
+
+    # PULSES change u_m within this step; rounding alone tells the two apart.
+    u_m = np.concatenate([command(1.0 + part * dt, profile) for part in (0.0, 0.5, 1.0)])
+    one_step = rk4(x_dot, 1.0, x_m, None, matrices, dt)
+    assert model.step(x_m, u_m, model.stepper(dt, matrices)) == pytest.approx(one_step, rel=1e-14, abs=1e-15)
 
 
 def test_a_long_pulse_ends_at_its_value() -> None:

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aircraft_sim import dynamics, plant
+from aircraft_sim import sensors as sensor_maths
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.sensors import Sample, Sensors, Underway, arrives, noise, transmit
+from aircraft_sim.sensors import Drift, Sample, Sensors, Underway, arrives, measure, noise, start, transmit, walk
+from aircraft_sim.simulator import AirframeVehicle, Simulator
 from flight_analysis.metrics import error_figures, known_error, tracking_error, true_error
 from flight_analysis.scenario import Scenario
 from flight_analysis.simulate import simulate
@@ -131,14 +132,98 @@ def test_samples_that_fell_due_while_nobody_looked_arrive_together_oldest_first(
 
 def test_a_measured_sample_is_the_output_with_its_noise_or_nothing() -> None:
     values = {"airframe": "osprey", "rate": 100.0, "step": 0.01, "sensors": {"noise": NOISE, "dropout": 0.5}}
-    parts = AircraftParameters.validate_mapping(values, "aircraft").plant()
-    state = plant.start(parts)._replace(x=np.linspace(0.0, 0.7, 8))
-    seen = [plant.measure(k, state, parts) for k in range(20)]
-    assert {measured.y is None for measured in seen} == {True, False}
-    for k, measured in enumerate(seen):
-        assert (measured.noise == noise(k, parts.sensors)).all()
-        if measured.y is not None:
-            assert (measured.y == dynamics.y(state.x, parts.aircraft) + measured.noise).all()
+    parameters = AircraftParameters.validate_mapping(values, "aircraft")
+    simulator, flying = Simulator(parameters), AirframeVehicle(parameters)
+    u = np.array([0.01, 0.1, 0.02, 0.03])
+    arrivals = []
+    for k in range(20):
+        arrived = simulator.sample(k, u)
+        if k:
+            flying.advance((k - 1) * 10 * MS, u, 10 * MS)
+        error = noise(k, parameters.sensor_arrays())
+        assert (simulator.truth()[-4:] == error).all()
+        arrivals.append(len(arrived))
+        for sample in arrived:
+            assert sample.stamp_ns == k * 10 * MS
+            assert (sample.y == flying.y() + error).all()
+    assert set(arrivals) == {0, 1}
+
+
+# Bias, drift, quantisation
+
+
+def drifting(step: list[float], seed: int = 1) -> Sensors:
+    return sensors([0.0] * len(step), seed=seed)._replace(drift=np.array(step))
+
+
+def test_the_errors_add_up_and_the_quantisation_comes_last() -> None:
+    y = np.array([0.1234, -0.1234, 0.1234, 20.0])
+    params = sensors([0.01] * 4)._replace(
+        bias=np.array([0.2, -0.3, 0.0, 0.0]), drift=np.array([0.1, 0.1, 0.0, 0.1]), quantum=np.array([0.0, 0.05, 0.05, 0.5])
+    )
+    drift = walk(6, start(params), params)
+    measured = measure(7, y, drift, params)
+    analog = y + params.bias + walk(7, drift, params).value + noise(7, params)
+    assert measured.y[0] == pytest.approx(analog[0], abs=1e-15)
+    assert measured.y[1:] == pytest.approx([0.05, 0.05, 0.5] * np.round(analog[1:] / [0.05, 0.05, 0.5]), abs=1e-15)
+    assert np.abs(measured.y - analog).max() <= 0.25  # half a step
+    assert measured.error == pytest.approx(measured.y - y, abs=1e-15)
+
+
+def test_quantisation_rounds_to_the_nearest_step_and_halves_to_even() -> None:
+    params = sensors([0.0] * 6)._replace(quantum=np.full(6, 0.25))
+    y = np.array([0.1, 0.125, 0.375, -0.1, -0.2, 0.3])  # 0.125 and 0.375 are exact halves
+    assert measure(0, y, start(params), params).y.tolist() == [0.0, 0.0, 0.5, -0.0, -0.25, 0.25]
+
+
+def test_a_bias_is_the_whole_error_of_a_sensor_that_has_nothing_else() -> None:
+    params = sensors([0.0] * 2)._replace(bias=np.array([0.5, -0.25]))
+    for k in (0, 9):
+        measured = measure(k, np.array([1.0, 2.0]), start(params), params)
+        assert measured.error.tolist() == [0.5, -0.25]
+        assert measured.y.tolist() == [1.5, 1.75]
+
+
+def test_drift_does_not_depend_on_what_was_missed() -> None:
+    params = drifting([0.1, 0.2])
+    each: list[Drift] = [start(params)]
+    for k in range(1, 101):
+        each.append(walk(k, each[-1], params))
+    seen = start(params)
+    for k in (0, 3, 4, 50, 51, 100):
+        seen = walk(k, seen, params)
+        assert seen.value.tobytes() == each[k].value.tobytes()
+    assert walk(100, seen, params).value.tobytes() == seen.value.tobytes()  # nothing moves without time
+    assert (each[0].value == 0.0).all()
+
+
+def test_drift_does_not_depend_on_noise_and_loss_and_differs_by_seed() -> None:
+    alone = walk(20, start(drifting([0.1] * 4)), drifting([0.1] * 4)).value
+    noisy = drifting([0.1] * 4)._replace(noise=np.array(NOISE), dropout=0.5)
+    assert (walk(20, start(noisy), noisy).value == alone).all()
+    other = drifting([0.1] * 4, seed=2)
+    assert (walk(20, start(other), other).value != alone).all()
+    first = walk(1, start(drifting([1.0] * 4)), drifting([1.0] * 4)).value
+    assert (first != noise(1, sensors([1.0] * 4))).all()  # a stream of its own under the same seed
+
+
+def test_the_variance_of_the_drift_grows_with_time_whatever_the_rate() -> None:
+    # 0.2 SI per sqrt(s): variance 0.04 t. 400 walks at two rates: chi-square of 400 has a standard deviation of 7 %; four of
+    # them hold in 99.99 % of seeds.
+    for rate, samples in ((10.0, 20), (40.0, 80)):
+        values = {"airframe": "osprey", "rate": rate, "step": 0.005, "sensors": {"drift": [0.2, 0.0, 0.4, 0.0]}}
+        params = AircraftParameters.validate_mapping(values, "aircraft").sensor_arrays()
+        ends = np.array([walk(samples, start(params), params._replace(seed=seed)).value for seed in range(400)])
+        variance = np.mean(ends**2, axis=0)
+        assert variance[[0, 2]] == pytest.approx([0.04 * 2.0, 0.16 * 2.0], rel=0.28)
+        assert (variance[[1, 3]] == 0.0).all()
+
+
+def test_ideal_sensors_give_y_to_the_last_bit() -> None:
+    y = np.array([0.1, -1e-300, 3.0, 7.7])
+    measured = measure(3, y, start(sensors([0.0] * 4)), sensors([0.0] * 4))
+    assert measured.y.tobytes() == y.tobytes()
+    assert (measured.error == 0.0).all()
 
 
 @pytest.mark.parametrize(
@@ -151,6 +236,9 @@ def test_a_measured_sample_is_the_output_with_its_noise_or_nothing() -> None:
         ({"dropout": 1.0}, "aircraft.sensors.dropout: found 1.0, expected less than 1"),
         ({"seed": 1.5}, "aircraft.sensors.seed: found 1.5, expected an? .*integer"),
         ({"nois": NOISE}, "aircraft.sensors.nois: unknown key, expected noise perhaps"),
+        ({"bias": [0.1]}, "aircraft.sensors.bias: found 1 values, expected 4, one for each of q, V, p, r"),
+        ({"drift": [0.1] * 3 + [-0.1]}, r"aircraft.sensors.drift\[3\]: found -0.1, expected greater than or equal to 0"),
+        ({"quantisation": [-0.1] * 4}, r"aircraft.sensors.quantisation\[0\]: found -0.1, expected greater than or equal to 0"),
     ],
 )
 def test_sensors_that_do_not_fit_are_refused_by_name(section: dict[str, Any], sentence: str) -> None:
@@ -189,6 +277,19 @@ def test_truth_knows_the_noise_of_every_sample_also_of_those_that_are_lost(servo
     for name in y.names:
         assert (y[name] == truth[f"x.{name}"][at] + truth[f"noise.{name}"][at]).all()
         assert (truth[f"noise.{name}"] != 0.0).all()
+
+
+def test_truth_knows_the_whole_error_of_sensors_with_every_fault(servo: Scenario) -> None:
+    faults = {"bias": [0.01, 0.5, 0.0, -0.01], "drift": [1e-3, 0.0, 1e-3, 1e-3], "quantisation": [1e-3, 0.0, 1e-3, 5e-4]}
+    tape = simulate(with_sensors(servo, dropout=0.3, **faults).vary(flight={"duration": 2.0}))
+    y, truth = tape["y"], tape["truth"]
+    at = np.searchsorted(truth.stamp_ns, y.stamp_ns)
+    for name in y.names:
+        assert y[name] == pytest.approx(truth[f"x.{name}"][at] + truth[f"noise.{name}"][at], abs=1e-15)
+    assert np.mean(truth["noise.V"]) == pytest.approx(0.5, abs=0.01)  # the bias; the noise is 0.03 over 200 samples
+    assert y["q"] / 1e-3 == pytest.approx(np.round(y["q"] / 1e-3), abs=1e-9)
+    again = simulate(with_sensors(servo, dropout=0.3, **faults).vary(flight={"duration": 2.0}))
+    assert again["truth"].values.tobytes() == truth.values.tobytes()
 
 
 def test_the_true_error_leaves_out_the_noise_that_the_measured_error_holds(servo: Scenario) -> None:
@@ -269,6 +370,6 @@ def test_gaps_of_half_a_second_do_no_harm(servo: Scenario, monkeypatch: pytest.M
     # 0.5 s of every 5 s without a sample, most of them between the commands. u is held, and beyond max_age the controller
     # engages afresh when samples come again: the gap is integrated by nobody. Measured 8.5, 0.11, 9.8, 6.7; the prototype had
     # 8.4 in q where it integrated one nominal dt, and 11.7 with the whole gap as dt.
-    monkeypatch.setattr(plant, "arrives", lambda number, params: not 300 <= number % 500 < 350)
+    monkeypatch.setattr(sensor_maths, "arrives", lambda number, params: not 300 <= number % 500 < 350)
     gaps = rms(simulate(servo))
     assert (gaps < [9.0, 0.12, 11.0, 7.5]).all(), gaps

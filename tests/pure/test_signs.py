@@ -20,7 +20,6 @@ from aircraft_sim.airframe import LIBRARY
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.plant import Plant
-from aircraft_sim.sensors import Sensors
 from flight_analysis.metrics import error_figures, true_error
 from flight_analysis.scenario import Scenario
 from flight_analysis.simulate import simulate
@@ -113,7 +112,7 @@ def fly(aircraft: Aircraft, law: LawParams, y_m: list[FloatArray], dt: float, bo
     """The errors e at 0, dt, 2 dt, ... from trim, shape (ticks, m), until one is above the bound: there the flight ends."""
     period_ns, m = nanoseconds(dt), len(law.K)
     ideal = Actuators(np.zeros(m), np.full(m, -np.inf), np.full(m, np.inf), np.full(m, np.inf))
-    hardware = Plant(aircraft, ideal, Sensors(np.zeros(m), 0, 0.0, 1), period_ns)
+    hardware = Plant(aircraft, ideal, period_ns)
     flying, u = plant.start(hardware), np.zeros(m)
     state = rise.engage(dynamics.y(flying.x, aircraft), y_m[0])
     errors = [state.e]
@@ -146,10 +145,10 @@ def manoeuvre() -> list[FloatArray]:
     }
     section = SERVO.vary(reference_model={"pulses": pulses}).reference_model
     reference, profile = section.model(), section.profile()
-    x_m = zero_state(reference)
+    x_m, steps = zero_state(reference), model.stepper(FAST, reference)
     y_m = [model.output(x_m, reference)]
     for k in range(round(4.0 / FAST)):
-        x_m = model.step(k * FAST, x_m, lambda t: command(t, profile), FAST, reference)
+        x_m = model.step(x_m, np.concatenate([command((k + part) * FAST, profile) for part in (0.0, 0.5, 1.0)]), steps)
         y_m.append(model.output(x_m, reference))
     return y_m
 

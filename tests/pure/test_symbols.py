@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, get_args
 import pytest
 from pydantic import BaseModel
 
-from aircraft_sim import truth
+from aircraft_sim.simulator import Simulator
 from flight_analysis.lyapunov import Evidence
 from flight_analysis.scenario import SCHEMAS, Scenario
 from rise_di_controller import internals
@@ -121,14 +121,13 @@ def topics() -> set[str]:
 def channels(osprey_gust: Scenario) -> Mapping[str, Sequence[str]]:
     """Channel names by topic, in the default scenario."""
     outputs, inputs = osprey_gust.controller.outputs, osprey_gust.controller.inputs
-    airframe, _ = osprey_gust.aircraft.load()
     return {
         "y": outputs,
         "y_m": outputs,
         "u_m": outputs,
         "u": inputs,
         "internals": internals.names(outputs, inputs),
-        "truth": truth.names(airframe, osprey_gust.aircraft),
+        "truth": Simulator(osprey_gust.aircraft).truth_names,
     }
 
 

@@ -49,13 +49,20 @@ class Process:
             said = self._changed.wait_for(lambda: any(text in line for line in self.lines), timeout)
         assert said, f"{text!r} not said within {timeout} s; said:\n{self.output}"
 
+    def children(self) -> list[psutil.Process]:
+        """Its processes."""
+        return psutil.Process(self.popen.pid).children(recursive=True)
+
     def interrupt(self) -> None:
         """As Ctrl-C does."""
         self.popen.send_signal(signal.SIGINT)
 
     def end(self, timeout: float = 30.0) -> int:
         """Wait for the end; the exit status."""
-        status = self.popen.wait(timeout)
+        try:
+            status = self.popen.wait(timeout)
+        except subprocess.TimeoutExpired:
+            pytest.fail(f"still running after {timeout} s; said:\n{self.output}")
         self._reader.join()
         assert self.popen.stdout is not None
         self.popen.stdout.close()
@@ -82,7 +89,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
     yield begin
     for process in started:
         if process.popen.poll() is None:
-            for child in psutil.Process(process.popen.pid).children(recursive=True):
+            for child in process.children():
                 child.kill()
             process.popen.kill()
         process.end()

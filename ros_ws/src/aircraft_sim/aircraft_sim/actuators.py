@@ -1,29 +1,31 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators between the command u and the aircraft: lag, rate limit, end stops, in this order."""
+"""Actuators between the command u and the aircraft: dead zone, lag, rate limit, end stops, in this order; and their faults."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from array_api_compat import array_namespace
-
-from flight_core.vectors import Array
+from flight_core.vectors import Array, array_namespace
 
 SHORTEST_LAG = 1e-30  # s, stands for no lag: exp(-dt / 1e-30) is exactly 0, in float32 too, and nothing is divided by 0
 
 
 class Actuators(NamedTuple):
-    """Parameters of m actuators, SI. An ideal one has lag 0 and infinite limits."""
+    """Parameters of m actuators, SI. An ideal one has lag 0 and infinite limits. What is None is absent from all of them."""
 
-    lag: Array  # (m,) time constant of the first-order response, s, 0 = none
-    lower: Array  # (m,) lower end stop, deviation from trim, -inf = none
-    upper: Array  # (m,) upper end stop, deviation from trim, inf = none
-    rate: Array  # (m,) largest rate, units of u / s, inf = none
+    lag: Array | None = None  # (m,) time constant of the first-order response, s, 0 = none
+    lower: Array | None = None  # (m,) lower end stop, deviation from trim, -inf = none
+    upper: Array | None = None  # (m,) upper end stop, deviation from trim, inf = none
+    rate: Array | None = None  # (m,) largest rate, units of u / s, inf = none
+    dead_zone: Array | None = None  # (m,) half-width, 0 = none
+    stuck_at: Array | None = None  # (m,) s of flight time, inf = never
+    lost_at: Array | None = None  # (m,) s of flight time, inf = never
 
 
-def step(position: Array, command: Array, dt: Array, params: Actuators) -> Array:
+def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     """Actuator positions one step later, shape (m,), with the command held over the step.
 
-        lagged  = command - (command - position) exp(-dt / lag)                exact solution of lag p_dot = command - p
+        felt    = command - clip(command, -dead_zone, dead_zone)               dead zone: nothing inside, no jump at its edge
+        lagged  = felt - (felt - position) exp(-dt / lag)                      exact solution of lag p_dot = felt - p
         limited = position + clip(lagged - position, -rate dt, rate dt)        rate limit
         p+      = clip(limited, lower, upper)                                  end stops
 
@@ -34,8 +36,29 @@ def step(position: Array, command: Array, dt: Array, params: Actuators) -> Array
     Source: the lag is the zero-order-hold equivalent of 1 / (lag s + 1); Franklin, Powell, Workman, Digital Control, 4.3.
     """
     xp = array_namespace(position)
-    decay = xp.exp(-dt / xp.maximum(params.lag, xp.full_like(params.lag, SHORTEST_LAG)))
-    lagged = command - (command - position) * decay
-    reach = params.rate * dt
-    limited = xp.minimum(xp.maximum(lagged, position - reach), position + reach)
-    return xp.minimum(xp.maximum(limited, params.lower), params.upper)
+    moved = command
+    if params.dead_zone is not None:
+        moved = moved - xp.minimum(xp.maximum(moved, -params.dead_zone), params.dead_zone)
+    if params.lag is not None:
+        moved = moved - (moved - position) * xp.exp(-dt / xp.maximum(params.lag, SHORTEST_LAG))
+    if params.rate is not None:
+        reach = params.rate * dt
+        moved = xp.minimum(xp.maximum(moved, position - reach), position + reach)
+    if params.lower is not None:
+        moved = xp.maximum(moved, params.lower)
+    return moved if params.upper is None else xp.minimum(moved, params.upper)
+
+
+def fail(t: Any, position: Array, moved: Array, params: Actuators) -> Array:
+    """Positions at the end of a step that begins at t, where faults may have struck, shape (m,).
+
+        t >= stuck_at    position    it stays where it is
+        t >= lost_at     0           it gives no effect: the surface is free, floats to trim at once and stays; also if stuck
+        else             moved
+
+    Arguments: `position` at t, `moved` where it would be without faults. A fault within a step strikes at the next one.
+    """
+    xp = array_namespace(position)
+    if params.stuck_at is not None:
+        moved = xp.where(t >= params.stuck_at, position, moved)
+    return moved if params.lost_at is None else xp.where(t >= params.lost_at, 0.0 * moved, moved)

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
+from aircraft_sim.disturbance import AXES
 from flight_core.files import is_file, read_yaml
 from flight_core.parameters import Names, Numbers, Parameters, Positive, as_tuple, require
 from flight_core.units import SI_PER_UNIT
@@ -35,8 +37,16 @@ class Gravity(Parameters):
     gain: float = Field(description="the gain, SI")
 
 
+class Product(Parameters):
+    """One term f_into += gain * product of two states."""
+
+    into: str = Field(description="the state whose derivative it adds to")
+    product: Names = Field(description="two states")
+    gain: float = Field(description="the gain, SI")
+
+
 class Airframe(Parameters):
-    """An airframe as its file states it. `matrix_a` to `gust_direction` give SI arrays."""
+    """An airframe as its file states it. `matrix_a` to `products` give SI arrays."""
 
     name: str
     source: str = Field(description="where the figures come from")
@@ -47,7 +57,12 @@ class Airframe(Parameters):
     A: Matrix = Field(description="A, a row a state")
     B: Matrix = Field(description="B, a row a state, a column an input")
     gravity: Annotated[tuple[Gravity, ...], BeforeValidator(as_tuple)] = Field(default=(), description="sine terms of f")
-    gusts: dict[str, dict[str, float]] = Field(default={}, description="what w / V0 of each gust adds to each x_dot")
+    inertial_coupling: Annotated[tuple[Product, ...], BeforeValidator(as_tuple)] = Field(
+        default=(), description="terms of f from products of states"
+    )
+    gusts: dict[str, dict[str, float]] = Field(
+        default={}, description="what w / V0 of wind along each axis adds to each x_dot: longitudinal, lateral, vertical"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -59,6 +74,12 @@ class Airframe(Parameters):
         named = {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
         named |= {f"gravity[{i}].into": term.into for i, term in enumerate(self.gravity)}
         named |= {f"gravity[{i}].angle": term.angle for i, term in enumerate(self.gravity)}
+        named |= {f"inertial_coupling[{i}].into": term.into for i, term in enumerate(self.inertial_coupling)}
+        for i, term in enumerate(self.inertial_coupling):
+            require(len(term.product) == 2, f"inertial_coupling[{i}].product", f"{len(term.product)} states", "two of them")
+            named |= {f"inertial_coupling[{i}].product[{k}]": state for k, state in enumerate(term.product)}
+        for gust in self.gusts:
+            require(gust in AXES, f"gusts.{gust}", f"{gust!r}", f"an axis of the wind: {', '.join(AXES)}")
         named |= {f"gusts.{gust}.{state}": state for gust, direction in self.gusts.items() for state in direction}
         for key, name in named.items():
             require(name in self.states, key, f"{name!r}", f"a state: {', '.join(self.states)}")
@@ -91,6 +112,15 @@ class Airframe(Parameters):
         for term in self.gravity:
             matrix[self.index(term.into), self.index(term.angle)] += term.gain
         return matrix
+
+    def products(self) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
+        """Inertial coupling, P terms: f = gain @ (x[first] * x[second]), shapes (n, P), (P,) and (P,)."""
+        terms = self.inertial_coupling
+        gain = np.zeros((len(self.states), len(terms)))
+        for k, term in enumerate(terms):
+            gain[self.index(term.into), k] = term.gain
+        first, second = (np.array([self.index(term.product[k]) for term in terms], dtype=np.int64) for k in (0, 1))
+        return gain, first, second
 
     def with_matrices(self, A: FloatArray, B: FloatArray) -> Self:
         """The same airframe with other A, shape (n, n), and B, shape (n, m), SI; its file would hold them in its own units."""

@@ -1,12 +1,21 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Disturbances of the air."""
+"""Disturbances that are given functions of time: 1-cosine gusts of the air, biases and sines on x_dot.
+
+Assumption 2 asks for f in C1 with f and f_dot bounded. Gusts, sines and biases with a rise meet it; a bias with rise 0 is a
+step, does not, and lies outside the theorem.
+"""
 
 from typing import NamedTuple
 
-from array_api_compat import array_namespace
+from flight_core.vectors import Array, array_namespace
 
-from flight_core.vectors import Array
+AXES = ("longitudinal", "lateral", "vertical")
+"""Axes of the wind, FRD axes of trim: a tail wind is positive, and so are wind to the right and wind down."""
+
+REFERENCE_LENGTH = 106.68  # m, 350 ft: FAR/CS 25.341(a)(4)
+
+SHORTEST_RISE = 1e-30  # s, stands for a step: t / 1e-30 saturates for every t > 0, in float32 too, and nothing is divided by 0
 
 
 class Gusts(NamedTuple):
@@ -17,13 +26,54 @@ class Gusts(NamedTuple):
     length: Array  # (G,) distance H from entry to peak, m, > 0
 
 
+class Bias(NamedTuple):
+    """One bias a state; the value 0 is exactly none."""
+
+    start: Array  # (n,) instant at which it begins, s
+    value: Array  # (n,) what it comes to, [x]/s
+    rise: Array  # (n,) how long it takes, s; 0 is a step
+
+
+class Sines(NamedTuple):
+    """One sine a state; the amplitude 0 is exactly none."""
+
+    amplitude: Array  # (n,) [x]/s
+    frequency: Array  # (n,) rad/s
+    phase: Array  # (n,) rad
+
+
 def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
     """Speed of each gust in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)), s = V0 (t - start) held inside [0, 2H].
 
-    Zero before entry and after 2H/V0 seconds, with a continuous derivative throughout, as Assumption 2 asks of f.
+    Zero before entry and after 2H/V0 seconds. The derivative is continuous and at most U_ds/2 pi V0/H, as Assumption 2 asks.
     Source of the form: FAR/CS 25.341(a).
     """
     xp = array_namespace(gusts.speed)
     # minimum and maximum: several times faster than clip, which checks its bounds' types first
-    s = xp.minimum(xp.maximum(airspeed * (t - gusts.start), 0.0 * gusts.length), 2.0 * gusts.length)
-    return gusts.speed / 2.0 * (1.0 - xp.cos(xp.pi * s / gusts.length))
+    s = xp.minimum(xp.maximum(airspeed * (t - gusts.start) / gusts.length, 0.0), 2.0)
+    return gusts.speed / 2.0 * (1.0 - xp.cos(xp.pi * s))
+
+
+def design_gust_speed(length: Array, reference: Array, alleviation: Array) -> Array:
+    """Design gust speed U_ds = U_ref F_g (H / 350 ft)^(1/6), equivalent airspeed in m/s.
+
+    Arguments: `length` H from 9.144 to 106.68 m (30 to 350 ft), `reference` U_ref in m/s (17.07 at sea level, 13.41 at
+    4572 m), `alleviation` F_g of the aircraft, up to 1. Source: FAR/CS 25.341(a)(4) to (6).
+    """
+    return reference * alleviation * (length / REFERENCE_LENGTH) ** (1.0 / 6.0)
+
+
+def bias(t: Array, params: Bias) -> Array:
+    """Biases at t, shape (n,), [x]/s: value/2 (1 - cos(pi s)), s = (t - start)/rise held inside [0, 1].
+
+    With rise > 0 the derivative is continuous and at most value/2 pi/rise. With rise = 0 it is a step: zero up to start, the
+    value beyond it, and Assumption 2 does not hold at that instant.
+    """
+    xp = array_namespace(params.value)
+    s = xp.minimum(xp.maximum((t - params.start) / xp.maximum(params.rise, SHORTEST_RISE), 0.0), 1.0)
+    return params.value / 2.0 * (1.0 - xp.cos(xp.pi * s))
+
+
+def sines(t: Array, params: Sines) -> Array:
+    """Sines at t, shape (n,), [x]/s: amplitude sin(frequency t + phase). Smooth, with derivatives up to amplitude frequency."""
+    return params.amplitude * array_namespace(params.amplitude).sin(params.frequency * t + params.phase)

@@ -1,85 +1,128 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated aircraft's node: equation (1) in real time, u in, y and truth out."""
+"""The simulated aircraft's node: u in, y and truth out, in real time or in lockstep, whatever kind of aircraft it is."""
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from aircraft_sim import plant, truth
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.sensors import Underway, transmit
-from flight_core.outcome import FlightEnded
+from aircraft_sim.simulator import Simulator
 from flight_core.rates import nanoseconds, period_ns, seconds
-from flight_core.vectors import ChannelError
-from flight_ros.messages import from_message, to_message
+from flight_core.vectors import ChannelError, FloatArray
+from flight_ros.messages import NO_CHANNELS, Decoder, Encoder, instant, stamp_of
 from flight_ros.runtime import FlightNode, run
 from flight_ros.ticker import Tick
-from flight_ros.topics import TRUTH, U, Y
+from flight_ros.topics import CLOCK, RECORDED, TRUTH, U, Y
+
+WINDOW = 100
+"""Samples that a lockstep flight may be ahead of its log: less than publishers keep for a recorder that is held up."""
 
 
 class AircraftNode(FlightNode[AircraftParameters]):
-    """At tick k: the state from t(k-1) to t(k) under the u held since then, y and truth out, then the newest u is taken."""
+    """At tick k: the state from t(k-1) to t(k) under the u held since then, y and truth out, then the newest u is taken.
+
+    In lockstep it makes the time: /clock, y and truth at each of its instants, and at those of the controller it moves on when
+    u has come. Each instant has exactly one y, one without channels where no sample arrives.
+    """
 
     def __init__(self) -> None:
         super().__init__("aircraft", AircraftParameters)
-        self._airframe, _ = self.parameters.load()
-        self._plant = self.parameters.plant()
-        self._period_ns = period_ns(self.parameters.rate, "rate")
-        self._truth_names = truth.names(self._airframe, self.parameters)
-        self._state = plant.start(self._plant)
-        self._underway: Underway = ()
-        self._u = np.zeros(len(self._airframe.inputs))
+        self._simulator = Simulator(self.parameters)
+        self._u = np.zeros(len(self._simulator.inputs))
         self._u_from: str | None = None
         self._u_ns = 0  # when the last u came
-        self._u_inbox = self.inbox(U)
+        self._u_inbox, self._decoder = self.inbox(U), Decoder(self._simulator.inputs)
         self._y_publisher, self._truth_publisher = self.publisher(Y), self.publisher(TRUTH)
+        self._y_encoder = Encoder(self._simulator.outputs, self.instance)
+        self._truth_encoder = Encoder(self._simulator.truth_names, self.instance)
+        if self.parameters.lockstep:
+            self._number = 0  # of the sample that comes next
+            self._answered = True
+            self._recorded_ns = 0
+            self._control_ns = period_ns(self.parameters.control_rate, "control_rate")
+            self._end_ns = nanoseconds(self.parameters.duration) or None
+            self._nothing = Encoder((), self.instance)
+            self._recorded_inbox = self.inbox(RECORDED)
+            self._clock_publisher = self.publisher(CLOCK)
 
     def period_ns(self) -> int:
-        return self._period_ns
+        return self._simulator.period_ns
 
     def start_ns(self) -> int:
         return nanoseconds(self.parameters.start_time)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        before_ns, t_ns = tick.previous * self._period_ns, tick.number * self._period_ns
         share = self.parameters.commanded_share(now_ns - self._u_ns)
-        u = self._u if share == 1.0 else share * self._u
-        self._state = plant.advance(before_ns, self._state, u, t_ns - before_ns, self._plant)
-        if plant.diverged(self._state):
-            raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
-        measured = plant.measure(tick.number, self._state, self._plant)
-        self._underway, arrived = transmit(self._underway, now_ns, measured.y, self._plant.sensors)
-        for sample in arrived:
-            self._y_publisher.publish(to_message(sample.stamp_ns, self._airframe.outputs, sample.y, self.instance))
-        values = truth.values(t_ns, self._state, measured.noise, self._plant.aircraft)
-        self._truth_publisher.publish(to_message(now_ns, self._truth_names, values, self.instance))
+        self._publish(tick.number, now_ns - tick.number * self.period_ns(), self._u if share == 1.0 else share * self._u)
         self._take_u(now_ns)
 
-    def _take_u(self, now_ns: int) -> None:
-        for received in self._u_inbox.take():
-            sender = received.message.header.frame_id
-            if sender != self._u_from and not self._silent(now_ns):
-                self.reject(self._u_inbox, "sender", f"{sender} commands too, beside {self._u_from}")
-                continue
+    def _publish(self, number: int, start_ns: int, u: FloatArray) -> bool:
+        arrived = self._simulator.sample(number, u)
+        for sample in arrived:
+            self._y_publisher.publish(self._y_encoder.encode(start_ns + sample.stamp_ns, sample.y))
+        stamp_ns = start_ns + number * self.period_ns()
+        self._truth_publisher.publish(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
+        return bool(arrived)
+
+    def advance(self) -> bool:
+        if not self._answered and not self._take_u(self._number * self.period_ns()):
+            return False
+        self._answered = True
+        if self._finished() or self._ahead_of_the_log():
+            return False
+        t_ns = self._number * self.period_ns()
+        self._clock_publisher.publish(instant(t_ns))  # first: y_m is made while the aircraft moves
+        if not self._publish(self._number, 0, self._u):
+            self._y_publisher.publish(self._nothing.encode(t_ns, NO_CHANNELS))
+        self._answered = t_ns % self._control_ns != 0
+        self._number += 1
+        if self._finished():
+            self.get_logger().info(f"flown to its end at t = {seconds(t_ns):g} s")
+        return True
+
+    def _finished(self) -> bool:
+        return self._end_ns is not None and self._number * self.period_ns() > self._end_ns
+
+    def _ahead_of_the_log(self) -> bool:
+        if not self.parameters.recorded:
+            return False
+        for received in self._recorded_inbox.take():
+            self._recorded_ns = stamp_of(received.message)
+        return self._number * self.period_ns() >= self._recorded_ns + WINDOW * self.period_ns()
+
+    def awaits(self) -> str:
+        return self._u_inbox.name if not self._answered else self._recorded_inbox.name
+
+    def _take_u(self, now_ns: int) -> bool:
+        came = False
+        for received in self._u_inbox.take(1 if self.parameters.lockstep else None):  # in lockstep there is one answer
             try:
-                self._u = from_message(received.message, list(self._airframe.inputs)).value
+                sample = self._decoder.decode(received.message)
             except ChannelError as error:
                 self.reject(self._u_inbox, error.reason, str(error))
                 continue
-            self._u_ns = now_ns
-            if sender != self._u_from:
-                self._u_from = sender
-                self.get_logger().info(f"flown by {sender}")
+            if sample is None:  # the controller has nothing to say at this instant of a lockstep flight
+                came = True
+                continue
+            if sample.sender != self._u_from and not self._silent(now_ns):
+                self.reject(self._u_inbox, "sender", f"{sample.sender} commands too, beside {self._u_from}")
+                continue
+            came = True
+            self._u, self._u_ns = sample.value, now_ns
+            if sample.sender != self._u_from:
+                self._u_from = sample.sender
+                self.get_logger().info(f"flown by {self._u_from}")
         if self._silent(now_ns):
             self.waiting_for(self._u_inbox)
+        return came
 
     def _silent(self, now_ns: int) -> bool:
-        return now_ns - self._u_ns > nanoseconds(self.parameters.max_age)
+        return self._u_from is None or now_ns - self._u_ns > nanoseconds(self.parameters.max_age)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         if self._u_from is None:
             return DiagnosticStatus.WARN, "no u yet, flying in trim", {}
-        if self._silent(self.get_clock().now().nanoseconds):
+        if not self.parameters.lockstep and self._silent(self.get_clock().now().nanoseconds):
             return DiagnosticStatus.ERROR, f"{self._u_from} is silent: its last u is held, then let go to trim", {}
         return DiagnosticStatus.OK, f"flown by {self._u_from}", {}
 

@@ -2,22 +2,42 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the simulated aircraft, validated once, and the arrays that the maths takes."""
 
-from collections.abc import Sequence
-from typing import Annotated, Self
+from collections.abc import Mapping, Sequence
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
+from aircraft_sim import uncertainty
 from aircraft_sim.actuators import Actuators
-from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.disturbance import Gusts
-from aircraft_sim.dynamics import Aircraft
+from aircraft_sim.airframe import Airframe, Unit, load_airframe
+from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines
+from aircraft_sim.dynamics import Aircraft, Coupling
+from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, PREFIX, Air, Point, require_aircraft
 from aircraft_sim.plant import Plant
 from aircraft_sim.sensors import Sensors
+from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
 from flight_core.freshness import fade
-from flight_core.parameters import Parameters, Positive, as_tuple, require, require_length
+from flight_core.parameters import (
+    NodeParameters,
+    NonNegative,
+    ParameterError,
+    Parameters,
+    Positive,
+    as_tuple,
+    require,
+    require_length,
+)
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray
+
+
+class Channels(NamedTuple):
+    """What an aircraft shows to the outside, whatever kind it is."""
+
+    outputs: dict[str, Unit]  # in the order of y
+    inputs: dict[str, Unit]  # in the order of u; the unit that people read, topics are SI
+    speed: float  # trim speed V0, m/s
 
 
 class Gust(Parameters):
@@ -28,11 +48,64 @@ class Gust(Parameters):
     length: Positive = Field(description="the distance H from entry to peak, m")
 
 
+class TurbulenceParameters(Parameters):
+    """Dryden turbulence by MIL-F-8785C; `wind` gives its intensity at low altitude, `sigma` at high, both in between."""
+
+    altitude: float = Field(ge=LOWEST, description="the altitude above the ground, m; from 10 ft (3.048 m) on")
+    wind: float | None = Field(
+        default=None, ge=0, description="the wind at 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe"
+    )
+    sigma: float | None = Field(default=None, ge=0, description="the intensity at high altitude: standard deviation, m/s")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the turbulence")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for key, acts, where in (
+            ("wind", self.altitude < HIGH, f"below {HIGH:g} m"),
+            ("sigma", self.altitude > LOW, f"above {LOW:g} m"),
+        ):
+            value = getattr(self, key)
+            found, expected = ("none", "a value") if value is None else (f"{value:g} m/s", "none")
+            require((value is not None) == acts, key, found, f"{expected} at {self.altitude:g} m: it acts {where}")
+        return self
+
+    @property
+    def blows(self) -> bool:
+        """Whether it has any intensity."""
+        return bool(self.wind or self.sigma)
+
+
+class BiasParameters(Parameters):
+    """A bias on x_dot of one state: from 0 to its value along half a cosine, or a step with rise 0."""
+
+    start: float = Field(ge=0, description="the instant at which it begins, s")
+    value: float = Field(description="what it comes to, SI unit of the state per s")
+    rise: float = Field(ge=0, description="how long it takes, s; 0 is a step, which lies outside the theorem")
+
+
+class SineParameters(Parameters):
+    """A sine on x_dot of one state: amplitude sin(frequency t + phase)."""
+
+    amplitude: float = Field(description="the amplitude, SI unit of the state per s")
+    frequency: Positive = Field(description="the frequency, rad/s")
+    phase: float = Field(default=0.0, description="the phase, rad")
+
+
+class UncertaintyParameters(Parameters):
+    """An aircraft drawn around the airframe: each entry times 1 + d, d uniform and independent; rows of angles stay."""
+
+    A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
+    B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
+
+
 # One value a channel, or none at all for an ideal one. A limit may be infinite (.inf in YAML): none on that channel.
 NonNegativesOrNone = Annotated[tuple[Annotated[float, Field(ge=0)], ...], BeforeValidator(as_tuple)]
 Lower = Annotated[tuple[Annotated[float, Field(le=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
 Upper = Annotated[tuple[Annotated[float, Field(ge=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
 Rates = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
+NumbersOrNone = Annotated[tuple[float, ...], BeforeValidator(as_tuple)]
+Times = Upper  # from 0 on, .inf for never
 
 
 class ActuatorParameters(Parameters):
@@ -44,29 +117,58 @@ class ActuatorParameters(Parameters):
     lower: Lower = Field(default=(), description="lower end stops, deviations from trim, SI")
     upper: Upper = Field(default=(), description="upper end stops, deviations from trim, SI")
     rate: Rates = Field(default=(), description="rate limits, SI per s")
+    dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones of the commands, SI")
+    stuck_at: Times = Field(default=(), description="from when on each stays where it is, s; .inf is never")
+    lost_at: Times = Field(default=(), description="from when on each gives no effect and is at trim, s; .inf is never")
 
 
 class SensorParameters(Parameters):
     """The sensors; as they stand by default they are ideal."""
 
+    bias: NumbersOrNone = Field(default=(), description="constant errors, one an output, SI")
+    drift: NonNegativesOrNone = Field(default=(), description="random walks, one an output: standard deviation, SI per sqrt(s)")
     noise: NonNegativesOrNone = Field(default=(), description="standard deviation of the noise per sample, one an output, SI")
+    quantisation: NonNegativesOrNone = Field(
+        default=(), description="steps of the measured values, one an output, SI, 0 for none"
+    )
     delay: float = Field(default=0.0, ge=0, le=1e6, description="from its instant to its arrival, s; whole periods of `rate`")
     dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is lost")
-    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise and losses")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
 
-class AircraftParameters(Parameters):
+class AircraftParameters(NodeParameters):
     """All parameters of the aircraft's node."""
 
-    airframe: str = Field(description="the name of an airframe of the library, or the path of an airframe file")
+    airframe: str = Field(
+        description="the name of an airframe of the library, the path of an airframe file, or jsbsim:NAME for one of JSBSim's"
+    )
+    speed: Positive | None = Field(default=None, description="of an aircraft of JSBSim: the true airspeed it trims at, m/s")
+    altitude: NonNegative | None = Field(
+        default=None, description="of an aircraft of JSBSim: the altitude above sea level it trims at, m"
+    )
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y is published and u taken, Hz")
     step: Annotated[float, Field(gt=0, le=1)] = Field(description="the integration step, s; a whole fraction of 1 / rate")
     start_time: float = Field(
         default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
     )
-    gusts: dict[str, Gust] = Field(default={}, description="gusts by their name in the airframe")
+    gusts: dict[str, Gust] = Field(default={}, description="gusts by the axis of the wind: longitudinal, lateral, vertical")
+    turbulence: TurbulenceParameters | None = Field(default=None, description="turbulence of all axes that the airframe knows")
+    bias: dict[str, BiasParameters] = Field(default={}, description="biases on x_dot by state")
+    sines: dict[str, SineParameters] = Field(default={}, description="sines on x_dot by state")
+    inertial_coupling: float = Field(
+        default=0.0, ge=0, le=1, description="how much of the airframe's inertial coupling acts, 0 to 1"
+    )
+    uncertainty: UncertaintyParameters = Field(
+        default=UncertaintyParameters(), description="how far the aircraft is from its airframe"
+    )
     actuators: ActuatorParameters = Field(default=ActuatorParameters(), description="the actuators, ideal where left out")
     sensors: SensorParameters = Field(default=SensorParameters(), description="the sensors, ideal where left out")
+
+    control_rate: float = Field(
+        default=0.0, ge=0, le=1000, description="in lockstep: the controller's rate, at whose instants u is waited for, Hz"
+    )
+    duration: float = Field(default=0.0, ge=0, le=1e6, description="in lockstep: the flight time to stop at, s; 0 never stops")
+    recorded: bool = Field(default=False, description="in lockstep: wait for the recorder too, so that nothing is lost")
 
     max_age: float = Field(default=0.2, gt=0, le=1e6, description="how long without u until its controller counts as silent, s")
     hold: float = Field(default=0.5, ge=0, le=1e6, description="how long the last u is then held, s")
@@ -76,14 +178,21 @@ class AircraftParameters(Parameters):
     def _check(self) -> Self:
         period = period_ns(self.rate, "rate")
         divide(period, self.step_ns, "step", "1 / rate")
-        airframe = load_airframe(self.airframe)
-        for name in self.gusts:
-            airframe.gust_direction(name)
+        if self.lockstep:
+            require(self.control_rate > 0, "control_rate", "0 Hz", "the controller's rate in lockstep")
+            divides = period_ns(self.control_rate, "control_rate") % period == 0
+            require(divides, "control_rate", f"{self.control_rate:g} Hz", f"a whole fraction of rate ({self.rate:g} Hz)")
+        if self.is_jsbsim:
+            self._check_jsbsim()
+        else:
+            self._check_airframe()
+        channels = self.channels()
         for key, values in self.actuators:
             if values:
-                require_length(f"actuators.{key}", values, list(airframe.inputs))
-        if self.sensors.noise:
-            require_length("sensors.noise", self.sensors.noise, airframe.outputs)
+                require_length(f"actuators.{key}", values, list(channels.inputs))
+        for key in ("bias", "drift", "noise", "quantisation"):
+            if values := getattr(self.sensors, key):
+                require_length(f"sensors.{key}", values, list(channels.outputs))
         require(
             nanoseconds(self.sensors.delay) % period == 0,
             "sensors.delay",
@@ -91,6 +200,42 @@ class AircraftParameters(Parameters):
             f"a whole multiple of 1 / rate ({seconds(period):g} s)",
         )
         return self
+
+    def _check_airframe(self) -> None:
+        for key in ("speed", "altitude"):
+            value = getattr(self, key)
+            require(value is None, key, value, f"none: the airframe {self.airframe} is what it is in one trim")
+        airframe = load_airframe(self.airframe)
+        for name in self.gusts:
+            airframe.gust_direction(name)
+        for key, named in (("bias", self.bias), ("sines", self.sines)):
+            for name in named:
+                states = ", ".join(airframe.states)
+                require(name in airframe.states, f"{key}.{name}", f"{name!r}", f"a state of {airframe.name}: {states}")
+        has_none = f"the airframe {airframe.name} has no"
+        known = bool(airframe.inertial_coupling) or self.inertial_coupling == 0.0
+        require(known, "inertial_coupling", f"{self.inertial_coupling:g}", f"0: {has_none} inertial_coupling")
+        require(bool(airframe.gusts) or self.turbulence is None, "turbulence", "a section", f"none: {has_none} gusts")
+
+    def _check_jsbsim(self) -> None:
+        require_aircraft(self.airframe)
+        for key, unit in (("speed", "true airspeed to trim at, m/s"), ("altitude", "altitude to trim at, m")):
+            require(getattr(self, key) is not None, key, "none", f"the {unit}")
+        for name in self.gusts:
+            require(name in AXES, f"gusts.{name}", f"{name!r}", f"an axis of the wind: {', '.join(AXES)}")
+        drawn = self.uncertainty.A > 0.0 or self.uncertainty.B > 0.0
+        for key, found in (
+            ("bias", self.bias),
+            ("sines", self.sines),
+            ("inertial_coupling", self.inertial_coupling),
+            ("uncertainty", drawn),
+        ):
+            require(not found, key, "it", f"none: {self.airframe} has no matrices that it could change")
+
+    @property
+    def is_jsbsim(self) -> bool:
+        """Whether the aircraft is one of JSBSim's."""
+        return self.airframe.startswith(PREFIX)
 
     @property
     def step_ns(self) -> int:
@@ -101,43 +246,90 @@ class AircraftParameters(Parameters):
         """How much of the last u is still commanded after a silence of its controller: `fade` from max_age on."""
         return fade(silence_ns, nanoseconds(self.max_age + self.hold), nanoseconds(self.ramp))
 
-    def load(self) -> tuple[Airframe, Aircraft]:
-        """The airframe and the arrays of equation (1) in this disturbance."""
+    def channels(self) -> Channels:
+        """Outputs and inputs with their units, and the trim speed."""
+        if self.is_jsbsim:
+            return Channels(dict(OUTPUTS), dict.fromkeys(INPUTS, "1"), self.point().speed)
         airframe = load_airframe(self.airframe)
-        gusts = self.gusts.values()
-        direction = [airframe.gust_direction(name) for name in self.gusts]
+        inputs = {name: one.unit for name, one in airframe.inputs.items()}
+        return Channels({name: airframe.states[name] for name in airframe.outputs}, inputs, airframe.speed)
+
+    def drawn(self) -> Airframe:
+        """The airframe that flies: the one named, or that of `uncertainty` around it."""
+        return uncertainty.draw(load_airframe(self.airframe), self.uncertainty.A, self.uncertainty.B, self.uncertainty.seed)
+
+    def load(self) -> tuple[Airframe, Aircraft]:
+        """The airframe that flies and the arrays of equation (1) in this disturbance, all axes of the wind that it knows."""
+        airframe = self.drawn()
+        gusts = [self.gusts.get(axis, CALM) for axis in airframe.gusts]
+        direction = [airframe.gust_direction(axis) for axis in airframe.gusts]
+        gain, first, second = airframe.products()
+        biases = {name: one for name, one in self.bias.items() if one.value != 0.0}
+        sines = {name: one for name, one in self.sines.items() if one.amplitude != 0.0}
         return airframe, Aircraft(
             airframe.matrix_a(),
             airframe.matrix_b(),
             airframe.matrix_c(),
             airframe.matrix_gravity(),
             np.reshape(direction, (len(direction), len(airframe.states))).T,
-            Gusts(*(np.array([getattr(gust, key) for gust in gusts]) for key in ("start", "speed", "length"))),
+            Gusts(*(np.array([getattr(gust, key) for gust in gusts]) for key in Gusts._fields)),
             np.array(airframe.speed),
+            Coupling(self.inertial_coupling * gain, first, second) if self.inertial_coupling > 0.0 else None,
+            Bias(*_by_state(biases, Bias._fields, airframe)) if biases else None,
+            Sines(*_by_state(sines, Sines._fields, airframe)) if sines else None,
         )
 
     def plant(self) -> Plant:
-        """All of the aircraft as arrays: equation (1), actuators, sensors."""
+        """What moves as arrays: equation (1), the actuators and the turbulence."""
         airframe, aircraft = self.load()
-        inputs, outputs = len(airframe.inputs), len(airframe.outputs)
-        limits = self.actuators
-        return Plant(
-            aircraft,
-            Actuators(
-                lag=_filled(limits.lag, inputs, 0.0),
-                lower=_filled(limits.lower, inputs, -np.inf),
-                upper=_filled(limits.upper, inputs, np.inf),
-                rate=_filled(limits.rate, inputs, np.inf),
-            ),
-            Sensors(
-                noise=_filled(self.sensors.noise, outputs, 0.0),
-                delay_ns=nanoseconds(self.sensors.delay),
-                dropout=self.sensors.dropout,
-                seed=self.sensors.seed,
-            ),
-            self.step_ns,
+        return Plant(aircraft, self.moves(), self.step_ns, self._turbulence(airframe.speed, list(airframe.gusts)))
+
+    def moves(self) -> Actuators:
+        """The actuators as arrays."""
+        return Actuators(**{key: _array(values, key in {"lag", "dead_zone"}) for key, values in self.actuators})
+
+    def point(self) -> Point:
+        """The aircraft of JSBSim and the condition it flies in. Raises ParameterError where it is none of those."""
+        if self.speed is None or self.altitude is None:
+            raise ParameterError(f"airframe: found {self.airframe!r}, expected {PREFIX}NAME with a speed and an altitude")
+        return Point(self.airframe.removeprefix(PREFIX), self.speed, self.altitude, self.step_ns)
+
+    def air(self) -> Air:
+        """What blows around an aircraft of JSBSim, on all axes."""
+        gusts = [self.gusts.get(axis, CALM) for axis in AXES]
+        arrays = (np.array([getattr(gust, key) for gust in gusts]) for key in Gusts._fields)
+        return Air(Gusts(*arrays), self._turbulence(self.point().speed, AXES))
+
+    def _turbulence(self, speed: float, axes: Sequence[str]) -> Turbulence | None:
+        air = self.turbulence
+        if air is None or not air.blows:
+            return None
+        spectrum = dryden(air.altitude, air.wind or 0.0, air.sigma or 0.0)  # none is given where it does not act
+        return filters(spectrum, speed, self.step, [AXES.index(axis) for axis in axes], air.seed)
+
+    def sensor_arrays(self) -> Sensors:
+        """The sensors as arrays."""
+        sensors = self.sensors
+        drift = _array(sensors.drift, zero_is_none=True)
+        return Sensors(
+            noise=np.array(sensors.noise) if sensors.noise else np.zeros(len(self.channels().outputs)),
+            delay_ns=nanoseconds(sensors.delay),
+            dropout=sensors.dropout,
+            seed=sensors.seed,
+            bias=_array(sensors.bias, zero_is_none=True),
+            drift=None if drift is None else drift * np.sqrt(1.0 / self.rate),
+            quantum=_array(sensors.quantisation, zero_is_none=True),
         )
 
 
-def _filled(values: Sequence[float], length: int, default: float) -> FloatArray:
-    return np.array(values, dtype=np.float64) if values else np.full(length, default)
+CALM = Gust(start=0.0, speed=0.0, length=1.0)
+
+
+def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
+    """The values, None where they are left out or, if that is so here, all zero: what is off is absent."""
+    return None if not values or (zero_is_none and not any(values)) else np.array(values, dtype=np.float64)
+
+
+def _by_state(named: Mapping[str, Parameters], keys: Sequence[str], airframe: Airframe) -> list[FloatArray]:
+    """A column a key, with 0 for a state that is not named."""
+    return [np.array([float(getattr(named.get(state), key, 0.0)) for state in airframe.states]) for key in keys]

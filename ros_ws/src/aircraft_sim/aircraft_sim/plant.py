@@ -1,19 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The aircraft in time: equation (1) behind its actuators, in fixed steps, and what its sensors see."""
+"""The aircraft in time: equation (1) behind its actuators, in fixed steps."""
 
 from typing import NamedTuple
 
-from array_api_compat import array_namespace
-
-from aircraft_sim import dynamics
+from aircraft_sim import actuators, dynamics, turbulence
 from aircraft_sim.actuators import Actuators
-from aircraft_sim.actuators import step as move
-from aircraft_sim.dynamics import Aircraft, x_dot
-from aircraft_sim.sensors import Sensors, arrives, noise
+from aircraft_sim.dynamics import Aircraft
+from aircraft_sim.turbulence import Turbulence
 from flight_core.integrators import rk4
 from flight_core.rates import divide, seconds
-from flight_core.vectors import Array
+from flight_core.vectors import Array, array_namespace
 
 LARGEST = 1e6
 """SI. No state of an aircraft comes near it; a diverged loop passes it on its way to infinity."""
@@ -24,8 +21,8 @@ class Plant(NamedTuple):
 
     aircraft: Aircraft
     actuators: Actuators
-    sensors: Sensors
     step_ns: int  # of the integration
+    turbulence: Turbulence | None = None  # of one step; None in calm air
 
 
 class AircraftState(NamedTuple):
@@ -33,39 +30,54 @@ class AircraftState(NamedTuple):
 
     x: Array  # (n,)
     position: Array  # (m,) of the actuators: the input that acts
-
-
-class Measured(NamedTuple):
-    """What the sensors make of one instant."""
-
-    y: Array | None  # (m,) C x + noise, None where the sample is lost
-    noise: Array  # (m,)
+    turbulence: Array | None = None  # (5,) of its filters; None in calm air
 
 
 def start(plant: Plant) -> AircraftState:
-    """The state in trim: x = 0 and the actuators at 0."""
+    """The state in trim: x = 0, the actuators at 0, and the turbulence, if any, drawn from its stationary distribution."""
     xp = array_namespace(plant.aircraft.A)
-    return AircraftState(xp.zeros_like(plant.aircraft.A[0, :]), xp.zeros_like(plant.aircraft.B[0, :]))
+    z = None if plant.turbulence is None else turbulence.start(plant.turbulence)
+    return AircraftState(xp.zeros_like(plant.aircraft.A[0, :]), xp.zeros_like(plant.aircraft.B[0, :]), z)
 
 
-def advance(t_ns: int, state: AircraftState, u: Array, duration_ns: int, plant: Plant) -> AircraftState:
+def advance(
+    t_ns: int, state: AircraftState, u: Array, duration_ns: int, plant: Plant, normals: Array | None = None
+) -> AircraftState:
     """State at t + duration from that at t, with the command u held (zero-order hold).
 
-    Each step dt is
+    Each step dt, from t_k on, is
 
-        position+ = actuators.step(position, u, dt)
-        x+        = Runge-Kutta step of equation (1) with the input position+
+        position+ = actuators.step(position, u, dt), or what a fault leaves of it
+        x+        = Runge-Kutta step of equation (1) with the input position+ and the turbulence at t_k
+        z+        = turbulence.step(z, n_k)
 
     The position at the end of the step acts during all of it: an ideal actuator then passes u on without a delay, to the last
-    bit, and a real one leads its continuous model by dt / 2. Time is counted in ns so that steps add up exactly. Raises
-    ParameterError where the step does not divide the duration.
+    bit, and a real one leads its continuous model by dt / 2. The turbulence at the beginning of the step acts during all of
+    it: seen at the steps it has its spectrum exactly, in between it is held. Time is counted in ns so that steps add up
+    exactly. `normals` are the numbers n_k, shape (steps, 5); by default those of the seed, which only NumPy can draw.
+    Raises ParameterError where the step does not divide the duration.
     """
-    x, position = state
-    dt = seconds(plant.step_ns)
-    for k in range(divide(duration_ns, plant.step_ns, "step", "the duration")):
-        position = move(position, u, dt, plant.actuators)
-        x = rk4(x_dot, seconds(t_ns + k * plant.step_ns), x, position, plant.aircraft, dt)
-    return AircraftState(x, position)
+    x, position, z = state
+    aircraft, air = plant.aircraft, plant.turbulence
+    steps, dt = divide(duration_ns, plant.step_ns, "step", "the duration"), seconds(plant.step_ns)
+    if normals is None:
+        normals = () if air is None else turbulence.normals(t_ns // plant.step_ns, steps, air.seed)
+
+    def x_dot(since: float, x: Array, rest: Array, params: Aircraft) -> Array:
+        return dynamics.rate(x, rest[round(2.0 * since / dt)], params)
+
+    # What depends on time alone, at the beginnings, middles and ends of all steps together.
+    halves = array_namespace(aircraft.A).arange(2 * steps + 1, dtype=aircraft.A.dtype)
+    given = dynamics.at_times(seconds(t_ns) + dt / 2.0 * halves, aircraft)
+    for k in range(steps):
+        moved = actuators.step(position, u, dt, plant.actuators)
+        position = actuators.fail(seconds(t_ns + k * plant.step_ns), position, moved, plant.actuators)
+        held = aircraft.B @ position
+        if air is not None:
+            held = held + aircraft.gust_direction @ turbulence.wind(z, air)
+            z = turbulence.step(z, normals[k], air)
+        x = rk4(x_dot, 0.0, x, given[2 * k : 2 * k + 3] + held, aircraft, dt)
+    return AircraftState(x, position, z)
 
 
 def diverged(state: AircraftState) -> bool:
@@ -74,8 +86,6 @@ def diverged(state: AircraftState) -> bool:
     return not bool(xp.all(xp.abs(state.x) < LARGEST))  # False for NaN too
 
 
-def measure(number: int, state: AircraftState, plant: Plant) -> Measured:
-    """What the sensors make of the state at sample `number` >= 0: y = C x + noise, or nothing where the sample is lost."""
-    error = noise(number, plant.sensors)
-    y = dynamics.y(state.x, plant.aircraft) + error
-    return Measured(y if arrives(number, plant.sensors) else None, error)
+def output(state: AircraftState, plant: Plant) -> Array:
+    """The outputs y = C x, before any sensor, shape (m,)."""
+    return dynamics.y(state.x, plant.aircraft)

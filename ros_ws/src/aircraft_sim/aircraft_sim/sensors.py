@@ -1,27 +1,40 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors between the aircraft and y: noise, loss and delay of samples.
-
-Random numbers come from a counter-based generator: those of sample k depend on the seed and on k alone, so that two runs
-agree whatever either of them missed before. It is NumPy's and stays outside the maths that other array types run.
-"""
+"""Sensors between the aircraft and y: bias, drift, noise and quantisation, then loss and delay of samples."""
 
 from typing import NamedTuple
 
 import numpy as np
 
+from aircraft_sim import draws
 from flight_core.vectors import FloatArray
-
-NOISE_STREAM, LOSS_STREAM = 0, 1
 
 
 class Sensors(NamedTuple):
-    """Parameters of the sensors of m outputs. Ideal ones have noise 0, delay 0 and dropout 0."""
+    """Parameters of the sensors of m outputs. Ideal ones have noise 0, delay 0 and dropout 0. What is None is absent."""
 
     noise: FloatArray  # (m,) standard deviation per sample, SI
     delay_ns: int  # from the instant of a sample to its arrival
     dropout: float  # probability that a sample is lost, all channels together
     seed: int
+    bias: FloatArray | None = None  # (m,) SI
+    drift: FloatArray | None = None  # (m,) standard deviation of the random walk's step from sample to sample, SI
+    quantum: FloatArray | None = None  # (m,) steps of the quantisation, SI, 0 = none
+
+
+class Drift(NamedTuple):
+    """What the sensors carry in time: a random walk up to a sample."""
+
+    number: int
+    value: FloatArray  # (m,) SI
+
+
+class Measured(NamedTuple):
+    """What the sensors make of one instant."""
+
+    y: FloatArray  # (m,)
+    error: FloatArray  # (m,) y measured - C x
+    drift: Drift
 
 
 class Sample(NamedTuple):
@@ -34,19 +47,56 @@ class Sample(NamedTuple):
 Underway = tuple[Sample, ...]
 
 
-def noise(number: int, params: Sensors) -> FloatArray:
-    """Error of sample `number` >= 0: noise_i n_i with n_i standard normal, white over channels and samples; shape (m,).
+def start(params: Sensors) -> Drift:
+    """The random walk at sample 0, from zero."""
+    return Drift(0, np.zeros_like(params.noise))
 
-    Source of the generator: Salmon et al., Parallel random numbers: as easy as 1, 2, 3, SC11 (Philox).
-    """
+
+def measure(number: int, y: FloatArray, drift: Drift, params: Sensors) -> Measured:
+    """What the sensors make of y = C x, shape (m,), at sample `number`, not before that of `drift`:
+
+        error    = bias + walk(number) + noise(number)
+        measured = y + error, then quantum round((y + error) / quantum), half to even
+
+    The error of a quantised sample is its measured value less y, the whole of it. Ideal sensors give y to the last bit.
+    """  # noqa: D400, D415 - what follows is an equation
+    drift = walk(number, drift, params)
+    error = noise(number, params)
+    if params.bias is not None:
+        error = error + params.bias
+    if params.drift is not None:
+        error = error + drift.value
+    measured = y + error
+    if params.quantum is not None:
+        coarse = params.quantum > 0.0
+        measured = np.where(coarse, params.quantum * np.round(measured / np.where(coarse, params.quantum, 1.0)), measured)
+        error = np.where(coarse, measured - y, error)
+    return Measured(measured, error, drift)
+
+
+def noise(number: int, params: Sensors) -> FloatArray:
+    """Error of sample `number` >= 0: noise_i n_i with n_i standard normal, white over channels and samples; shape (m,)."""
     if not params.noise.any():
         return np.zeros_like(params.noise)
-    return params.noise * _generator(number, NOISE_STREAM, params.seed).standard_normal(len(params.noise))
+    return params.noise * draws.generator(number, draws.NOISE, params.seed).standard_normal(len(params.noise))
+
+
+def walk(number: int, drift: Drift, params: Sensors) -> Drift:
+    """The random walk at sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k), with n standard normal and independent.
+
+    The steps of samples that nobody looked at are made up for, one by one: the walk does not depend on what was missed.
+    """
+    if params.drift is None:
+        return drift
+    value = drift.value
+    for k in range(drift.number + 1, number + 1):
+        value = value + params.drift * draws.generator(k, draws.DRIFT, params.seed).standard_normal(len(value))
+    return Drift(number, value)
 
 
 def arrives(number: int, params: Sensors) -> bool:
     """Whether sample `number` >= 0 is not lost: v >= dropout with v uniform in [0, 1), independent of the noise."""
-    return params.dropout == 0.0 or _generator(number, LOSS_STREAM, params.seed).random() >= params.dropout
+    return params.dropout == 0.0 or draws.generator(number, draws.LOSS, params.seed).random() >= params.dropout
 
 
 def transmit(underway: Underway, now_ns: int, y: FloatArray | None, params: Sensors) -> tuple[Underway, Underway]:
@@ -58,8 +108,3 @@ def transmit(underway: Underway, now_ns: int, y: FloatArray | None, params: Sens
     sent = underway if y is None else (*underway, Sample(now_ns, y))
     arrived = sum(sample.stamp_ns + params.delay_ns <= now_ns for sample in sent)
     return sent[arrived:], sent[:arrived]
-
-
-def _generator(number: int, stream: int, seed: int) -> np.random.Generator:
-    # The counter's lowest word counts the draws within a sample.
-    return np.random.Generator(np.random.Philox(key=seed, counter=[0, number, stream, 0]))

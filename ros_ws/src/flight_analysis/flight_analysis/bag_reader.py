@@ -19,6 +19,7 @@ from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_recorder.bag import SCENARIO
 
 # What reading raises where a file was cut or its bytes were changed: between records, inside one, inside a compressed chunk.
 UNFINISHED = (McapError, struct.error, zstandard.ZstdError, SerdeError, UnicodeDecodeError)
@@ -77,13 +78,15 @@ def read_run(run: Path) -> Run:
                     vector_channels[record.id] = record.topic.rsplit("/", 1)[-1]
                 elif isinstance(record, Message) and record.channel_id in vector_channels:
                     message: Any = store.deserialize_cdr(record.data, JOINT_STATE)
+                    if not message.name and not len(message.position):
+                        continue  # in lockstep: no sample at this instant
                     rows = topics.setdefault(vector_channels[record.channel_id], _Rows(tuple(message.name)))
                     if tuple(message.name) == rows.names and len(message.position) == len(rows.names):
                         rows.stamps.append(message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec)
                         rows.values.append(message.position)
                     else:
                         rows.refused += 1
-                elif isinstance(record, Attachment) and record.media_type == "application/yaml":
+                elif isinstance(record, Attachment) and record.media_type == SCENARIO:
                     scenario = StoredFile(Path(record.name).name, record.data)
         except UNFINISHED as error:
             notes.append(f"{file.name} is damaged or has no end ({type(error).__name__}): read up to its last whole chunk")

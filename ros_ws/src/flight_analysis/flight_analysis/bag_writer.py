@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tape -> MCAP bag, without ROS: a flight in one process leaves the same file as one over topics."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,11 @@ from rosbags.typesys import Stores, get_typestore
 from flight_analysis.bag_reader import JOINT_STATE
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
-from flight_recorder.bag import BagWriter
+from flight_recorder.bag import OTHER, SCENARIO, BagWriter
 
 
-def write_run(tape: Tape, directory: Path, scenario_file: Path) -> Path:
-    """Write the tape and its scenario as a bag into a folder; returns the path of the MCAP file.
+def write_run(tape: Tape, directory: Path, scenario_file: Path, attached: Sequence[Path] = ()) -> Path:
+    """Write the tape, its scenario and what goes with it as a bag into a folder; returns the path of the MCAP file.
 
     Each sample becomes a message whose log time is its stamp, in order of time.
     """
@@ -29,7 +30,9 @@ def write_run(tape: Tape, directory: Path, scenario_file: Path) -> Path:
     )
     signals = list(tape.signals.items())
     with BagWriter(directory) as bag:
-        bag.attach(scenario_file.name, "application/yaml", scenario_file.read_bytes(), tape.start_ns)
+        bag.attach(scenario_file.name, SCENARIO, scenario_file.read_bytes(), tape.start_ns)
+        for path in attached:
+            bag.attach(path.name, OTHER, path.read_bytes(), tape.start_ns)
         for name, _ in signals:
             bag.add_topic(f"/{name}", JOINT_STATE, "")
         none = np.zeros(0)

@@ -19,6 +19,7 @@ from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.params import Gust
+from aircraft_sim.uncertainty import uncertain
 from flight_analysis.airframe_table import invariant_zeros
 from flight_analysis.lyapunov import Plant, decay
 from flight_analysis.scenario import Scenario
@@ -48,9 +49,6 @@ LARGEST_COUPLING = 10.0
 """max abs(U - I) above which inputs and outputs are paired wrongly. It is 25 on the `osprey` with aileron and rudder
 swapped and 13.6 on the first edition's Aerosonde, which no gain set of either procedure holds behind servos; 2.2 at most on
 the other airframes of the library."""
-
-KINEMATIC = ("theta", "phi", "psi")
-"""States whose derivatives are known exactly: their rows stay as published in uncertain airframes."""
 
 STEP = 0.01
 """s. Steps of the ideal control: a gust of a second and hidden modes up to 10 1/s are resolved to 1e-6 of their size."""
@@ -163,24 +161,6 @@ def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
     return Manoeuvre(reference, gusts, scenario.flight.duration)
 
 
-def uncertain(airframe: Airframe, uncertainty: float, samples: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: as published first, then uncertain ones.
-
-    Every entry is multiplied by 1 + d, d uniform in +-uncertainty and independent; the rows of angles stay. Raises
-    ParameterError for an uncertainty outside [0, 1).
-    """
-    require(0.0 <= uncertainty < 1.0, "uncertainty", uncertainty, "a part of each entry, 0 <= uncertainty < 1")
-    generator = np.random.default_rng(seed)
-    known = np.array([[float(state not in KINEMATIC)] for state in airframe.states])
-
-    def spread(matrix: FloatArray) -> FloatArray:
-        part = uncertainty * generator.uniform(-1.0, 1.0, (1 + samples, *matrix.shape))
-        part[0] = 0.0
-        return np.asarray(matrix * (1.0 + known * part))
-
-    return spread(airframe.matrix_a()), spread(airframe.matrix_b())
-
-
 def study(airframe: Airframe, flown: Manoeuvre, uncertainty: float = 0.3, samples: int = 100, seed: int = 1) -> Study:
     """Find the rate of the ideal control along a manoeuvre, on the airframe as published and on uncertain ones.
 
@@ -258,7 +238,7 @@ def _references(flown: Manoeuvre, airframe: Airframe) -> _References:
     def commanded(t: Array) -> Array:
         return command(t, profile)
 
-    x = zero_state(matrices)
+    x, step = zero_state(matrices), model.stepper(STEP / 2.0, matrices)
     rows = []
     for k in range(2 * round(flown.duration / STEP) + 1):
         t = k * STEP / 2.0
@@ -266,7 +246,7 @@ def _references(flown: Manoeuvre, airframe: Airframe) -> _References:
         u_dot = (commanded(t + near) - commanded(t - near)) / (2.0 * near)
         x_ddot = model.x_m_dot(t, x_dot, u_dot, matrices)  # (2) differentiated
         rows.append([model.output(z, matrices) for z in (x, x_dot, x_ddot)])
-        x = model.step(t, x, commanded, STEP / 2.0, matrices)
+        x = model.step(x, np.concatenate([commanded(t + part * STEP / 2.0) for part in (0.0, 0.5, 1.0)]), step)
     places = [flown.reference.outputs.index(name) for name in airframe.outputs]
     y, y_dot, y_ddot = np.moveaxis(np.array(rows), 1, 0)[..., places]
     return _References(y, y_dot, y_ddot)

@@ -2,160 +2,178 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report: one page that needs no network, the flight's figures first, then its pictures."""
 
-import itertools
+from collections.abc import Iterable, Sequence
 from html import escape
+from itertools import groupby, product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
 import plotly.graph_objects as go
-from numpy.typing import NDArray
-from plotly.subplots import make_subplots
 
-from flight_analysis.metrics import PARTS, tracking_error
+from flight_analysis import pictures
+from flight_analysis.metrics import PARTS, Windows
+from flight_analysis.pictures import Limits
 from flight_analysis.scenario import Scenario
 from flight_analysis.summary import PART_NAMES, Shown, error_rows, shown_units
-from flight_core.tape import Signal, Tape
-from flight_core.vectors import FloatArray
+from flight_core.outcome import COMPLETED
+from flight_core.tape import Tape
+from rise_di_controller.internals import Limited
 
-PLANT, REFERENCE, ERROR = "#123c52", "#f6a85f", "#8b1f4f"
-GUST = "#7f7f7f"
-MOST_POINTS = 6000  # of a trace; 100 Hz over a minute
-
+# In the dark the pictures are inverted, and their hues turned back.
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <style>
-body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 2rem auto; padding: 0 1rem }}
-table {{ border-collapse: collapse; margin: 1rem 0 }}
-th, td {{ padding: .25rem .9rem; text-align: right; border-bottom: 1px solid #ddd }}
+:root {{ color-scheme: light dark; --line: #8884; --quiet: #777 }}
+body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 1.5rem auto; padding: 0 1rem }}
+h1 {{ font-size: 1.6rem; margin: 0 }}
+h2 {{ font-size: 1.1rem; margin: 2rem 0 0 }}
+p {{ margin: .3rem 0 }}
+table {{ border-collapse: collapse; font-variant-numeric: tabular-nums }}
+th, td {{ padding: .15rem .7rem; text-align: right; border-bottom: 1px solid var(--line) }}
 th:first-child, td:first-child {{ text-align: left }}
-caption {{ text-align: left; font-weight: 600; padding-bottom: .4rem }}
-.note {{ color: #8a4b00 }}
+th {{ font-weight: 500; color: var(--quiet) }}
+caption {{ text-align: left; font-weight: 600; padding-bottom: .2rem }}
+.tables {{ display: flex; flex-wrap: wrap; gap: 1.2rem 3rem; align-items: start; margin-top: 1rem }}
+.outcome {{ padding: .1rem .6rem; border-radius: 1rem; color: #fff; background: #a3242b }}
+.outcome.good {{ background: #23784f }}
+.note {{ color: #b06000 }}
+.hint {{ color: var(--quiet); font-size: .85rem }}
+section {{ break-inside: avoid }}
+@media screen and (prefers-color-scheme: dark) {{ .plotly-graph-div {{ filter: invert(.9) hue-rotate(180deg) }} }}
+@media print {{ body {{ margin: 0; font-size: 12px }} .modebar {{ display: none }} }}
 </style></head><body>
 <h1>{title}</h1>
-<p>{lead}</p>
-{tables}
+<p><span class="outcome{good}">{outcome}</span> {lead}</p>
+{notes}
+<div class="tables">{tables}</div>
 {pictures}
+<script>
+const plots = [...document.querySelectorAll(".plotly-graph-div")];
+let following = false;
+for (const plot of plots) plot.on("plotly_relayout", moved => {{  // a zoom in time is one in all pictures
+  if (following || !Object.keys(moved).some(key => /^xaxis\\d*\\.(range|autorange)/.test(key))) return;
+  following = true;
+  const range = [...plot.layout.xaxis.range];
+  Promise.all(plots.filter(other => other !== plot).map(other => Plotly.relayout(other, {{"xaxis.range": range}})))
+    .finally(() => following = false);
+}});
+</script>
 </body></html>
 """
+
+
+class Event(NamedTuple):
+    """Something that happened in a flight, from its first to its last instant in s."""
+
+    what: str
+    start: float
+    stop: float
+    how_much: str
 
 
 def write_report(path: Path, scenario: Scenario, tape: Tape, summary: dict[str, Any]) -> None:
     """Write the page of one flight."""
     units = shown_units(scenario)
-    gusts = scenario.gust_windows()
-    pictures = [
-        tracking_picture(tape, units, gusts),
-        _stack(tape, "Tracking error e = y - y_m", {"e": (tracking_error(tape), ERROR)}, units, gusts),
-        _stack(tape, "Input u", {"u": (tape["u"], PLANT)}, units, gusts) if "u" in tape else None,
-        _ticks_picture(tape),
+    scene = pictures.flight_scene(tape, units, scenario.gust_windows())
+    sections = [
+        ("Output y over the reference y_m", "", pictures.tracking_picture(scene)),
+        ("Tracking error e = y - y_m", "", pictures.error_picture(scene)),
+        (
+            "Input u and the actuators",
+            "Limits are in view where u comes near them. Above each row: when the controller held it back.",
+            pictures.input_picture(scene, known_limits(scenario, tape)),
+        ),
+        ("Wind", "along the body axes of trim", pictures.wind_picture(scene)),
+        ("States", "SI where no unit is given", pictures.state_picture(scene)),
+        ("Error of the sensors", "y less the true output", pictures.sensor_picture(scene)),
+        (
+            "Ticks of the controller",
+            "late: after its deadline; age: of y at the tick; dt: as integrated",
+            pictures.tick_picture(scene),
+        ),
     ]
-    drawn = [figure for figure in pictures if figure is not None]
-    html = [
-        figure.to_html(full_html=False, include_plotlyjs=index == 0, config={"displaylogo": False})
-        for index, figure in enumerate(drawn)
-    ]
-    lead = f"{summary['duration']:.1f} s flown, {summary['outcome']}."
-    notes = "".join(f'<p class="note">{escape(note)}</p>' for note in summary["notes"])
+    drawn = [(title, hint, figure) for title, hint, figure in sections if figure is not None]
+    law = scenario.controller.sampled_sign()[1]
     page = PAGE.format(
         title=escape(f"Flight {path.parent.name}"),
-        lead=escape(lead),
-        tables=notes + _error_table(summary, units) + _tick_table(summary),
-        pictures="\n".join(html),
+        good=" good" if summary["outcome"] == COMPLETED else "",
+        outcome=escape(summary["outcome"]),
+        lead=escape(f"{summary['duration']:.1f} s flown at {scenario.controller.rate:g} Hz with the {law}."),
+        notes="".join(f'<p class="note">{escape(note)}</p>' for note in summary["notes"]),
+        tables=_error_table(summary, units) + _event_table(events(tape, scenario.gust_windows())) + _tick_table(summary),
+        pictures="\n".join(_section(*one, with_library=index == 0) for index, one in enumerate(drawn)),
     )
     path.write_text(page, encoding="utf-8")
 
 
-def tracking_picture(tape: Tape, units: dict[str, Shown], gusts: dict[str, tuple[float, float]]) -> go.Figure:
-    """Picture of y over y_m for every channel, the gusts marked."""
-    signals = {"y_m": (tape["y_m"], REFERENCE), "y": (tape["y"], PLANT)}
-    return _stack(tape, "Output y over the reference y_m", signals, units, gusts)
+def known_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
+    """Limits of u by whose they are and by input: of the actuators where they are simulated, and of the controller."""
+    actuators, controller = scenario.aircraft.actuators, scenario.controller
+    limits = {"limits of the controller": _pairs(controller.inputs, controller.lower or (), controller.upper or ())}
+    if "truth" not in tape or not tape["truth"].group("actuator").names:
+        return limits
+    return {"end stops": _pairs(tuple(scenario.aircraft.channels().inputs), actuators.lower, actuators.upper)} | limits
 
 
-def drawn_points(values: FloatArray, most: int = MOST_POINTS) -> NDArray[np.int64]:
-    """Places of at most `most` >= 2 samples to draw of values of shape (N,): all, else the smallest and largest of each bin."""
-    if len(values) <= most:
-        return np.arange(len(values))
-    edges = np.linspace(0, len(values), most // 2 + 1).astype(np.int64)
-    bins = itertools.pairwise(edges)
-    extremes = [start + extreme(values[start:stop]) for start, stop in bins for extreme in (np.argmin, np.argmax)]
-    return np.unique(np.array(extremes, dtype=np.int64))
+def _pairs(names: Sequence[str], lower: Sequence[float], upper: Sequence[float]) -> Limits:
+    none = [float("inf")] * len(names)
+    return dict(zip(names, zip(lower or [-bound for bound in none], upper or none, strict=True), strict=True))
 
 
-def _stack(
-    tape: Tape,
-    title: str,
-    signals: dict[str, tuple[Signal, str]],
-    units: dict[str, Shown],
-    gusts: dict[str, tuple[float, float]],
-) -> go.Figure:
-    """One row a channel, all signals that have it over each other."""
-    channels = next(reversed(signals.values()))[0].names
-    figure = make_subplots(rows=len(channels), cols=1, shared_xaxes=True, vertical_spacing=0.03)
-    for row, channel in enumerate(channels, start=1):
-        unit, factor = units[channel]
-        for label, (signal, colour) in signals.items():
-            keep = drawn_points(signal[channel])
-            figure.add_trace(
-                go.Scattergl(
-                    x=((signal.stamp_ns - tape.start_ns) / 1e9)[keep],
-                    y=(signal[channel] * factor)[keep],
-                    name=label,
-                    legendgroup=label,
-                    showlegend=row == 1,
-                    line={"color": colour, "width": 6 if label == "y_m" else 1.4},
-                ),
-                row=row,
-                col=1,
-            )
-        figure.update_yaxes(title_text=f"{channel} ({unit})", row=row, col=1)
-        for name, (start, stop) in gusts.items():
-            mark = {"annotation_text": f"{name} gust", "annotation_position": "top left"} if row == 1 else {}
-            figure.add_vrect(x0=start, x1=stop, fillcolor=GUST, opacity=0.25, line_width=0, row=row, col=1, **mark)
-    figure.update_xaxes(title_text="t (s)", row=len(channels), col=1)
-    figure.update_layout(
-        title=title,
-        height=150 + 150 * len(channels),
-        template="plotly_white",
-        margin={"l": 80, "r": 20, "t": 60, "b": 40},
-        legend={"orientation": "h", "y": 1.02, "x": 1, "xanchor": "right", "yanchor": "bottom"},
-        hovermode="x unified",
-    )
-    return figure
+def events(tape: Tape, gusts: Windows) -> list[Event]:
+    """Gusts, modes other than ENGAGED, and limits that the controller reached, one event each, by their first instant."""
+    found = []
+    marked = pictures.gust_bands(tape, gusts) + pictures.mode_bands(tape)
+    for label, group in groupby(marked, key=lambda band: band.label):
+        bands = list(group)
+        times = f", {len(bands)} times" if len(bands) > 1 else ""
+        found.append(Event(label, bands[0].start, bands[-1].stop, f"{sum(b.stop - b.start for b in bands):.2f} s{times}"))
+    if "internals" in tape:
+        limited, t = tape["internals"].group("limited"), tape.time("internals")
+        for name, what in product(limited.names, (Limited.MAGNITUDE, Limited.RATE)):
+            hit = limited[name] == what
+            if hit.any():
+                first, last = t[hit][[0, -1]]
+                found.append(Event(f"{name} limited: {what.name.lower()}", first, last, f"{hit.sum()} of {len(hit)} ticks"))
+    return sorted(found, key=lambda event: event.start)
 
 
-def _ticks_picture(tape: Tape) -> go.Figure | None:
-    if "internals" not in tape or not tape["internals"]["late"].any():
-        return None
-    figure = go.Figure()
-    for name, meaning in (("late", "tick after its deadline"), ("age", "y at the tick")):
-        figure.add_trace(go.Scattergl(x=tape.time("internals"), y=tape["internals"][name] * 1e3, name=f"{name}: {meaning}"))
-    figure.update_layout(
-        title="Ticks of the controller", height=320, template="plotly_white", xaxis_title="t (s)", yaxis_title="ms"
-    )
-    return figure
+def _section(title: str, hint: str, figure: go.Figure, *, with_library: bool) -> str:
+    plot = figure.to_html(full_html=False, include_plotlyjs=with_library, config={"displaylogo": False, "responsive": True})
+    said = f'<p class="hint">{escape(hint)}</p>' if hint else ""
+    return f"<section><h2>{escape(title)}</h2>{said}{plot}</section>"
+
+
+def _table(caption: str, head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    def row(cells: Iterable[str], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+
+    return f"<table><caption>{escape(caption)}</caption>{row(head, 'th')}{''.join(row(cells, 'td') for cells in rows)}</table>"
 
 
 def _error_table(summary: dict[str, Any], units: dict[str, Shown]) -> str:
-    head = "".join(f"<th>{part} rms</th><th>{part} max</th>" for part in PART_NAMES)
-    rows = ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in error_rows(summary, units)]
-    caption = f"Tracking error ({escape(summary['error'])}; {PARTS})"
-    return f"<table><caption>{caption}</caption><tr><th>channel</th>{head}</tr>{''.join(rows)}</table>"
+    head = ["channel", *(f"{part} {figure}" for part in PART_NAMES for figure in ("rms", "max"))]
+    table = _table(f"Tracking error ({summary['error']})", head, error_rows(summary, units))
+    return f'<div>{table}<p class="hint">{escape(PARTS)}</p></div>'
+
+
+def _event_table(happened: Sequence[Event]) -> str:
+    if not happened:
+        return ""
+    rows = [(event.what, f"{event.start:.2f}", f"{event.stop:.2f}", event.how_much) for event in happened]
+    return _table("What happened", ("", "from (s)", "to (s)", ""), rows)
 
 
 def _tick_table(summary: dict[str, Any]) -> str:
     ticks = summary["ticks"]
     if ticks is None:
         return ""
-    rows = "".join(
-        f"<tr><td>{name}</td><td>{value}</td></tr>"
-        for name, value in (
-            ("ticks", ticks["ticks"]),
-            ("periods without a new y", ticks["without_new_y"]),
-            ("period mean / p99 / max (ms)", " / ".join(f"{ticks[f'period_{k}'] * 1e3:.3f}" for k in ("mean", "p99", "max"))),
-            ("after the deadline p99 / max (ms)", " / ".join(f"{ticks[f'late_{k}'] * 1e3:.3f}" for k in ("p99", "max"))),
-            ("age of y p99 (ms)", f"{ticks['age_p99'] * 1e3:.3f}"),
-        )
+    rows = (
+        ("ticks", f"{ticks['ticks']}"),
+        ("periods without a new y", f"{ticks['without_new_y']}"),
+        ("period mean / p99 / max (ms)", " / ".join(f"{ticks[f'period_{k}'] * 1e3:.3f}" for k in ("mean", "p99", "max"))),
+        ("after the deadline p99 / max (ms)", " / ".join(f"{ticks[f'late_{k}'] * 1e3:.3f}" for k in ("p99", "max"))),
+        ("age of y p99 (ms)", f"{ticks['age_p99'] * 1e3:.3f}"),
     )
-    return f"<table><caption>Ticks of the controller</caption>{rows}</table>"
+    return _table("Ticks of the controller", ("", ""), rows)

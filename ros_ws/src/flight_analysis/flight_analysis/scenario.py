@@ -22,6 +22,7 @@ class FlightParameters(Parameters):
     """What whoever runs the scenario needs to know."""
 
     duration: Annotated[float, Field(gt=0, le=1e6)] = Field(description="how long to fly, s")
+    lockstep: bool = Field(default=False, description="fly as fast as the machine allows, in lockstep, instead of real time")
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,8 @@ class Scenario:
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
         """From when to when each gust blows, s: entry to entry + 2 H / V0."""
-        _, aircraft = self.aircraft.load()
-        return {
-            name: (gust.start, gust.start + 2.0 * gust.length / float(aircraft.speed))
-            for name, gust in self.aircraft.gusts.items()
-        }
+        speed = self.aircraft.channels().speed
+        return {name: (gust.start, gust.start + 2.0 * gust.length / speed) for name, gust in self.aircraft.gusts.items()}
 
 
 SCHEMAS: dict[str, type[Parameters]] = {
@@ -77,18 +75,18 @@ def load_scenario(path: Path) -> Scenario:
 
 
 def _check_together(scenario: Scenario) -> None:
-    airframe, _ = scenario.aircraft.load()
+    channels = scenario.aircraft.channels()
     controller, reference = scenario.controller, scenario.reference_model
     for key, found, expected in (
-        ("controller.outputs", controller.outputs, airframe.outputs),
-        ("controller.inputs", controller.inputs, tuple(airframe.inputs)),
-        ("reference_model.outputs", reference.outputs, airframe.outputs),
+        ("controller.outputs", controller.outputs, tuple(channels.outputs)),
+        ("controller.inputs", controller.inputs, tuple(channels.inputs)),
+        ("reference_model.outputs", reference.outputs, tuple(channels.outputs)),
     ):
         require(
             sorted(found) == sorted(expected),
             key,
             ", ".join(found),
-            f"the channels of the airframe {airframe.name} in any order: {', '.join(expected)}",
+            f"the channels of the airframe {scenario.aircraft.airframe} in any order: {', '.join(expected)}",
         )
     control_ns = period_ns(controller.rate, "controller.rate")
     for key, rate in (("aircraft.rate", scenario.aircraft.rate), ("reference_model.rate", reference.rate)):

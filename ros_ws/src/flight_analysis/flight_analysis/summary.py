@@ -24,12 +24,12 @@ class Shown(NamedTuple):
 
 def shown_units(scenario: Scenario) -> dict[str, Shown]:
     """Units for tables and pictures by channel of y and u: angular rates in mrad/s, inputs as the airframe file has them."""
-    airframe, _ = scenario.aircraft.load()
+    channels = scenario.aircraft.channels()
     units = {
         name: Shown("mrad/s", 1e3) if unit == "rad/s" else Shown(unit, 1.0 / SI_PER_UNIT[unit])
-        for name, unit in airframe.states.items()
+        for name, unit in channels.outputs.items()
     }
-    return units | {name: Shown(i.unit, 1.0 / SI_PER_UNIT[i.unit]) for name, i in airframe.inputs.items()}
+    return units | {name: Shown(unit, 1.0 / SI_PER_UNIT[unit]) for name, unit in channels.inputs.items()}
 
 
 def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:

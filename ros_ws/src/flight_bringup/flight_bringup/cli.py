@@ -45,6 +45,12 @@ def fly(
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Fly in one process without ROS, as fast as it goes.")
     ] = False,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Over topics as fast as the machine allows, repeatable to the byte.")
+    ] = False,
+    one_process: Annotated[
+        bool, typer.Option("--one-process", help="In lockstep, with aircraft, reference model and controller in one process.")
+    ] = False,
     runs: Annotated[Path, typer.Option(help="Folder that the run's folder is made in.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")] = False,
 ) -> None:
@@ -64,8 +70,11 @@ def fly(
         def progress(t: float, shown: str) -> None:
             bar.update(task, completed=t, clock=f"t = {t:5.1f} of {chosen.flight.duration:g} s", shown=shown)
 
-        method = flying.fly_in_process if in_process else flying.fly_over_topics
-        outcome = method(chosen, run, progress)
+        if in_process:
+            outcome = flying.fly_in_process(chosen, run, progress)
+        else:
+            stepping = lockstep or one_process or chosen.flight.lockstep
+            outcome = flying.fly_over_topics(chosen, run, progress, lockstep=stepping, one_process=one_process)
         if outcome == "completed":
             progress(chosen.flight.duration, outcome)
     status = STATUS.get(outcome, ENDED_EARLY)
@@ -74,7 +83,8 @@ def fly(
     except ParameterError:
         if status == 0:
             raise
-        print(f"error: {outcome} before anything was flown; see {_short(run / 'log')}", file=sys.stderr)
+        flying.conclude_unflown(run, chosen, outcome)
+        print(f"error: {outcome}, before anything was flown; see {_short(run)}", file=sys.stderr)
         raise typer.Exit(status) from None
     outcome = flown.summary["outcome"]
     status = STATUS.get(outcome, ENDED_EARLY)

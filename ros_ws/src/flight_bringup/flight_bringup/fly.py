@@ -12,7 +12,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flight_analysis.bag_reader import read_run
 from flight_analysis.bag_writer import write_run
@@ -20,12 +20,19 @@ from flight_analysis.report import write_report
 from flight_analysis.scenario import Scenario, load_scenario
 from flight_analysis.simulate import simulate
 from flight_analysis.summary import shown_units, summarise
+from flight_bringup.graph import attachments
 from flight_bringup.processes import Flight
 from flight_core.outcome import COMPLETED, INTERRUPTED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 
+if TYPE_CHECKING:
+    from flight_bringup.node import Monitor
+
 POLL_PERIOD = 0.05  # s, of the progress bar
+
+STUCK = 40.0
+"""s. A lockstep flight in which nothing moves for as long ends; a peer that is gone ends it within two seconds."""
 
 Progress = Callable[[float, str], None]  # flight time in s, and what to show beside it
 
@@ -68,34 +75,65 @@ def _signals_as_interrupt() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def fly_over_topics(scenario: Scenario, run: Path, progress: Progress) -> str:
-    """Fly in real time as separate processes and record the bag into `run`. Returns the outcome.
+def fly_over_topics(
+    scenario: Scenario, run: Path, progress: Progress, *, lockstep: bool = False, one_process: bool = False
+) -> str:
+    """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
-    "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence naming the process that ended early.
+    In real time, or in `lockstep` as fast as the machine allows; `one_process` holds aircraft, reference model and controller
+    in one process, for lockstep alone. "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence naming the process that
+    ended early.
     """
     from flight_bringup.node import Monitor  # noqa: PLC0415 - loads rclpy, which no other command needs
 
-    units = shown_units(scenario)
-    outputs = scenario.controller.outputs
     try:
         with (
             _signals_as_interrupt(),
-            Monitor(outputs) as monitor,
-            Flight(scenario.path, run, before_start=monitor.require_nobody_flies) as flight,
+            Monitor(scenario.controller.outputs, lockstep=lockstep) as monitor,
+            Flight(
+                scenario, run, before_start=monitor.require_nobody_flies, lockstep=lockstep, one_process=one_process
+            ) as flight,
         ):
-            shown = "starting"
-            while (t := time.time() - flight.start_time) < scenario.flight.duration:
-                if (sentence := flight.ended_early()) is not None:
-                    return sentence
-                if (seen := monitor.newest()) is not None:
-                    errors = ", ".join(
-                        f"{name} {value * units[name].factor:+.2f}" for name, value in zip(outputs, seen.e, strict=True)
-                    )
-                    shown = f"{seen.mode}  e: {errors}"
-                progress(max(t, 0.0), shown)
-                time.sleep(POLL_PERIOD)
+            follow = _follow_lockstep if lockstep else _follow_real_time
+            return follow(scenario, flight, monitor, progress)
     except KeyboardInterrupt:
         return INTERRUPTED
+
+
+def _follow_real_time(scenario: Scenario, flight: Flight, monitor: "Monitor", progress: Progress) -> str:
+    units, outputs = shown_units(scenario), scenario.controller.outputs
+    shown = "starting"
+    while (t := time.time() - flight.start_time) < scenario.flight.duration:
+        if (sentence := flight.ended_early()) is not None:
+            return sentence
+        if (seen := monitor.newest()) is not None:
+            errors = ", ".join(f"{name} {value * units[name].factor:+.2f}" for name, value in zip(outputs, seen.e, strict=True))
+            shown = f"{seen.mode}  e: {errors}"
+        progress(max(t, 0.0), shown)
+        time.sleep(POLL_PERIOD)
+    return COMPLETED
+
+
+def _follow_lockstep(scenario: Scenario, flight: Flight, monitor: "Monitor", progress: Progress) -> str:
+    """The real-time factor shown is that since the first instant in the log."""
+    end = scenario.flight.duration
+    flown, first, moved, shown = 0.0, 0.0, time.monotonic(), "lockstep, starting"
+    begin = moved
+    # The last instant is the last whole period of the aircraft.
+    while flown < end - 1.0 / scenario.aircraft.rate:
+        if (sentence := flight.ended_early()) is not None:
+            return sentence
+        now = time.monotonic()
+        if (recorded := monitor.recorded()) is not None:
+            if moved == begin:
+                begin, first = now, recorded
+            flown, moved = recorded, now
+            if now > begin:
+                shown = f"lockstep, {(flown - first) / (now - begin):.1f} times real time"
+        elif now > moved + STUCK:
+            return f"stuck at t = {flown:g} s: nothing has moved for {STUCK:g} s"
+        progress(flown, shown)
+        time.sleep(POLL_PERIOD)
     return COMPLETED
 
 
@@ -103,7 +141,7 @@ def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
     """Fly in one process without ROS, as fast as it goes, and write the bag into `run`. Returns the outcome."""
     with _signals_as_interrupt():
         tape = simulate(scenario, lambda t: progress(t, "in one process"))
-    write_run(tape, run, scenario.path)
+    write_run(tape, run, scenario.path, attachments(scenario, run))
     return tape.outcome
 
 
@@ -132,6 +170,15 @@ def conclude(run: Path, outcome: str | None = None) -> Flown:
     except OSError as error:
         raise ParameterError(f"{run}: cannot be written ({error.strerror}), expected a folder that can") from None
     return Flown(scenario, min(run.glob("*.mcap")), run / "report.html", summary)
+
+
+def conclude_unflown(run: Path, scenario: Scenario, outcome: str) -> Path:
+    """Write summary.json of a flight that ended before its first sample; its path. The log, such as it is, stays."""
+    summary = {"scenario": scenario.name, "outcome": outcome, "duration": 0.0, "errors": {}, "ticks": None, "notes": []}
+    path = run / "summary.json"
+    path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    _point_latest(run)
+    return path
 
 
 def _outcome_before(summary: Path) -> str:

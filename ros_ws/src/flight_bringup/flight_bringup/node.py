@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The monitor: the one thing of a running flight that the command line listens to."""
+"""What the command line needs of ROS: a monitor of a running flight, and the three nodes as objects in one process."""
 
 import os
 from typing import NamedTuple
@@ -8,13 +8,18 @@ from typing import NamedTuple
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
+from aircraft_sim.node import AircraftNode
 from flight_core.parameters import require
+from flight_core.rates import seconds
 from flight_core.vectors import ChannelError, FloatArray
 from flight_ros import transport
 from flight_ros.inbox import Inbox
-from flight_ros.messages import from_message
-from flight_ros.topics import INTERNALS, LISTEN, Y_M, Y
+from flight_ros.messages import Decoder, stamp_of
+from flight_ros.runtime import run
+from flight_ros.topics import INTERNALS, LISTEN, RECORDED, STEP, Y_M, Y
+from reference_model.node import ReferenceModelNode
 from rise_di_controller.guard import Mode
+from rise_di_controller.node import ControllerNode
 
 MODES = {float(mode): mode.name for mode in Mode}
 
@@ -29,13 +34,15 @@ class Seen(NamedTuple):
 class Monitor:
     """Listens to `internals`. A context manager, so that the middleware is always shut down."""
 
-    def __init__(self, outputs: tuple[str, ...]) -> None:
+    def __init__(self, outputs: tuple[str, ...], *, lockstep: bool) -> None:
         transport.prepare()
         # Ctrl-C is for the runner to handle, not for rclpy.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node("monitor", start_parameter_services=False)
-        self._inbox = Inbox(self._node, INTERNALS, LISTEN)
-        self._wanted = ("mode", *(f"e.{output}" for output in outputs))
+        # In lockstep every listener costs time, so it listens to the recorder alone.
+        self._inbox = None if lockstep else Inbox(self._node, INTERNALS, LISTEN, raw=True)
+        self._recorded_inbox = Inbox(self._node, RECORDED, STEP, raw=True)
+        self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
 
     def __enter__(self) -> "Monitor":
         return self
@@ -47,13 +54,21 @@ class Monitor:
     def newest(self) -> Seen | None:
         """The newest sample since the last call, None where none has come."""
         seen = None
-        for received in self._inbox.take():
+        for received in self._inbox.take() if self._inbox is not None else ():
             try:
-                values = from_message(received.message, self._wanted).value
+                sample = self._decoder.decode(received.message)
             except ChannelError:
                 continue
-            seen = Seen(MODES.get(values[0], "?"), values[1:])
+            if sample is not None:
+                seen = Seen(MODES.get(sample.value[0], "?"), sample.value[1:])
         return seen
+
+    def recorded(self) -> float | None:
+        """The flight time up to which a lockstep flight is in its log, s; None where that has not changed."""
+        recorded = None
+        for received in self._recorded_inbox.take():
+            recorded = seconds(stamp_of(received.message))
+        return recorded
 
     def require_nobody_flies(self) -> None:
         """Raise ParameterError where an aircraft or a reference model is already there, which would fly into this flight."""
@@ -62,3 +77,12 @@ class Monitor:
             domain = os.environ.get("ROS_DOMAIN_ID", "0")
             found = f"{count} publishers of {topic.name} already"
             require(count == 0, f"ROS_DOMAIN_ID {domain}", found, "a domain of its own for each flight: set ROS_DOMAIN_ID")
+
+
+def main() -> None:
+    """Aircraft, reference model and controller as objects in one process, in lockstep over the same topics."""
+    run(AircraftNode, ReferenceModelNode, ControllerNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -17,7 +17,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from flight_bringup.graph import FIRST, READY, RECORDER, THEN, NodeSpec, parameters, start_lead
+from flight_analysis.scenario import Scenario
+from flight_bringup.graph import FIRST, ONE_PROCESS, READY, RECORDER, THEN, NodeSpec, Told, parameters, start_lead
 from flight_core.parameters import ParameterError
 
 STOP_TIMEOUT = 2.5  # s for all processes together; a node ends within 0.2 s
@@ -33,7 +34,7 @@ def end_with_parent() -> list[str]:
 class NodeProcess:
     """One node as a process of its own, its output kept in a file and in the last lines."""
 
-    def __init__(self, node: NodeSpec, scenario_file: Path, told: dict[str, str | float], log: Path) -> None:
+    def __init__(self, node: NodeSpec, scenario_file: Path, told: Told, log: Path) -> None:
         self.node = node
         self.lines: deque[str] = deque(maxlen=20)
         self.ready = threading.Event()
@@ -67,6 +68,8 @@ class NodeProcess:
         status = self.popen.wait()
         self._reader.join(timeout=1.0)
         self._log.close()
+        if self.popen.stdout is not None:
+            self.popen.stdout.close()
         return status
 
 
@@ -76,22 +79,27 @@ class Flight:
     `before_start` is called when the first nodes are ready, before aircraft and reference model start.
     """
 
-    def __init__(self, scenario_file: Path, run: Path, before_start: Callable[[], None]) -> None:
-        self._scenario_file, self._run, self._before_start = scenario_file, run, before_start
+    def __init__(
+        self, scenario: Scenario, run: Path, before_start: Callable[[], None], *, lockstep: bool, one_process: bool
+    ) -> None:
+        self._scenario, self._run, self._before_start = scenario, run, before_start
+        self._lockstep = lockstep
+        self._first: tuple[NodeSpec, ...] = (RECORDER,) if one_process else FIRST
+        self._then: tuple[NodeSpec, ...] = (ONE_PROCESS,) if one_process else THEN
         self.processes: list[NodeProcess] = []
         self.start_time = math.inf  # system time of t = 0, s; set once the first nodes are ready
 
     def __enter__(self) -> Self:
         try:
             begin = time.monotonic()
-            first = [self._start(node) for node in FIRST]
+            first = [self._start(node) for node in self._first]
             while not all(process.ready.wait(0.02) for process in first):
                 self._require_running()
                 if time.monotonic() > begin + READY_TIMEOUT:
                     raise ParameterError(f"not ready after {READY_TIMEOUT:g} s; see the logs in {self._run / 'log'}")
             self._before_start()
             self.start_time = round(time.time() + start_lead(time.monotonic() - begin), 3)
-            for node in THEN:
+            for node in self._then:
                 self._start(node)
         except BaseException:
             self.stop()
@@ -104,8 +112,8 @@ class Flight:
     def _start(self, node: NodeSpec) -> NodeProcess:
         log = self._run / "log" / f"{node.executable}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
-        told = parameters(node, self._scenario_file, self._run, self.start_time)
-        process = NodeProcess(node, self._scenario_file, told, log)
+        told = parameters(node, self._scenario, self._run, self.start_time, lockstep=self._lockstep)
+        process = NodeProcess(node, self._scenario.path, told, log)
         self.processes.append(process)
         return process
 

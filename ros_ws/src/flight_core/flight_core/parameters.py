@@ -37,6 +37,12 @@ class Parameters(BaseModel):
             raise ParameterError(_sentence(cls, where, first) + more) from None
 
 
+class NodeParameters(Parameters):
+    """Base of the parameters of a node of a flight."""
+
+    lockstep: bool = Field(default=False, description="move when all others have, as fast as the machine allows; no real time")
+
+
 def as_tuple(value: object) -> object:
     """A sequence other than a string as a tuple; anything else as it is, for the validator behind to refuse."""
     return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value

@@ -5,12 +5,21 @@
 from collections.abc import Sequence
 from typing import Any
 
-import array_api_compat.numpy  # noqa: F401 - else its first use imports it, 0.15 s in the middle of a tick
+import array_api_compat
+import array_api_compat.numpy  # else its first use imports it, 0.15 s in the middle of a tick
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 Array = Any  # an array of whichever array namespace the caller flies with: NumPy, JAX
+
+
+def array_namespace(array: Array) -> Any:
+    """The array namespace of an array.
+
+    NumPy's at once, for most of the time of a step of a few small arrays would go into looking what else it could be.
+    """
+    return array_api_compat.numpy if type(array) is np.ndarray else array_api_compat.array_namespace(array)
 
 
 class ChannelError(ValueError):

@@ -13,6 +13,7 @@ from mcap.writer import CompressionType, Writer
 from flight_recorder.definitions import Definition, definition
 
 ROSBAG2_VERSION = 9
+SCENARIO, OTHER = "application/yaml", "text/yaml"  # media types of attachments: the scenario, and what goes with it
 CHUNK_BYTES = 256 * 1024
 
 

@@ -4,14 +4,17 @@
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from flight_core.parameters import Parameters
+from flight_core.parameters import NodeParameters, as_tuple
+
+OptionalNames = Annotated[tuple[str, ...], BeforeValidator(as_tuple)]
 
 
-class RecorderParameters(Parameters):
+class RecorderParameters(NodeParameters):
     """All parameters of the recorder's node."""
 
     rate: Annotated[float, Field(ge=5, le=1000)] = Field(description="how often the topics are emptied to the file, Hz")
     directory: str = Field(default="", description="the folder of the bag; empty makes runs/<UTC stamp>-recording")
+    attach: OptionalNames = Field(default=(), description="further files to store inside the log")
     scenario_file: str = Field(default="", description="a scenario file to store inside the log")

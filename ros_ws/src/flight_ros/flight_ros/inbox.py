@@ -6,10 +6,13 @@ A tick takes what has arrived (about 1 us when nothing has); a storm of messages
 back stops nothing.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 from rclpy.callback_groups import CallbackGroup
+from rclpy.context import Context
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -49,19 +52,35 @@ class Inbox:
         )
 
     @property
+    def handle(self) -> Any:
+        """The middleware's subscription, for a wait set."""
+        return self._subscription.handle
+
+    @property
     def name(self) -> str:
         """The full name of the topic."""
         return str(self._subscription.topic_name)
 
-    def take(self) -> Iterator[Received]:
-        """All messages that have arrived since the last call, oldest first, at most the queue's depth of them."""
-        subscription = self._subscription
-        for _ in range(self.qos.depth):
-            with subscription.handle:
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+    def take(self, most: int | None = None) -> Iterator[Received]:
+        """The messages that have arrived since the last call, oldest first, at most so many, else the queue's depth of them."""
+        handle, kind, raw = self._subscription.handle, self._subscription.msg_type, self._subscription.raw
+        for _ in range(most or self.qos.depth):
+            with handle:
+                taken = handle.take_message(kind, raw)
             if taken is None:
                 return
             message, info = taken
             yield Received(
                 message, info["source_timestamp"], info["received_timestamp"], info["publication_sequence_number"] or 0
             )
+
+
+def wait(inboxes: Sequence[Inbox], context: Context, timeout_ns: int) -> None:
+    """Until something has come into one of the inboxes, or the time is over, whichever is sooner."""
+    wait_set = _rclpy.WaitSet(len(inboxes), 0, 0, 0, 0, 0, context.handle)
+    with wait_set, ExitStack() as held:
+        wait_set.clear_entities()
+        for inbox in inboxes:
+            held.enter_context(inbox.handle)
+            wait_set.add_subscription(inbox.handle)
+        wait_set.wait(timeout_ns)

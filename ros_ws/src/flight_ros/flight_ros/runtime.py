@@ -9,7 +9,7 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Any, Generic, TypeVar
 
@@ -17,6 +17,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
@@ -27,15 +28,16 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.signals import SignalHandlerOptions
 
 from flight_core.outcome import FlightEnded
-from flight_core.parameters import ParameterError, Parameters
+from flight_core.parameters import NodeParameters, ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_ros import transport
-from flight_ros.inbox import Inbox
+from flight_ros.company import Company
+from flight_ros.inbox import Inbox, wait
 from flight_ros.parameters import changed, read_parameters
 from flight_ros.ticker import Tick, Ticker
-from flight_ros.topics import DIAGNOSTICS, LISTEN, PUBLISH, Topic
+from flight_ros.topics import DIAGNOSTICS, LISTEN, PUBLISH, STEP, Topic
 
-P = TypeVar("P", bound=Parameters)
+P = TypeVar("P", bound=NodeParameters)
 
 ENDED_EARLY = 3  # exit status
 
@@ -46,18 +48,25 @@ WAIT_BEFORE_SAYING_NS = 3 * NANOSECONDS  # processes of one flight start one aft
 
 OLDEST_START_NS = 10 * NANOSECONDS  # a node that comes late catches up with what it missed, but not with hours
 
+START_PATIENCE_NS = 30 * NANOSECONDS  # in lockstep, for others that never come
+
+ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)  # at the end of a lockstep flight, what was sent is left time to arrive
+
 NICE_PAUSE = 0.02  # s, the longest sleep, so that a signal or a service call is not left waiting
 
 
 class FlightNode(Node, Generic[P]):
-    """A node that works at fixed ticks. A subclass says at which rate, and what one tick does."""
+    """A node that works at fixed ticks, or in lockstep. A subclass says at which rate, and what one tick or step does."""
 
     def __init__(self, name: str, schema: type[P], tunable: frozenset[str] = frozenset()) -> None:
         Node.__init__(self, name, automatically_declare_parameters_from_overrides=True)
         self.parameters = read_parameters(self, schema, tunable)
         if tunable:
             self.add_on_set_parameters_callback(self._change_parameters)
-        self.instance = f"{self.get_fully_qualified_name()}#{os.getpid()}"
+        self.company = Company(self, name) if self.parameters.lockstep else None
+        # In lockstep the same flight gives the same bytes, so the process is left out.
+        process = "" if self.parameters.lockstep else f"#{os.getpid()}"
+        self.instance = self.get_fully_qualified_name() + process
         self.rejected: Counter[str] = Counter()
         self._inboxes: list[Inbox] = []
         self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to say it next
@@ -81,6 +90,14 @@ class FlightNode(Node, Generic[P]):
         """One tick; `now_ns` is the nominal instant of tick.number on the system clock's scale."""
         raise NotImplementedError
 
+    def advance(self) -> bool:
+        """In lockstep: do all that can be done with what has come. Whether that was anything."""
+        raise NotImplementedError
+
+    def awaits(self) -> str:
+        """In lockstep: what it waits for, for people; empty where it waits for nothing any more."""
+        return ""
+
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         """Level, sentence and further figures for the 1 Hz diagnostics."""
         return DiagnosticStatus.OK, "running", {}
@@ -97,9 +114,9 @@ class FlightNode(Node, Generic[P]):
         """A publisher on a topic of the flight."""
         return self.create_publisher(topic.type, topic.name, PUBLISH)
 
-    def inbox(self, topic: Topic, qos: QoSProfile = LISTEN, *, raw: bool = False) -> Inbox:
-        """A subscription that is read at the tick; its publishers are checked once a second."""
-        inbox = Inbox(self, topic, qos, raw=raw)
+    def inbox(self, topic: Topic, qos: QoSProfile | None = None) -> Inbox:
+        """A subscription that is read at the tick, as bytes; its publishers are checked once a second."""
+        inbox = Inbox(self, topic, qos or (STEP if self.parameters.lockstep else LISTEN), raw=True)
         self._inboxes.append(inbox)
         return inbox
 
@@ -164,6 +181,26 @@ class FlightNode(Node, Generic[P]):
                         f"{inbox.name}: quality of service of {node} does not fit: {reason}", throttle_duration_sec=5.0
                     )
 
+    def steps(self) -> bool:
+        """Whether it moves by `advance` in lockstep; else by `tick` in real time."""
+        return self.parameters.lockstep
+
+    def inboxes(self) -> list[Inbox]:
+        """What it listens to."""
+        return self._inboxes
+
+    def require_company(self) -> None:
+        """Raise FlightEnded where a node that took part in lockstep is gone."""
+        if self.company is not None and (role := self.company.missing()):
+            raise FlightEnded(f"{role} is gone")
+
+    def finish(self) -> None:
+        """The end of the node: in lockstep what was sent is left time to arrive."""
+        self.close()
+        if self.parameters.lockstep and not (self.company and self.company.missing()):
+            for publisher in self.publishers:
+                publisher.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
     def publish_diagnostics(self) -> None:
         """The 1 Hz report: loop period, compute time, missed ticks, refused samples, and what the node adds."""
         level, sentence, figures = self.status()
@@ -202,13 +239,14 @@ class _Stop:
         self.requested = True
 
 
-def run(make_node: Callable[[], FlightNode[Any]]) -> None:
-    """Run a node until SIGINT or SIGTERM, then leave with exit status 0.
+def run(*make_nodes: Callable[[], FlightNode[Any]]) -> None:
+    """Run a node, or several in lockstep, until SIGINT or SIGTERM, then leave with exit status 0.
 
     Otherwise 2 for bad parameters, 3 for a flight that cannot go on, 1 for a fault.
 
-    Ticks run on the monotonic clock in the main thread; what comes over topics is taken at the tick. The executor serves
-    parameters and services, after ticks and without ever waiting.
+    Ticks run on the monotonic clock in the main thread; what comes over topics is taken at the tick. In lockstep there are no
+    ticks: a node moves when what it needs has come. The executor serves parameters and services, after ticks and without ever
+    waiting.
     """
     stop = _Stop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -216,15 +254,22 @@ def run(make_node: Callable[[], FlightNode[Any]]) -> None:
     try:
         transport.prepare()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        node = make_node()
+        nodes = [make_node() for make_node in make_nodes]
     except ParameterError as error:
         sys.exit(_refuse(str(error)))
+    except FlightEnded as error:
+        _refuse(str(error))
+        sys.exit(ENDED_EARLY)
     except REFUSALS as error:
         sys.exit(_refuse(" ".join(str(error).split())))
+    node = nodes[0]
     try:
         if sockets := transport.open_to_network():
             node.get_logger().error(f"the loopback profile is not in force: sockets open to the network: {', '.join(sockets)}")
-        _loop(node, stop)
+        if node.steps():
+            _step(nodes, stop)
+        else:
+            _loop(node, stop)
     except ParameterError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -235,8 +280,9 @@ def run(make_node: Callable[[], FlightNode[Any]]) -> None:
         node.get_logger().fatal(f"fault, the node ends: {traceback.format_exc()}")
         sys.exit(1)
     finally:
-        node.close()
-        node.destroy_node()
+        for one in nodes:
+            one.finish()
+            one.destroy_node()
         rclpy.try_shutdown()
 
 
@@ -246,9 +292,52 @@ def _refuse(sentence: str) -> int:
     return 2
 
 
-def _loop(node: FlightNode[Any], stop: _Stop) -> None:
+def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any]) -> None:
+    try:
+        executor.spin_once(timeout_sec=0)
+    except Exception as error:  # a service request that rclpy cannot serve, such as an invalid lifecycle transition
+        node.get_logger().error(f"request refused: {' '.join(str(error).split())}")
+
+
+def _begin(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
     executor = SingleThreadedExecutor()
-    executor.add_node(node)
+    for node in nodes:
+        executor.add_node(node)
+    gc.collect()
+    gc.freeze()  # a collection then takes microseconds, not tens of milliseconds
+    for node in nodes:
+        node.get_logger().info("ready")
+    return executor
+
+
+def _step(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
+    executor = _begin(nodes)
+    inboxes = [inbox for node in nodes for inbox in node.inboxes()]
+    begin_ns = serve_ns = report_ns = time.monotonic_ns()
+    moved = False
+    while not stop.requested:
+        moving = [node.advance() for node in nodes]
+        if any(moving):
+            moved = True
+        else:
+            wait(inboxes, nodes[0].context, nanoseconds(NICE_PAUSE))
+        now_ns = time.monotonic_ns()
+        if now_ns >= serve_ns:
+            serve_ns = now_ns + nanoseconds(NICE_PAUSE)
+            _serve(executor, nodes[0])
+            for node in nodes:
+                node.require_company()
+        if now_ns >= report_ns:
+            report_ns = now_ns + NANOSECONDS
+            for node in nodes:
+                node.publish_diagnostics()
+                node.check_graph()
+            if not moved and now_ns - begin_ns > START_PATIENCE_NS:
+                raise FlightEnded(f"waited {seconds(START_PATIENCE_NS):g} s for {nodes[0].awaits()}: nobody there")
+
+
+def _loop(node: FlightNode[Any], stop: _Stop) -> None:
+    executor = _begin([node])
     start_ns = node.start_ns() or time.time_ns()
     if (past := time.time_ns() - start_ns) > OLDEST_START_NS:
         raise ParameterError(
@@ -257,9 +346,6 @@ def _loop(node: FlightNode[Any], stop: _Stop) -> None:
     ticker = Ticker(node.period_ns(), time.monotonic_ns() + start_ns - time.time_ns())
     if (lead := start_ns - time.time_ns()) > nanoseconds(60):
         node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
-    gc.collect()
-    gc.freeze()  # a collection then takes microseconds, not tens of milliseconds
-    node.get_logger().info("ready")
     serve_ns = report_ns = time.monotonic_ns()
     while not stop.requested:
         pause = ticker.remaining()
@@ -270,10 +356,8 @@ def _loop(node: FlightNode[Any], stop: _Stop) -> None:
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
             serve_ns = now_ns + nanoseconds(NICE_PAUSE)
-            try:
-                executor.spin_once(timeout_sec=0)
-            except Exception as error:  # a service request that rclpy cannot serve, such as an invalid lifecycle transition
-                node.get_logger().error(f"request refused: {' '.join(str(error).split())}")
+            _serve(executor, node)
+            node.require_company()
         if now_ns >= report_ns:
             report_ns = now_ns + NANOSECONDS
             node.publish_diagnostics()

@@ -4,8 +4,11 @@
 
 from typing import NamedTuple
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 # Publishers are reliable and keep their last samples, so that a recorder that is matched a moment late, or held up, loses
@@ -14,6 +17,11 @@ PUBLISH = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE, durabili
 # Control loops want the newest samples and never a retransmission. The depth covers the samples between two ticks
 # that are needed to bring y_m to the stamp of y.
 LISTEN = QoSProfile(depth=16, reliability=ReliabilityPolicy.BEST_EFFORT)
+# In lockstep every sample counts, from the first one on, whoever is matched late.
+STEP = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# Nothing is ever sent with it: the middleware itself says when the process behind it no longer lives. Long enough for one
+# that a busy machine leaves waiting, short enough to end the others within two seconds.
+ALIVE = QoSProfile(depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=1.0))
 RECORD = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # For topics that others publish, whose kept samples cannot be counted on.
 RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -34,5 +42,7 @@ U_M = Topic("u_m", JointState, foreign=True)
 INTERNALS = Topic("internals", JointState)
 TRUTH = Topic("truth", JointState)
 DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, foreign=True)
+CLOCK = Topic("/clock", Clock)
+RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the log is complete
 
 FLIGHT = (Y, Y_M, U, U_M, INTERNALS, TRUTH, DIAGNOSTICS)

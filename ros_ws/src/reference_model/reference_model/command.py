@@ -7,9 +7,7 @@ Equation (2) asks for u_m and u_m_dot bounded, so a pulse has ramps for edges, n
 
 from typing import NamedTuple
 
-from array_api_compat import array_namespace
-
-from flight_core.vectors import Array
+from flight_core.vectors import Array, array_namespace
 
 
 class Profile(NamedTuple):
@@ -39,7 +37,8 @@ def command(t: Array, profile: Profile) -> Array:
     past = xp.maximum(since, 0.0 * since)
     rising = xp.minimum(past, profile.rise + 0.0 * past)
     angle = profile.frequency * t + profile.phase
-    w = xp.sum(profile.change * rising, axis=1) / profile.rise + profile.amplitude * xp.sin(angle)
-    w_integral = xp.sum(profile.change * (rising * rising / (2.0 * profile.rise) + past - rising), axis=1)
+    every = xp.ones_like(profile.change[0, :])  # a product with it is a sum over the edges, and several times faster
+    w = (profile.change * rising) @ every / profile.rise + profile.amplitude * xp.sin(angle)
+    w_integral = (profile.change * (rising * rising / (2.0 * profile.rise) + past - rising)) @ every
     w_integral = w_integral + profile.amplitude / profile.frequency * (xp.cos(profile.phase) - xp.cos(angle))
-    return w + profile.turn_rate * xp.sin(xp.sum(profile.bank_rate * w_integral))
+    return w + profile.turn_rate * xp.sin(profile.bank_rate @ w_integral)

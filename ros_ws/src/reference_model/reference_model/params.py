@@ -7,7 +7,17 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from flight_core.parameters import Names, Numbers, ParameterError, Parameters, Positive, Positives, require, require_length
+from flight_core.parameters import (
+    Names,
+    NodeParameters,
+    Numbers,
+    ParameterError,
+    Parameters,
+    Positive,
+    Positives,
+    require,
+    require_length,
+)
 from flight_core.rates import period_ns
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
@@ -62,7 +72,7 @@ class Linear(Parameters):
     B_m: Numbers = Field(description="B_m row by row")
 
 
-class ReferenceModelParameters(Parameters):
+class ReferenceModelParameters(NodeParameters):
     """All parameters of the reference model's node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y_m is published, Hz")

@@ -8,11 +8,10 @@ It takes y_m alone, no state of the aircraft, and leaves the law as it is: see d
 from typing import NamedTuple
 
 import numpy as np
-from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from flight_core.integrators import rk4
-from flight_core.vectors import Array
+from flight_core.vectors import Array, array_namespace
 
 ORIGIN = 1e-6
 """1/s. Real parts below it are zero: rounding leaves 1e-14, and a mode this slow takes 11 days."""

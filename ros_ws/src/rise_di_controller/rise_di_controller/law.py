@@ -5,9 +5,7 @@
 from enum import IntEnum
 from typing import NamedTuple
 
-from array_api_compat import array_namespace
-
-from flight_core.vectors import Array
+from flight_core.vectors import Array, array_namespace
 
 
 class Sign(IntEnum):

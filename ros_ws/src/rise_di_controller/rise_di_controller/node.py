@@ -1,22 +1,22 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's node: the law at a fixed rate, y and y_m in, u and internals out, as a lifecycle node."""
+"""The controller's node: the law at a fixed rate or in lockstep, y and y_m in, u and internals out, as a lifecycle node."""
 
 from collections import deque
+from collections.abc import Callable, Iterator
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
-from flight_core.rates import seconds
+from flight_core.rates import period_ns
 from flight_core.vectors import ChannelError
 from flight_ros.inbox import Inbox
-from flight_ros.messages import from_message, to_message
+from flight_ros.messages import NO_CHANNELS, Decoder, Encoder
 from flight_ros.runtime import FlightNode, run
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
-from rise_di_controller import guard, internals
+from rise_di_controller.controller import Controller
 from rise_di_controller.guard import Mode, Sample
-from rise_di_controller.law import retune
 from rise_di_controller.params import ControllerParameters
 
 # What may be changed in flight: gains and guards. What decides the sign or the meaning of a channel may not.
@@ -42,19 +42,29 @@ TUNABLE = frozenset(
 
 
 class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
-    """Takes the newest y and the last y_m at each tick, steps the law, publishes u with the stamp of y."""
+    """Takes the newest y and the last y_m at each tick, steps the law, publishes u with the stamp of y.
+
+    In lockstep counting the y tells the time. A tick is taken when the y and the y_m of its instant have come, and has exactly
+    one u, one without channels where the law has nothing to say.
+    """
 
     def __init__(self) -> None:
         FlightNode.__init__(self, "controller", ControllerParameters, TUNABLE)
         LifecycleNodeMixin.__init__(self)
         self._active = False
-        self._law, self._guard = self.parameters.law(), self.parameters.guard()
-        self._names = internals.names(self.parameters.outputs, self.parameters.inputs)
-        self._state = guard.start(len(self.parameters.inputs))
-        self._y: deque[Sample] = deque(maxlen=1)
-        self._y_m: deque[Sample] = deque(maxlen=guard.KEPT_REFERENCES)
-        self._y_inbox, self._y_m_inbox = self.inbox(Y), self.inbox(Y_M)
+        self._controller = Controller(self.parameters)
+        outputs = self.parameters.outputs
+        self._y_inbox, self._y_decoder = self.inbox(Y), Decoder(outputs)
+        self._y_m_inbox, self._y_m_decoder = self.inbox(Y_M), Decoder(outputs)
         self._u_publisher, self._internals_publisher = self.publisher(U), self.publisher(INTERNALS)
+        self._u_encoder = Encoder(self.parameters.inputs, self.instance)
+        self._internals_encoder = Encoder(self._controller.names, self.instance)
+        if self.parameters.lockstep:
+            self._nothing = Encoder((), self.instance)
+            self._number = 0  # of the y that comes next
+            self._y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
+            self._y_due: deque[Sample | None] = deque()
+            self._y_m_due: deque[Sample] = deque()
         if self.parameters.autostart:
             self.trigger_configure()
             self.trigger_activate()
@@ -63,8 +73,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """The parameters were checked as a whole when they were set; the law starts anew from them."""
-        # u stays what it was: a node that is configured again does not jump either
-        self._state = guard.start(len(self.parameters.inputs))._replace(u=self._state.u)
+        self._controller.restart()  # u stays what it was: a node that is configured again does not jump either
         self.get_logger().info(self.parameters.sampled_sign()[1])
         return TransitionCallbackReturn.SUCCESS
 
@@ -82,64 +91,90 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
 
     def on_parameters(self, parameters: ControllerParameters) -> None:
         """Take a new set, between two ticks, all at once and without a jump of u."""
-        law = parameters.law()
-        if self._state.law is not None:
-            self._state = self._state._replace(law=retune(self._state.law, self._law, law))
-        self._law, self._guard = law, parameters.guard()
+        self._controller.retune(parameters)
 
     def period_ns(self) -> int:
-        return self._guard.period_ns
+        return self._controller.period_ns
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         now_ns += tick.late_ns
-        self._collect(self._y_inbox, self._y, now_ns)
-        self._collect(self._y_m_inbox, self._y_m, now_ns)
-        y = self._y[-1] if self._y else None
-        before = self._state.mode
-        self._state, used = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, self._active)
-        if self._state.mode is not before:
-            self.get_logger().info(f"{before.name} -> {self._state.mode.name}")
-        if self._active and self._state.mode is not Mode.ENGAGED:
+        for inbox, decoder, take in (
+            (self._y_inbox, self._y_decoder, self._controller.take_y),
+            (self._y_m_inbox, self._y_m_decoder, self._controller.take_y_m),
+        ):
+            for sample in self._samples(inbox, decoder):
+                if sample is not None:
+                    self._take(inbox, take, sample, now_ns)
+        self._fly(now_ns, tick.late_ns)
+        if self._active and self._controller.mode is not Mode.ENGAGED:
             self._say_what_is_missing(now_ns)
-        if used is None:
-            return
-        late, age = seconds(tick.late_ns), seconds(now_ns - used.stamp_ns)
-        self._u_publisher.publish(to_message(used.stamp_ns, self.parameters.inputs, self._state.u, self.instance))
-        values = internals.values(self._state, used, self._guard.limits, late, age)
-        self._internals_publisher.publish(to_message(used.stamp_ns, self._names, values, self.instance))
 
-    def _collect(self, inbox: Inbox, samples: deque[Sample], now_ns: int) -> None:
+    def _samples(self, inbox: Inbox, decoder: Decoder) -> Iterator[Sample | None]:
         for received in inbox.take():
             try:
-                sample = Sample(*from_message(received.message, self.parameters.outputs))
+                decoded = decoder.decode(received.message)
             except ChannelError as error:
                 self.reject(inbox, error.reason, str(error))
-                continue
-            if sample.stamp_ns > now_ns + self._guard.max_age_ns:
-                self.reject(inbox, "future", f"stamp {seconds(sample.stamp_ns - now_ns):g} s ahead of the clock")
-            elif samples and sample.stamp_ns <= samples[-1].stamp_ns:
-                self.reject(inbox, "order", f"stamp {seconds(sample.stamp_ns - samples[-1].stamp_ns):g} s after the last one")
+                yield None
             else:
-                samples.append(sample)
+                yield None if decoded is None else Sample(decoded.stamp_ns, decoded.value)
+
+    def _take(self, inbox: Inbox, take: Callable[[Sample, int], None], sample: Sample, now_ns: int) -> None:
+        try:
+            take(sample, now_ns)
+        except ChannelError as error:
+            self.reject(inbox, error.reason, str(error))
+
+    def _fly(self, now_ns: int, late_ns: int) -> bool:
+        before = self._controller.mode
+        commanded = self._controller.tick(now_ns, late_ns, active=self._active)
+        if self._controller.mode is not before:
+            self.get_logger().info(f"{before.name} -> {self._controller.mode.name}")
+        if commanded is None:
+            return False
+        self._u_publisher.publish(self._u_encoder.encode(commanded.stamp_ns, commanded.u))
+        self._internals_publisher.publish(self._internals_encoder.encode(commanded.stamp_ns, commanded.internals))
+        return True
+
+    def advance(self) -> bool:
+        self._y_due.extend(self._samples(self._y_inbox, self._y_decoder))
+        self._y_m_due.extend(sample for sample in self._samples(self._y_m_inbox, self._y_m_decoder) if sample is not None)
+        moved = False
+        while self._y_due:
+            now_ns = self._number * self._y_period_ns
+            due = now_ns % self.period_ns() == 0
+            if due and not (self._y_m_due and self._y_m_due[-1].stamp_ns >= now_ns):
+                break
+            self._number += 1
+            if (y := self._y_due.popleft()) is not None:
+                self._take(self._y_inbox, self._controller.take_y, y, now_ns)
+            while self._y_m_due and self._y_m_due[0].stamp_ns <= now_ns:
+                self._take(self._y_m_inbox, self._controller.take_y_m, self._y_m_due.popleft(), now_ns)
+            if due and not self._fly(now_ns, late_ns=0):
+                self._u_publisher.publish(self._nothing.encode(now_ns, NO_CHANNELS))
+            moved = True
+        return moved
+
+    def awaits(self) -> str:
+        return (self._y_m_inbox if self._y_due else self._y_inbox).name
 
     def _say_what_is_missing(self, now_ns: int) -> None:
-        complete = True
-        for inbox, samples in ((self._y_inbox, self._y), (self._y_m_inbox, self._y_m)):
-            if not samples or now_ns - samples[-1].stamp_ns > self._guard.max_age_ns:
-                complete = False
+        stale = self._controller.stale(now_ns)
+        for inbox in (self._y_inbox, self._y_m_inbox):
+            if inbox.topic.name in stale:
                 self.waiting_for(inbox)
-        if complete:
+        if not stale:
             pair = f"no {self._y_m_inbox.name} at the stamp of {self._y_inbox.name}"
             self.get_logger().warning(f"{pair}: is one delayed, or stamped by another clock?", throttle_duration_sec=2.0)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
-        level = DiagnosticStatus.OK if self._state.mode is Mode.ENGAGED else DiagnosticStatus.WARN
-        ages = {
-            f"age of {inbox.topic.name} (s)": f"{seconds(self.get_clock().now().nanoseconds - samples[-1].stamp_ns):.4f}"
-            for inbox, samples in ((self._y_inbox, self._y), (self._y_m_inbox, self._y_m))
-            if samples
-        }
-        return level, self._state.mode.name, {"mode": self._state.mode.name, "sign": self._law.sign.name, **ages}
+        mode = self._controller.mode
+        level = DiagnosticStatus.OK if mode is Mode.ENGAGED else DiagnosticStatus.WARN
+        ages = {}
+        if not self.parameters.lockstep:
+            found = self._controller.ages(self.get_clock().now().nanoseconds)
+            ages = {f"age of {name} (s)": f"{age:.4f}" for name, age in found.items()}
+        return level, mode.name, {"mode": mode.name, "sign": self._controller.sign.name, **ages}
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from flight_core.parameters import (
     Names,
+    NodeParameters,
     NonNegatives,
     Numbers,
     ParameterError,
@@ -21,7 +22,7 @@ from flight_core.parameters import (
     require,
     require_length,
 )
-from flight_core.rates import nanoseconds, period_ns
+from flight_core.rates import divide, nanoseconds, period_ns
 from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.feedforward import ORIGIN, Nominal, zero_dynamics
 from rise_di_controller.guard import DT_RANGE, GuardParams, Limits
@@ -61,10 +62,13 @@ class FeedforwardParameters(Parameters):
         return Nominal(A, B, C, gravity, np.linalg.inv(C @ B), np.array(self.lead))
 
 
-class ControllerParameters(Parameters):
+class ControllerParameters(NodeParameters):
     """All parameters of the controller's node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of the law, Hz")
+    y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(
+        default=0.0, description="in lockstep: the rate of y, so that counting them tells the time, Hz"
+    )
     outputs: Names = Field(description="the channels of y in the order of the law; the last has the smallest gain (22)")
     inputs: Names = Field(description="the channels of u, paired with the outputs")
     k_g: Positive = Field(description="k_g of equation (22), 1/s")
@@ -96,7 +100,10 @@ class ControllerParameters(Parameters):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        period_ns(self.rate, "rate")
+        period = period_ns(self.rate, "rate")
+        if self.lockstep:
+            require(self.y_rate > 0, "y_rate", "0 Hz", "the rate of y in lockstep")
+            divide(period, period_ns(self.y_rate, "y_rate"), "y_rate", "1 / rate")
         require_length("inputs", self.inputs, self.outputs)
         require_length("k_d", self.k_d, self.outputs[:-1])
         for key in ("Lambda", "beta", "D", "input_scale", "omega", "lag"):

@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated aircraft at its sample instants: what moves, and the sensors that look at it.
+
+The node over topics and the loop in one process both fly this, whatever kind of aircraft moves behind it.
+"""
+
+from typing import Protocol
+
+import numpy as np
+
+from aircraft_sim import plant, sensors, truth
+from aircraft_sim.jsbsim_plant import JsbsimVehicle
+from aircraft_sim.params import AircraftParameters
+from aircraft_sim.sensors import Underway
+from flight_core.outcome import FlightEnded
+from flight_core.rates import period_ns, seconds
+from flight_core.vectors import FloatArray
+
+
+class Vehicle(Protocol):
+    """What moves between the command and the sensors."""
+
+    @property
+    def truth_names(self) -> tuple[str, ...]:
+        """Channels of `truth` that it knows: "group.name"."""
+
+    def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
+        """From t to t + duration with the command u held, deviations from trim, SI."""
+
+    def y(self) -> FloatArray:
+        """The outputs before the sensors, deviations from trim, shape (m,), SI."""
+
+    def truth(self, t_ns: int) -> FloatArray:
+        """Values in the order of `truth_names`."""
+
+    def diverged(self) -> bool:
+        """Whether the state is beyond anything that flies."""
+
+
+class AirframeVehicle:
+    """Equation (1) with the matrices of an airframe, behind its actuators."""
+
+    def __init__(self, parameters: AircraftParameters) -> None:
+        airframe, _ = parameters.load()
+        self._plant = parameters.plant()
+        self._state = plant.start(self._plant)
+        self.truth_names = truth.names(airframe)
+
+    def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
+        """See Vehicle."""
+        self._state = plant.advance(t_ns, self._state, u, duration_ns, self._plant)
+
+    def y(self) -> FloatArray:
+        """See Vehicle."""
+        y: FloatArray = plant.output(self._state, self._plant)
+        return y
+
+    def truth(self, t_ns: int) -> FloatArray:
+        """See Vehicle."""
+        return truth.values(t_ns, self._state, self._plant)
+
+    def diverged(self) -> bool:
+        """See Vehicle."""
+        return plant.diverged(self._state)
+
+
+def vehicle(parameters: AircraftParameters) -> Vehicle:
+    """The vehicle that the parameters name, in trim at t = 0."""
+    if parameters.is_jsbsim:
+        return JsbsimVehicle(parameters.point(), parameters.moves(), parameters.air())
+    return AirframeVehicle(parameters)
+
+
+class Simulator:
+    """A vehicle and its sensors, sample by sample."""
+
+    def __init__(self, parameters: AircraftParameters) -> None:
+        channels = parameters.channels()
+        self.outputs, self.inputs = tuple(channels.outputs), tuple(channels.inputs)
+        self.period_ns = period_ns(parameters.rate, "rate")
+        self._vehicle = vehicle(parameters)
+        self._sensors = parameters.sensor_arrays()
+        self.truth_names = ("t", *self._vehicle.truth_names, *(f"noise.{name}" for name in self.outputs))
+        self._drift = sensors.start(self._sensors)
+        self._underway: Underway = ()
+        self._error = np.zeros(len(self.outputs))
+        self._number = 0
+
+    def sample(self, number: int, u: FloatArray) -> Underway:
+        """Sample `number`, at number periods of flight time: moves there with u held since the one before, and measures.
+
+        The y that arrive now, the oldest first; their stamps are flight time. Raises FlightEnded where the aircraft has
+        diverged.
+        """
+        t_ns, before_ns = number * self.period_ns, self._number * self.period_ns
+        if number > self._number:
+            self._vehicle.advance(before_ns, u, t_ns - before_ns)
+        self._number = number
+        if self._vehicle.diverged():
+            raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
+        measured, self._error, self._drift = sensors.measure(number, self._vehicle.y(), self._drift, self._sensors)
+        y = measured if sensors.arrives(number, self._sensors) else None
+        self._underway, arrived = sensors.transmit(self._underway, t_ns, y, self._sensors)
+        return arrived
+
+    def truth(self) -> FloatArray:
+        """What the aircraft really does at the instant of the last sample, in the order of `truth_names`."""
+        t_ns = self._number * self.period_ns
+        return np.concatenate([[seconds(t_ns)], self._vehicle.truth(t_ns), self._error])

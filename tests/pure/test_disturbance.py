@@ -1,0 +1,340 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Gusts, biases, sines and inertial coupling: their formulas, what Assumption 2 says of them, and that off is off."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from aircraft_sim import dynamics
+from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines, bias, design_gust_speed, one_minus_cosine, sines
+from aircraft_sim.dynamics import Aircraft
+from aircraft_sim.params import AircraftParameters
+from aircraft_sim.plant import AircraftState, advance
+from flight_analysis.metrics import true_error
+from flight_analysis.scenario import Scenario
+from flight_analysis.simulate import simulate
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+
+MS = 1_000_000
+V0 = 25.0
+
+
+def one(kind: Any, *values: float) -> Any:
+    """A set of arrays of one element each."""
+    return kind(*(np.array([value]) for value in values))
+
+
+def aircraft(**section: Any) -> Aircraft:
+    values = {"airframe": "osprey", "rate": 100.0, "step": 0.002}
+    return AircraftParameters.validate_mapping(values | section, "aircraft").load()[1]
+
+
+# Gusts
+
+
+@pytest.mark.parametrize(
+    ("feet", "reference_fps", "alleviation", "expected_fps"),
+    [
+        (350.0, 56.0, 1.0, 56.0),  # U_ref itself, at sea level
+        (350.0, 44.0, 0.8, 35.2),  # at 15 000 ft
+        (30.0, 56.0, 1.0, 37.182),  # (30/350)^(1/6) = 0.66397
+        (107.0 / 0.3048, 56.0, 1.0, 56.028),  # the longest, in the figures of CS-25
+    ],
+)
+def test_the_design_gust_is_that_of_25_341(feet: float, reference_fps: float, alleviation: float, expected_fps: float) -> None:
+    found = design_gust_speed(feet * 0.3048, reference_fps * 0.3048, alleviation)
+    assert found / 0.3048 == pytest.approx(expected_fps, rel=1e-4)
+
+
+@given(H=st.floats(9.144, 106.68), reference=st.floats(6.0, 17.07), alleviation=st.floats(0.5, 1.0))
+def test_a_gust_has_the_peak_and_the_length_of_the_formula(H: float, reference: float, alleviation: float) -> None:
+    peak = reference * alleviation * (H * 3.280839895 / 350.0) ** (1.0 / 6.0)
+    gust = one(Gusts, 40.0, design_gust_speed(H, reference, alleviation), H)
+
+    def w(s: float) -> float:
+        return float(one_minus_cosine(np.array(40.0 + s / V0), gust, np.array(V0))[0])
+
+    # U_ds/2 (1 - cos(pi s/H)): U_ds at H, half of it at H/2 and 3H/2, nothing at 0 and from 2H on.
+    found = [w(share * H) for share in (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)]
+    assert found == pytest.approx([0.0, 0.5 * peak, peak, 0.5 * peak, 0.0, 0.0], rel=1e-6, abs=1e-9)
+
+
+def test_wind_along_an_axis_takes_the_airspeed_with_it() -> None:
+    # x_rel = x - w: minus the column of V, of beta = v / V0 and, as published to three digits, of alpha = w / V0.
+    osprey = load_airframe("osprey")
+    A = osprey.matrix_a()
+    assert osprey.gust_direction("longitudinal") == pytest.approx(-A[:, osprey.index("V")])
+    assert osprey.gust_direction("lateral") == pytest.approx(-A[:, osprey.index("beta")] / V0)
+    assert osprey.gust_direction("vertical") == pytest.approx(-A[:, osprey.index("alpha")] / V0, abs=0.051 / V0)
+    assert set(osprey.gusts) == set(AXES)
+
+
+def test_an_airframe_file_names_the_axes_of_the_wind() -> None:
+    values = load_airframe("osprey").model_dump()
+    with pytest.raises(
+        ParameterError, match=r"gusts\.up: found 'up', expected an axis of the wind: longitudinal, lateral, vert"
+    ):
+        Airframe.validate_mapping(values | {"gusts": {"up": {"q": 1.0}}}, "airframe")
+
+
+# Biases and sines
+
+
+def test_a_bias_rises_along_half_a_cosine_and_stays() -> None:
+    params = one(Bias, 2.0, 0.3, 4.0)
+    at = [float(bias(np.array(t), params)[0]) for t in (0.0, 2.0, 3.0, 4.0, 5.0, 6.0, 60.0)]
+    # 0.15 (1 - cos(pi s)) at s = 0, 1/4, 1/2, 3/4, 1
+    assert at == pytest.approx(
+        [0.0, 0.0, 0.15 - 0.15 / math.sqrt(2.0), 0.15, 0.15 + 0.15 / math.sqrt(2.0), 0.3, 0.3], abs=1e-15
+    )
+
+
+def test_a_bias_without_a_rise_is_a_step() -> None:
+    params = one(Bias, 2.0, 0.3, 0.0)
+    assert [float(bias(np.array(t), params)[0]) for t in (0.0, 2.0, 2.0 + 1e-9, 9.0)] == [0.0, 0.0, 0.3, 0.3]
+
+
+def test_a_sine_is_a_sine() -> None:
+    params = one(Sines, 0.2, 3.0, 0.5)
+    assert [float(sines(np.array(t), params)[0]) for t in (0.0, 1.7)] == pytest.approx(
+        [0.2 * math.sin(0.5), 0.2 * math.sin(5.6)]
+    )
+
+
+def test_biases_and_sines_act_on_the_state_they_name() -> None:
+    given_parts = aircraft(
+        bias={"q": {"start": 1.0, "value": 0.3, "rise": 0.0}, "V": {"start": 0.0, "value": -2.0, "rise": 1.0}},
+        sines={"r": {"amplitude": 0.1, "frequency": 2.0}, "q": {"amplitude": 0.2, "frequency": 1.0, "phase": 1.0}},
+    )
+    osprey = load_airframe("osprey")
+    f = dict(zip(osprey.states, dynamics.f(3.0, np.zeros(8), given_parts), strict=True))
+    assert f["q"] == pytest.approx(0.3 + 0.2 * math.sin(4.0))
+    assert f["V"] == pytest.approx(-2.0)
+    assert f["r"] == pytest.approx(0.1 * math.sin(6.0))
+    assert [f[name] for name in ("alpha", "theta", "beta", "p", "phi")] == [0.0] * 5
+
+
+# Assumption 2: f in C1, f and f_dot bounded
+
+Disturbance = Callable[[FloatArray], FloatArray]
+GUST: Gusts = one(Gusts, 2.0, 10.0, 15.0)
+SMOOTH: dict[str, tuple[Disturbance, float, float]] = {  # with the largest derivative, and the largest second one
+    "gust": (lambda t: one_minus_cosine(t, GUST, np.array(V0)), 5.0 * math.pi * V0 / 15.0, 5.0 * (math.pi * V0 / 15.0) ** 2),
+    "bias": (lambda t: bias(t, one(Bias, 2.0, 10.0, 0.6)), 5.0 * math.pi / 0.6, 5.0 * (math.pi / 0.6) ** 2),
+    "sine": (lambda t: sines(t, one(Sines, 10.0, 4.0, 1.0)), 40.0, 160.0),
+}
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_gusts_sines_and_biases_with_a_rise_meet_assumption_2(name: str) -> None:
+    # A derivative that is bounded by d1 and changes by at most d2 dt in dt is continuous. Second differences beyond 2 ms round.
+    value, first, second = SMOOTH[name]
+    for dt in (0.02, 0.002):
+        d = value(np.arange(0.0, 5.0, dt))
+        assert np.abs(np.diff(d)).max() <= first * dt * (1.0 + 1e-9)
+        assert np.abs(np.diff(d, 2)).max() <= second * dt**2 * (1.0 + 1e-6)
+        assert np.abs(np.diff(d, 2)).max() > 0.5 * second * dt**2  # the bound is not an empty one
+
+
+def test_a_bias_without_a_rise_lies_outside_assumption_2() -> None:
+    # The largest difference does not fall with dt: no derivative bounds it.
+    step = one(Bias, 2.0, 10.0, 0.0)
+    assert [np.abs(np.diff(bias(np.arange(0.0, 5.0, dt), step))).max() for dt in (0.02, 0.002, 0.0002)] == [10.0] * 3
+
+
+INSIDE: dict[str, dict[str, Any]] = {
+    "sine": {"sines": {"q": {"amplitude": 2.0, "frequency": 5.0}}},
+    "bias that rises": {"bias": {"q": {"start": 2.0, "value": 2.0, "rise": 0.2}}},
+}
+OUTSIDE: dict[str, dict[str, Any]] = {
+    "step": {"bias": {"q": {"start": 2.0, "value": 2.0, "rise": 0.0}}},
+    "turbulence": {"turbulence": {"altitude": 100.0, "wind": 7.7}},
+}
+
+
+def largest(disturbed: dict[str, Any], rate: float, scenario: Scenario) -> FloatArray:
+    """The largest errors of q and r of the default law at a rate, in 6 s without commands and gusts, mrad/s."""
+    quiet = scenario.vary(
+        aircraft={"gusts": {}, "rate": 400.0, "step": 0.0025} | disturbed,
+        reference_model={"rate": 400.0, "pulses": {}},
+        controller={"rate": rate, "delay": 0.0},
+        flight={"duration": 6.0},
+    )
+    error = true_error(simulate(quiet))
+    assert error is not None
+    return 1e3 * np.array([np.abs(error[name]).max() for name in ("q", "r")])
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_inside_assumption_2_the_error_falls_with_the_square_of_the_period(name: str, osprey_gust: Scenario) -> None:
+    # Measured in q at 100 and 200 Hz: 1.00 and 0.25 mrad/s in the sine, 1.56 and 0.39 at the bias.
+    coarse, fine = (largest(INSIDE[name], rate, osprey_gust)[0] for rate in (100.0, 200.0))
+    assert coarse / fine == pytest.approx(4.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "channel"), [("step", 0), ("turbulence", 1)])
+def test_outside_assumption_2_a_shorter_period_does_not_help(name: str, channel: int, osprey_gust: Scenario) -> None:
+    # Measured at 100 and 200 Hz: 35.3 and 32.6 mrad/s in q at the step, 63 and 61 in r in light turbulence at 100 m.
+    coarse, fine = (largest(OUTSIDE[name], rate, osprey_gust)[channel] for rate in (100.0, 200.0))
+    assert coarse / fine < 1.2
+
+
+# Inertial coupling
+
+INERTIA = np.array([[0.8244, 0.0, -0.1204], [0.0, 1.135, 0.0], [-0.1204, 0.0, 1.759]])  # Aerosonde, kg m^2
+PQR = [5, 2, 6]  # places of p, q, r in the state of the osprey
+
+
+def coupled(scale: float) -> Aircraft:
+    """Nothing but the inertial coupling: no A, B and gravity."""
+    whole = aircraft(inertial_coupling=scale)
+    return whole._replace(A=0.0 * whole.A, B=0.0 * whole.B, gravity=0.0 * whole.gravity)
+
+
+def test_the_coupling_is_that_of_eulers_equations() -> None:
+    # J w_dot = -w x (J w); the file keeps six digits
+    rng = np.random.default_rng(3)
+    for w in rng.uniform(-2.0, 2.0, (20, 3)):
+        x = np.zeros(8)
+        x[PQR] = w
+        w_dot = np.linalg.solve(INERTIA, -np.cross(w, INERTIA @ w))
+        f = dynamics.f(0.0, x, coupled(1.0))
+        assert f[PQR] == pytest.approx(w_dot, abs=1e-5)
+        assert dynamics.f(0.0, x, coupled(0.25))[PQR] == pytest.approx(0.25 * w_dot, abs=1e-5)
+        assert np.count_nonzero(np.delete(f, PQR)) == 0
+
+
+def test_free_rotation_keeps_energy_and_angular_momentum() -> None:
+    # Ten seconds of tumbling at 2 rad/s, against an adaptive integrator of the vector equation, and against what is conserved.
+    w = np.array([0.3, 2.0, -0.4])  # about the middle axis, which is unstable: it turns over
+    x: FloatArray = np.zeros(8)
+    x[PQR] = w
+    parts = AircraftParameters.validate_mapping({"airframe": "osprey", "rate": 100.0, "step": 0.002}, "aircraft").plant()
+    free = parts._replace(aircraft=coupled(1.0))
+    exact = solve_ivp(
+        lambda _, w: np.linalg.solve(INERTIA, -np.cross(w, INERTIA @ w)), (0.0, 10.0), w, rtol=1e-11, atol=1e-12, max_step=0.01
+    )
+    end = advance(0, AircraftState(x, np.zeros(4)), np.zeros(4), 10_000 * MS, free).x[PQR]
+    assert end == pytest.approx(exact.y[:, -1], abs=1e-4)  # six digits of the gains, over three turns
+    assert np.ptp(exact.y[1]) > 3.0  # it has turned over
+    for kept in (lambda w: w @ INERTIA @ w, lambda w: np.linalg.norm(INERTIA @ w)):
+        assert kept(end) == pytest.approx(kept(w), rel=1e-5)
+
+
+# Off is off, to the last bit
+
+FLOWN: dict[str, Any] = {
+    "gusts": {
+        "vertical": {"start": 0.5, "speed": 5.0, "length": 15.0},
+        "lateral": {"start": 0.8, "speed": 2.0, "length": 10.0},
+    },
+    "actuators": {"lag": [0.02, 0.1, 0.02, 0.02], "rate": [5.0, 2.0, 5.0, 5.0]},
+    "sensors": {"noise": [1e-3, 1e-2, 1e-3, 1e-3]},
+}
+NEVER = math.inf
+NONE = [0.0] * 4
+
+
+def tail_wind(speed: float) -> dict[str, Any]:
+    return {"longitudinal": {"start": 0.2, "speed": speed, "length": 9.0}}
+
+
+SECTIONS: dict[str, tuple[str, Any, Any]] = {  # section, off, on
+    "gust": ("gusts", tail_wind(0.0), tail_wind(1.0)),
+    "turbulence": ("turbulence", {"altitude": 50.0, "wind": 0.0}, {"altitude": 50.0, "wind": 1.0}),
+    "bias": ("bias", {"q": {"start": 0.1, "value": 0.0, "rise": 0.1}}, {"q": {"start": 0.1, "value": 1e-3, "rise": 0.1}}),
+    "sines": ("sines", {"r": {"amplitude": 0.0, "frequency": 1.0}}, {"r": {"amplitude": 1e-3, "frequency": 1.0}}),
+    "inertial_coupling": ("inertial_coupling", 0.0, 1.0),
+    "uncertainty": ("uncertainty", {"A": 0.0, "B": 0.0, "seed": 5}, {"A": 0.0, "B": 0.1, "seed": 5}),
+    "dead_zone": ("actuators", {"dead_zone": NONE}, {"dead_zone": [1e-4, 0.0, 0.0, 0.0]}),
+    "stuck_at": ("actuators", {"stuck_at": [NEVER] * 4}, {"stuck_at": [NEVER, NEVER, NEVER, 0.6]}),
+    "lost_at": ("actuators", {"lost_at": [NEVER] * 4}, {"lost_at": [0.6, NEVER, NEVER, NEVER]}),
+    "limits": ("actuators", {"lower": [-NEVER] * 4, "upper": [NEVER] * 4}, {"upper": [1e-3] * 4}),
+    "sensor bias": ("sensors", {"bias": NONE}, {"bias": [0.0, 1e-3, 0.0, 0.0]}),
+    "drift": ("sensors", {"drift": NONE}, {"drift": [1e-4, 0.0, 0.0, 0.0]}),
+    "quantisation": ("sensors", {"quantisation": NONE}, {"quantisation": [1e-4, 0.0, 0.0, 0.0]}),
+}
+
+
+@pytest.fixture(scope="module")
+def calm(osprey_gust: Scenario) -> Scenario:
+    """1.2 s of the default flight with servos, noise and two gusts, but without what is tried here."""
+    slow = {"rate": 100.0, "step": 0.005}
+    return osprey_gust.vary(aircraft=FLOWN | slow, reference_model={"rate": 100.0}, flight={"duration": 1.2})
+
+
+@pytest.fixture(scope="module")
+def without(calm: Scenario) -> dict[str, bytes]:
+    """What that flight publishes."""
+    return published(calm)
+
+
+def published(scenario: Scenario) -> dict[str, bytes]:
+    return {topic: signal.values.tobytes() for topic, signal in simulate(scenario).signals.items()}
+
+
+@pytest.mark.parametrize("name", SECTIONS)
+def test_amplitude_zero_is_exactly_off(name: str, calm: Scenario, without: dict[str, bytes]) -> None:
+    section, off, on = SECTIONS[name]
+
+    def vary(value: Any) -> Scenario:
+        return calm.vary(aircraft={section: FLOWN.get(section, {}) | value if isinstance(value, dict) else value})
+
+    assert published(vary(off)) == without
+    assert published(vary(on)) != without
+
+
+STEP = {"start": 0.0, "value": 1.0, "rise": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"bias": {"h": STEP}}, r"bias\.h: found 'h', expected a state of osprey: V, alpha"),
+        ({"bias": {"q": {"start": 0.0, "value": 1.0}}}, r"bias\.q\.rise: missing, expected a value"),
+        ({"bias": {"q": STEP | {"rise": -1.0}}}, r"bias\.q\.rise: found -1\.0, expected greater than or equal to 0"),
+        ({"sines": {"y": {"amplitude": 1.0, "frequency": 1.0}}}, r"sines\.y: found 'y', expected a state of osprey: V, alpha"),
+        ({"sines": {"q": {"amplitude": 1.0, "frequency": 0.0}}}, r"sines\.q\.frequency: found 0\.0, expected greater than 0"),
+        ({"inertial_coupling": 1.5}, r"inertial_coupling: found 1\.5, expected less than or equal to 1"),
+        (
+            {"inertial_coupling": 0.5, "airframe": "f16_lateral"},
+            r"inertial_coupling: found 0\.5, expected 0: the airframe f16_lateral has no inertial_coupling",
+        ),
+        (
+            {"gusts": {"up": {"start": 0.0, "speed": 1.0, "length": 9.0}}},
+            r"gusts: found 'up', expected one the airframe osprey knows: vertical, lateral, longitudinal",
+        ),
+    ],
+)
+def test_disturbances_that_do_not_fit_are_refused_by_name(values: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=f"^aircraft.{sentence}"):
+        AircraftParameters.validate_mapping({"airframe": "osprey", "rate": 100.0, "step": 0.002} | values, "aircraft")
+
+
+@pytest.mark.parametrize(
+    ("term", "sentence"),
+    [
+        (
+            {"into": "p", "product": ["q"], "gain": 1.0},
+            r"inertial_coupling\[0\]\.product: found 1 states, expected two of them",
+        ),
+        (
+            {"into": "p", "product": ["q", "w"], "gain": 1.0},
+            r"inertial_coupling\[0\]\.product\[1\]: found 'w', expected a state",
+        ),
+        ({"into": "w", "product": ["q", "p"], "gain": 1.0}, r"inertial_coupling\[0\]\.into: found 'w', expected a state"),
+    ],
+)
+def test_products_that_do_not_fit_are_refused_by_name(term: dict[str, Any], sentence: str) -> None:
+    values = load_airframe("osprey").model_dump() | {"inertial_coupling": [term]}
+    with pytest.raises(ParameterError, match=sentence):
+        Airframe.validate_mapping(values, "airframe")

@@ -1,0 +1,320 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The report: which pictures it has of which flight, what they mark, and that it stays one small page."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+
+from flight_analysis import pictures
+from flight_analysis.drawing import Band, Scene, drawn_points, spans
+from flight_analysis.report import events, known_limits, write_report
+from flight_analysis.scenario import Scenario
+from flight_analysis.summary import Shown, shown_units, summarise
+from flight_bringup.scenarios import find_scenario
+from flight_core.outcome import COMPLETED
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
+from rise_di_controller.guard import Mode
+from rise_di_controller.internals import Limited
+
+MS = 1_000_000
+EPOCH = 1_795_000_000_000_000_000  # a stamp of today
+OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
+DEG = np.pi / 180.0
+
+
+@pytest.fixture(scope="module")
+def servo() -> Scenario:
+    return find_scenario("osprey_servo")
+
+
+def signal(stamps_ms: list[float], **channels: list[float]) -> Signal:
+    stamps = EPOCH + np.array([round(stamp * MS) for stamp in stamps_ms], dtype=np.int64)
+    return Signal(stamps, tuple(channels), np.column_stack([np.array(values, dtype=float) for values in channels.values()]))
+
+
+def ticks(count: int, **channels: list[float]) -> Signal:
+    """Internals of a controller at 100 Hz that flew on time and inside its limits, but for the channels given."""
+    quiet = {"mode": [float(Mode.ENGAGED)] * count, "dt": [0.01] * count, "late": [0.0] * count, "age": [0.0] * count}
+    limited = {f"limited.{name}": [float(Limited.NO)] * count for name in INPUTS}
+    return signal([10.0 * k for k in range(count)], **(quiet | limited | channels))
+
+
+def truth(count: int, **channels: float) -> Signal:
+    """Truth at 100 Hz with channels that hold a value."""
+    return signal(
+        [10.0 * k for k in range(count)], **{name.replace("__", "."): [value] * count for name, value in channels.items()}
+    )
+
+
+def flight(count: int = 101, **signals: Signal) -> Tape:
+    """A flight at 100 Hz in which nothing moved, but for the signals given."""
+    stamps = [10.0 * k for k in range(count)]
+    still = signal(stamps, **{name: [0.0] * count for name in OUTPUTS})
+    return Tape({"y": still, "y_m": still, **signals}, EPOCH)
+
+
+def scene(tape: Tape, units: dict[str, Shown] | None = None) -> Scene:
+    return pictures.flight_scene(tape, units or {}, {})
+
+
+def traces(figure: go.Figure | None, name: str) -> list[Any]:
+    assert figure is not None
+    return [trace for trace in figure.data if trace.name == name]
+
+
+def titles(figure: go.Figure | None) -> list[str]:
+    """What the rows are called, top down."""
+    assert figure is not None
+    return [axis.title.text for axis in figure.select_yaxes()]
+
+
+def page_of(tmp_path: Path, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> str:
+    path = tmp_path / "report.html"
+    write_report(path, scenario, tape, summarise(scenario, tape, outcome))
+    return path.read_text(encoding="utf-8")
+
+
+def headings(page: str) -> list[str]:
+    return [part.partition("</h2>")[0] for part in page.split("<h2>")[1:]]
+
+
+# The page
+
+
+def test_a_simulated_flight_shows_everything_that_moved(tmp_path: Path, servo: Scenario) -> None:
+    whole = flight(
+        u=signal([0, 1000], **{name: [0.0, 0.1] for name in INPUTS}),
+        internals=ticks(101, late=[1e-3] * 101),
+        truth=truth(101, x__q=0.0, x__V=0.0, x__p=0.0, x__r=0.0, gust__vertical=2.0, actuator__elevator=0.0, noise__q=1e-3),
+    )
+    assert headings(page_of(tmp_path, servo, whole)) == [
+        "Output y over the reference y_m",
+        "Tracking error e = y - y_m",
+        "Input u and the actuators",
+        "Wind",
+        "States",
+        "Error of the sensors",
+        "Ticks of the controller",
+    ]
+
+
+def test_a_log_that_knows_only_y_and_its_reference_has_a_report(tmp_path: Path, servo: Scenario) -> None:
+    page = page_of(tmp_path, servo, flight())
+    assert headings(page) == ["Output y over the reference y_m", "Tracking error e = y - y_m"]
+    assert "What happened" not in page
+
+
+def test_a_flight_of_one_sample_has_a_report(tmp_path: Path, servo: Scenario) -> None:
+    one = flight(1, u=signal([0], **{name: [0.0] for name in INPUTS}), internals=ticks(1), truth=truth(1, x__q=0.0))
+    assert len(headings(page_of(tmp_path, servo, one))) == 4  # y, e, u, states: nothing blew, no tick was late
+
+
+def test_a_minute_is_a_page_below_eight_megabytes(tmp_path: Path, servo: Scenario) -> None:
+    # White noise on all channels of the scenario at its rates: nothing of it can be left out or compressed. plotly itself
+    # takes 4.8 MB. Measured 7.4 MB.
+    random = np.random.default_rng(1)
+
+    def noise(rate: int, names: list[str]) -> Signal:
+        stamps = EPOCH + np.arange(60 * rate + 1, dtype=np.int64) * (1000 * MS // rate)
+        return Signal(stamps, tuple(names), random.standard_normal((len(stamps), len(names))))
+
+    states = ["V", "alpha", "q", "theta", "beta", "p", "r", "phi"]
+    groups = {"x": states, "gust": ["a", "b", "c"], "actuator": INPUTS, "noise": OUTPUTS}
+    tape = Tape(
+        {
+            "y": noise(500, list(OUTPUTS)),
+            "y_m": noise(500, list(OUTPUTS)),
+            "u": noise(100, list(INPUTS)),
+            "truth": noise(500, [f"{group}.{name}" for group, names in groups.items() for name in names]),
+        },
+        EPOCH,
+    )
+    page = page_of(tmp_path, servo, tape)
+    assert len(page) < 8e6
+    assert 'src="http' not in page
+
+
+def test_words_from_outside_are_shown_as_words(tmp_path: Path, servo: Scenario) -> None:
+    page = page_of(tmp_path, servo, flight(), outcome="ended: <script>alert(1)</script>")
+    assert "ended: &lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert "<script>alert" not in page
+
+
+# What happened
+
+
+def test_events_are_told_once_each_in_the_order_of_their_first_instant() -> None:
+    mode = (
+        [Mode.ENGAGED] * 20 + [Mode.HOLD] * 10 + [Mode.ENGAGED] * 20 + [Mode.HOLD] * 5 + [Mode.RAMP] * 5 + [Mode.ENGAGED] * 41
+    )
+    rate = [Limited.NO] * 2 + [Limited.RATE] * 3 + [Limited.NO] * 90 + [Limited.RATE] + [Limited.NO] * 5
+    tape = flight(internals=ticks(101, mode=[float(one) for one in mode], **{"limited.thrust": [float(one) for one in rate]}))
+    told = events(tape, {"lateral": (0.9, 2.0), "vertical": (5.0, 6.0)})
+    assert [(event.what, round(event.start, 3), round(event.stop, 3), event.how_much) for event in told] == [
+        ("thrust limited: rate", 0.02, 0.95, "4 of 101 ticks"),
+        ("hold", 0.2, 0.55, "0.15 s, 2 times"),  # 0.2 s to 0.3 s and 0.5 s to 0.55 s
+        ("ramp", 0.55, 0.6, "0.05 s"),
+        ("lateral gust", 0.9, 1.0, "0.10 s"),  # the flight ends in it, and before the other
+    ]
+
+
+def test_a_span_ends_where_the_next_sample_begins() -> None:
+    t = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
+    assert spans(t, np.array([False, True, True, False, True])) == [(1.0, 4.0), (5.0, 5.0)]
+    assert spans(t, np.zeros(5, dtype=bool)) == []
+    assert spans(np.zeros(0), np.zeros(0, dtype=bool)) == []
+
+
+def test_spans_closer_than_can_be_seen_are_one_and_none_is_too_short_to_see() -> None:
+    t = np.arange(10.0)
+    mask = np.array([True, False, True, False, False, False, False, True, False, False])
+    assert spans(t, mask) == [(0.0, 1.0), (2.0, 3.0), (7.0, 8.0)]
+    assert spans(t, mask, join=1.5) == [(0.0, 3.5), (7.0, 8.5)]
+
+
+def test_every_mode_but_engaged_is_a_band_under_its_name() -> None:
+    assert set(pictures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
+    assert set(pictures.LIMITED_COLOURS) == set(Limited) - {Limited.NO}
+    modes = [float(one) for one in Mode for _ in range(10)]
+    bands = pictures.mode_bands(flight(60, internals=ticks(60, mode=modes)))
+    assert {band.label: (round(band.start, 3), round(band.stop, 3)) for band in bands} == {
+        "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5), "inactive": (0.5, 0.59),
+    }  # fmt: skip
+
+
+def test_bands_are_drawn_over_the_whole_height_of_every_picture() -> None:
+    bands = [Band("hold", 0.2, 0.3, "#f2c230", False), Band("a gust", 0.5, 0.6, "#7f7f7f", True)]
+    drawn = pictures.tracking_picture(scene(flight())._replace(bands=bands))
+    assert [(shape.x0, shape.x1, shape.y0, shape.y1, shape.yref) for shape in drawn.layout.shapes] == [
+        (0.2, 0.3, 0, 1, "paper"),
+        (0.5, 0.6, 0, 1, "paper"),
+    ]
+    assert [note.text for note in drawn.layout.annotations] == ["a gust"]
+    assert len(traces(drawn, "hold")) == 1  # in the legend
+
+
+# The input
+
+
+def input_flight(**limited: list[float]) -> Tape:
+    """Elevator up to 2 deg, the others at rest."""
+    u = {name: [0.0] * 101 for name in INPUTS} | {"elevator": [2.0 * DEG] * 101}
+    return flight(u=signal([10.0 * k for k in range(101)], **u), internals=ticks(101, **limited))
+
+
+def test_limits_near_the_input_are_in_view_and_far_ones_are_not(servo: Scenario) -> None:
+    units = shown_units(servo)
+    near = servo.vary(controller={"lower": [-3 * DEG, -1.0, -1.0, -1.0], "upper": [3 * DEG, 1.0, 1.0, 1.0]})
+    for scenario, limit, inside in ((near, 3.0, True), (servo, 30.0, False)):
+        tape = input_flight()
+        figure = pictures.input_picture(scene(tape, units), known_limits(scenario, tape))
+        assert figure is not None
+        lines = traces(figure, "limits of the controller")
+        assert [line.y[0] for line in lines[:2]] == pytest.approx([-limit, limit])  # deg
+        low, high = next(figure.select_yaxes()).range
+        assert (low <= 2.0 <= high, low <= limit <= high) == (True, inside)
+
+
+def test_end_stops_are_those_of_actuators_that_are_simulated(servo: Scenario) -> None:
+    # The scenario gives them in the airframe's order, u has the law's: thrust is the one of 50 %.
+    tape = input_flight()
+    assert set(known_limits(servo, tape)) == {"limits of the controller"}
+    simulated = flight(truth=truth(101, actuator__elevator=0.0))
+    stops = known_limits(servo, simulated)["end stops"]
+    assert stops["thrust"] == (-0.5, 0.5)
+    assert stops["elevator"] == pytest.approx((-30.0 * DEG, 30.0 * DEG), rel=1e-5)
+
+
+def test_an_input_without_limits_has_no_lines(osprey_gust: Scenario) -> None:
+    tape = input_flight()
+    figure = pictures.input_picture(scene(tape), known_limits(osprey_gust, tape))
+    assert not traces(figure, "limits of the controller")
+
+
+def test_when_an_input_was_limited_is_marked_in_its_row_alone() -> None:
+    limited = [float(Limited.NO)] * 101
+    limited[50:60] = [float(Limited.MAGNITUDE)] * 10
+    limited[80] = float(Limited.RATE)
+    tape = input_flight(**{"limited.aileron": limited})
+    figure = pictures.input_picture(scene(tape), {})
+    (magnitude,), (rate,) = traces(figure, "limited: magnitude"), traces(figure, "limited: rate")
+    assert magnitude.yaxis == rate.yaxis == "y2"  # aileron is the second row
+    assert magnitude.x[:2] == pytest.approx((0.5, 0.6))
+    assert rate.x[:2] == pytest.approx((0.8, 0.81))
+
+
+def test_the_actuator_is_drawn_over_the_command_by_name() -> None:
+    tape = input_flight()
+    behind = flight(u=tape["u"], truth=truth(101, actuator__thrust=0.3, actuator__elevator=0.01))
+    figure = pictures.input_picture(scene(behind, {"elevator": Shown("deg", 1 / DEG)}), {})
+    assert titles(figure) == ["elevator (deg)", "aileron", "rudder", "thrust"]
+    by_axis = {trace.yaxis: trace.y[0] for trace in traces(figure, "actuator")}
+    assert by_axis == {"y": pytest.approx(0.01 / DEG), "y4": pytest.approx(0.3)}
+    assert len(traces(figure, "command u")) == 4
+
+
+# What only a simulation knows
+
+
+def test_states_of_any_name_are_shown_those_of_known_unit_in_it() -> None:
+    tape = flight(truth=truth(101, x__q=0.25, x__altitude=1200.0))
+    figure = pictures.state_picture(scene(tape, {"q": Shown("mrad/s", 1e3)}))
+    assert titles(figure) == ["q (mrad/s)", "altitude"]
+    assert [trace.y[0] for trace in traces(figure, "x")] == [250.0, 1200.0]
+
+
+def test_sensors_without_error_and_air_at_rest_are_left_out() -> None:
+    calm = scene(flight(truth=truth(101, noise__q=0.0, gust__vertical=0.0, x__q=0.0)))
+    assert pictures.sensor_picture(calm) is None
+    assert pictures.wind_picture(calm) is None
+    some = scene(flight(truth=truth(101, noise__q=0.0, noise__V=0.1, gust__vertical=0.0, gust__longitudinal=1.0)))
+    assert titles(pictures.sensor_picture(some)) == ["V"]
+    assert titles(pictures.wind_picture(some)) == ["longitudinal (m/s)"]
+
+
+def test_the_true_error_is_drawn_over_the_measured_one_where_they_differ() -> None:
+    states = {f"x__{name}": 0.5 for name in OUTPUTS}
+    quiet = pictures.error_picture(scene(flight(truth=truth(101, **states, noise__q=0.0))))
+    assert {trace.name for trace in quiet.data} == {"e"}
+    noisy = pictures.error_picture(scene(flight(truth=truth(101, **states, noise__q=0.1))))
+    assert [traces(noisy, name)[0].y[0] for name in ("measured", "true")] == [0.0, 0.5]
+
+
+def test_ticks_are_shown_where_one_was_late_or_y_old_or_dt_changed() -> None:
+    assert pictures.tick_picture(scene(flight(internals=ticks(101)))) is None
+    for channel, values in (("late", [0.0] * 100 + [1e-4]), ("age", [2e-3] * 101), ("dt", [0.0] + [0.01] * 99 + [0.02])):
+        figure = pictures.tick_picture(scene(flight(internals=ticks(101, **{channel: values}))))
+        assert titles(figure) == ["late (ms)", "age (ms)", "dt (ms)"]
+
+
+# Curves
+
+
+def test_a_curve_is_broken_where_samples_are_missing_and_u_is_held() -> None:
+    stamps = [10.0 * k for k in range(101) if not 30 <= k < 60]
+    holed = signal(stamps, **{name: [1.0] * len(stamps) for name in OUTPUTS})
+    u = signal(stamps, **{name: [1.0] * len(stamps) for name in INPUTS})
+    tape = Tape({"y": holed, "y_m": flight()["y"], "u": u}, EPOCH)
+    y: FloatArray = traces(pictures.tracking_picture(scene(tape)), "y")[0].y
+    assert np.flatnonzero(np.isnan(y)).tolist() == [30]
+    assert not np.isnan(traces(pictures.input_picture(scene(tape), {}), "u")[0].y).any()
+
+
+def test_what_is_drawn_of_a_long_signal_keeps_its_peaks() -> None:
+    values = np.zeros(11_999)
+    values[[5001, 7003]] = 4.0, -3.0  # one sample each: every second sample would miss both
+    drawn = drawn_points(values, 6000)
+    assert len(drawn) <= 6000
+    assert (np.diff(drawn) > 0).all()
+    assert (values[drawn].max(), values[drawn].min()) == (4.0, -3.0)
+    assert drawn_points(values[:6000], 6000).tolist() == list(range(6000))
+
+
+def test_time_is_that_of_the_flight_whatever_the_stamps() -> None:
+    drawn = traces(pictures.tracking_picture(scene(flight())), "y")[0]
+    assert (drawn.x[0], drawn.x[-1]) == (0.0, 1.0)
