@@ -49,7 +49,7 @@ def fly(
         bool, typer.Option("--lockstep", help="Over topics as fast as the machine allows, repeatable to the byte.")
     ] = False,
     one_process: Annotated[
-        bool, typer.Option("--one-process", help="In lockstep, with aircraft, reference model and controller in one process.")
+        bool, typer.Option("--one-process", help="In lockstep, with all nodes as objects in one process.")
     ] = False,
     runs: Annotated[Path, typer.Option(help="Folder that the run's folder is made in.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")] = False,

@@ -80,8 +80,8 @@ def fly_over_topics(
 ) -> str:
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
-    In real time, or in `lockstep` as fast as the machine allows; `one_process` holds aircraft, reference model and controller
-    in one process, for lockstep alone. "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence naming the process that
+    In real time, or in `lockstep` as fast as the machine allows; `one_process` holds all nodes in one process, for lockstep
+    alone. "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence naming the process that
     ended early.
     """
     from flight_bringup.node import Monitor  # noqa: PLC0415 - loads rclpy, which no other command needs

@@ -26,7 +26,7 @@ AIRCRAFT = NodeSpec("aircraft_sim", "aircraft")
 REFERENCE_MODEL = NodeSpec("reference_model", "reference_model")
 CONTROLLER = NodeSpec("rise_di_controller", "controller")
 
-# The three that fly as objects in one process, for lockstep; each reads its own section of the scenario.
+# All four as objects in one process, for lockstep; each reads its own section of the scenario.
 ONE_PROCESS = NodeSpec("flight_bringup", "one_process")
 
 # These start first, and say that they are ready before the others start: the whole flight is then in the log, and the
@@ -56,8 +56,8 @@ def parameters(node: NodeSpec, scenario: Scenario, run: Path, start_time: float,
     waits for u and where the flight ends, and the controller how often y comes.
     """
     if node is ONE_PROCESS:
-        members = (AIRCRAFT, REFERENCE_MODEL, CONTROLLER)
-        told_by = {one: parameters(one, scenario, run, start_time, lockstep=lockstep) for one in members}
+        told_by = {one: parameters(one, scenario, run, start_time, lockstep=lockstep) for one in (*FIRST, *THEN)}
+        told_by[AIRCRAFT]["recorded"] = False  # a log in the same process is never behind
         return {f"{one.executable}:{name}": value for one, told in told_by.items() for name, value in told.items()}
     told: Told = {"lockstep": lockstep}
     if node is RECORDER:

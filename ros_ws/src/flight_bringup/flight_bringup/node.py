@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the command line needs of ROS: a monitor of a running flight, and the three nodes as objects in one process."""
+"""What the command line needs of ROS: a monitor of a running flight, and the four nodes as objects in one process."""
 
 import os
 from typing import NamedTuple
@@ -12,6 +12,7 @@ from aircraft_sim.node import AircraftNode
 from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import ChannelError, FloatArray
+from flight_recorder.node import RecorderNode
 from flight_ros import transport
 from flight_ros.inbox import Inbox
 from flight_ros.messages import Decoder, stamp_of
@@ -80,8 +81,8 @@ class Monitor:
 
 
 def main() -> None:
-    """Aircraft, reference model and controller as objects in one process, in lockstep over the same topics."""
-    run(AircraftNode, ReferenceModelNode, ControllerNode)
+    """The four nodes as objects in one process, in lockstep over the same topics."""
+    run(AircraftNode, ReferenceModelNode, ControllerNode, RecorderNode)
 
 
 if __name__ == "__main__":

@@ -84,7 +84,7 @@ class Flight:
     ) -> None:
         self._scenario, self._run, self._before_start = scenario, run, before_start
         self._lockstep = lockstep
-        self._first: tuple[NodeSpec, ...] = (RECORDER,) if one_process else FIRST
+        self._first: tuple[NodeSpec, ...] = () if one_process else FIRST
         self._then: tuple[NodeSpec, ...] = (ONE_PROCESS,) if one_process else THEN
         self.processes: list[NodeProcess] = []
         self.start_time = math.inf  # system time of t = 0, s; set once the first nodes are ready

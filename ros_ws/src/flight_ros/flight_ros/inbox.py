@@ -50,16 +50,12 @@ class Inbox:
         self._subscription = node.create_subscription(
             topic.type, topic.name, lambda _: None, qos, callback_group=_TakenByHand(), raw=raw
         )
+        self.name = str(self._subscription.topic_name)  # in full
 
     @property
     def handle(self) -> Any:
         """The middleware's subscription, for a wait set."""
         return self._subscription.handle
-
-    @property
-    def name(self) -> str:
-        """The full name of the topic."""
-        return str(self._subscription.topic_name)
 
     def take(self, most: int | None = None) -> Iterator[Received]:
         """The messages that have arrived since the last call, oldest first, at most so many, else the queue's depth of them."""

@@ -24,7 +24,7 @@ class Profile(NamedTuple):
 
 
 def command(t: Array, profile: Profile) -> Array:
-    """u_m(t), shape (m,).
+    """u_m(t), shape (m,), or (T, m) at T instants at once.
 
     u_m = w(t) + turn_rate sin(phi(t)),  phi(t) = bank_rate . integral_0^t w
     w_i = sum_k change_ik G(t - time_ik) + amplitude_i sin(frequency_i t + phase_i),  G(s) = clip(s / rise, 0, 1)
@@ -33,7 +33,8 @@ def command(t: Array, profile: Profile) -> Array:
     inside [0, rise]. The turn rate g/V0 sin(phi) is that of a coordinated turn.
     """
     xp = array_namespace(profile.change)
-    since = t - profile.time
+    t = xp.asarray(t)[..., None]
+    since = t[..., None] - profile.time
     past = xp.maximum(since, 0.0 * since)
     rising = xp.minimum(past, profile.rise + 0.0 * past)
     angle = profile.frequency * t + profile.phase
@@ -41,4 +42,4 @@ def command(t: Array, profile: Profile) -> Array:
     w = (profile.change * rising) @ every / profile.rise + profile.amplitude * xp.sin(angle)
     w_integral = (profile.change * (rising * rising / (2.0 * profile.rise) + past - rising)) @ every
     w_integral = w_integral + profile.amplitude / profile.frequency * (xp.cos(profile.phase) - xp.cos(angle))
-    return w + profile.turn_rate * xp.sin(profile.bank_rate @ w_integral)
+    return w + profile.turn_rate * xp.sin(w_integral @ profile.bank_rate)[..., None]

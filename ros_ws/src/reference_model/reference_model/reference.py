@@ -4,7 +4,7 @@
 
 import numpy as np
 
-from flight_core.rates import period_ns, seconds
+from flight_core.rates import NANOSECONDS, period_ns, seconds
 from flight_core.vectors import FloatArray
 from reference_model import model
 from reference_model.command import command
@@ -26,13 +26,16 @@ class Reference:
     def sample(self, number: int) -> FloatArray:
         """y_m at sample `number`, shape (m,), moved there in steps of one period."""
         while self._number < number:
-            half_ns = self.period_ns * (2 * self._number + 1)
-            middle, end = self._command(seconds(half_ns) / 2.0), self._command(seconds(half_ns + self.period_ns) / 2.0)
-            self._x_m = model.step(self._x_m, np.concatenate((self._u_m, middle, end)), self._stepper)
-            self._u_m = end
+            middle_ns = self._number * self.period_ns + self.period_ns / 2.0
+            u_m = np.concatenate(
+                (self._u_m, self._commands([middle_ns / NANOSECONDS, seconds((self._number + 1) * self.period_ns)]))
+            )
+            self._x_m = model.step(self._x_m, u_m, self._stepper)
+            self._u_m = u_m[-len(self._u_m) :]
             self._number += 1
         y_m: FloatArray = model.output(self._x_m, self._model)
         return y_m
 
-    def _command(self, t: float) -> FloatArray:
-        return command(t, self._profile) if self.live is None else self.live
+    def _commands(self, t: list[float]) -> FloatArray:
+        u_m = command(np.array(t), self._profile) if self.live is None else np.tile(self.live, (len(t), 1))
+        return np.ravel(u_m)

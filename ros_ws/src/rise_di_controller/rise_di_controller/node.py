@@ -137,7 +137,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         return True
 
     def advance(self) -> bool:
-        self._y_due.extend(self._samples(self._y_inbox, self._y_decoder))
+        if not self._y_due:
+            self._y_due.extend(self._samples(self._y_inbox, self._y_decoder))
         self._y_m_due.extend(sample for sample in self._samples(self._y_m_inbox, self._y_m_decoder) if sample is not None)
         moved = False
         while self._y_due:

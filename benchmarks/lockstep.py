@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How fast a lockstep flight goes, beside the bare echo of the same message on the same machine.
+
+The scenario osprey_gust with aircraft and reference model at the 100 Hz of the controller (Runge-Kutta step 10 ms), recorded:
+
+    four processes   aircraft, reference model, controller, recorder
+    one process      the same four as objects in one process
+    without ROS      the same parts in one loop
+    bare echo        a vector of four channels to another process and back, nothing else, by the same publisher and inbox
+
+    .venv/bin/python benchmarks/lockstep.py [--duration 60] [--repeat 3]
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+import yaml
+from mcap.records import Channel, Message
+from mcap.stream_reader import StreamReader
+from rclpy.context import Context
+from rclpy.node import Node
+
+from flight_analysis.scenario import Scenario, load_scenario
+from flight_analysis.simulate import simulate
+from flight_bringup.fly import fly_over_topics
+from flight_bringup.scenarios import find_scenario
+from flight_ros import transport
+from flight_ros.inbox import Inbox, wait
+from flight_ros.messages import Encoder
+from flight_ros.topics import PUBLISH, STEP, U, Y
+
+ECHOES = 5000
+
+
+def at_the_rate_of_the_controller(folder: Path, duration: float) -> Scenario:
+    """The scenario osprey_gust with one sample of aircraft and reference a tick."""
+    tree = yaml.safe_load(find_scenario("osprey_gust").path.read_text(encoding="utf-8"))
+    tree["/**/flight"]["ros__parameters"]["duration"] = duration
+    tree["/**/aircraft"]["ros__parameters"] |= {"rate": 100.0, "step": 0.01}
+    tree["/**/reference_model"]["ros__parameters"]["rate"] = 100.0
+    path = folder / "at_100_hz.yaml"
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    return load_scenario(path)
+
+
+def flown_steps_per_second(scenario: Scenario, run: Path, *, one_process: bool) -> float:
+    """Steps of the controller per second of a lockstep flight, between its first and its last u in the log."""
+    outcome = fly_over_topics(scenario, run, lambda t, shown: None, lockstep=True, one_process=one_process)
+    if outcome != "completed":
+        sys.exit(f"error: {outcome}")
+    topics: dict[int, str] = {}
+    times = []
+    with min(run.glob("*.mcap")).open("rb") as stream:
+        for record in StreamReader(stream).records:
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message) and topics[record.channel_id] == "/u":
+                times.append(record.publish_time)
+    return (len(times) - 1) / ((times[-1] - times[0]) / 1e9)
+
+
+def looped_steps_per_second(scenario: Scenario) -> float:
+    """The same without ROS."""
+    begin = time.perf_counter()
+    tape = simulate(scenario)
+    return (len(tape["u"].stamp_ns) - 1) / (time.perf_counter() - begin)
+
+
+def echo() -> None:
+    """The other end: whatever comes on y goes back on u, until the parent closes the pipe."""
+    os.set_blocking(sys.stdin.fileno(), False)
+    context, node = _node("echo")
+    inbox, publisher = Inbox(node, Y, STEP, raw=True), node.create_publisher(U.type, U.name, PUBLISH)
+    while sys.stdin.buffer.read(1) is None:  # b"" at its end
+        wait([inbox], context, 20_000_000)
+        for received in inbox.take():
+            publisher.publish(received.message)
+    node.destroy_node()
+    context.try_shutdown()
+
+
+def echoed_steps_per_second() -> float:
+    """Round trips per second of four channels to another process and back."""
+    context, node = _node("asker")
+    inbox, publisher = Inbox(node, U, STEP, raw=True), node.create_publisher(Y.type, Y.name, PUBLISH)
+    encoder, values = Encoder(("q", "V", "p", "r"), "asker"), np.zeros(4)
+    other = subprocess.Popen([sys.executable, __file__, "--echo"], stdin=subprocess.PIPE)  # noqa: S603 - this file
+    try:
+        begin = 0.0
+        for k in range(ECHOES):
+            if k == 1:  # the first one waits for the other process
+                begin = time.perf_counter()
+            publisher.publish(encoder.encode(k, values))
+            while not list(inbox.take(1)):
+                wait([inbox], context, 20_000_000)
+        return (ECHOES - 1) / (time.perf_counter() - begin)
+    finally:
+        other.communicate()
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def _node(name: str) -> tuple[Context, Node]:
+    transport.prepare()
+    context = Context()
+    rclpy.init(context=context)
+    return context, Node(name, context=context)
+
+
+def main() -> None:
+    """Run all of it, interleaved, and print medians."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--duration", type=float, default=60.0, help="flight time, s")
+    parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--echo", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.echo:
+        echo()
+        return
+    found: dict[str, list[float]] = {"bare echo": [], "four processes": [], "one process": [], "without ROS": []}
+    with tempfile.TemporaryDirectory() as folder:
+        scenario = at_the_rate_of_the_controller(Path(folder), arguments.duration)
+        for k in range(arguments.repeat):
+            found["bare echo"].append(echoed_steps_per_second())
+            for name in ("four processes", "one process"):
+                run = Path(folder) / f"{name} {k}"
+                found[name].append(flown_steps_per_second(scenario, run, one_process=name == "one process"))
+            found["without ROS"].append(looped_steps_per_second(scenario))
+    floor = float(np.median(found["bare echo"]))
+    print(f"median of {arguments.repeat}, {arguments.duration:g} s of flight each")
+    print(f"{'':16}{'steps/s':>9}{'to the echo':>13}{'times real time':>17}")
+    for name, rates in found.items():
+        rate = float(np.median(rates))
+        real_time = "" if name == "bare echo" else f"{rate / scenario.controller.rate:.1f}"
+        print(f"{name:16}{rate:9.0f}{rate / floor:13.2f}{real_time:>17}")
+
+
+if __name__ == "__main__":
+    main()
