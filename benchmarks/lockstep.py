@@ -33,7 +33,7 @@ from flight_analysis.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.scenarios import find_scenario
 from flight_ros import transport
-from flight_ros.inbox import Inbox, wait
+from flight_ros.inbox import Inbox, Waiter
 from flight_ros.messages import Encoder
 from flight_ros.topics import PUBLISH, STEP, U, Y
 
@@ -79,8 +79,9 @@ def echo() -> None:
     os.set_blocking(sys.stdin.fileno(), False)
     context, node = _node("echo")
     inbox, publisher = Inbox(node, Y, STEP, raw=True), node.create_publisher(U.type, U.name, PUBLISH)
+    waiter = Waiter([inbox], context)
     while sys.stdin.buffer.read(1) is None:  # b"" at its end
-        wait([inbox], context, 20_000_000)
+        waiter.wait(20_000_000)
         for received in inbox.take():
             publisher.publish(received.message)
     node.destroy_node()
@@ -91,7 +92,7 @@ def echoed_steps_per_second() -> float:
     """Round trips per second of four channels to another process and back."""
     context, node = _node("asker")
     inbox, publisher = Inbox(node, U, STEP, raw=True), node.create_publisher(Y.type, Y.name, PUBLISH)
-    encoder, values = Encoder(("q", "V", "p", "r"), "asker"), np.zeros(4)
+    waiter, encoder, values = Waiter([inbox], context), Encoder(("q", "V", "p", "r"), "asker"), np.zeros(4)
     other = subprocess.Popen([sys.executable, __file__, "--echo"], stdin=subprocess.PIPE)  # noqa: S603 - this file
     try:
         begin = 0.0
@@ -100,7 +101,7 @@ def echoed_steps_per_second() -> float:
                 begin = time.perf_counter()
             publisher.publish(encoder.encode(k, values))
             while not list(inbox.take(1)):
-                wait([inbox], context, 20_000_000)
+                waiter.wait(20_000_000)
         return (ECHOES - 1) / (time.perf_counter() - begin)
     finally:
         other.communicate()

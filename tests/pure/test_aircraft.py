@@ -130,7 +130,8 @@ def test_truth_holds_the_state_the_disturbance_and_the_actuators() -> None:
     parameters = AircraftParameters.validate_mapping(values, "aircraft")
     names = truth.names(parameters.load()[0])
     state = AircraftState(np.arange(8.0) / 100, np.array([0.1, 0.2, 0.3, 0.4]))
-    shown = dict(zip(names, truth.values(400 * MS, state, parameters.plant()), strict=True))
+    now = dynamics.at_times(np.array([0.4]), parameters.plant().aircraft)
+    shown = dict(zip(names, truth.values(state, now.wind[0], now.rate[0], parameters.plant()), strict=True))
     assert shown["x.phi"] == 0.07
     assert shown["gust.vertical"] == pytest.approx(2.0)  # s = 25 0.4 = H
     assert shown["gust.lateral"] == shown["gust.longitudinal"] == 0.0  # every axis that the airframe knows

@@ -268,9 +268,9 @@ def test_numbers_from_elsewhere_may_take_the_place_of_the_seed() -> None:
     assert parts.turbulence is not None
     state = plant.start(parts)
     own = plant.advance(0, state, u, 20 * MS, parts)
-    given_numbers = plant.advance(0, state, u, 20 * MS, parts, turbulence.normals(0, 10, parts.turbulence.seed))
+    given_numbers = plant.advance(0, state, u, 20 * MS, parts, normals=turbulence.normals(0, 10, parts.turbulence.seed))
     assert own.x.tobytes() == given_numbers.x.tobytes()
-    assert (plant.advance(0, state, u, 20 * MS, parts, np.zeros((10, 5))).x != own.x).any()
+    assert (plant.advance(0, state, u, 20 * MS, parts, normals=np.zeros((10, 5))).x != own.x).any()
 
 
 def test_truth_shows_the_wind_that_acts_from_then_on_and_f_holds_it() -> None:

@@ -80,14 +80,22 @@ def wind(t: Any, params: Aircraft, turbulence: Array | None = None) -> Array:
     return gusts if turbulence is None else gusts + turbulence
 
 
-def at_times(t: Array, params: Aircraft) -> Array:
-    """of_time in the gusts at T instants at once, t of shape (T,): shape (T, n)."""
+class Forcing(NamedTuple):
+    """What depends on time alone, at T instants."""
+
+    wind: Array  # (T, G) of the gusts along the G axes, m/s
+    rate: Array  # (T, n) of_time in it
+
+
+def at_times(t: Array, params: Aircraft) -> Forcing:
+    """The gusts and of_time in them at T instants at once, t of shape (T,)."""
 
     def column(of: Any) -> Any:
         return None if of is None else type(of)(*(one[:, None] for one in of))
 
     columns = params._replace(gusts=column(params.gusts), bias=column(params.bias), sines=column(params.sines))
-    return of_time(t, wind(t, columns), columns).T
+    gusts = wind(t, columns)
+    return Forcing(gusts.T, of_time(t, gusts, columns).T)
 
 
 def y(x: Array, params: Aircraft) -> Array:

@@ -32,7 +32,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         self._u_from: str | None = None
         self._u_ns = 0  # when the last u came
         self._u_inbox, self._decoder = self.inbox(U), Decoder(self._simulator.inputs)
-        self._y_publisher, self._truth_publisher = self.publisher(Y), self.publisher(TRUTH)
+        self._publish_y, self._publish_truth = self.outlet(Y), self.outlet(TRUTH)
         self._y_encoder = Encoder(self._simulator.outputs, self.instance)
         self._truth_encoder = Encoder(self._simulator.truth_names, self.instance)
         if self.parameters.lockstep:
@@ -43,7 +43,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
             self._end_ns = nanoseconds(self.parameters.duration) or None
             self._nothing = Encoder((), self.instance)
             self._recorded_inbox = self.inbox(RECORDED)
-            self._clock_publisher = self.publisher(CLOCK)
+            self._publish_clock = self.outlet(CLOCK)
 
     def period_ns(self) -> int:
         return self._simulator.period_ns
@@ -59,9 +59,9 @@ class AircraftNode(FlightNode[AircraftParameters]):
     def _publish(self, number: int, start_ns: int, u: FloatArray) -> bool:
         arrived = self._simulator.sample(number, u)
         for sample in arrived:
-            self._y_publisher.publish(self._y_encoder.encode(start_ns + sample.stamp_ns, sample.y))
+            self._publish_y(self._y_encoder.encode(start_ns + sample.stamp_ns, sample.y))
         stamp_ns = start_ns + number * self.period_ns()
-        self._truth_publisher.publish(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
+        self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
         return bool(arrived)
 
     def advance(self) -> bool:
@@ -71,9 +71,9 @@ class AircraftNode(FlightNode[AircraftParameters]):
         if self._finished() or self._ahead_of_the_log():
             return False
         t_ns = self._number * self.period_ns()
-        self._clock_publisher.publish(instant(t_ns))  # first: y_m is made while the aircraft moves
+        self._publish_clock(instant(t_ns))  # first: y_m is made while the aircraft moves
         if not self._publish(self._number, 0, self._u):
-            self._y_publisher.publish(self._nothing.encode(t_ns, NO_CHANNELS))
+            self._publish_y(self._nothing.encode(t_ns, NO_CHANNELS))
         self._answered = t_ns % self._control_ns != 0
         self._number += 1
         if self._finished():

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from aircraft_sim import actuators, dynamics, turbulence
 from aircraft_sim.actuators import Actuators
-from aircraft_sim.dynamics import Aircraft
+from aircraft_sim.dynamics import Aircraft, Forcing
 from aircraft_sim.turbulence import Turbulence
 from flight_core.integrators import rk4
 from flight_core.rates import divide, seconds
@@ -40,8 +40,20 @@ def start(plant: Plant) -> AircraftState:
     return AircraftState(xp.zeros_like(plant.aircraft.A[0, :]), xp.zeros_like(plant.aircraft.B[0, :]), z)
 
 
+def forcing(t_ns: int, steps: int, plant: Plant) -> Forcing:
+    """What depends on time alone at the beginnings, middles and ends of so many steps from t on: 2 steps + 1 instants."""
+    halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
+    return dynamics.at_times(seconds(t_ns) + seconds(plant.step_ns) / 2.0 * halves, plant.aircraft)
+
+
 def advance(
-    t_ns: int, state: AircraftState, u: Array, duration_ns: int, plant: Plant, normals: Array | None = None
+    t_ns: int,
+    state: AircraftState,
+    u: Array,
+    duration_ns: int,
+    plant: Plant,
+    forced: Forcing | None = None,
+    normals: Array | None = None,
 ) -> AircraftState:
     """State at t + duration from that at t, with the command u held (zero-order hold).
 
@@ -54,7 +66,8 @@ def advance(
     The position at the end of the step acts during all of it: an ideal actuator then passes u on without a delay, to the last
     bit, and a real one leads its continuous model by dt / 2. The turbulence at the beginning of the step acts during all of
     it: seen at the steps it has its spectrum exactly, in between it is held. Time is counted in ns so that steps add up
-    exactly. `normals` are the numbers n_k, shape (steps, 5); by default those of the seed, which only NumPy can draw.
+    exactly. `forced` is the `forcing` of these steps, where the caller has it. `normals` are the numbers n_k, shape (steps, 5);
+    by default those of the seed, which only NumPy can draw.
     Raises ParameterError where the step does not divide the duration.
     """
     x, position, z = state
@@ -66,9 +79,7 @@ def advance(
     def x_dot(since: float, x: Array, rest: Array, params: Aircraft) -> Array:
         return dynamics.rate(x, rest[round(2.0 * since / dt)], params)
 
-    # What depends on time alone, at the beginnings, middles and ends of all steps together.
-    halves = array_namespace(aircraft.A).arange(2 * steps + 1, dtype=aircraft.A.dtype)
-    given = dynamics.at_times(seconds(t_ns) + dt / 2.0 * halves, aircraft)
+    given = (forcing(t_ns, steps, plant) if forced is None else forced).rate
     for k in range(steps):
         moved = actuators.step(position, u, dt, plant.actuators)
         position = actuators.fail(seconds(t_ns + k * plant.step_ns), position, moved, plant.actuators)

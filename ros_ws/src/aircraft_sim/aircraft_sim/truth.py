@@ -7,7 +7,6 @@ import numpy as np
 from aircraft_sim import dynamics, turbulence
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.plant import AircraftState, Plant
-from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
 
 
@@ -26,10 +25,13 @@ def names(airframe: Airframe) -> tuple[str, ...]:
     return tuple(f"{group}.{name}" for group, members in groups.items() for name in members)
 
 
-def values(t_ns: int, state: AircraftState, plant: Plant) -> FloatArray:
-    """Values of `truth` in the order of `names`; f and the wind are those that act from t on."""
-    t, aircraft = seconds(t_ns), plant.aircraft
-    air = None if plant.turbulence is None else turbulence.wind(state.turbulence, plant.turbulence)
-    wind = dynamics.wind(t, aircraft, air)
-    f = dynamics.of_state(state.x, aircraft) + dynamics.of_time(t, wind, aircraft)
+def values(state: AircraftState, wind: FloatArray, rate: FloatArray, plant: Plant) -> FloatArray:
+    """Values of `truth` in the order of `names`; f and the wind are those that act from now on.
+
+    `wind` (G,) and `rate` (n,) are what `dynamics.Forcing` says of this instant.
+    """
+    f = dynamics.of_state(state.x, plant.aircraft) + rate
+    if plant.turbulence is not None:
+        air = turbulence.wind(state.turbulence, plant.turbulence)
+        wind, f = wind + air, f + plant.aircraft.gust_direction @ air
     return np.concatenate([state.x, f, wind, state.position])

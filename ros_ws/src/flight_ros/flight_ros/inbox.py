@@ -6,8 +6,7 @@ A tick takes what has arrived (about 1 us when nothing has); a storm of messages
 back stops nothing.
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rclpy.callback_groups import CallbackGroup
@@ -57,26 +56,35 @@ class Inbox:
         """The middleware's subscription, for a wait set."""
         return self._subscription.handle
 
-    def take(self, most: int | None = None) -> Iterator[Received]:
+    def take(self, most: int | None = None) -> list[Received]:
         """The messages that have arrived since the last call, oldest first, at most so many, else the queue's depth of them."""
         handle, kind, raw = self._subscription.handle, self._subscription.msg_type, self._subscription.raw
-        for _ in range(most or self.qos.depth):
-            with handle:
-                taken = handle.take_message(kind, raw)
-            if taken is None:
-                return
-            message, info = taken
-            yield Received(
-                message, info["source_timestamp"], info["received_timestamp"], info["publication_sequence_number"] or 0
-            )
+        received = []
+        with handle:
+            for _ in range(most or self.qos.depth):
+                if (taken := handle.take_message(kind, raw)) is None:
+                    break
+                message, info = taken
+                received.append(
+                    Received(
+                        message, info["source_timestamp"], info["received_timestamp"], info["publication_sequence_number"] or 0
+                    )
+                )
+        return received
 
 
-def wait(inboxes: Sequence[Inbox], context: Context, timeout_ns: int) -> None:
-    """Until something has come into one of the inboxes, or the time is over, whichever is sooner."""
-    wait_set = _rclpy.WaitSet(len(inboxes), 0, 0, 0, 0, 0, context.handle)
-    with wait_set, ExitStack() as held:
+class Waiter:
+    """Waits for several inboxes at once, of one context."""
+
+    def __init__(self, inboxes: Sequence[Inbox], context: Context) -> None:
+        self._handles = [inbox.handle for inbox in inboxes]
+        self._wait_set = _rclpy.WaitSet(len(inboxes), 0, 0, 0, 0, 0, context.handle)
+
+    def wait(self, timeout_ns: int) -> bool:
+        """Until something has come into one of the inboxes, or the time is over; whether something has."""
+        wait_set = self._wait_set
         wait_set.clear_entities()
-        for inbox in inboxes:
-            held.enter_context(inbox.handle)
-            wait_set.add_subscription(inbox.handle)
+        for handle in self._handles:
+            wait_set.add_subscription(handle)
         wait_set.wait(timeout_ns)
+        return bool(wait_set.get_ready_entities("subscription"))

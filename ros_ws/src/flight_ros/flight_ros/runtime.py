@@ -23,7 +23,6 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.signals import SignalHandlerOptions
 
@@ -32,7 +31,7 @@ from flight_core.parameters import NodeParameters, ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_ros import transport
 from flight_ros.company import Company
-from flight_ros.inbox import Inbox, wait
+from flight_ros.inbox import Inbox, Waiter
 from flight_ros.parameters import changed, read_parameters
 from flight_ros.ticker import Tick, Ticker
 from flight_ros.topics import DIAGNOSTICS, LISTEN, PUBLISH, STEP, Topic
@@ -52,6 +51,8 @@ START_PATIENCE_NS = 30 * NANOSECONDS  # in lockstep, for others that never come
 
 ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)  # at the end of a lockstep flight, what was sent is left time to arrive
 
+BUSY_PAUSE = 0.1  # s, between two looks at signals of life and service calls while a lockstep flight moves
+
 NICE_PAUSE = 0.02  # s, the longest sleep, so that a signal or a service call is not left waiting
 
 
@@ -70,7 +71,7 @@ class FlightNode(Node, Generic[P]):
         self.rejected: Counter[str] = Counter()
         self._inboxes: list[Inbox] = []
         self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to say it next
-        self._diagnostics = self.publisher(DIAGNOSTICS)
+        self._diagnostics = self.create_publisher(DIAGNOSTICS.type, DIAGNOSTICS.name, PUBLISH)
         self._periods: list[int] = []
         self._compute: list[int] = []
         self._missed = 0
@@ -110,9 +111,11 @@ class FlightNode(Node, Generic[P]):
 
     # What a subclass uses
 
-    def publisher(self, topic: Topic) -> Publisher:
-        """A publisher on a topic of the flight."""
-        return self.create_publisher(topic.type, topic.name, PUBLISH)
+    def outlet(self, topic: Topic) -> Callable[[bytes], None]:
+        """A publisher of serialised messages on a topic of the flight, as the function that publishes one."""
+        handle = self.create_publisher(topic.type, topic.name, STEP if self.parameters.lockstep else PUBLISH).handle
+        publish: Callable[[bytes], None] = handle.publish_raw
+        return publish
 
     def inbox(self, topic: Topic, qos: QoSProfile | None = None) -> Inbox:
         """A subscription that is read at the tick, as bytes; its publishers are checked once a second."""
@@ -312,18 +315,18 @@ def _begin(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
 
 def _step(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     executor = _begin(nodes)
-    inboxes = [inbox for node in nodes for inbox in node.inboxes()]
+    waiter = Waiter([inbox for node in nodes for inbox in node.inboxes()], nodes[0].context)
     begin_ns = serve_ns = report_ns = time.monotonic_ns()
     moved = False
     while not stop.requested:
         moving = [node.advance() for node in nodes]
         if any(moving):
             moved = True
-        else:
-            wait(inboxes, nodes[0].context, nanoseconds(NICE_PAUSE))
+        elif not waiter.wait(nanoseconds(NICE_PAUSE)):
+            serve_ns = 0  # nothing comes: perhaps one of the others is gone
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
-            serve_ns = now_ns + nanoseconds(NICE_PAUSE)
+            serve_ns = now_ns + nanoseconds(BUSY_PAUSE)
             _serve(executor, nodes[0])
             for node in nodes:
                 node.require_company()

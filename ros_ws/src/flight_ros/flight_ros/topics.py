@@ -17,8 +17,9 @@ PUBLISH = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE, durabili
 # Control loops want the newest samples and never a retransmission. The depth covers the samples between two ticks
 # that are needed to bring y_m to the stamp of y.
 LISTEN = QoSProfile(depth=16, reliability=ReliabilityPolicy.BEST_EFFORT)
-# In lockstep every sample counts, from the first one on, whoever is matched late.
-STEP = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# In lockstep every sample counts, from the first one on, whoever is matched late. The depth is for speed: with a history that
+# is full, Fast DDS asks for an acknowledgement of each sample.
+STEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Nothing is ever sent with it: the middleware itself says when the process behind it no longer lives. Long enough for one
 # that a busy machine leaves waiting, short enough to end the others within two seconds.
 ALIVE = QoSProfile(depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=1.0))

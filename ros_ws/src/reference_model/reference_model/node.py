@@ -21,7 +21,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
     def __init__(self) -> None:
         super().__init__("reference_model", ReferenceModelParameters)
         self._reference = Reference(self.parameters)
-        self._y_m_publisher = self.publisher(Y_M)
+        self._publish_y_m = self.outlet(Y_M)
         self._encoder = Encoder(self.parameters.outputs, self.instance)
         if self.parameters.lockstep:
             self._number, self._next = 0, self._reference.sample(0)
@@ -36,7 +36,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
         return nanoseconds(self.parameters.start_time)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        self._y_m_publisher.publish(self._encoder.encode(now_ns, self._reference.sample(tick.number)))
+        self._publish_y_m(self._encoder.encode(now_ns, self._reference.sample(tick.number)))
         for received in self._u_m_inbox.take():
             try:
                 sample = self._decoder.decode(received.message)
@@ -54,7 +54,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
         if now_ns < 0:
             return False
         while self._number * self.period_ns() <= now_ns:
-            self._y_m_publisher.publish(self._encoder.encode(self._number * self.period_ns(), self._next))
+            self._publish_y_m(self._encoder.encode(self._number * self.period_ns(), self._next))
             self._number += 1
             self._next = self._reference.sample(self._number)
         return True

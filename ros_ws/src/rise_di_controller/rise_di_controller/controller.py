@@ -29,6 +29,7 @@ class Controller:
         self._state = guard.start(len(parameters.inputs))
         self.names = internals.names(parameters.outputs, parameters.inputs)
         self.period_ns = self._guard.period_ns
+        self._number = 0  # of the last `internals`
         self._y: deque[Sample] = deque(maxlen=1)
         self._y_m: deque[Sample] = deque(maxlen=guard.KEPT_REFERENCES)
 
@@ -78,8 +79,9 @@ class Controller:
         self._state, used = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, active)
         if used is None:
             return None
+        self._number += 1
         age = seconds(now_ns - used.stamp_ns)
-        values = internals.values(self._state, used, self._guard.limits, seconds(late_ns), age)
+        values = internals.values(self._state, used, self._guard.limits, seconds(late_ns), age, self._number)
         return Commanded(used.stamp_ns, self._state.u, values)
 
     def ages(self, now_ns: int) -> dict[str, float]:

@@ -10,8 +10,8 @@ import numpy as np
 from flight_core.vectors import FloatArray
 from rise_di_controller.guard import ControllerState, Limits, Used
 
-SCALARS = ("mode", "dt", "y_m_offset", "late", "age")
-OUTPUT_GROUPS = ("y", "y_m", "e", "integral_e", "Pi")
+SCALARS = ("mode", "dt", "y_m_offset", "late", "age", "number")
+OUTPUT_GROUPS = ("y", "y_m", "e", "e_0", "integral_e", "Pi")
 INPUT_GROUPS = ("u_free", "u", "u_trim", "limited", "u_ff")
 
 
@@ -26,8 +26,9 @@ class Limited(IntEnum):
 def names(outputs: Sequence[str], inputs: Sequence[str]) -> tuple[str, ...]:
     """Channel names of `internals`: the scalars, then "group.output" and "group.input".
 
-    mode (guard.Mode), dt (s), y_m_offset (s), late (s, the tick after its deadline), age (s, of y at the tick); y and y_m as
-    used, e = y - y_m, integral_e (units s), Pi (scaled input); u before (u_free) and after limits, u_trim, limited (Limited),
+    mode (guard.Mode), dt (s), y_m_offset (s), late (s, the tick after its deadline), age (s, of y at the tick), number (of
+    this sample since the controller's start, from 1: a gap is a loss); y and y_m as used, e = y - y_m, e_0 (e at engagement),
+    integral_e (units s), Pi (scaled input); u before (u_free) and after limits, u_trim, limited (Limited),
     u_ff (what the feedforward adds to u_trim + the law's u).
     """
     by_output = (f"{group}.{name}" for group in OUTPUT_GROUPS for name in outputs)
@@ -35,12 +36,12 @@ def names(outputs: Sequence[str], inputs: Sequence[str]) -> tuple[str, ...]:
     return (*SCALARS, *by_output, *by_input)
 
 
-def values(state: ControllerState, used: Used, limits: Limits, late: float, age: float) -> FloatArray:
+def values(state: ControllerState, used: Used, limits: Limits, late: float, age: float, number: int) -> FloatArray:
     """Values of `internals` in the order of `names`. Raises ValueError for a state that was never engaged."""
     if state.law is None:
         raise ValueError("internals of a controller that was never engaged")
-    scalars = np.array([float(state.mode), used.dt, used.y_m_offset, late, age])
+    scalars = np.array([float(state.mode), used.dt, used.y_m_offset, late, age, float(number)])
     inside = (state.u_free >= limits.lower) & (state.u_free <= limits.upper)
     limited = np.where(state.u == state.u_free, Limited.NO, np.where(inside, Limited.RATE, Limited.MAGNITUDE))
-    by_output = (used.y, used.y_m, state.law.e, state.law.integral_e, state.law.Pi)
+    by_output = (used.y, used.y_m, state.law.e, state.law.e_0, state.law.integral_e, state.law.Pi)
     return np.concatenate([scalars, *by_output, state.u_free, state.u, state.u_trim, limited, state.u_ff])

@@ -56,7 +56,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         outputs = self.parameters.outputs
         self._y_inbox, self._y_decoder = self.inbox(Y), Decoder(outputs)
         self._y_m_inbox, self._y_m_decoder = self.inbox(Y_M), Decoder(outputs)
-        self._u_publisher, self._internals_publisher = self.publisher(U), self.publisher(INTERNALS)
+        self._publish_u, self._publish_internals = self.outlet(U), self.outlet(INTERNALS)
         self._u_encoder = Encoder(self.parameters.inputs, self.instance)
         self._internals_encoder = Encoder(self._controller.names, self.instance)
         if self.parameters.lockstep:
@@ -132,8 +132,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
             self.get_logger().info(f"{before.name} -> {self._controller.mode.name}")
         if commanded is None:
             return False
-        self._u_publisher.publish(self._u_encoder.encode(commanded.stamp_ns, commanded.u))
-        self._internals_publisher.publish(self._internals_encoder.encode(commanded.stamp_ns, commanded.internals))
+        self._publish_u(self._u_encoder.encode(commanded.stamp_ns, commanded.u))
+        self._publish_internals(self._internals_encoder.encode(commanded.stamp_ns, commanded.internals))
         return True
 
     def advance(self) -> bool:
@@ -152,7 +152,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
             while self._y_m_due and self._y_m_due[0].stamp_ns <= now_ns:
                 self._take(self._y_m_inbox, self._controller.take_y_m, self._y_m_due.popleft(), now_ns)
             if due and not self._fly(now_ns, late_ns=0):
-                self._u_publisher.publish(self._nothing.encode(now_ns, NO_CHANNELS))
+                self._publish_u(self._nothing.encode(now_ns, NO_CHANNELS))
             moved = True
         return moved
 
