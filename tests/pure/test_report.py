@@ -116,7 +116,7 @@ def test_a_flight_of_one_sample_has_a_report(tmp_path: Path, servo: Scenario) ->
 
 def test_a_minute_is_a_page_below_eight_megabytes(tmp_path: Path, servo: Scenario) -> None:
     # White noise on all channels of the scenario at its rates: nothing of it can be left out or compressed. plotly itself
-    # takes 4.8 MB. Measured 7.4 MB.
+    # takes 4.8 MB. Measured 7.2 MB.
     random = np.random.default_rng(1)
 
     def noise(rate: int, names: list[str]) -> Signal:

@@ -89,7 +89,7 @@ def test_guarded_thrust_comes_back_without_undershoot_as_soon_as_the_stop_allows
 
 
 def test_unguarded_thrust_winds_up_to_hundreds_of_percent_and_undershoots() -> None:
-    # Measured: command 673 %, undershoot 1.34 m/s, 14.2 s, rms 1.17 m/s. The prototype, whose pulse may have been shorter:
+    # Measured: command 673 %, undershoot 1.34 m/s, 14.2 s, rms 1.17 m/s. The prototype, whose pulse was 20 s long:
     # 677 %, 1.42, 12.6 s, 0.96.
     tape = thrust_flight(guarded=False)
     e, t = error(tape)["V"], tape.time("truth")

@@ -20,7 +20,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
 PLAIN = Shown("", 1.0)  # a channel whose unit is not known is shown in SI
-MOST_POINTS = 6000  # of a curve; 100 Hz over a minute
+MOST_POINTS = 6000  # of a curve over the page's width; 100 Hz over a minute
 GAP = 10.0  # times the median period: a curve is broken where as much is missing
 SHADE = 0.25  # opacity of bands
 CLEAR = "rgba(0,0,0,0)"
@@ -94,7 +94,7 @@ def stack(scene: Scene, curves: Mapping[str, Curve], *, columns: int = 1, height
         unit, factor = scene.units.get(channel, PLAIN)
         for label, curve in curves.items():
             if channel in curve.signal.names:
-                trace = _trace(scene.tape.start_ns, curve, channel, factor)
+                trace = _trace(scene.tape.start_ns, curve, channel, factor, MOST_POINTS // columns)
                 trace.update(name=label, legendgroup=label, showlegend=place == 0 and len(curves) > 1)
                 figure.add_trace(trace.update(hovertemplate=f"%{{y:.4g}} {unit}"), **cell)
         figure.update_yaxes(title_text=f"{channel} ({unit})" if unit else channel, title_standoff=6, **cell)
@@ -129,9 +129,9 @@ def add_line(
     figure.add_trace(trace.update(hoverinfo="skip"), row=row, col=1)
 
 
-def _trace(start_ns: int, curve: Curve, channel: str, factor: float) -> go.Scatter:
+def _trace(start_ns: int, curve: Curve, channel: str, factor: float, most: int) -> go.Scatter:
     values = curve.signal[channel] * factor
-    t, keep = (curve.signal.stamp_ns - start_ns) / NANOSECONDS, drawn_points(values)
+    t, keep = (curve.signal.stamp_ns - start_ns) / NANOSECONDS, drawn_points(values, most)
     periods = np.diff(t)
     missing = periods > GAP * np.median(periods) if len(periods) and not curve.held else np.zeros(0)
     before = np.flatnonzero(missing)

@@ -29,12 +29,12 @@ body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 1.5rem 
 h1 {{ font-size: 1.6rem; margin: 0 }}
 h2 {{ font-size: 1.1rem; margin: 2rem 0 0 }}
 p {{ margin: .3rem 0 }}
-table {{ border-collapse: collapse; font-variant-numeric: tabular-nums }}
-th, td {{ padding: .15rem .7rem; text-align: right; border-bottom: 1px solid var(--line) }}
+table {{ border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .85rem; margin: 1rem 0 .3rem }}
+th, td {{ padding: .15rem .5rem; text-align: right; border-bottom: 1px solid var(--line) }}
 th:first-child, td:first-child {{ text-align: left }}
 th {{ font-weight: 500; color: var(--quiet) }}
 caption {{ text-align: left; font-weight: 600; padding-bottom: .2rem }}
-.tables {{ display: flex; flex-wrap: wrap; gap: 1.2rem 3rem; align-items: start; margin-top: 1rem }}
+.tables {{ display: flex; flex-wrap: wrap; gap: 0 2.5rem }}
 .outcome {{ padding: .1rem .6rem; border-radius: 1rem; color: #fff; background: #a3242b }}
 .outcome.good {{ background: #23784f }}
 .note {{ color: #b06000 }}
@@ -46,7 +46,7 @@ section {{ break-inside: avoid }}
 <h1>{title}</h1>
 <p><span class="outcome{good}">{outcome}</span> {lead}</p>
 {notes}
-<div class="tables">{tables}</div>
+<div class="tables"><div>{errors}</div><div>{happened}</div></div>
 {pictures}
 <script>
 const plots = [...document.querySelectorAll(".plotly-graph-div")];
@@ -101,7 +101,8 @@ def write_report(path: Path, scenario: Scenario, tape: Tape, summary: dict[str, 
         outcome=escape(summary["outcome"]),
         lead=escape(f"{summary['duration']:.1f} s flown at {scenario.controller.rate:g} Hz with the {law}."),
         notes="".join(f'<p class="note">{escape(note)}</p>' for note in summary["notes"]),
-        tables=_error_table(summary, units) + _event_table(events(tape, scenario.gust_windows())) + _tick_table(summary),
+        errors=_error_table(summary, units),
+        happened=_event_table(events(tape, scenario.gust_windows())) + _tick_table(summary),
         pictures="\n".join(_section(*one, with_library=index == 0) for index, one in enumerate(drawn)),
     )
     path.write_text(page, encoding="utf-8")
@@ -155,7 +156,7 @@ def _table(caption: str, head: Iterable[str], rows: Iterable[Iterable[str]]) -> 
 def _error_table(summary: dict[str, Any], units: dict[str, Shown]) -> str:
     head = ["channel", *(f"{part} {figure}" for part in PART_NAMES for figure in ("rms", "max"))]
     table = _table(f"Tracking error ({summary['error']})", head, error_rows(summary, units))
-    return f'<div>{table}<p class="hint">{escape(PARTS)}</p></div>'
+    return f'{table}<p class="hint">{escape(PARTS)}</p>'
 
 
 def _event_table(happened: Sequence[Event]) -> str:
