@@ -1,22 +1,30 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The log: what independent readers find in it, and what ours reads from a file without an end."""
+"""The log: what independent readers find in it, and what ours reads from it, from a damaged one, and from those of others."""
 
+import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from tests.joint_states import JOINT_STATE, STORE, vector
 
 from flight_analysis.bag_reader import read_run
 from flight_analysis.bag_writer import write_run
+from flight_analysis.named_vectors import decoder
 from flight_analysis.scenario import Scenario
 from flight_analysis.simulate import simulate
 from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
+from flight_recorder.bag import Enclosed
 from flight_recorder.definitions import definition
 
 
@@ -25,27 +33,65 @@ def tape(osprey_gust: Scenario) -> Tape:
     return simulate(osprey_gust.vary(flight={"duration": 2.0}))
 
 
+@pytest.fixture(scope="module")
+def recorded(tape: Tape, osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recorded") / "run"
+    write_run(tape, folder, Enclosed(osprey_gust.path))
+    return folder
+
+
 @pytest.fixture
-def run(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> Path:
-    write_run(tape, tmp_path / "run", osprey_gust.path)
+def run(recorded: Path, tmp_path: Path) -> Path:
+    """A copy to damage."""
+    shutil.copytree(recorded, tmp_path / "run")
     return tmp_path / "run"
 
 
-def test_a_tape_comes_back_to_the_last_bit(tape: Tape, run: Path) -> None:
-    back = read_run(run).tape
+def cut(run: Path, share: float) -> None:
+    """As a recorder that was killed leaves it: a part of the file, and no metadata.yaml."""
+    file = run / "run_0.mcap"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(len(whole) * share)])
+    (run / "metadata.yaml").unlink()
+
+
+def test_a_tape_comes_back_to_the_last_bit(tape: Tape, recorded: Path) -> None:
+    back = read_run(recorded).tape
     assert set(back.signals) == set(tape.signals)
+    assert back.notes == ()
     for name, signal in tape.signals.items():
         assert back[name].names == signal.names
         assert (back[name].stamp_ns == signal.stamp_ns).all()
         assert back[name].values.tobytes() == signal.values.tobytes()
 
 
-def test_the_scenario_comes_back_as_it_was(run: Path, osprey_gust: Scenario) -> None:
-    assert read_run(run).scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
+def test_the_scenario_comes_back_as_it_was(recorded: Path, osprey_gust: Scenario) -> None:
+    assert read_run(recorded).scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
 
 
-def test_rosbags_reads_every_topic(tape: Tape, run: Path) -> None:
-    with AnyReader([run]) as reader:
+def test_what_is_enclosed_comes_back_as_it_was(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
+    attached, metadata = tmp_path / "airframe.yaml", tmp_path / "metadata.yaml"
+    attached.write_bytes(b"A: [[1.0]]\n\xc3\xa9")
+    metadata.write_text("host: {cores: '2', kernel: '6.1 #1'}\nversions: {}\n", encoding="utf-8")
+    write_run(tape, tmp_path / "run", Enclosed(osprey_gust.path, (attached,), metadata))
+    back = read_run(tmp_path / "run")
+    assert back.attachments == (("airframe.yaml", attached.read_bytes()),)
+    assert {name: back.metadata[name] for name in ("host", "versions")} == {
+        "host": {"cores": "2", "kernel": "6.1 #1"},
+        "versions": {},
+    }
+
+
+@pytest.mark.parametrize("text", ["host: 3\n", "- a\n", "host: {cores: 2}\n"])
+def test_metadata_that_are_no_strings_are_refused(text: str, tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
+    metadata = tmp_path / "metadata.yaml"
+    metadata.write_text(text, encoding="utf-8")
+    with pytest.raises(ParameterError, match="expected a mapping of mappings of strings"):
+        write_run(tape, tmp_path / "run", Enclosed(osprey_gust.path, (), metadata))
+
+
+def test_rosbags_reads_every_topic(tape: Tape, recorded: Path) -> None:
+    with AnyReader([recorded]) as reader:
         assert {c.topic.lstrip("/"): c.msgcount for c in reader.connections} == {
             n: len(s.stamp_ns) for n, s in tape.signals.items()
         }
@@ -55,8 +101,8 @@ def test_rosbags_reads_every_topic(tape: Tape, run: Path) -> None:
         assert message.position.tolist() == tape["y"].values[0].tolist()
 
 
-def test_mcap_ros2_support_reads_every_message(tape: Tape, run: Path) -> None:
-    with (run / "run_0.mcap").open("rb") as stream:
+def test_mcap_ros2_support_reads_every_message(tape: Tape, recorded: Path) -> None:
+    with (recorded / "run_0.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         messages = [message for _, _, _, message in reader.iter_decoded_messages(topics=["/u"])]
     assert len(messages) == len(tape["u"].stamp_ns)
@@ -65,8 +111,8 @@ def test_mcap_ros2_support_reads_every_message(tape: Tape, run: Path) -> None:
     assert list(last.position) == tape["u"].values[-1].tolist()
 
 
-def test_the_file_is_a_ros2_profile_with_installed_definitions_and_hashes(run: Path) -> None:
-    with (run / "run_0.mcap").open("rb") as stream:
+def test_the_file_is_a_ros2_profile_with_installed_definitions_and_hashes(recorded: Path) -> None:
+    with (recorded / "run_0.mcap").open("rb") as stream:
         reader = make_reader(stream)
         summary = reader.get_summary()
         assert summary is not None
@@ -80,41 +126,71 @@ def test_the_file_is_a_ros2_profile_with_installed_definitions_and_hashes(run: P
 
 @pytest.mark.parametrize("share", [0.4, 0.55, 0.6, 0.75, 0.9])
 def test_a_file_without_an_end_is_read_up_to_its_last_whole_chunk(share: float, tape: Tape, run: Path) -> None:
-    file = run / "run_0.mcap"
-    whole = file.read_bytes()
-    file.write_bytes(whole[: int(len(whole) * share)])
-    (run / "metadata.yaml").unlink()
+    cut(run, share)
     back = read_run(run).tape
     assert 0 < len(back["y"].stamp_ns) <= len(tape["y"].stamp_ns)
     assert (back["y"].values == tape["y"].values[: len(back["y"].stamp_ns)]).all()
-    assert "is damaged or has no end" in back.notes[0]
+    end = max(back.time(name)[-1] for name in back.signals)
+    assert f"run_0.mcap has no end: read up to its last whole chunk, t = {end:.3f} s" in back.notes[0]
+    assert back.notes[1] == f"metadata.yaml is missing: rise-di repair {run}"
 
 
-def test_a_file_with_changed_bytes_is_read_as_far_as_it_goes_or_refused(tape: Tape, run: Path) -> None:
-    file, generator = run / "run_0.mcap", np.random.default_rng(1)
-    whole, read = file.read_bytes(), 0
+def test_a_cut_file_says_how_much_is_missing_where_anything_knows(tape: Tape, run: Path) -> None:
+    file = run / "run_0.mcap"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    back = read_run(run).tape  # metadata.yaml knows when the last message came
+    missing = (tape["truth"].stamp_ns[-1] - back["truth"].stamp_ns[-1]) / NANOSECONDS
+    assert missing > 0.1
+    assert f"{missing:.3f} s are missing behind it" in back.notes[0]
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_damaged_chunk_is_left_out_and_all_others_are_read(number: int, tape: Tape, run: Path) -> None:
+    file = run / "run_0.mcap"
+    with file.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    chunks = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
+    assert len(chunks) > 2
+    content = bytearray(file.read_bytes())
+    content[chunks[number].chunk_start_offset + chunks[number].chunk_length - 100] ^= 1
+    file.write_bytes(content)
+    back = read_run(run).tape
+    assert back.notes == ("run_0.mcap is damaged: 1 of its parts left out",)
+    begin, end = (np.array([getattr(chunks[number], f"message_{end}_time")]) for end in ("start", "end"))
+    stamps, kept = tape["y"].stamp_ns, back["y"].stamp_ns  # the log times, in one process
+    assert set(stamps[(stamps < begin) | (stamps > end)]) <= set(kept)
+    assert len(kept) < len(stamps)
+
+
+def test_a_file_with_changed_bytes_gives_true_samples_or_is_refused(tape: Tape, recorded: Path, tmp_path: Path) -> None:
+    file, generator = tmp_path / "run_0.mcap", np.random.default_rng(1)
+    whole, read = (recorded / "run_0.mcap").read_bytes(), 0
+    true = set(zip(tape["y"].stamp_ns.tolist(), map(bytes, tape["y"].values), strict=True))
     for _ in range(60):
         damaged = bytearray(whole)
-        for place in generator.integers(0, len(whole), 10):
+        for place in generator.integers(0, len(whole), 3):
             damaged[place] ^= 1 << generator.integers(0, 8)
         file.write_bytes(damaged)
         try:
-            back = read_run(run).tape
+            back = read_run(file).tape
         except ParameterError:
             continue
-        read += "y" in back and "is damaged or has no end" in "".join(back.notes)
-    assert read > 0
+        if "y" in back:
+            read += 1
+            assert set(zip(back["y"].stamp_ns.tolist(), map(bytes, back["y"].values), strict=True)) <= true
+    assert read > 10  # of 60: the samples lie in two chunks, one of which three changed bytes spare now and then
 
 
 def test_two_logs_in_a_folder_are_refused(run: Path) -> None:
     (run / "copy.mcap").write_bytes((run / "run_0.mcap").read_bytes())
-    with pytest.raises(ParameterError, match=r"run: found 2 \.mcap files, expected exactly one"):
+    with pytest.raises(ParameterError, match=r"run: found 2 \.mcap files that are no parts of one bag, expected one bag"):
         read_run(run)
 
 
 def test_a_tape_whose_first_signal_has_no_sample_is_written(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
     empty = {"y": tape["y"].until(-1), "u": tape["u"]}
-    write_run(Tape(empty), tmp_path / "run", osprey_gust.path)
+    write_run(Tape(empty), tmp_path / "run", Enclosed(osprey_gust.path))
     assert list(read_run(tmp_path / "run").tape.signals) == ["u"]
 
 
@@ -133,8 +209,137 @@ def test_definitions_hold_all_that_they_refer_to() -> None:
         definition("no_such_msgs/msg/Thing")
 
 
-def test_stamps_of_signals_may_differ_in_number(run: Path) -> None:
-    back = read_run(run).tape
+def test_stamps_of_signals_may_differ_in_number(recorded: Path) -> None:
+    back = read_run(recorded).tape
     assert len(back["y"].stamp_ns) == 1001
     assert len(back["u"].stamp_ns) == 201
     assert np.diff(back["u"].stamp_ns).tolist() == [10_000_000] * 200
+
+
+# Bags of others
+
+
+def record(
+    folder: Path, topics: dict[str, list[bytes]], storage: StoragePlugin, packed: CompressionMode = CompressionMode.NONE
+) -> None:
+    """A bag written by rosbags, one message of each topic after the other, 1 ms apart; with a topic of another type in it."""
+    writer = Writer(folder, version=9, storage_plugin=storage)
+    if packed is not CompressionMode.NONE:
+        writer.set_compression(packed, CompressionFormat.ZSTD)
+    with writer:
+        connections = {topic: writer.add_connection(topic, JOINT_STATE, typestore=STORE) for topic in topics}
+        other = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=STORE)
+        text = STORE.types["std_msgs/msg/String"]("hello")
+        writer.write(other, 1, STORE.serialize_cdr(text, "std_msgs/msg/String"))
+        for topic, messages in topics.items():
+            for index, message in enumerate(messages):
+                writer.write(connections[topic], 1_000_000 * (index + 1), message)
+
+
+SAMPLES = [vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k)) for k in range(50)]
+
+
+@pytest.mark.parametrize("storage", StoragePlugin)
+@pytest.mark.parametrize("packed", [CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_bags_of_other_recorders_are_read(storage: StoragePlugin, packed: CompressionMode, tmp_path: Path) -> None:
+    record(tmp_path / "bag", {"/y": SAMPLES}, storage, packed)
+    back = read_run(tmp_path / "bag").tape
+    assert list(back.signals) == ["y"]
+    assert back.notes == ()
+    assert back["y"].stamp_ns.tolist() == [2_000_000 * k for k in range(50)]
+    assert back["y"]["q"].tolist() == [0.1 * k for k in range(50)]
+
+
+def test_a_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
+    # more than ten, so that the order of numbers is not that of names
+    for part in range(12):
+        record(tmp_path / f"part{part}", {"/y": SAMPLES[4 * part : 4 * part + 4]}, StoragePlugin.MCAP)
+        (tmp_path / "bag").mkdir(exist_ok=True)
+        (tmp_path / f"part{part}" / f"part{part}.mcap").rename(tmp_path / "bag" / f"bag_{part}.mcap")
+    files = [f"bag_{part}.mcap" for part in range(12)]
+    information = yaml.safe_load((tmp_path / "part0" / "metadata.yaml").read_text(encoding="utf-8"))
+    information["rosbag2_bagfile_information"]["relative_file_paths"] = files
+    (tmp_path / "bag" / "metadata.yaml").write_text(yaml.safe_dump(information), encoding="utf-8")
+    back = read_run(tmp_path / "bag").tape
+    assert back["y"].stamp_ns.tolist() == [2_000_000 * k for k in range(48)]
+    assert back["y"]["V"].tolist() == [-float(k) for k in range(48)]
+
+
+def test_two_aircraft_in_one_bag_are_told_apart_by_their_namespace(tmp_path: Path) -> None:
+    topics = {"/one/y": SAMPLES, "/fleet/two/y": SAMPLES[:7], "/fleet/two/gps/speed": SAMPLES[:3], "/one/u": SAMPLES[:5]}
+    record(tmp_path / "bag", topics, StoragePlugin.MCAP)
+    with pytest.raises(
+        ParameterError, match=r"bag: found aircraft in the namespaces /fleet/two, /one, expected that one of them"
+    ):
+        read_run(tmp_path / "bag")
+    with pytest.raises(ParameterError, match=r"namespaces /fleet/two, /one, expected one in '/three'"):
+        read_run(tmp_path / "bag", "/three")
+    assert {name: len(signal.stamp_ns) for name, signal in read_run(tmp_path / "bag", "/one").tape.signals.items()} == {
+        "y": 50,
+        "u": 5,
+    }
+    two = read_run(tmp_path / "bag", "fleet/two/").tape
+    assert {name: len(signal.stamp_ns) for name, signal in two.signals.items()} == {"y": 7, "gps/speed": 3}
+
+
+def test_an_aircraft_at_the_root_does_not_hold_those_in_namespaces(tmp_path: Path) -> None:
+    record(tmp_path / "bag", {"/y": SAMPLES, "/two/y": SAMPLES[:7], "/arm/joints": SAMPLES[:2]}, StoragePlugin.MCAP)
+    assert set(read_run(tmp_path / "bag", "/").tape.signals) == {"y", "arm/joints"}
+    assert set(read_run(tmp_path / "bag", "two").tape.signals) == {"y"}
+
+
+def test_one_aircraft_in_a_namespace_needs_no_name(tmp_path: Path) -> None:
+    record(tmp_path / "bag", {"/two/y": SAMPLES[:7], "/joints": SAMPLES}, StoragePlugin.MCAP)
+    assert set(read_run(tmp_path / "bag").tape.signals) == {"y"}
+
+
+def test_a_bag_that_is_none_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}\n", encoding="utf-8")
+    with pytest.raises(ParameterError, match="expected a bag of rosbag2"):
+        read_run(tmp_path)
+
+
+# Messages as vectors: all at once gives what one by one does
+
+
+def one_by_one(messages: Sequence[bytes]) -> list[tuple[tuple[str, ...], int, bytes]]:
+    found = []
+    for message in messages:
+        one: Any = STORE.deserialize_cdr(message, JOINT_STATE)
+        if one.name:
+            stamp = one.header.stamp.sec * NANOSECONDS + one.header.stamp.nanosec
+            found.append((tuple(one.name), stamp, one.position.tobytes()))
+    return sorted(found)
+
+
+MIXTURES = {
+    "a change of sender": [*SAMPLES[:5], *(vector(k, ("q", "V"), (k, 1.0), "/another#1") for k in range(5)), *SAMPLES[5:9]],
+    "samples that do not come": [SAMPLES[0], vector(1, (), ()), SAMPLES[1], vector(2, (), ())],
+    "other channels of the same length": [SAMPLES[0], vector(3, ("V", "q"), (1.0, 2.0)), SAMPLES[1]],
+    "velocities": [vector(k, ("q",), (k,), velocity=(1.0,)) for k in range(3)],
+    "values that are all alike": [vector(k, ("q", "V", "p"), (0.0, 0.0, 0.0)) for k in range(3)] + [SAMPLES[3]],
+    "before 1970 and not finite": [vector(-5 * NANOSECONDS, ("q",), (np.nan,)), vector(1, ("q",), (np.inf,))],
+    "none at all": [],
+}
+
+
+@pytest.mark.parametrize("messages", MIXTURES.values(), ids=MIXTURES)
+def test_messages_read_at_once_are_what_they_are_one_by_one(messages: list[bytes]) -> None:
+    decode = decoder("/y", JOINT_STATE)
+    assert decode is not None
+    found = [
+        (samples.names, int(stamp), values.tobytes())
+        for part in (messages[:4], messages[4:])
+        for samples in decode(part).samples
+        for stamp, values in zip(samples.stamp_ns, samples.values, strict=True)
+    ]
+    assert sorted(found) == one_by_one(messages)
+
+
+def test_what_is_no_named_vector_has_no_decoder_and_what_is_malformed_is_counted() -> None:
+    assert decoder("/rosout", "rcl_interfaces/msg/Log") is None
+    decode = decoder("/y", JOINT_STATE)
+    assert decode is not None
+    decoded = decode([SAMPLES[0][:20], SAMPLES[1], b""])
+    assert decoded.unreadable == 2
+    assert [len(samples.stamp_ns) for samples in decoded.samples] == [1]

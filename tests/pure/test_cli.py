@@ -29,6 +29,7 @@ def test_a_flight_ends_with_table_log_and_report(flown: tuple[Path, subprocess.C
     run = (where / "runs" / "latest").resolve()
     assert {path.name for path in run.iterdir()} == {
         "metadata.yaml", "report.html", "osprey_gust.yaml", "summary.json", f"{run.name}_0.mcap",
+        "airframe.yaml", "parameters.yaml", "provenance.yaml",
     }  # fmt: skip
     assert "q (mrad/s)" in shown.stdout
     assert f"runs/{run.name}/report.html" in shown.stdout

@@ -275,7 +275,7 @@ def test_internals_hold_the_integrals_and_what_limited_each_input(params: Contro
     )
     used = guard.Used(0, np.zeros(4), np.zeros(4), 0.0, 0.01)
     shown = dict(
-        zip(internals.names(params.outputs, params.inputs), internals.values(state, used, limits, 0.0, 0.0, 7), strict=True)
+        zip(internals.names(params.outputs, params.inputs), internals.values(state, used, limits, 0.0, 0.0, 7, 8), strict=True)
     )
     assert (shown["e.q"], shown["e_0.q"], shown["integral_e.q"], shown["Pi.q"]) == (1.0, 0.0, 2.0, 3.0)
     assert (shown["u_free.aileron"], shown["u.aileron"], shown["u_trim.aileron"]) == (5.0, 1.0, 0.1)
@@ -289,10 +289,11 @@ def test_internals_are_named_after_the_outputs(params: ControllerParameters) -> 
     shown = dict(
         zip(
             internals.names(params.outputs, params.inputs),
-            internals.values(state, used, params.guard().limits, 1e-4, 2e-3, 1),
+            internals.values(state, used, params.guard().limits, 1e-4, 2e-3, 1, 2**48 - 1),
             strict=True,
         )
     )
     assert shown["mode"] == Mode.ENGAGED
     assert (shown["late"], shown["age"], shown["number"], shown["dt"]) == (1e-4, 2e-3, 1.0, 0.0)
+    assert int(shown["parameters"]) == 2**48 - 1
     assert (shown["y.V"], shown["y_m.V"], shown["e.V"], shown["Pi.V"]) == (1.5, 0.5, 1.0, 0.0)

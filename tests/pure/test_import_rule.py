@@ -17,6 +17,7 @@ MAY = {  # which packages of the stack a package's maths may import
     "reference_model": {"flight_core"},
     "rise_di_controller": {"flight_core"},
     "aircraft_sim": {"flight_core"},
+    "autopilot_bridge": {"flight_core"},
     "flight_recorder": {"flight_core"},
     "flight_analysis": {"flight_core", "reference_model", "rise_di_controller", "aircraft_sim", "flight_recorder"},
 }

@@ -7,8 +7,29 @@ import math
 import numpy as np
 import pytest
 
-from flight_analysis.metrics import error_figures, error_table, in_windows, tick_figures, tracking_error
+from flight_analysis.metrics import (
+    Transient,
+    engagements,
+    error_figures,
+    error_table,
+    in_spans,
+    input_table,
+    latency_figures,
+    limited_shares,
+    live_commands,
+    noise_floor,
+    part_masks,
+    settled,
+    settling_bands,
+    settling_time,
+    sign_switches,
+    spectra,
+    tick_figures,
+    tracking_error,
+)
 from flight_core.tape import Signal, Tape
+from rise_di_controller.guard import Mode
+from rise_di_controller.internals import Limited
 
 MS = 1_000_000
 EPOCH = 1_795_000_000_000_000_000  # a stamp of today, where float64 seconds resolve no better than 0.2 us
@@ -42,14 +63,178 @@ def test_y_outside_the_reference_is_left_out() -> None:
     assert tracking_error(Tape({"y": y, "y_m": y_m}, EPOCH))["q"].tolist() == [1.0, 1.0]
 
 
-def test_calm_and_gust_are_told_apart() -> None:
-    windows = {"vertical": (1.0, 2.0)}
-    assert in_windows(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), windows, 0.5).tolist() == [False, True, True, True, False]
+def test_a_span_holds_for_a_while_after_its_end() -> None:
+    assert in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [False, True, True, True, False]
+
+
+def test_the_parts_of_a_flight_are_told_apart() -> None:
+    happened = [
+        Transient("engagement", "", 0.0, 0.0),
+        Transient("command", "q", 3.0, 3.1),
+        Transient("gust", "vertical", 3.5, 4.0),
+    ]
+    t = np.array([0.0, 0.5, 1.5, 3.0, 3.4, 3.6, 4.5, 5.5])
+    masks = {part: t[mask].tolist() for part, mask in part_masks(t, happened, settle=1.0).items()}
+    assert masks == {
+        "whole": t.tolist(),
+        "calm": [1.5, 5.5],  # 0 and 0.5 are of the engagement
+        "command": [3.0, 3.4],
+        "gust": [3.6, 4.5],  # although the command lasts to 4.1
+    }
+
+
+def test_errors_are_told_by_part_and_the_bound_is_the_largest_in_calm() -> None:
     y = signal([0, 1000, 2000], q=[3.0, 4.0, 0.0])
-    table = error_table(Tape({"y": y, "y_m": signal([0, 2000], q=[0.0, 0.0])}, EPOCH), {"g": (0.9, 1.1)}, settle=0.0)
+    tape = Tape({"y": y, "y_m": signal([0, 2000], q=[0.0, 0.0])}, EPOCH)
+    table = error_table(tape, [Transient("gust", "g", 0.9, 1.1)], settle=0.0)
     assert table["q"]["gust"] == (4.0, 4.0)
-    assert table["q"]["calm"].rms == pytest.approx(math.sqrt(4.5))
+    assert tuple(table["q"]["calm"]) == pytest.approx((math.sqrt(4.5), 3.0))
     assert table["q"]["whole"].max == 4.0
+
+
+# Transients
+
+
+def test_the_controller_engages_where_its_mode_becomes_so() -> None:
+    mode = [Mode.ENGAGED, Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]
+    internals = signal([0, 10, 20, 30, 40], mode=[float(one) for one in mode])
+    assert [one.start for one in engagements(Tape({"internals": internals}, EPOCH))] == [0.0, 0.04]
+
+
+def test_live_commands_that_follow_each_other_closely_are_one() -> None:
+    stamps = [0.0, 500.0, 1000.0, 1500.0, 3000.0, 3500.0]
+    u_m = signal(stamps, q=[0.0, 0.1, 0.2, 0.2, 0.0, 0.0], V=[1.0] * 6)
+    assert live_commands(Tape({"u_m": u_m}, EPOCH)) == [
+        Transient("command", "V", 0.0, 0.0),  # what begins elsewhere than at 0 has moved
+        Transient("command", "q", 0.5, 1.0),
+        Transient("command", "q", 3.0, 3.0),
+    ]
+
+
+def test_settling_is_timed_to_the_sample_from_which_on_the_error_stays_in_the_band() -> None:
+    t = np.arange(6.0) + 10.0
+    for e, settling in (
+        ([0.0, 3.0, -2.0, 1.0, 0.5, 0.0], 3.0),
+        ([0.0, 1.0, -1.0, 0.0, 0.0, 0.0], 0.0),
+        ([0.0, 0.0, 0.0, 5.0, 0.0, 0.0], 0.0),  # it left the band after the 2 s
+        ([5.0, 0.0, 5.0, 5.0, 5.0, 2.0], None),
+        ([5.0, 0.0, 0.0, 0.0, 5.0, 0.0], 1.0),  # back for 3 s, which is enough
+        ([5.0, 0.0, 0.0, 5.0, 5.0, 0.0], 5.0),  # back for 2 s, then to the end
+    ):
+        assert settling_time(t, np.array(e), band=1.0, leaves=2.0, dwell=3.0) == settling
+    assert settling_time(np.zeros(0), np.zeros(0), band=1.0, leaves=2.0) is None
+
+
+def test_the_band_is_a_share_of_the_reference_or_of_the_error_where_that_rests() -> None:
+    y = signal([0, 10], q=[0.5, -3.0], p=[0.25, 0.0])
+    y_m = signal([0, 10], q=[0.0, -2.0], p=[0.0, 0.0])
+    assert settling_bands(Tape({"y": y, "y_m": y_m}, EPOCH)) == {"q": 0.02, "p": 0.0025}
+
+
+def test_the_band_of_a_measured_error_is_wide_enough_for_its_noise() -> None:
+    # Second differences of +-1 about 0 are +-4: the floor is 4 / (0.6745 sqrt(6)), and 4 of it exceed 1 % of a reference of 10.
+    stamps = [10.0 * k for k in range(100)]
+    noisy, y_m = signal(stamps, q=[1.0, -1.0] * 50), signal(stamps, q=[10.0] * 100)
+    floor = 4.0 / (0.6745 * math.sqrt(6.0))
+    assert settling_bands(Tape({"y": noisy, "y_m": y_m}, EPOCH)) == {"q": pytest.approx(4.0 * floor)}
+    truth = signal(stamps, **{"x.q": [10.0] * 100})
+    assert settling_bands(Tape({"y": noisy, "y_m": y_m, "truth": truth}, EPOCH)) == {"q": pytest.approx(0.1)}
+
+
+def test_a_transient_is_judged_up_to_the_next_that_concerns_the_channel() -> None:
+    # q leaves the band at 1 s and at 5 s, each time for 0.2 s; its reference of 1 makes it 0.01 wide.
+    stamps = [100.0 * k for k in range(81)]
+    t = np.array(stamps) / 1000.0
+    error = np.where(((t > 0.95) & (t < 1.15)) | ((t > 4.95) & (t < 5.15)), 0.5, 0.0)
+    y = signal(stamps, q=(1.0 + error).tolist(), p=[0.0] * 81)
+    tape = Tape({"y": y, "y_m": signal(stamps, q=[1.0] * 81, p=[0.0] * 81)}, EPOCH)
+    happened = [
+        Transient("gust", "late", 9.0, 9.5),  # the flight did not come to it
+        Transient("command", "q", 1.0, 1.1),
+        Transient("command", "p", 3.0, 3.1),
+        Transient("gust", "vertical", 5.0, 5.1),
+    ]
+    first, other, gust = settled(tape, happened)
+    assert first.until == {"q": 5.0}
+    assert first.time == {"q": pytest.approx(0.2)}
+    assert (other.transient.name, other.until, other.time) == ("p", {"p": 5.0}, {"p": 0.0})
+    assert gust.until == {"q": 8.0, "p": 8.0}
+    assert gust.time == {"q": pytest.approx(0.2), "p": 0.0}
+
+
+# Inputs and the sign term
+
+
+def test_effort_is_the_rms_about_trim_and_the_rate_the_way_over_the_time() -> None:
+    # 0 -> 2 -> -2 -> -2 in 0.1 s each: a way of 6 in 0.3 s. sqrt((0 + 4 + 4 + 4) / 4) = sqrt(3).
+    tape = Tape({"u": signal([0, 100, 200, 300], elevator=[0.0, 2.0, -2.0, -2.0])}, EPOCH)
+    whole = input_table(tape, [])["elevator"]["whole"]
+    assert tuple(whole) == pytest.approx((math.sqrt(3.0), 2.0, 20.0))
+    # The step into the gust and the one within it end there: 4 and 0 in 0.2 s.
+    parts = input_table(tape, [Transient("gust", "g", 0.15, 0.35)], settle=0.0)["elevator"]
+    assert tuple(parts["gust"]) == pytest.approx((2.0, 2.0, 20.0))
+    assert parts["calm"].rate == pytest.approx(20.0)  # 2 in 0.1 s
+    assert math.isnan(parts["command"].rms)
+    assert math.isnan(parts["command"].rate)
+    assert input_table(Tape({}, EPOCH), []) == {}
+
+
+def test_limited_ticks_are_shared_out_by_what_limited_them() -> None:
+    kinds = [Limited.NO, Limited.MAGNITUDE, Limited.RATE, Limited.RATE]
+    internals = signal([0, 10, 20, 30], **{"limited.thrust": [float(one) for one in kinds]})
+    assert limited_shares(Tape({"internals": internals}, EPOCH)) == {"thrust": {"magnitude": 0.25, "rate": 0.5}}
+    assert limited_shares(Tape({}, EPOCH)) == {}
+
+
+def test_sign_switches_are_counted_on_the_increments_of_pi() -> None:
+    # Increments +, 0, +, -, -, +: two changes in 0.06 s; an increment of 0 is no direction.
+    internals = signal([10.0 * k for k in range(7)], **{"Pi.q": [0.0, 1.0, 1.0, 2.0, 1.0, 0.0, 1.0]})
+    assert sign_switches(Tape({"internals": internals}, EPOCH)) == {"q": pytest.approx(2 / 0.06)}
+
+
+def test_sign_switches_are_those_of_the_error_where_the_controller_is_not_known() -> None:
+    y, y_m = signal([0, 10, 20], q=[1.0, -1.0, 2.0]), signal([0, 20], q=[0.0, 0.0])
+    assert sign_switches(Tape({"y": y, "y_m": y_m}, EPOCH)) == {"q": pytest.approx(2 / 0.02)}
+
+
+# What the sensors leave
+
+
+def test_the_floor_is_the_noise_that_the_tape_knows() -> None:
+    tape = Tape({"y": signal([0, 10], q=[1.0, 2.0]), "truth": signal([0, 10], **{"noise.q": [3.0, -4.0]})}, EPOCH)
+    assert noise_floor(tape) == {"q": pytest.approx(math.sqrt(12.5))}
+
+
+def test_the_floor_is_found_in_y_where_the_truth_is_not_known() -> None:
+    # Normal noise of rms 0.02 on a slow sine of 1; of 20 000 samples the estimate is good to some per cent.
+    k = np.arange(20_000)
+    y = np.sin(k / 2000.0) + 0.02 * np.random.default_rng(1).standard_normal(len(k))
+    tape = Tape({"y": Signal(EPOCH + k * 2 * MS, ("q",), y[:, None])}, EPOCH)
+    assert noise_floor(tape)["q"] == pytest.approx(0.02, rel=0.05)
+
+
+def test_the_floor_is_never_below_the_rounding_of_y() -> None:
+    still = Tape({"y": signal([0, 10, 20, 30], q=[0.1] * 4, V=[0.0] * 4)}, EPOCH)
+    assert noise_floor(still) == {"q": 2.0**-56, "V": 0.0}  # 0.1 lies between 2^-4 and 2^-3, and 52 bits follow the first
+
+
+def test_the_spectrum_of_a_sine_stands_at_its_frequency_and_holds_its_variance() -> None:
+    # 5 Hz of amplitude 2: variance 2, which the square of the density gives back over all frequencies.
+    k = np.arange(6000)
+    u = Signal(EPOCH + k * 10 * MS, ("elevator",), 2.0 * np.sin(2 * np.pi * 5.0 * k / 100.0)[:, None])
+    frequency, density = spectra(u, 10 * MS)
+    assert frequency[np.argmax(density["elevator"])] == pytest.approx(5.0, abs=0.1)
+    assert np.sum(density["elevator"] ** 2) * (frequency[1] - frequency[0]) == pytest.approx(2.0, rel=0.01)
+
+
+def test_a_spectrum_stands_missing_samples() -> None:
+    k = np.delete(np.arange(1000), [100, 101, 500])
+    frequency, density = spectra(Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS)
+    assert frequency[-1] == 50.0
+    assert np.all(density["u"] < 1e-12)  # held over the gaps it is a constant
+
+
+# Time
 
 
 def test_ticks_are_counted_against_their_period() -> None:
@@ -59,6 +244,23 @@ def test_ticks_are_counted_against_their_period() -> None:
     assert figures is not None
     assert (figures.ticks, figures.without_new_y, figures.period_max, figures.late_max) == (4, 1, 0.02, 3e-4)
     assert figures.period_mean == pytest.approx(0.04 / 3, abs=1e-9)
+    assert figures.jitter == 0.0  # the last took two whole periods
+
+
+def test_jitter_is_how_far_ticks_are_from_a_whole_number_of_periods() -> None:
+    # 10 + 0.3, 10 - 0.4 and 20 ms: sqrt((0.09 + 0.16 + 0) / 3) ms
+    internals = signal([0, 10.3, 19.9, 39.9], late=[0.0] * 4, age=[0.0] * 4)
+    figures = tick_figures(Tape({"internals": internals}, EPOCH), 10 * MS)
+    assert figures is not None
+    assert figures.jitter == pytest.approx(math.sqrt(0.25 / 3) * 1e-3)
+
+
+def test_latency_has_figures_where_the_tape_knows_it() -> None:
+    latency = signal([0, 10, 20], y_to_u=[1e-3, 3e-3, 2e-3])
+    figures = latency_figures(Tape({"latency": latency}, EPOCH))
+    assert figures is not None
+    assert (figures.median, figures.max) == (2e-3, 3e-3)
+    assert latency_figures(Tape({}, EPOCH)) is None
 
 
 def test_a_flight_of_one_tick_has_no_tick_figures() -> None:

@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report: which pictures it has of which flight, what they mark, and that it stays one small page."""
 
+import base64
+import re
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +12,14 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 
-from flight_analysis import pictures
+from flight_analysis import comparison, drawing, pictures, tables
 from flight_analysis.drawing import Band, Scene, drawn_points, spans
-from flight_analysis.report import events, known_limits, write_report
+from flight_analysis.pictures import known_limits
+from flight_analysis.recorded import Recorded
+from flight_analysis.report import write_page
 from flight_analysis.scenario import Scenario
-from flight_analysis.summary import Shown, shown_units, summarise
+from flight_analysis.summary import Shown, cell, commanded, shown_units, slowest, summarise, transients
+from flight_analysis.tables import events
 from flight_bringup.scenarios import find_scenario
 from flight_core.outcome import COMPLETED
 from flight_core.tape import Signal, Tape
@@ -41,7 +47,8 @@ def ticks(count: int, **channels: list[float]) -> Signal:
     """Internals of a controller at 100 Hz that flew on time and inside its limits, but for the channels given."""
     quiet = {"mode": [float(Mode.ENGAGED)] * count, "dt": [0.01] * count, "late": [0.0] * count, "age": [0.0] * count}
     limited = {f"limited.{name}": [float(Limited.NO)] * count for name in INPUTS}
-    return signal([10.0 * k for k in range(count)], **(quiet | limited | channels))
+    integrals = {f"{group}.{name}": [0.0] * count for group in ("integral_e", "Pi") for name in OUTPUTS}
+    return signal([10.0 * k for k in range(count)], **(quiet | limited | integrals | channels))
 
 
 def truth(count: int, **channels: float) -> Signal:
@@ -75,8 +82,12 @@ def titles(figure: go.Figure | None) -> list[str]:
 
 def page_of(tmp_path: Path, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> str:
     path = tmp_path / "report.html"
-    write_report(path, scenario, tape, summarise(scenario, tape, outcome))
+    write_page(path, [recorded("flown", scenario, tape, outcome)])
     return path.read_text(encoding="utf-8")
+
+
+def recorded(name: str, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> Recorded:
+    return Recorded(name, scenario, tape, summarise(scenario, tape, outcome))
 
 
 def headings(page: str) -> list[str]:
@@ -88,7 +99,7 @@ def headings(page: str) -> list[str]:
 
 def test_a_simulated_flight_shows_everything_that_moved(tmp_path: Path, servo: Scenario) -> None:
     whole = flight(
-        u=signal([0, 1000], **{name: [0.0, 0.1] for name in INPUTS}),
+        u=signal([10.0 * k for k in range(101)], **{name: [0.1] * 101 for name in INPUTS}),
         internals=ticks(101, late=[1e-3] * 101),
         truth=truth(101, x__q=0.0, x__V=0.0, x__p=0.0, x__r=0.0, gust__vertical=2.0, actuator__elevator=0.0, noise__q=1e-3),
     )
@@ -98,8 +109,11 @@ def test_a_simulated_flight_shows_everything_that_moved(tmp_path: Path, servo: S
         "Input u and the actuators",
         "Wind",
         "States",
+        "Integrals of the law",
         "Error of the sensors",
+        "Spectrum of u",
         "Ticks of the controller",
+        "How the ticks were spread",
     ]
 
 
@@ -111,12 +125,12 @@ def test_a_log_that_knows_only_y_and_its_reference_has_a_report(tmp_path: Path, 
 
 def test_a_flight_of_one_sample_has_a_report(tmp_path: Path, servo: Scenario) -> None:
     one = flight(1, u=signal([0], **{name: [0.0] for name in INPUTS}), internals=ticks(1), truth=truth(1, x__q=0.0))
-    assert len(headings(page_of(tmp_path, servo, one))) == 4  # y, e, u, states: nothing blew, no tick was late
+    assert len(headings(page_of(tmp_path, servo, one))) == 5  # y, e, u, states, integrals: nothing blew, no tick was late
 
 
 def test_a_minute_is_a_page_below_eight_megabytes(tmp_path: Path, servo: Scenario) -> None:
-    # White noise on all channels of the scenario at its rates: nothing of it can be left out or compressed. plotly itself
-    # takes 4.8 MB. Measured 7.2 MB.
+    # White noise on all channels of the scenario at its rates, all samples of it: nothing can be left out, and little
+    # compressed. plotly itself takes 2 MB. Measured 7.3 MB.
     random = np.random.default_rng(1)
 
     def noise(rate: int, names: list[str]) -> Signal:
@@ -143,6 +157,20 @@ def test_words_from_outside_are_shown_as_words(tmp_path: Path, servo: Scenario) 
     page = page_of(tmp_path, servo, flight(), outcome="ended: <script>alert(1)</script>")
     assert "ended: &lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert "<script>alert" not in page
+
+
+def test_every_colour_of_a_page_has_its_own_in_the_dark(tmp_path: Path, servo: Scenario) -> None:
+    # Colours of modes and limits are told apart on both grounds; all others are drawn on the ground of the page.
+    both = {*pictures.MODE_COLOURS.values(), *pictures.LIMITED_COLOURS.values(), pictures.GUST}
+    whole = flight(
+        u=signal([10.0 * k for k in range(101)], **{name: [0.1] * 101 for name in INPUTS}),
+        internals=ticks(101, late=[1e-3] * 101),
+        truth=truth(101, x__q=0.0, x__V=0.0, x__p=0.0, x__r=0.0, gust__up=2.0, actuator__elevator=0.0, noise__q=1e-3),
+    )
+    specifications = re.findall(r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, whole))
+    used = set(re.findall(r"#[0-9a-f]{6}", " ".join(specifications)))
+    assert used - both <= set(drawing.DARK | pictures.DARK)
+    assert len(used) > 5
 
 
 # What happened
@@ -292,6 +320,133 @@ def test_ticks_are_shown_where_one_was_late_or_y_old_or_dt_changed() -> None:
         assert titles(figure) == ["late (ms)", "age (ms)", "dt (ms)"]
 
 
+def test_the_floor_of_the_error_is_drawn_on_both_sides_where_it_can_be_seen() -> None:
+    tape = flight(y=signal([0, 1000], **{name: [1.0, 0.0] for name in OUTPUTS}))
+    figure = pictures.error_picture(scene(tape), {"q": 0.5, "V": 1e-9})
+    (floor,) = traces(figure, "floor")
+    assert (floor.yaxis, set(floor.y)) == ("y", {0.5, -0.5})  # q alone
+
+
+def test_both_integrals_of_an_output_stand_side_by_side() -> None:
+    tape = flight(internals=ticks(101, **{"Pi.p": [0.0] * 100 + [3.0], "integral_e.p": [0.0] * 100 + [2.0]}))
+    figure = pictures.integral_picture(scene(tape))
+    assert figure is not None
+    assert titles(figure)[4:6] == ["∫e p", "Pi p"]
+    assert [trace.y[-1] for trace in figure.data[4:6]] == [2.0, 3.0]
+
+
+def test_the_spectrum_of_a_commanded_sine_has_its_peak_there() -> None:
+    stamps = [10.0 * k for k in range(1001)]
+    sine = np.sin(2.0 * np.pi * 5.0 * np.array(stamps) / 1000.0)
+    u = signal(stamps, elevator=sine.tolist(), thrust=[0.0] * 1001)
+    figure = pictures.spectrum_picture(scene(flight(u=u), {"elevator": Shown("deg", 1 / DEG)}), 10 * MS)
+    assert figure is not None
+    assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
+    assert figure.data[0].x[np.argmax(figure.data[0].y)] == pytest.approx(5.0, abs=0.2)
+    assert pictures.spectrum_picture(scene(flight(u=u.until(EPOCH + 100 * MS))), 10 * MS) is None  # eleven samples
+
+
+def test_the_controllers_time_is_spread_where_there_is_any() -> None:
+    assert pictures.timing_picture(scene(flight(internals=ticks(101))), 10 * MS) is None
+    waiting = flight(internals=ticks(101), latency=signal([0, 10, 20], y_to_u=[1e-3, 1e-3, 3e-3]))
+    figure = pictures.timing_picture(scene(waiting), 10 * MS)
+    assert figure is not None
+    assert [axis.title.text for axis in figure.select_xaxes()] == ["y sent to u sent (ms)"]
+    assert [count for count in figure.data[0].y if count] == [2.0, 1.0]
+
+
+# Several flights
+
+
+@pytest.fixture(scope="module")
+def pair(servo: Scenario) -> list[Recorded]:
+    """Two flights: the second has half the error in q, and no p."""
+    y_m = signal([0, 1000], **{name: [1.0, 1.0] for name in OUTPUTS})
+    first = flight(y=signal([0, 1000], q=[1.2, 1.2], V=[1.0, 1.0], p=[1.0, 1.0], r=[1.0, 1.0]), y_m=y_m)
+    second = flight(y=signal([0, 1000], r=[1.0, 1.0], V=[1.0, 1.0], q=[1.1, 1.1]), y_m=y_m)
+    return [recorded("a", servo, first), recorded("b", servo, second)]
+
+
+def test_figures_of_several_flights_stand_beside_each_other_by_name(pair: list[Recorded]) -> None:
+    blocks = {block.name: {row.what: row for row in block.rows} for block in comparison.error_blocks(pair)}
+    assert list(blocks) == ["q (mrad/s)", "V (m/s)", "p (mrad/s)", "r (mrad/s)"]
+    whole = blocks["q (mrad/s)"]["rms whole"]
+    assert whole.texts == ("200", "100")
+    assert whole.ratios == pytest.approx((1.0, 0.5))
+    assert blocks["p (mrad/s)"]["rms whole"].texts == ("0.00", "-")
+    assert blocks["p (mrad/s)"]["rms whole"].ratios == (None, None)  # nothing divides by 0
+    assert "rms gust" not in blocks["q (mrad/s)"]  # neither came to one
+
+
+def test_less_error_is_better_and_less_input_is_neither(pair: list[Recorded]) -> None:
+    def cells(judged: bool) -> str:
+        rows = tuple(comparison.Row("rms", ("1", "2"), (1.0, ratio), judged) for ratio in (0.5, 1.01, 2.0, None))
+        return tables.compared_tables([comparison.Block("q", rows)], ["", ""])
+
+    assert re.findall('class="(better|same|worse)"', cells(True)) == ["better", "same", "worse", "same"]
+    assert set(re.findall('class="(better|same|worse)"', cells(False))) == {"same"}
+
+
+def test_curves_of_several_flights_lie_over_each_other_and_one_reference_below(pair: list[Recorded]) -> None:
+    drawn = comparison.tracking_picture(comparison.scene(pair), pair)
+    of_q = [trace for trace in drawn.data if trace.yaxis == "y"]
+    assert [trace.name for trace in of_q] == ["y_m", "a", "b"]
+    assert [trace.y[0] for trace in of_q] == pytest.approx([1000.0, 1200.0, 1100.0])
+    assert [trace.name for trace in drawn.data if trace.yaxis == "y3"] == ["y_m", "a"]  # p
+    errors = comparison.error_picture(comparison.scene(pair), pair)
+    assert [trace.y[0] for trace in errors.data if trace.yaxis == "y"] == pytest.approx([200.0, 100.0])
+
+
+def test_a_reference_of_its_own_is_drawn_for_each_flight(pair: list[Recorded], servo: Scenario) -> None:
+    other = flight(y_m=signal([0, 1000], **{name: [0.0, 2.0] for name in OUTPUTS}))
+    three = [*pair, recorded("c", servo, other)]
+    drawn = comparison.tracking_picture(comparison.scene(three), three)
+    assert [trace.name for trace in drawn.data if trace.yaxis == "y"] == ["y_m a", "y_m c", "a", "b", "c"]
+
+
+def test_flights_of_one_name_are_numbered(pair: list[Recorded]) -> None:
+    assert comparison.labels([pair[0], pair[1], pair[0]]) == ["a (1)", "b", "a (3)"]
+
+
+def test_a_comparison_is_a_page(tmp_path: Path, pair: list[Recorded]) -> None:
+    path = tmp_path / "comparison.html"
+    write_page(path, pair)
+    page = path.read_text(encoding="utf-8")
+    assert "2 flights compared" in page
+    assert '<td class="better">&times;0.500</td>' in page
+    assert headings(page) == ["Tracking error", "Output y over the reference y_m", "Tracking error e = y - y_m"]
+
+
+# Words and numbers
+
+
+def test_the_edges_of_pulses_are_the_commands(osprey_gust: Scenario) -> None:
+    pulses = {"q": {"start": [2.0, 6.0], "stop": [4.0, 8.0], "value": [0.1, -0.1]}}
+    edges = commanded(osprey_gust.vary(reference_model={"pulses": pulses, "rise": 0.1}))
+    assert [(edge.kind, edge.name, edge.start) for edge in edges] == [("command", "q", at) for at in (2.0, 4.0, 6.0, 8.0)]
+    assert [edge.stop for edge in edges] == pytest.approx([2.1, 4.1, 6.1, 8.1])
+
+
+def test_live_commands_take_the_place_of_the_scenarios(osprey_gust: Scenario) -> None:
+    live = signal([5000, 5500], q=[0.0, 0.1])
+    happened = [one for one in transients(osprey_gust, flight(u_m=live)) if one.kind == "command"]
+    assert [one.start for one in happened] == [2.0, 4.0, 5.5]  # the scenario has q at 2, 4, 6 and 8 s, and more
+
+
+def test_the_slowest_settling_says_where_the_time_was_too_short_for_it() -> None:
+    def settling(*times: float | None) -> str:
+        told = [{"kind": "gust", "start": 1.0, "until": {"q": 3.5}, "settling": {"q": time}} for time in times]
+        return slowest({"transients": told}, "q", "gust")
+
+    assert settling() == "-"
+    assert settling(0.5, 2.0) == "2.00"
+    assert settling(0.5, None) == "> 2.50"
+
+
+def test_figures_have_three_digits() -> None:
+    assert [cell(value) for value in (None, 0.0, 1.0, 123.4, 4.5678e-7)] == ["-", "0.00", "1.00", "123", "4.57e-07"]
+
+
 # Curves
 
 
@@ -313,6 +468,47 @@ def test_what_is_drawn_of_a_long_signal_keeps_its_peaks() -> None:
     assert (np.diff(drawn) > 0).all()
     assert (values[drawn].max(), values[drawn].min()) == (4.0, -3.0)
     assert drawn_points(values[:6000], 6000).tolist() == list(range(6000))
+
+
+def test_a_break_of_a_curve_is_drawn_beside_its_peaks() -> None:
+    values = np.zeros(10_000)
+    values[[500, 501, 502]] = 1.0, np.nan, -1.0
+    drawn = drawn_points(values, 100)
+    assert {500, 501, 502} <= set(drawn.tolist())
+    assert len(drawn) <= 101
+
+
+def unpacked(text: str, kind: str) -> FloatArray:
+    """What the page's script makes of packed samples."""
+    sorted_bytes = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype=np.uint8)
+    return np.ascontiguousarray(sorted_bytes.reshape(np.dtype(kind).itemsize, -1).T).view(kind)[:, 0]
+
+
+def test_all_samples_of_what_is_thinned_out_are_kept_once() -> None:
+    count = 5000
+    stamps = EPOCH + np.arange(count, dtype=np.int64) * 2 * MS
+    y = Signal(stamps, OUTPUTS, np.random.default_rng(1).standard_normal((count, 4)))
+    shared = scene(Tape({"y": y, "y_m": Signal(stamps, OUTPUTS, np.zeros((count, 4)))}, EPOCH - 7))
+    drawn = [*pictures.tracking_picture(shared).data, *pictures.error_picture(shared).data]
+    of_q = [trace for trace in drawn if trace.yaxis == "y"]
+    assert [len(trace.y) < count for trace in of_q] == [True] * 3
+    instants = np.cumsum(unpacked(shared.samples.packed[of_q[1].meta["t"]], "<f8"))
+    assert instants.tolist() == (stamps - EPOCH + 7).tolist()  # to the nanosecond
+    assert unpacked(shared.samples.packed[of_q[1].meta["v"]], "<f4").tolist() == y["q"].astype(np.float32).tolist()
+    assert of_q[1].meta["v"] == of_q[2].meta["v"]  # y_m is 0: e is y
+    assert len(shared.samples.packed) == 1 + 4 + 1  # one time, four y, and the zeros of all y_m
+
+
+def test_a_curve_of_few_samples_is_drawn_whole_and_kept_nowhere_else() -> None:
+    shared = scene(flight())
+    assert traces(pictures.tracking_picture(shared), "y")[0].meta is None
+    assert shared.samples.packed == {}
+
+
+def test_names_of_bands_that_would_run_into_each_other_are_one() -> None:
+    bands = [Band(name, start, start + 1.0, "#7f7f7f", True) for name, start in (("c", 50.0), ("a", 10.0), ("b", 12.0))]
+    drawn = pictures.tracking_picture(scene(flight(10_001))._replace(bands=bands))
+    assert [(note.x, note.text) for note in drawn.layout.annotations] == [(10.0, "a, b"), (50.0, "c")]
 
 
 def test_time_is_that_of_the_flight_whatever_the_stamps() -> None:

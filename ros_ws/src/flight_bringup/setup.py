@@ -15,6 +15,7 @@ setup(
         ("share/flight_bringup", ["package.xml"]),
         ("share/flight_bringup/launch", sorted(glob("launch/*.launch.py"))),
         ("share/flight_bringup/config", sorted(glob("config/*.yaml"))),
+        ("share/flight_bringup/layouts", sorted(glob("layouts/*"))),
     ],
     entry_points={"console_scripts": ["rise-di = flight_bringup.cli:main"]},
 )

@@ -78,7 +78,7 @@ STATES: Mapping[str, Quantity] = {
 
 OUTPUTS: Mapping[str, Unit] = {name: one.unit for name, one in STATES.items() if one.unit is not None}
 
-HEADING, HEIGHT = "attitude/psi-rad", "position/h-agl-ft"
+HEADING, HEIGHT, CONTACT = "attitude/psi-rad", "position/h-agl-ft", "forces/fbz-gear-lbs"
 
 WIND = ("atmosphere/wind-north-fps", "atmosphere/wind-east-fps", "atmosphere/wind-down-fps")
 
@@ -218,10 +218,14 @@ class JsbsimVehicle:
         self._at_trim = [[node.get_double_value() for node in nodes] for nodes in self._commands]
         self._wind_nodes = [self._node(path) for path in WIND]
         self._state_nodes = [(self._node(one.property), one.si) for one in STATES.values()]
-        self._heading, self._height = self._node(HEADING), self._node(HEIGHT)
+        self._heading, self._height, self._contact = (self._node(path) for path in (HEADING, HEIGHT, CONTACT))
+        self._engines = [self._node(_running(i)) for i in range(_engines(self._fdm))]
         self._moves, self._air = moves, air
         self._z = None if air.turbulence is None else turbulence.start(air.turbulence)
-        self._position, self._x = np.zeros(len(INPUTS)), np.zeros(len(STATES))
+        self._position = np.zeros(len(INPUTS))
+        self._blow(self._wind(0))
+        _settle(self._fdm, seconds(point.step_ns))  # one step, so that the aircraft feels the wind of t = 0 from t = 0 on
+        self._x = self._deviations()
         self.truth_names = (
             *(f"x.{name}" for name in STATES),
             *(f"gust.{name}" for name in AXES),
@@ -231,7 +235,7 @@ class JsbsimVehicle:
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """From t to t + duration with the command u held, shape (4,), deviations from trim.
 
-        Raises FlightEnded where JSBSim gives up, or the aircraft is below the ground.
+        Raises FlightEnded where JSBSim gives up, an engine stops or the aircraft touches the ground.
         """
         step_ns = self.point.step_ns
         dt, steps = seconds(step_ns), divide(duration_ns, step_ns, "step", "the duration")
@@ -251,9 +255,12 @@ class JsbsimVehicle:
                 self._fdm.run()
             except jsbsim.BaseError as error:
                 raise FlightEnded(f"{self.point.title} gave up at t = {seconds(after_ns):.2f} s: {_reason(error)}") from None
-        self._x = np.array([node.get_double_value() * si for node, si in self._state_nodes]) - self.trim.states
-        if self._height.get_double_value() < 0.0:
-            raise FlightEnded(f"{self.point.title} hit the ground at t = {seconds(t_ns + duration_ns):.2f} s")
+        self._x = self._deviations()
+        now = f"at t = {seconds(t_ns + duration_ns):.2f} s"
+        if self._height.get_double_value() < 0.0 or self._contact.get_double_value() != 0.0:
+            raise FlightEnded(f"{self.point.title} hit the ground {now}")
+        if stopped := [str(i + 1) for i, node in enumerate(self._engines) if not node.get_double_value()]:
+            raise FlightEnded(f"{self.point.title}: engine {', '.join(stopped)} stopped {now}")
 
     def y(self) -> FloatArray:
         """[q, V, p, r], deviations from trim, shape (4,)."""
@@ -266,6 +273,9 @@ class JsbsimVehicle:
     def diverged(self) -> bool:
         """Whether a state is not finite, or above LARGEST in any component."""
         return not bool(np.all(np.abs(self._x) < LARGEST))
+
+    def _deviations(self) -> FloatArray:
+        return np.array([node.get_double_value() * si for node, si in self._state_nodes]) - self.trim.states
 
     def _node(self, path: str) -> jsbsim.FGPropertyNode:
         node = self._fdm.get_property_manager().get_node(path)
@@ -318,6 +328,36 @@ def try_out(name: str, speed: float, altitude: float, step_ns: int) -> Recipe:
     return found
 
 
+def sideslip_zero(point: Point) -> float:
+    """Rate at which sideslip decays (negative) or grows while p and r are held in trim, 1/s: a zero of the aircraft.
+
+        beta_dot V = Y_beta beta + Y_u u,  0 = N_beta beta + N_u u  ->  beta_dot = (Y_beta - Y_u N_u^-1 N_beta) beta / V
+
+    with Y the side acceleration, N those of p and r, u aileron and rudder, by central differences in frozen flight; gravity
+    aside, which ties bank to it much more slowly. Positive, Assumption 3 does not hold. Raises FlightEnded.
+    """
+    found = recipe(point)
+
+    def derivative(name: str, step: float) -> FloatArray:
+        ends = []
+        for sign in (1.0, -1.0):
+            fdm, _ = _follow(point, found)
+            if name == "beta":
+                fdm[WIND[1]] -= sign * step * point.speed / FOOT  # wind from the right
+            else:
+                fdm[INPUTS[name].property] += sign * step
+            _settle(fdm, 0.5)  # flight control systems answer, engines hardly
+            ends.append(_residuals(fdm)[[1, 3, 5]])
+        return np.asarray((ends[0] - ends[1]) / (2.0 * step))
+
+    beta, u = derivative("beta", 0.01), np.column_stack([derivative(name, 0.05) for name in ("aileron", "rudder")])
+    return float(beta[0] - u[0] @ np.linalg.solve(u[1:], beta[1:])) / point.speed
+
+
+def _running(engine: int) -> str:
+    return f"propulsion/engine[{engine}]/set-running"
+
+
 def _engines(fdm: jsbsim.FGFDMExec) -> int:
     return int(fdm.get_propulsion().get_num_engines())
 
@@ -328,7 +368,8 @@ def _properties(engines: int) -> list[str]:
     trims = [one.trim_property for one in INPUTS.values() if one.trim_property is not None]
     states = [one.property for one in STATES.values()]
     residuals = [f"accelerations/{name}" for name in RESIDUALS]
-    return [*commands, *trims, *states, *WIND, HEADING, HEIGHT, *residuals, *FROZEN]
+    running = [_running(i) for i in range(engines)]
+    return [*commands, *trims, *states, *WIND, HEADING, HEIGHT, CONTACT, *residuals, *running, *FROZEN]
 
 
 def _paths(command: Command, engines: int) -> list[str]:
@@ -478,7 +519,7 @@ def _at_rest(fdm: jsbsim.FGFDMExec) -> bool:
 
 
 def _what_is_left(fdm: jsbsim.FGFDMExec) -> str:
-    stopped = [str(i + 1) for i in range(_engines(fdm)) if not fdm[f"propulsion/engine[{i}]/set-running"]]
+    stopped = [str(i + 1) for i in range(_engines(fdm)) if not fdm[_running(i)]]
     if stopped:
         return f"engine {', '.join(stopped)} cannot be started"
     linear, angular = np.abs(_residuals(fdm)).reshape(2, 3).max(axis=1)

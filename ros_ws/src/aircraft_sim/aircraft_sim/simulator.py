@@ -10,8 +10,8 @@ from typing import Protocol
 import numpy as np
 
 from aircraft_sim import plant, sensors, truth
-from aircraft_sim.jsbsim_plant import JsbsimVehicle
 from aircraft_sim.dynamics import Forcing
+from aircraft_sim.jsbsim_plant import JsbsimVehicle
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.sensors import Underway
 from flight_core.outcome import FlightEnded

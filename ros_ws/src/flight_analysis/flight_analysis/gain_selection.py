@@ -539,9 +539,9 @@ def as_yaml(selection: Selection) -> str:
         "/**/controller:",
         "  ros__parameters:",
     ]
-    for key, value in controller.model_dump(exclude_none=True, exclude={"feedforward"}).items():
+    for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward"}).items():
         reason = reasons.get(key, "" if key == "inputs" else ControllerParameters.model_fields[key].description)
-        lines.append(f"    {key}: {_flow(value)}" + (f"  # {reason}" if reason else ""))
+        lines.append(f"    {key}: {flow(value)}" + (f"  # {reason}" if reason else ""))
     if controller.feedforward is not None:
         lines += _feedforward_lines(controller.feedforward, found.airframe.name)
     return "\n".join(lines) + "\n"
@@ -551,7 +551,7 @@ def _feedforward_lines(model: FeedforwardParameters, airframe: str) -> list[str]
     lines = [f"    feedforward:  # an extension of the paper: the input of {airframe} along y_m is added; SI, a line a state"]
     for key, value in model.model_dump(exclude_none=True).items():
         columns = len(value) if key in {"states", "lead"} else len(value) // len(model.states)
-        rows = [_flow(value[i : i + columns])[1:-1] for i in range(0, len(value), columns)]
+        rows = [flow(value[i : i + columns])[1:-1] for i in range(0, len(value), columns)]
         lines.append(f"      {key}: [" + (",\n" + " " * (9 + len(key))).join(rows) + "]" + ("  # s" if key == "lead" else ""))
     return lines
 
@@ -563,12 +563,12 @@ def _response(answer: Answer, found: Study) -> FloatArray:
     return np.asarray(np.abs(found.Omega[rows, columns]) * answer.controller.input_scale)
 
 
-def _flow(value: Any) -> str:
+def flow(value: Any) -> str:
     """A value in YAML's flow style; floats with six digits and always a point, which YAML 1.1 needs to see a float."""
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(_flow(one) for one in value)}]"
+        return f"[{', '.join(flow(one) for one in value)}]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_flow(one)}" for key, one in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {flow(one)}" for key, one in value.items()) + "}"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):

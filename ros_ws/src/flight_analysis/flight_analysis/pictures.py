@@ -5,14 +5,15 @@
 Nothing here knows an aircraft: channels are drawn under the names that they have.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
-from flight_analysis.drawing import PLAIN, Band, Curve, Scene, add_line, spans, stack
-from flight_analysis.metrics import Windows, tracking_error, true_error
+from flight_analysis.drawing import PLAIN, Band, Curve, Samples, Scene, add_line, cell, framed, grid, spans, stack
+from flight_analysis.metrics import Windows, spectra, tick_periods, tracking_error, true_error
+from flight_analysis.scenario import Scenario
 from flight_analysis.summary import Shown
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
@@ -20,6 +21,8 @@ from rise_di_controller.guard import Mode
 from rise_di_controller.internals import Limited
 
 PLANT, REFERENCE, ERROR, MEASURED, WIND, GUST = "#123c52", "#f6a85f", "#8b1f4f", "#e3b6c9", "#2a7f62", "#7f7f7f"
+DARK = {PLANT: "#9edbff", REFERENCE: "#8f5820", ERROR: "#f285b3", MEASURED: "#70405a", WIND: "#63cba6"}
+"""Colours of curves, and what the page draws in their place on a dark ground."""
 MODE_COLOURS = {
     Mode.WAITING: "#b0b0b0",
     Mode.HOLD: "#f2c230",
@@ -29,6 +32,12 @@ MODE_COLOURS = {
 }
 LIMITED_COLOURS = {Limited.MAGNITUDE: "#d62728", Limited.RATE: "#8a63b8"}
 LIMIT_LINES = ({"color": "#bbbbbb", "width": 4}, {"color": "#444444", "width": 1.2, "dash": "dash"})
+DARK |= {"#bbbbbb": "#555c64", "#444444": "#b9c0c7"}
+FLOOR_LINE = {"color": "#444444", "width": 1.0, "dash": "dot"}
+INTEGRALS = {"integral_e": "∫e", "Pi": "Pi"}  # groups of `internals`, and what their rows are called
+FEWEST = 64  # samples that a spectrum is drawn of
+BINS = 80  # of a histogram
+FREQUENCIES = [digit * 10.0**power for power in range(-4, 4) for digit in (1, 2, 5)]  # Hz, that are marked in a spectrum
 FINEST = 1 / 500  # of the flight, about two pixels: what is shorter is drawn as long, so that it is seen
 IN_SIGHT = 3.0  # a limit is in view where u comes within this ratio of it; farther ones would leave little of u to see
 
@@ -39,7 +48,7 @@ Limits = Mapping[str, tuple[float, float]]
 def flight_scene(tape: Tape, units: Mapping[str, Shown], gusts: Windows) -> Scene:
     """The scene of a flight: the gusts it came to and the modes of its controller are marked in every picture."""
     end = flight_end(tape)
-    return Scene(tape, units, [*gust_bands(tape, gusts), *mode_bands(tape, end * FINEST)], end)
+    return Scene(tape, units, [*gust_bands(tape, gusts), *mode_bands(tape, end * FINEST)], end, Samples())
 
 
 def flight_end(tape: Tape) -> float:
@@ -71,12 +80,22 @@ def tracking_picture(scene: Scene) -> go.Figure:
     return stack(scene, {"y_m": Curve(tape["y_m"], REFERENCE, 6.0), "y": Curve(tape["y"], PLANT)})
 
 
-def error_picture(scene: Scene) -> go.Figure:
-    """E = y - y_m of every output, and over it the true error where the sensors have errors that the tape knows."""
+def error_picture(scene: Scene, floors: Mapping[str, float] | None = None) -> go.Figure:
+    """E = y - y_m of every output, and over it the true error where the sensors have errors that the tape knows.
+
+    The floors, by channel in SI, are lines on both sides of 0 where they are wide enough to see.
+    """
     measured, true = Curve(tracking_error(scene.tape), ERROR), true_error(scene.tape)
-    if true is None or not _moving(scene.tape, "noise").names:
-        return stack(scene, {"e": measured}, height=110)
-    return stack(scene, {"measured": measured._replace(colour=MEASURED), "true": Curve(true, ERROR)}, height=110)
+    curves = {"e": measured}
+    if true is not None and _moving(scene.tape, "noise").names:
+        curves = {"measured": measured._replace(colour=MEASURED), "true": Curve(true, ERROR)}
+    figure = stack(scene, curves, height=110)
+    for row, name in enumerate(measured.signal.names, start=1):
+        floor, largest = (floors or {}).get(name, 0.0), np.max(np.abs(measured.signal[name]), initial=0.0)
+        if floor > FINEST * largest > 0.0:
+            shown = floor * scene.units.get(name, PLAIN).factor
+            add_line(figure, row, "floor", [0.0, scene.end, None, 0.0, scene.end], [shown] * 3 + [-shown] * 2, FLOOR_LINE)
+    return framed(figure, 110, labels=16)
 
 
 def input_picture(scene: Scene, limits: Mapping[str, Limits]) -> go.Figure | None:
@@ -102,7 +121,102 @@ def input_picture(scene: Scene, limits: Mapping[str, Limits]) -> go.Figure | Non
             x = [instant for start, stop in hit for instant in (start, stop, None)]
             add_line(figure, row, f"limited: {what.name.lower()}", x, [strip] * len(x), {"color": colour, "width": 9})
         figure.update_yaxes(range=[low, top], row=row, col=1)
-    return figure
+    return framed(figure, 150, labels=16)
+
+
+def known_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
+    """Limits of u by whose they are and by input: of the actuators where they are simulated, and of the controller."""
+    actuators, controller = scenario.aircraft.actuators, scenario.controller
+    limits = {"limits of the controller": _pairs(controller.inputs, controller.lower or (), controller.upper or ())}
+    if not _group(tape, "actuator").names:
+        return limits
+    return {"end stops": _pairs(tuple(scenario.aircraft.channels().inputs), actuators.lower, actuators.upper)} | limits
+
+
+def _pairs(names: Sequence[str], lower: Sequence[float], upper: Sequence[float]) -> Limits:
+    none = [float("inf")] * len(names)
+    return dict(zip(names, zip(lower or [-bound for bound in none], upper or none, strict=True), strict=True))
+
+
+def integral_picture(scene: Scene) -> go.Figure | None:
+    """Both integrals of the law, by output: that of e beside that of the sign."""
+    if "internals" not in scene.tape:
+        return None
+    internals = scene.tape["internals"]
+    outputs = internals.group("Pi").names
+    shown = {f"{label} {name}": f"{group}.{name}" for name in outputs for group, label in INTEGRALS.items()}
+    if not outputs:
+        return None
+    curve = Signal(internals.stamp_ns, tuple(shown), np.column_stack([internals[channel] for channel in shown.values()]))
+    return stack(scene, {"": Curve(curve, PLANT)}, columns=2, height=120)
+
+
+def spectrum_picture(scene: Scene, period_ns: int) -> go.Figure | None:
+    """Amplitude spectral density of u, both axes logarithmic; None without as many samples as tell one."""
+    if "u" not in scene.tape or len(scene.tape["u"].stamp_ns) < FEWEST:
+        return None
+    return draw_spectra({"u": (scene.tape["u"], period_ns)}, {"u": PLANT}, scene.units)
+
+
+def draw_spectra(runs: Mapping[str, tuple[Signal, int]], colours: Mapping[str, str], units: Mapping[str, Shown]) -> go.Figure:
+    """A cell a channel, in it the spectra of all runs that have it: of a signal with its period in ns each."""
+    channels = list(dict.fromkeys(name for signal, _ in runs.values() for name in signal.names))
+    columns = min(len(channels), 2)
+    figure = grid(len(channels), columns, 190, vertical_spacing=0.2)
+    for label, (signal, period_ns) in runs.items():
+        frequency, densities = spectra(signal, period_ns)
+        for name, density in densities.items():
+            unit, factor = units.get(name, PLAIN)
+            line = go.Scatter(
+                x=frequency, y=density * factor, mode="lines", name=label, line={"color": colours[label], "width": 1.4}
+            )
+            first = name == channels[0] and len(runs) > 1
+            line.update(legendgroup=label, showlegend=first, hovertemplate=f"%{{y:.3g}} {unit}/√Hz at %{{x:.3g}} Hz")
+            figure.add_trace(line, **cell(channels.index(name), columns))
+    for place, name in enumerate(channels):
+        unit = units.get(name, PLAIN).unit
+        at = cell(place, columns)
+        figure.update_yaxes(type="log", dtick=1, exponentformat="power", title_text=f"{name} ({unit}/√Hz)", **at)
+        figure.update_xaxes(type="log", tickvals=FREQUENCIES, title_text="Hz", **at)
+    return framed(figure, 190, below=44)
+
+
+def timing_picture(scene: Scene, period_ns: int) -> go.Figure | None:
+    """How the controller's time was spread, by the number of ticks: None where all ticks were on time and none waited."""
+    shown = timing(scene.tape, period_ns)
+    return draw_histograms({"": shown}, {"": PLANT}) if shown else None
+
+
+def timing(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
+    """What there is to say of a controller's time, in ms, by what it is; nothing where all of it is 0."""
+    found: dict[str, FloatArray] = {}
+    if "internals" in tape:
+        periods = tick_periods(tape)
+        found["tick to tick, off a whole period"] = (periods - period_ns * np.round(periods / period_ns)) / 1e6
+        found["tick after its deadline"] = tape["internals"]["late"] * 1e3
+        found["age of y at the tick"] = tape["internals"]["age"] * 1e3
+    if "latency" in tape:
+        found["y sent to u sent"] = tape["latency"].values[:, 0] * 1e3
+    return {what: values for what, values in found.items() if len(values) and np.any(np.abs(values) > 1e-6)}
+
+
+def draw_histograms(runs: Mapping[str, Mapping[str, FloatArray]], colours: Mapping[str, str]) -> go.Figure:
+    """A cell a quantity, in ms, in it the counts of every run that has it, on the same bins; logarithmic."""
+    quantities = list(dict.fromkeys(what for run in runs.values() for what in run))
+    columns = min(len(quantities), 2)
+    figure = grid(len(quantities), columns, 150, vertical_spacing=0.24)
+    for place, what in enumerate(quantities):
+        of = {label: run[what] for label, run in runs.items() if what in run}
+        edges = np.histogram_bin_edges(np.concatenate(list(of.values())), bins=BINS)
+        for label, values in of.items():
+            counts, width = np.histogram(values, edges)[0].astype(float), edges[1] - edges[0]
+            bars = go.Bar(x=edges[:-1] + width / 2.0, y=counts, width=width, name=label, marker={"color": colours[label]})
+            bars.update(legendgroup=label, showlegend=place == 0 and len(runs) > 1, opacity=1.0 if len(runs) == 1 else 0.6)
+            figure.add_trace(bars.update(hovertemplate="%{y} ticks around %{x:.4g} ms"), **cell(place, columns))
+        figure.update_xaxes(title_text=f"{what} (ms)", **cell(place, columns))
+    figure.update_yaxes(type="log", title_text="ticks")
+    figure.update_layout(barmode="overlay")
+    return framed(figure, 150, below=44)
 
 
 def wind_picture(scene: Scene) -> go.Figure | None:

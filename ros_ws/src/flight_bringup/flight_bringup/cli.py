@@ -10,19 +10,22 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
-from rich.table import Table
 
-from flight_analysis.metrics import PARTS
-from flight_analysis.summary import PART_NAMES, Shown, error_rows, shown_units
 from flight_bringup import fly as flying
 from flight_bringup.airframes_command import airframes
+from flight_bringup.check_signs_command import check_signs
 from flight_bringup.gains_command import gains
+from flight_bringup.identify_command import identify_aircraft
+from flight_bringup.layouts_command import layouts
+from flight_bringup.play_command import play
+from flight_bringup.repair_command import repair_run
+from flight_bringup.replay_command import replay_run
+from flight_bringup.report_command import report, short, show
 from flight_bringup.scenarios import find_scenario
 from flight_core import outcome as ends
 from flight_core.parameters import ParameterError
@@ -84,56 +87,27 @@ def fly(
         if status == 0:
             raise
         flying.conclude_unflown(run, chosen, outcome)
-        print(f"error: {outcome}, before anything was flown; see {_short(run)}", file=sys.stderr)
+        print(f"error: {outcome}, before anything was flown; see {short(run)}", file=sys.stderr)
         raise typer.Exit(status) from None
-    outcome = flown.summary["outcome"]
+    outcome = flown.flight.summary["outcome"]
     status = STATUS.get(outcome, ENDED_EARLY)
     if as_json:
-        print(json.dumps(flown.summary))
+        print(json.dumps(flown.flight.summary))
     else:
-        show(Console(), flown.summary, shown_units(flown.scenario))
-        print(f"outcome: {outcome}\nlog:     {_short(flown.mcap)}\nreport:  {_short(flown.report)}")
+        show(Console(), flown.flight)
+        print(f"outcome: {outcome}\nlog:     {short(flown.mcap)}\nreport:  {short(flown.report)}")
     raise typer.Exit(status)
 
 
-@app.command()
-def report(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> None:
-    """Write the report of a recorded run again, and print its table."""
-    flown = flying.conclude(run)
-    show(Console(), flown.summary, shown_units(flown.scenario))
-    print(f"outcome: {flown.summary['outcome']}\nreport:  {_short(flown.report)}")
-
-
+app.command()(report)
 app.command()(gains)
 app.command()(airframes)
-
-
-def show(console: Console, summary: dict[str, Any], units: dict[str, Shown]) -> None:
-    """Print the tables of a summary."""
-    title = f"Tracking error ({summary['error']}), {summary['duration']:.1f} s flown"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
-    table.add_column("channel", no_wrap=True)
-    for part in PART_NAMES:
-        table.add_column(f"{part}\nrms", justify="right", no_wrap=True)
-        table.add_column("\nmax", justify="right", no_wrap=True)
-    for row in error_rows(summary, units):
-        table.add_row(*row)
-    console.print(table)
-    console.print(PARTS, style="dim")
-    if (ticks := summary["ticks"]) is not None:
-        ms = {key: f"{value * 1e3:.3f}" for key, value in ticks.items()}
-        console.print(
-            f"ticks: {ticks['ticks']}, {ticks['without_new_y']} without a new y;"
-            f" period mean {ms['period_mean']} ms, p99 {ms['period_p99']}, max {ms['period_max']};"
-            f" late p99 {ms['late_p99']} ms, max {ms['late_max']}",
-            highlight=False,
-        )
-    for note in summary["notes"]:
-        console.print(f"note: {note}", highlight=False)
-
-
-def _short(path: Path) -> str:
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+app.command("identify")(identify_aircraft)
+app.command()(check_signs)
+app.command("replay")(replay_run)
+app.command()(play)
+app.command()(layouts)
+app.command("repair")(repair_run)
 
 
 def main() -> None:

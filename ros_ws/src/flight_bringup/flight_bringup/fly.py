@@ -12,23 +12,27 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from flight_analysis.bag_reader import read_run
 from flight_analysis.bag_writer import write_run
-from flight_analysis.report import write_report
+from flight_analysis.latency import latency
+from flight_analysis.recorded import Recorded
+from flight_analysis.report import write_page
 from flight_analysis.scenario import Scenario, load_scenario
 from flight_analysis.simulate import simulate
-from flight_analysis.summary import shown_units, summarise
-from flight_bringup.graph import attachments
+from flight_analysis.summary import shown_units, summarise, summarise_unflown
+from flight_bringup.graph import enclosed
 from flight_bringup.processes import Flight
 from flight_core.outcome import COMPLETED, INTERRUPTED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
+from flight_recorder.bag import bag_files
 
 if TYPE_CHECKING:
     from flight_bringup.node import Monitor
 
+SUMMARY = "summary.json"
 POLL_PERIOD = 0.05  # s, of the progress bar
 
 STUCK = 40.0
@@ -37,13 +41,12 @@ STUCK = 40.0
 Progress = Callable[[float, str], None]  # flight time in s, and what to show beside it
 
 
-class Flown(NamedTuple):
-    """A flight that has ended, however."""
+class Concluded(NamedTuple):
+    """A flight that has ended, however, and where it lies."""
 
-    scenario: Scenario
+    flight: Recorded
     mcap: Path
     report: Path
-    summary: dict[str, Any]
 
 
 def new_run(scenario: Scenario, runs: Path) -> Path:
@@ -141,44 +144,66 @@ def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
     """Fly in one process without ROS, as fast as it goes, and write the bag into `run`. Returns the outcome."""
     with _signals_as_interrupt():
         tape = simulate(scenario, lambda t: progress(t, "in one process"))
-    write_run(tape, run, scenario.path, attachments(scenario, run))
+    write_run(tape, run, enclosed(scenario, run))
     return tape.outcome
 
 
-def conclude(run: Path, outcome: str | None = None) -> Flown:
-    """Read the bag back, write its scenario, summary.json and report.html beside it, point runs/latest at the run.
+def read_flight(run: Path, outcome: str | None = None) -> Recorded:
+    """A recorded flight with its summary; its scenario is written beside the log.
 
-    Without an outcome, that of the run's summary is kept: the report of an old run is written again. Raises ParameterError
-    where the log cannot be read, or holds no scenario.
+    Without an outcome, that of the run's summary is kept. Raises ParameterError where the log cannot be read, or holds no
+    scenario.
     """
     recorded = read_run(run)
     if recorded.scenario is None:
         raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
-    run = run.resolve() if run.is_dir() else run.resolve().parent  # runs/latest is a link
-    try:
-        stored, kept = run / recorded.scenario.name, run / "summary.json"
+    folder = _folder(run)
+    stored = folder / recorded.scenario.name
+    with _writing(folder):
         stored.write_bytes(recorded.scenario.content)
-        scenario = load_scenario(stored)
-        tape = _until_last_input(recorded.tape)
-        if outcome == COMPLETED and "internals" not in tape:
-            outcome = "the controller never engaged"
-        summary = summarise(scenario, tape, outcome or _outcome_before(kept))
-        kept.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        write_report(run / "report.html", scenario, tape, summary)
+    scenario = load_scenario(stored)
+    waited = latency(run)
+    signals = recorded.tape.signals if waited is None else {**recorded.tape.signals, "latency": waited}
+    tape = _until_last_input(replace(recorded.tape, signals=signals))
+    if outcome == COMPLETED and "internals" not in tape:
+        outcome = "the controller never engaged"
+    name = folder.name if run.is_dir() else run.stem
+    return Recorded(name, scenario, tape, summarise(scenario, tape, outcome or _outcome_before(folder / SUMMARY)))
+
+
+def conclude(run: Path, outcome: str | None = None) -> Concluded:
+    """Read the bag back, write its scenario, summary.json and report.html beside it, point runs/latest at the run.
+
+    Without an outcome it is the report of an old run that is written again. Raises ParameterError as `read_flight` does.
+    """
+    flight, folder = read_flight(run, outcome), _folder(run)
+    with _writing(folder):
+        (folder / SUMMARY).write_text(json.dumps(flight.summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_page(folder / "report.html", [flight])
         if outcome is not None:
-            _point_latest(run)
-    except OSError as error:
-        raise ParameterError(f"{run}: cannot be written ({error.strerror}), expected a folder that can") from None
-    return Flown(scenario, min(run.glob("*.mcap")), run / "report.html", summary)
+            _point_latest(folder)
+    return Concluded(flight, min(bag_files(run), default=folder), folder / "report.html")
 
 
 def conclude_unflown(run: Path, scenario: Scenario, outcome: str) -> Path:
     """Write summary.json of a flight that ended before its first sample; its path. The log, such as it is, stays."""
-    summary = {"scenario": scenario.name, "outcome": outcome, "duration": 0.0, "errors": {}, "ticks": None, "notes": []}
-    path = run / "summary.json"
-    path.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    path = run / SUMMARY
+    path.write_text(json.dumps(summarise_unflown(scenario, outcome), indent=2) + "\n", encoding="utf-8")
     _point_latest(run)
     return path
+
+
+def _folder(run: Path) -> Path:
+    """The folder of a run, which may be named by its log; runs/latest is a link."""
+    return run.resolve() if run.is_dir() else run.resolve().parent
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ParameterError(f"{folder}: cannot be written ({error.strerror}), expected a folder that can") from None
 
 
 def _outcome_before(summary: Path) -> str:

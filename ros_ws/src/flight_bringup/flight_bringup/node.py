@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the command line needs of ROS: a monitor of a running flight, and the four nodes as objects in one process."""
+"""What the command line needs of ROS: a monitor of a running flight, a player of a log, the four nodes in one process."""
 
 import os
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import rclpy
@@ -16,6 +17,7 @@ from flight_recorder.node import RecorderNode
 from flight_ros import transport
 from flight_ros.inbox import Inbox
 from flight_ros.messages import Decoder, stamp_of
+from flight_ros.player import Player
 from flight_ros.runtime import run
 from flight_ros.topics import INTERNALS, LISTEN, RECORDED, STEP, Y_M, Y
 from reference_model.node import ReferenceModelNode
@@ -78,6 +80,11 @@ class Monitor:
             domain = os.environ.get("ROS_DOMAIN_ID", "0")
             found = f"{count} publishers of {topic.name} already"
             require(count == 0, f"ROS_DOMAIN_ID {domain}", found, "a domain of its own for each flight: set ROS_DOMAIN_ID")
+
+
+def player(types: Mapping[str, str], shared: Collection[str]) -> Player:
+    """A player of topics, by their names with their types; see flight_ros.player. Raises ParameterError."""
+    return Player(types, shared)
 
 
 def main() -> None:

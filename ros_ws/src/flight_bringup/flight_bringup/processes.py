@@ -13,6 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -58,8 +59,9 @@ class NodeProcess:
             return
         for line in self.popen.stdout:
             self.lines.append(line.rstrip())
-            self._log.write(line)
-            self._log.flush()
+            with suppress(OSError):  # on a full disk the output is still taken, else the node would wait for it
+                self._log.write(line)
+                self._log.flush()
             if READY in line:
                 self.ready.set()
 
@@ -67,7 +69,8 @@ class NodeProcess:
         """Collect what is left of the output; the exit status."""
         status = self.popen.wait()
         self._reader.join(timeout=1.0)
-        self._log.close()
+        with suppress(OSError):
+            self._log.close()
         if self.popen.stdout is not None:
             self.popen.stdout.close()
         return status

@@ -24,8 +24,9 @@ STEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE, durabili
 # that a busy machine leaves waiting, short enough to end the others within two seconds.
 ALIVE = QoSProfile(depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=1.0))
 RECORD = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# For topics that others publish, whose kept samples cannot be counted on.
-RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
+# For topics that others publish, whose kept samples cannot be counted on; where one of them offers less, the recorder asks for
+# less.
+RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 class Topic(NamedTuple):

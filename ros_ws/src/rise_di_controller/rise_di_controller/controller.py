@@ -30,6 +30,7 @@ class Controller:
         self.names = internals.names(parameters.outputs, parameters.inputs)
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
+        self._digest = parameters.digest()
         self._y: deque[Sample] = deque(maxlen=1)
         self._y_m: deque[Sample] = deque(maxlen=guard.KEPT_REFERENCES)
 
@@ -48,11 +49,13 @@ class Controller:
         self._state = guard.start(len(self._state.u))._replace(u=self._state.u)
 
     def retune(self, parameters: ControllerParameters) -> None:
-        """Take new parameters between two ticks, all at once and without a jump of u."""
-        law = parameters.law()
+        """Take new parameters between two ticks, all at once and without a jump of u; the same ones change nothing."""
+        law, digest = parameters.law(), parameters.digest()
+        if digest == self._digest:
+            return
         if self._state.law is not None:
             self._state = self._state._replace(law=retune(self._state.law, self._law, law))
-        self._law, self._guard = law, parameters.guard()
+        self._law, self._guard, self._digest = law, parameters.guard(), digest
 
     def take_y(self, sample: Sample, now_ns: int) -> None:
         """A sample of y, shape (m,), in the law's order.
@@ -81,7 +84,8 @@ class Controller:
             return None
         self._number += 1
         age = seconds(now_ns - used.stamp_ns)
-        values = internals.values(self._state, used, self._guard.limits, seconds(late_ns), age, self._number)
+        limits, digest = self._guard.limits, self._digest
+        values = internals.values(self._state, used, limits, seconds(late_ns), age, self._number, digest)
         return Commanded(used.stamp_ns, self._state.u, values)
 
     def ages(self, now_ns: int) -> dict[str, float]:

@@ -1,0 +1,139 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Identify and fly the aircraft of JSBSim, all by the procedure of `rise-di identify`, and print docs/experiments.md's tables.
+
+.venv/bin/python benchmarks/jsbsim_fleet.py               the fleet, some ten seconds an aircraft
+.venv/bin/python benchmarks/jsbsim_fleet.py f16 c172p     some of it
+.venv/bin/python benchmarks/jsbsim_fleet.py --all         every aircraft that comes with JSBSim: which ones fly, and why not
+"""
+
+import sys
+from typing import NamedTuple
+
+import numpy as np
+
+from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, aircraft_names
+from flight_analysis.identification import Flown, Identified, fly_all, identify, without_beta
+from flight_core.outcome import COMPLETED, FlightEnded
+from flight_core.parameters import ParameterError
+
+KNOT, FOOT = 1852.0 / 3600.0, 0.3048  # m/s, m; exact
+
+
+class Condition(NamedTuple):
+    """Where an aircraft is flown."""
+
+    speed: float  # true airspeed, kt
+    altitude: float  # ft
+
+
+FLEET = {
+    "c172p": Condition(90, 4000),
+    "c172x": Condition(90, 4000),
+    "J3Cub": Condition(60, 2000),
+    "DHC6": Condition(130, 6000),
+    "T37": Condition(200, 8000),
+    "F80C": Condition(260, 12000),
+    "A4": Condition(300, 15000),
+    "T38": Condition(300, 12000),
+    "f16": Condition(300, 10000),
+    "global5000": Condition(330, 25000),
+    "737": Condition(300, 20000),
+    "B747": Condition(350, 25000),
+}
+"""Light, utility, trainers, fighters, business jet, airliners: a usual speed and altitude of each."""
+
+OTHERS = {
+    "787-8": Condition(350, 25000),
+    "A320": Condition(300, 20000),
+    "B17": Condition(130, 5000),
+    "Boeing314": Condition(120, 5000),
+    "C130": Condition(200, 10000),
+    "Camel": Condition(80, 2000),
+    "Concorde": Condition(350, 20000),
+    "F4N": Condition(350, 15000),
+    "L410": Condition(150, 8000),
+    "MD11": Condition(350, 25000),
+    "OV10": Condition(160, 6000),
+    "Short_S23": Condition(120, 4000),
+    "Submarine_Scout": Condition(30, 1000),
+    "X15": Condition(600, 40000),
+    "XB-70": Condition(450, 15000),
+    "ZLT-NT": Condition(30, 1500),
+    "c172r": Condition(90, 4000),
+    "c182": Condition(110, 4000),
+    "c310": Condition(150, 6000),
+    "f104": Condition(350, 15000),
+    "f15": Condition(350, 15000),
+    "f22": Condition(350, 15000),
+    "fokker100": Condition(280, 15000),
+    "fokker50": Condition(200, 10000),
+    "p51d": Condition(200, 8000),
+    "pc7": Condition(150, 6000),
+    "pogo-jsbsim": Condition(120, 3000),
+    "t6texan2": Condition(180, 8000),
+    "wrightFlyer1903": Condition(30, 50),
+    "x24b": Condition(250, 20000),
+}
+UNKNOWN = Condition(100, 3000)
+
+
+def main() -> None:
+    """Print the tables asked for."""
+    asked = sys.argv[1:]
+    names = list(FLEET) if not asked else list(aircraft_names()) if asked == ["--all"] else asked
+    rows, reasons = [], []
+    for number, name in enumerate(names, 1):
+        print(f"{number} of {len(names)}: {name}", file=sys.stderr)
+        where = (FLEET | OTHERS).get(name, UNKNOWN)
+        try:
+            found = identify(name, where.speed * KNOT, where.altitude * FOOT)
+        except (FlightEnded, ParameterError) as error:
+            reasons.append(f"| {name} | {where.speed:g} kt, {where.altitude:g} ft | {error} |")
+            continue
+        rows.append(_row(name, where, found))
+        if found.lost:
+            reasons.append(f"| {name} | {where.speed:g} kt, {where.altitude:g} ft | {found.lost} |")
+    headings = (
+        "aircraft",
+        "Omega of q, V, p, r",
+        "D",
+        "lag (s)",
+        "zero (1/s)",
+        "calm",
+        "gust",
+        "turbulence",
+        "without beta",
+        "largest u",
+    )
+    print(f"| {' | '.join(headings)} |\n|{'---|' * len(headings)}")
+    print("\n".join(rows))
+    print("\n| aircraft | at | why it does not fly |\n|---|---|---|")
+    print("\n".join(reasons))
+
+
+def _row(name: str, where: Condition, found: Identified) -> str:
+    steps = found.responses
+    pi = fly_all(without_beta(found.scenario()))
+    return " | ".join(
+        (
+            f"| {name}, {where.speed:g} kt, {where.altitude:g} ft",
+            " / ".join(f"{value:.3g}" for value in np.diag(steps.Omega)),
+            " ".join(f"{sign:+d}"[0] for sign in found.D),
+            " / ".join(f"{lag:.2g}" for lag in steps.lag),
+            f"{found.zero:.2g}",
+            *(_errors(found.flights[title]) for title in found.flights),
+            ", ".join(_errors(one) for one in pi.values()),
+            " / ".join(f"{found.flights['turbulence'].largest[one]:.2g}" for one in INPUTS) + " |",
+        )
+    )
+
+
+def _errors(flight: Flown) -> str:
+    if flight.outcome != COMPLETED:
+        return flight.outcome
+    return " / ".join(f"{flight.rms[one] * (1.0 if one == 'V' else 1e3):.2g}" for one in OUTPUTS)
+
+
+if __name__ == "__main__":
+    main()

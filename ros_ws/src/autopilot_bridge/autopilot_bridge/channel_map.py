@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a row of a channel map does: a field of a message, by its path, and the line between its value and the channel.
+
+Works on any object with the published field names, so it needs no message package. Arrays of a message may be lists,
+array.array or NumPy arrays.
+"""
+
+import importlib
+import math
+import re
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_core.parameters import ParameterError
+from flight_core.vectors import ChannelError
+
+PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
+STEP = re.compile(r"(\w+)(?:\[(\d+)\])?")
+
+SEA_LEVEL_DENSITY = 1.225
+"""kg/m^3, ISO 2533; with it the speed from a pressure is the indicated one, not the true one."""
+
+
+class Line(NamedTuple):
+    """Channel = sign scale raw + offset; SI and radians on the side of the channel, the autopilot's unit on the raw one."""
+
+    sign: int  # +1 or -1
+    scale: float  # above 0, units of the channel per unit of the raw value
+    offset: float  # unit of the channel
+
+
+def to_channel(raw: float, line: Line) -> float:
+    """Channel = sign scale raw + offset."""
+    return line.sign * line.scale * raw + line.offset
+
+
+def to_raw(channel: float, line: Line) -> float:
+    """Raw = sign (channel - offset) / scale, the inverse of `to_channel`."""
+    return line.sign * (channel - line.offset) / line.scale
+
+
+def is_path(text: str) -> bool:
+    """Whether the text is the path of a field: names with dots between them, each with a place in brackets or none."""
+    return PATH.fullmatch(text) is not None
+
+
+def get_field(message: Any, path: str) -> Any:
+    """The value at a path such as "twist.angular.y" or "axes[1]". Raises ChannelError, reason "field", where there is none."""
+    value = message
+    for name, place in STEP.findall(path):
+        try:
+            value = getattr(value, name)
+            if place:
+                value = value[int(place)]
+        except (AttributeError, IndexError, TypeError):
+            raise ChannelError("field", f"{type(message).__name__} has no {path}") from None
+    return value
+
+
+def set_field(message: Any, path: str, value: Any) -> None:
+    """Put a value at a path; a number into a field of whole numbers is rounded. Raises ChannelError, reason "field" or "range".
+
+    A whole number cannot be NaN or infinite, and one outside its type is refused, never wrapped or cut.
+    """
+    found = get_field(message, path)
+    if isinstance(found, int | np.integer) and isinstance(value, float):
+        if not math.isfinite(value):
+            raise ChannelError("range", f"{path} takes whole numbers, not {value:g}")
+        value = round(value)
+    *parents, (name, place) = STEP.findall(path)
+    parent = message
+    for parent_name, parent_place in parents:
+        parent = getattr(parent, parent_name)
+        if parent_place:
+            parent = parent[int(parent_place)]
+    try:
+        if place:
+            getattr(parent, name)[int(place)] = value
+        else:
+            setattr(parent, name, value)
+    except (AssertionError, OverflowError, TypeError, ValueError) as error:
+        raise ChannelError("range", f"{path} cannot be {value!r} ({error})") from None
+
+
+def _itself(found: Any) -> float:
+    return float(found)
+
+
+def _norm(found: Any) -> float:
+    """sqrt(x^2 + y^2 + z^2) of a vector with members x, y, z or with three places."""
+    parts = (found.x, found.y, found.z) if hasattr(found, "x") else found
+    return math.hypot(*(float(part) for part in parts))
+
+
+def _dynamic_pressure(found: Any) -> float:
+    """The indicated airspeed sqrt(2 dp / rho_0), m/s, of a dynamic pressure in Pa; below zero it is noise at standstill: 0."""
+    return math.sqrt(2.0 * max(float(found), 0.0) / SEA_LEVEL_DENSITY)
+
+
+DERIVED: Mapping[str, Callable[[Any], float]] = MappingProxyType(
+    {"value": _itself, "norm": _norm, "airspeed_of_pressure": _dynamic_pressure}
+)
+"""How the raw value comes from the field: itself, the length of a vector, the speed of a dynamic pressure."""
+
+
+def read_raw(message: Any, path: str, function: str) -> float:
+    """The raw value of a row. Raises ChannelError, reason "field" where it is not there, "finite" where it is not finite."""
+    found = get_field(message, path)
+    try:
+        raw = DERIVED[function](found)
+    except (AttributeError, TypeError, ValueError):
+        raise ChannelError("field", f"{path} of {type(message).__name__} is nothing to take the {function} of") from None
+    if not math.isfinite(raw):
+        raise ChannelError("finite", f"{path} = {raw} is not finite")
+    return raw
+
+
+def message_type(name: str, load: Callable[[str], Any] = importlib.import_module) -> type:
+    """The class of "package/msg/Type". Raises ParameterError that says what to install."""
+    package, _, kind = name.split("/")
+    try:
+        module = load(f"{package}.msg")
+    except ModuleNotFoundError:
+        debian = f"ros-jazzy-{package.replace('_', '-')}"
+        raise ParameterError(
+            f"{name}: found no Python package {package}, expected it: install {debian}, or build {package} in a workspace and"
+            " source it"
+        ) from None
+    found = getattr(module, kind, None)
+    if not isinstance(found, type):
+        raise ParameterError(f"{name}: found no {kind} in the installed {package}, expected another version of {package}")
+    return found

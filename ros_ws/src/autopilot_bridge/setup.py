@@ -1,0 +1,17 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+setup(
+    name="autopilot_bridge",
+    version="0.1.0",
+    description="Takes the simulated aircraft's place: y from the topics of a real autopilot, u to them, by a channel map.",
+    license="Apache-2.0",
+    packages=["autopilot_bridge"],
+    package_data={"autopilot_bridge": ["maps/*.yaml"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/autopilot_bridge"]),
+        ("share/autopilot_bridge", ["package.xml"]),
+    ],
+    entry_points={"console_scripts": ["bridge = autopilot_bridge.node:main"]},
+)

@@ -1,0 +1,149 @@
+// Draws the pictures of a report from what the page holds: a specification in each <figure>, plotly and all samples packed.
+"use strict";
+
+const MARGIN = 0.5; // of the view, drawn on both sides of it so that there is something to pan into
+const SHEET = {width: 690, height: 0.72}; // pixels; and what becomes of the height, so that two pictures share a sheet
+const DARK = JSON.parse(document.getElementById("dark").textContent);
+const scheme = matchMedia("(prefers-color-scheme: dark)");
+const figures = [...document.querySelectorAll("figure")].map(node => ({
+  node, text: node.querySelector("script").textContent, inTime: "time" in node.dataset, plot: node.querySelector("div"), drawn: "",
+}));
+let range = null; // s, what all pictures over time show; null: all of it, as it was drawn
+let turn = 0;
+
+// ---- Packed content: base64 of a zlib stream, the bytes of items sorted by their place
+
+async function unpack(id, width = 1) {
+  const packed = await fetch("data:;base64," + document.getElementById(id).textContent);
+  const stream = packed.body.pipeThrough(new DecompressionStream("deflate"));
+  const sorted = new Uint8Array(await new Response(stream).arrayBuffer());
+  const count = sorted.length / width, bytes = new Uint8Array(sorted.length);
+  for (let place = 0; place < width; place++)
+    for (let k = 0; k < count; k++) bytes[k * width + place] = sorted[place * count + k];
+  return bytes.buffer;
+}
+
+async function unpackTimes(id) { // steps in ns -> s
+  const t = new Float64Array(await unpack(id, 8));
+  let sum = 0;
+  return t.map(step => (sum += step) / 1e9);
+}
+
+const kept = new Map();
+function samples(id) {
+  if (!kept.has(id)) kept.set(id, id[0] === "t" ? unpackTimes(id) : unpack(id, 4).then(bytes => new Float32Array(bytes)));
+  return kept.get(id);
+}
+
+// ---- What a view shows of them: all where they are few, else the smallest and largest of each bin, and the gaps
+
+function firstAfter(t, instant) {
+  let low = 0, high = t.length;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (t[middle] < instant) low = middle + 1; else high = middle;
+  }
+  return low;
+}
+
+function view(t, v, [from, to], most) {
+  const begin = Math.max(firstAfter(t, from) - 1, 0), end = Math.min(firstAfter(t, to) + 2, t.length);
+  const width = end - begin > most ? Math.ceil((end - begin) / (most / 2)) : 1;
+  const places = [];
+  for (let first = begin; first < end; first += width) {
+    let low = -1, high = -1, gap = -1;
+    for (let k = first; k < Math.min(first + width, end); k++) {
+      if (Number.isNaN(v[k])) gap = k;
+      else {
+        if (low < 0 || v[k] < v[low]) low = k;
+        if (high < 0 || v[k] > v[high]) high = k;
+      }
+    }
+    places.push(...[...new Set([low, high, gap])].filter(k => k >= 0).sort((a, b) => a - b));
+  }
+  return {x: places.map(k => t[k]), y: places.map(k => v[k])};
+}
+
+async function views(data) { // of the traces of which more is known than is drawn, by their place
+  const margin = MARGIN * (range[1] - range[0]), wide = [range[0] - margin, range[1] + margin], found = new Map();
+  for (const [place, {meta}] of data.entries())
+    if (meta) found.set(place, view(await samples(meta.t), await samples(meta.v), wide, meta.most));
+  return found;
+}
+
+// ---- Drawing
+
+const look = () => (scheme.matches ? "dark" : "light");
+
+const axes = layout => Object.keys(layout).filter(key => /^xaxis\d*$/.test(key)); // all over one time, but each has its range
+
+function specification(figure, style) {
+  return JSON.parse(style === "dark" ? figure.text.replace(/#[0-9a-f]{6}/g, colour => DARK[colour] ?? colour) : figure.text);
+}
+
+async function draw(figure, style) {
+  const {data, layout} = specification(figure, style);
+  if (range && figure.inTime) {
+    for (const [place, {x, y}] of await views(data)) Object.assign(data[place], {x, y});
+    for (const axis of axes(layout)) layout[axis].range = [...range];
+  }
+  await Plotly.newPlot(figure.plot, data, layout, {displaylogo: false, responsive: true, doubleClick: "reset"});
+  if (figure.inTime) figure.plot.on("plotly_relayout", change => moved(figure, change));
+}
+
+async function follow(figure) { // a view of all others
+  const found = await views(figure.plot.data), all = [...found.values()];
+  const traces = {x: all.map(one => one.x), y: all.map(one => one.y)};
+  const ranges = Object.fromEntries(axes(figure.plot.layout).map(axis => [`${axis}.range`, [...range]]));
+  await Plotly.update(figure.plot, traces, ranges, [...found.keys()]);
+}
+
+function moved(figure, change) { // a zoom in time is one in all pictures
+  if (!Object.keys(change).some(key => /^xaxis\d*\.(range|autorange)/.test(key))) return;
+  range = [...figure.plot.layout.xaxis.range].map(Number);
+  showAll();
+}
+
+async function showAll() { // those in sight first
+  const mine = ++turn, distance = ({node}) => {
+    const {top, bottom} = node.getBoundingClientRect();
+    return Math.max(top - innerHeight, -bottom, 0);
+  };
+  for (const figure of [...figures].sort((a, b) => distance(a) - distance(b))) {
+    const style = look(), wanted = `${style} ${figure.inTime && range}`;
+    if (figure.drawn !== wanted) {
+      if (figure.drawn.startsWith(style) && range && figure.inTime) await follow(figure);
+      else await draw(figure, style);
+      figure.drawn = wanted;
+      performance.mark("picture");
+      await new Promise(resume => setTimeout(resume)); // lets the reader scroll meanwhile
+    }
+    if (mine !== turn) return; // another view is wanted by now
+  }
+  document.body.dataset.drawn = turn;
+}
+
+function print() { // on white, as wide as a sheet; at once, for the browser does not wait
+  for (const figure of figures) {
+    const {data, layout} = specification(figure, "light"), shown = figure.plot.data ?? data;
+    for (const [place, {x, y}] of shown.entries()) Object.assign(data[place], {x, y});
+    if (range && figure.inTime) for (const axis of axes(layout)) layout[axis].range = [...range];
+    for (const text of [layout, ...(layout.annotations ?? [])]) text.font.size *= SHEET.height;
+    Object.assign(layout, {width: SHEET.width, height: SHEET.height * layout.height});
+    figure.plot.style.height = "auto";
+    Plotly.newPlot(figure.plot, data, layout, {staticPlot: true});
+    figure.drawn = "";
+  }
+}
+
+async function start() {
+  const library = document.createElement("script");
+  library.textContent = new TextDecoder().decode(await unpack("library"));
+  document.head.append(library);
+  await showAll();
+  scheme.addEventListener("change", showAll);
+  addEventListener("beforeprint", print);
+  addEventListener("afterprint", showAll);
+}
+
+start();

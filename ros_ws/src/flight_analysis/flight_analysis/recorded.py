@@ -1,0 +1,17 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A recorded flight, as it is drawn, exported and compared."""
+
+from typing import Any, NamedTuple
+
+from flight_analysis.scenario import Scenario
+from flight_core.tape import Tape
+
+
+class Recorded(NamedTuple):
+    """What was flown, under the name of its run."""
+
+    name: str
+    scenario: Scenario
+    tape: Tape
+    summary: dict[str, Any]  # `summary.summarise`

@@ -1,0 +1,49 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di repair`: the log of a killed recorder made one that every reader of rosbag2 takes."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import yaml
+
+from flight_analysis.bag_reader import read_run
+from flight_bringup.graph import PARAMETERS
+from flight_core.parameters import ParameterError
+from flight_core.rates import seconds
+from flight_recorder.bag import METADATA
+from flight_recorder.repair import Repaired, repair
+
+
+def repair_run(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> None:
+    """Rebuild the log of a run whose recorder was killed, or that is damaged; leave an intact one alone.
+
+    What could be read is kept, with an index and metadata.yaml; the damaged file stays beside it as *.damaged.
+    """
+    repaired = repair(run)
+    for file in repaired.files:
+        if file.damaged is not None:
+            print(f"{file.path.name} had {file.faults}: {file.kept} messages kept; as it was: {file.damaged.name}")
+    if repaired.wrote_metadata:
+        print(f"{METADATA} written; {_end(run, repaired.files[-1])}")
+    else:
+        print(f"{run} is intact: nothing to repair")
+
+
+def _end(run: Path, last: Repaired) -> str:
+    """How much is missing, compared with what is known of the end: what the files say, else how long the flight was to be."""
+    if (missing := seconds(last.known_end_ns - last.last_ns)) > 0:
+        return f"{missing:.3f} s are missing at its end"
+    if not last.faults:
+        return "nothing is missing"
+    try:
+        recorded = read_run(run)
+    except ParameterError:
+        return "nothing says how much is missing at its end"
+    end = max(float(recorded.tape.time(name)[-1]) for name in recorded.tape.signals)
+    for stored in recorded.attachments:
+        if stored.name == PARAMETERS:
+            duration = yaml.safe_load(stored.content)["/**/flight"]["ros__parameters"]["duration"]
+            return f"the log ends at t = {end:.3f} s of the {duration:g} s that were to be flown"
+    return f"the log ends at t = {end:.3f} s; nothing says how much is missing"

@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Sends the messages of a log again, with their timing."""
+
+import os
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping
+from importlib import import_module
+from types import TracebackType
+from typing import Any, Self
+
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_ros import transport
+from flight_ros.messages import STAMP, STAMP_PLACE, instant
+from flight_ros.runtime import ACKNOWLEDGED_WITHIN, NICE_PAUSE
+from flight_ros.topics import CLOCK, STEP
+
+DISCOVERY = 1.0  # s, for somebody who is there to be found
+MATCHING = 0.5  # s, for listeners to be found by the publishers
+
+CLOCK_PERIOD_NS = 10_000_000
+"""ns of the log between two samples of `/clock`."""
+
+SHOWN_EVERY_NS = 100_000_000
+
+
+Outgoing = tuple[int, str, bytes, bool]
+"""The instant of the log at which a message is due, ns; its topic; its bytes; whether they begin with a stamp to be moved."""
+
+
+class Player:
+    """Publishers on the topics of a log and on `/clock`. A context manager, so that the middleware is always shut down.
+
+    `shared` are topics on which others may publish too. Raises ParameterError where somebody publishes on any other of them,
+    or a message type is not installed.
+    """
+
+    def __init__(self, types: Mapping[str, str], shared: Collection[str]) -> None:
+        kinds = {topic: _message_type(topic, name) for topic, name in types.items()}
+        transport.prepare()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C is for the command to handle
+        self._node = rclpy.create_node("player", start_parameter_services=False, enable_rosout=False)
+        try:
+            self._require_alone([topic for topic in (*types, CLOCK.name) if topic not in shared])
+            self._publishers = {topic: self._node.create_publisher(kind, topic, STEP) for topic, kind in kinds.items()}
+            self._clock = self._node.create_publisher(CLOCK.type, CLOCK.name, STEP)
+            time.sleep(MATCHING)
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._node.destroy_node()
+        rclpy.try_shutdown()
+
+    def _require_alone(self, topics: list[str]) -> None:
+        end_ns = time.monotonic_ns() + nanoseconds(DISCOVERY)
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        while time.monotonic_ns() < end_ns:
+            for topic in topics:
+                count = self._node.count_publishers(topic)
+                expected = "nobody there: set ROS_DOMAIN_ID to a domain of its own, or choose other --topics"
+                require(count == 0, f"ROS_DOMAIN_ID {domain}", f"{count} publishers of {topic} already", expected)
+            time.sleep(NICE_PAUSE)
+
+    def play(
+        self, messages: Iterable[Outgoing], rate: float, *, stamps_now: bool, progress: Callable[[int], None] | None = None
+    ) -> None:
+        """Send all messages, the first one at once, each of the others at its distance from it over `rate`.
+
+        Deadlines are absolute, on the monotonic clock. With `stamps_now` a stamp becomes as old, against the system clock, as
+        it was against the instant at which its message was due, over `rate`. `progress` is told the instant of the log in ns
+        ten times a second.
+        """
+        begin_ns = begin_system_ns = first_ns = clock_ns = shown_ns = 0
+        for due_ns, topic, message, stamped in messages:
+            if begin_ns == 0:
+                begin_ns, begin_system_ns = time.monotonic_ns(), time.time_ns()
+                first_ns = clock_ns = due_ns
+            while clock_ns <= due_ns:
+                _sleep_until(begin_ns + round((clock_ns - first_ns) / rate))
+                self._clock.publish(instant(clock_ns))
+                clock_ns += CLOCK_PERIOD_NS
+                if progress is not None and time.monotonic_ns() >= shown_ns:
+                    shown_ns = time.monotonic_ns() + SHOWN_EVERY_NS
+                    progress(due_ns)
+            _sleep_until(begin_ns + round((due_ns - first_ns) / rate))
+            fresh = stamps_now and stamped
+            self._publishers[topic].publish(_restamped(message, begin_system_ns, first_ns, rate) if fresh else message)
+        for publisher in self._publishers.values():
+            publisher.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+
+
+def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
+    seconds, nanosecond = STAMP.unpack_from(data, STAMP_PLACE)
+    since_ns = seconds * NANOSECONDS + nanosecond - first_ns
+    fresh = bytearray(data)
+    STAMP.pack_into(fresh, STAMP_PLACE, *divmod(begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate)), NANOSECONDS))
+    return bytes(fresh)
+
+
+def _sleep_until(deadline_ns: int) -> None:
+    while (pause_ns := deadline_ns - time.monotonic_ns()) > 0:
+        time.sleep(min(pause_ns / NANOSECONDS, NICE_PAUSE))
+
+
+def _message_type(topic: str, name: str) -> Any:
+    package, _, kind = name.partition("/msg/")
+    try:
+        return getattr(import_module(f"{package}.msg"), kind)
+    except (ImportError, AttributeError):
+        raise ParameterError(f"{topic}: its type {name} is not installed, expected the package {package}") from None

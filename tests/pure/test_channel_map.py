@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Channel maps: each row of each map by values worked out by hand, the conversion, and what a map may not say.
+
+Messages of packages that are not installed (px4_msgs, mavros_msgs, rosflight_msgs, rosplane_msgs) are stood in for by plain
+objects with the published field names; those of common_interfaces are too here, and real ones in tests/ros/test_bridge.py.
+"""
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from autopilot_bridge.channel_map import Line, get_field, message_type, read_raw, set_field, to_channel, to_raw
+from autopilot_bridge.params import LIBRARY, BridgeParameters, ChannelMap, load_map
+from flight_core.parameters import ParameterError
+from flight_core.vectors import ChannelError
+
+MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
+LINES = st.builds(Line, st.sampled_from((-1, 1)), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
+
+
+def thing(**fields: Any) -> SimpleNamespace:
+    return SimpleNamespace(**fields)
+
+
+FLU = thing(x=0.3, y=-0.2, z=-0.1)  # rolls right at 0.3 rad/s, nose up at 0.2, nose right at 0.1
+FRD = np.array([0.3, 0.2, 0.1], dtype=np.float32)  # the same motion, as fixed arrays of a message are
+MOTION = {"p": 0.3, "q": 0.2, "r": 0.1}  # what each of the maps has to make of it
+RATES = {
+    "ardupilot": thing(twist=thing(linear=thing(x=9.0, y=9.0, z=9.0), angular=FLU)),
+    "mavros": thing(angular_velocity=FLU),
+    "px4": thing(angular_velocity=FRD),
+    "rosflight": thing(p=0.3, q=0.2, r=0.1, va=27.0),
+}
+AIRSPEED = {  # 27 m/s, which is 2 m/s above the trim of 25 m/s
+    "ardupilot": thing(vector=thing(x=-18.0, y=18.0, z=-9.0)),  # 9 (2, 2, 1), of length 27
+    "mavros": thing(airspeed=27.0),
+    "px4": thing(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
+    "rosflight": RATES["rosflight"],
+}
+SENT = {  # elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to the right, rudder 0.1 rad to the right
+    "ardupilot": {"axes[1]": 0.1 / 0.523599, "axes[2]": 0.2, "axes[0]": 0.1 / 0.523599, "axes[3]": 0.1 / 0.523599},
+    "px4": {"torque.xyz[1]": 0.1 / 0.523599, "thrust.xyz[0]": 0.6, "torque.xyz[0]": 0.1 / 0.523599, "torque.xyz[2]": 0.190986},
+    "mavros": {"channels[1]": 1595.493, "channels[2]": 1600.0, "channels[0]": 1595.493, "channels[3]": 1595.493},
+    "rosflight": {"u[4]": -0.1 / 0.523599, "u[0]": 0.6, "u[3]": 0.1 / 0.523599, "u[5]": -0.1 / 0.523599},
+}
+RELEASED = {"ardupilot": math.nan, "px4": math.nan, "mavros": 0.0, "rosflight": 0.0}
+
+
+@pytest.mark.parametrize("name", MAPS)
+@pytest.mark.parametrize("channel", ["q", "V", "p", "r"])
+def test_each_output_comes_in_si_and_frd(name: str, channel: str) -> None:
+    row = load_map(name).outputs[channel]
+    message = AIRSPEED[name] if channel == "V" else RATES[name]
+    value = to_channel(read_raw(message, row.field, row.function), row.line)
+    assert value == pytest.approx(2.0 if channel == "V" else MOTION[channel], abs=1e-6)  # float32 in a message of PX4
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_each_input_is_sent_in_the_autopilots_unit_and_sign(name: str) -> None:
+    chart = load_map(name)
+    for (path, expected), row in zip(SENT[name].items(), chart.inputs.values(), strict=True):
+        assert path in (row.field, f"{row.message}.{row.field}")
+        assert to_raw(row.trim + 0.1, row.line) == pytest.approx(expected, abs=1e-3)  # us are whole ones anyway
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_each_map_sends_nothing_by_default_and_says_where_each_row_is_from(name: str) -> None:
+    chart = load_map(name)
+    assert chart.dry_run
+    assert list(chart.outputs) == ["q", "V", "p", "r"]
+    assert list(chart.inputs) == ["elevator", "thrust", "aileron", "rudder"]
+    rows: list[Any] = [*chart.outputs.values(), *chart.inputs.values(), *chart.overrides.values()]
+    assert all(len(row.source) > 10 for row in rows)
+    for row in chart.inputs.values():
+        assert row.release == pytest.approx(RELEASED[name], nan_ok=True)
+        assert to_channel(row.neutral, row.line) == pytest.approx(row.trim, abs=1e-6)
+
+
+def test_ardupilots_map_needs_the_message_types_of_common_interfaces_alone() -> None:
+    types = {kind for _, _, kind in load_map("ardupilot").used_topics()}
+    assert types == {"geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Vector3Stamped", "sensor_msgs/msg/Joy"}
+
+
+@given(LINES, st.floats(-1e4, 1e4))
+def test_sending_a_value_and_reading_it_back_gives_the_value(line: Line, channel: float) -> None:
+    assert to_channel(to_raw(channel, line), line) == pytest.approx(channel, rel=1e-12, abs=1e-9)
+
+
+@given(LINES, st.floats(-1e4, 1e4), st.floats(1e-3, 1e3))
+def test_a_channel_rises_with_the_raw_value_by_its_sign_and_scale(line: Line, raw: float, more: float) -> None:
+    rise = to_channel(raw + more, line) - to_channel(raw, line)
+    assert rise == pytest.approx(line.sign * line.scale * more, rel=1e-6, abs=1e-5)  # cancellation beside 1e7
+
+
+@given(st.floats(0.0, 300.0))
+def test_the_speed_of_a_dynamic_pressure_is_the_one_that_makes_it(speed: float) -> None:
+    message = thing(fluid_pressure=0.5 * 1.225 * speed**2)
+    assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == pytest.approx(speed, abs=1e-6)
+
+
+def test_fields_are_reached_by_their_paths() -> None:
+    message = thing(twist=thing(angular=thing(y=1.5)), axes=[0.0, 2.5], parts=[thing(z=3.5)])
+    assert get_field(message, "twist.angular.y") == 1.5
+    assert get_field(message, "axes[1]") == 2.5
+    set_field(message, "parts[0].z", 4.5)
+    assert message.parts[0].z == 4.5
+    for path in ("twist.linear.y", "axes[2]", "axes.x", "twist[0]"):
+        with pytest.raises(ChannelError, match="has no"):
+            get_field(message, path)
+
+
+def test_whole_numbers_are_rounded_and_never_wrapped() -> None:
+    message = thing(channels=np.zeros(18, dtype=np.uint16))
+    set_field(message, "channels[1]", 1595.5001)
+    assert message.channels[1] == 1596
+    for wrong in (math.nan, -1.0, 70000.0):
+        with pytest.raises(ChannelError):
+            set_field(message, "channels[1]", wrong)
+    assert message.channels[1] == 1596
+
+
+@pytest.mark.parametrize("raw", [math.nan, math.inf])
+def test_a_value_that_is_not_finite_is_refused(raw: float) -> None:
+    with pytest.raises(ChannelError, match="not finite") as refused:
+        read_raw(thing(q=raw), "q", "value")
+    assert refused.value.reason == "finite"
+
+
+def test_a_missing_message_package_is_one_sentence_that_says_what_to_install() -> None:
+    with pytest.raises(ParameterError, match=r"px4_msgs/msg/VehicleOdometry: .*ros-jazzy-px4-msgs"):
+        message_type("px4_msgs/msg/VehicleOdometry")
+
+
+def test_a_message_that_another_version_lacks_is_one_sentence() -> None:
+    with pytest.raises(ParameterError, match="no Airspeed in the installed ardupilot_msgs"):
+        message_type("ardupilot_msgs/msg/Airspeed", lambda name: thing())
+
+
+# What a map may not say: (place, value) and the sentence.
+REFUSALS = (
+    (("outputs", "q", "sign"), 2, r"map test\.outputs\.q\.sign: found 2, expected 1 or -1|-1 or 1"),
+    (("outputs", "q", "scale"), 0.0, r"map test\.outputs\.q\.scale: found 0\.0"),
+    (("outputs", "q", "field"), "twist..y", r"map test\.outputs\.q\.field: found 'twist\.\.y'"),
+    (("outputs", "q", "type"), "TwistStamped", r"map test\.outputs\.q\.type"),
+    (("outputs", "q", "type"), "sensor_msgs/msg/Imu", r"map test\.outputs\.p\.type: found geometry_msgs/msg/TwistStamped"),
+    (("outputs", "q", "positive"), "up", r"map test\.outputs\.q\.positive: found 'up'"),
+    (("outputs", "q", "topic"), "/other", r"map test\.outputs\.q\.topic: found /other, .*quality of service"),
+    (("outputs", "q", "function"), "sum", r"map test\.outputs\.q\.function"),
+    (("inputs", "elevator", "message"), "yoj", r"map test\.inputs\.elevator\.message: found 'yoj', .* joy"),
+    (("inputs", "elevator", "field"), "axes[0]", r"map test\.inputs\.aileron\.field: found axes\[0\], that of elevator"),
+    (("inputs", "elevator", "lower"), -0.9, r"map test\.inputs\.elevator\.lower: found axes\[1\] = -1\.7"),
+    (("inputs", "elevator", "lower"), 0.1, r"map test\.inputs\.elevator\.lower: found 0\.1"),
+    (("inputs", "elevator", "trim"), math.nan, r"map test\.inputs\.elevator\.trim"),
+    (("inputs", "elevator", "neutral"), 1.5, r"map test\.inputs\.elevator\.neutral: found 1\.5"),
+    (("inputs", "elevator", "source"), "", r"map test\.inputs\.elevator\.source"),
+    (("messages", "joy", "when"), "ready", r"map test\.inputs\.elevator\.message: found one sent when ready"),
+    (("overrides", "gamepad", "above"), None, r"map test\.overrides\.gamepad: found above and below, or neither"),
+    (("topics", "/ap/joy", "depth"), 0, r"map test\.topics\./ap/joy\.depth"),
+    (("instant",), "x", r"map test\.instant: found 'x', expected one of the outputs q, V, p, r"),
+)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "sentence"), REFUSALS, ids=lambda one: ".".join(one) if isinstance(one, tuple) else ""
+)
+def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], value: object, sentence: str) -> None:
+    content = yaml.safe_load((LIBRARY / "ardupilot.yaml").read_text(encoding="utf-8"))
+    part = content
+    for key in place[:-1]:
+        part[key] = dict(part[key])  # merged keys share what they hold
+        part = part[key]
+    part[place[-1]] = value
+    with pytest.raises(ParameterError, match=sentence) as refused:
+        ChannelMap.validate_mapping(content, "map test")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_map_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(
+        ParameterError, match=r"bridge\.map: found 'nowhere', expected one of ardupilot, mavros, px4, rosflight"
+    ):
+        BridgeParameters.validate_mapping({"map": "nowhere"}, "bridge")
+    with pytest.raises(ParameterError, match="lockstep"):
+        BridgeParameters.validate_mapping({"map": "px4", "lockstep": True}, "bridge")

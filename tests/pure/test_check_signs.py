@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di check-signs`: a map that would turn the loop around is refused before anything is sent."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from aircraft_sim.airframe import load_airframe
+from autopilot_bridge.params import LIBRARY, ChannelMap, load_map
+from autopilot_bridge.signs import SURE, estimate, through
+from flight_analysis.simulate import simulate
+from flight_bringup.check_signs_command import check
+from flight_bringup.cli import app
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError
+from flight_core.rates import nanoseconds
+from flight_core.tape import Signal
+from flight_core.vectors import FloatArray
+
+MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
+OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
+
+
+def omega_of_the_osprey() -> FloatArray:
+    osprey = load_airframe("osprey")
+    assert osprey.outputs == ("q", "V", "p", "r")  # as in the maps
+    return osprey.matrix_c() @ osprey.matrix_b()
+
+
+def changed(name: str, kind: str, channel: str, **values: Any) -> ChannelMap:
+    content = load_map(name).model_dump()
+    content[kind][channel] |= values
+    return ChannelMap.validate_mapping(content, "map")
+
+
+def listed(value: Any) -> Any:
+    """With lists for tuples, as YAML has them."""
+    if isinstance(value, dict):
+        return {key: listed(one) for key, one in value.items()}
+    return [listed(one) for one in value] if isinstance(value, tuple) else value
+
+
+def written(chart: ChannelMap, folder: Path) -> str:
+    path = folder / f"{chart.name}.yaml"
+    path.write_text(yaml.safe_dump(listed(chart.model_dump(exclude_none=True)), sort_keys=False), encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_the_shipped_maps_fit_the_controller_of_the_osprey(name: str) -> None:
+    shown = CliRunner().invoke(app, ["check-signs", name, "--json"])
+    assert shown.exit_code == 0
+    assert [(one["output"], one["input"], one["D"]) for one in json.loads(shown.stdout)["channels"]] == [
+        ("q", "elevator", 1),
+        ("p", "aileron", 1),
+        ("r", "rudder", 1),
+        ("V", "thrust", 1),
+    ]
+
+
+def test_through_a_map_of_the_right_signs_omega_is_that_of_the_airframe() -> None:
+    for name in MAPS:
+        assert through(load_map(name), omega_of_the_osprey()) == pytest.approx(omega_of_the_osprey())
+
+
+@pytest.mark.parametrize("channel", INPUTS)
+@pytest.mark.parametrize("name", MAPS)
+def test_an_input_with_the_wrong_sign_turns_its_own_d_alone(name: str, channel: str) -> None:
+    row, k = load_map(name).inputs[channel], INPUTS.index(channel)
+    span = sum(row.range)  # the sign turns about the middle, so that trim stays inside the range
+    flipped = changed(name, "inputs", channel, sign=-row.sign, offset=row.offset + row.sign * row.scale * span)
+    found = check(flipped, omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1))
+    assert [one.D for one in found.channels] == [-1 if i == k else 1 for i in range(4)]
+    assert len(found.contradictions) == 1
+    assert f"D of {OUTPUTS[k]} and {channel} is -1, the controller has +1" in found.contradictions[0]
+
+
+@pytest.mark.parametrize("channel", OUTPUTS)
+def test_two_wrong_signs_that_cancel_in_d_are_no_less_wrong(channel: str) -> None:
+    k = OUTPUTS.index(channel)
+    flipped = changed("ardupilot", "outputs", channel, sign=-load_map("ardupilot").outputs[channel].sign)
+    row = flipped.inputs[INPUTS[k]]
+    content = flipped.model_dump()
+    content["inputs"][INPUTS[k]] |= {"sign": -row.sign}
+    found = check(ChannelMap.validate_mapping(content, "map"), omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1))
+    assert [one.D for one in found.channels] == [1, 1, 1, 1]
+    assert f"outputs.{channel} of the map ardupilot comes with the wrong sign" in found.contradictions[0]
+
+
+def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> None:
+    path = written(changed("ardupilot", "inputs", "elevator", sign=-1), tmp_path)
+    shown = CliRunner().invoke(app, ["check-signs", path])
+    assert shown.exit_code == 1
+    assert (
+        "error: with the map ardupilot D of q and elevator is -1, the controller has +1: a positive elevator makes"
+        in shown.stderr
+    )
+
+
+def test_a_map_of_other_channels_or_motions_is_one_sentence() -> None:
+    with pytest.raises(ParameterError, match=r"outputs\.q\.positive: found 'roll right', expected a motion that q shows"):
+        through(changed("ardupilot", "outputs", "q", positive="roll right"), omega_of_the_osprey())
+    with pytest.raises(ParameterError, match=r"inputs\.elevator\.positive: found 'roll right', .* in the airframe p"):
+        through(changed("ardupilot", "inputs", "elevator", positive="roll right"), omega_of_the_osprey())
+
+
+# What a recorded flight shows
+
+
+def excited(Omega: FloatArray, noise: float) -> tuple[Signal, Signal]:
+    """y_dot = -2 y + Omega u at 100 Hz for 20 s, each input in steps of its own period; integrated exactly between samples."""
+    generator = np.random.default_rng(1)
+    t = 0.01 * np.arange(2000)
+    periods = np.array([1.1, 1.7, 2.3, 2.9])
+    u = 0.1 * np.sign(np.sin(2.0 * np.pi * t[:, None] / periods))
+    y = np.zeros((len(t), 4))
+    decay = np.exp(-2.0 * 0.01)
+    for k in range(len(t) - 1):
+        y[k + 1] = decay * y[k] + (1.0 - decay) / 2.0 * (Omega @ u[k])
+    stamps = np.array([nanoseconds(one) for one in t], dtype=np.int64)
+    y = y + noise * generator.standard_normal(y.shape)
+    return Signal(stamps, OUTPUTS, y), Signal(stamps, INPUTS, u)
+
+
+def test_an_excited_flight_gives_omega_back() -> None:
+    Omega = np.array([[50.0, 1.0, 0.0, 0.0], [0.0, -80.0, 2.0, 0.0], [0.0, 3.0, 10.0, 0.0], [0.5, 0.0, 0.0, -6.0]])
+    y, u = excited(Omega, noise=0.0)
+    assert estimate(y, u, OUTPUTS, INPUTS).Omega == pytest.approx(Omega, rel=0.1, abs=0.5)  # slopes over 0.05 s of 1 / (2 1/s)
+
+
+def test_noise_makes_it_unsure_not_wrong() -> None:
+    """Ten times the noise of osprey_servo: of the strong channels it is sure, and of no sign is it sure and wrong."""
+    Omega = np.diag([50.0, -80.0, 1.0, -0.1])
+    y, u = excited(Omega, noise=0.02)
+    found = estimate(y, u, OUTPUTS, INPUTS)
+    diagonal, ratio = np.diag(found.Omega), np.diag(found.ratio)
+    assert (ratio[:2] > SURE).all()
+    assert ratio[3] < SURE
+    assert all(np.sign(diagonal[k]) == np.sign(Omega[k, k]) for k in range(4) if ratio[k] > SURE)
+
+
+def test_a_recorded_flight_of_the_osprey_shows_the_signs_of_its_omega() -> None:
+    tape = simulate(find_scenario("osprey_gust").vary(flight={"duration": 28.0}))
+    measured = estimate(tape["y"], tape["u"], OUTPUTS, INPUTS)
+    assert (np.diag(measured.ratio) > SURE).all()
+    right = check(load_map("ardupilot"), omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1), measured)
+    assert not right.contradictions
+    wrong = changed("ardupilot", "inputs", "rudder", positive="nose left")
+    found = check(wrong, omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, -1, 1), measured)
+    assert len(found.contradictions) == 1
+    assert "the recorded flight has r_dot rise with rudder" in found.contradictions[0]
+
+
+def test_a_flight_in_which_an_input_never_moves_says_nothing_of_it() -> None:
+    y, u = excited(np.eye(4), noise=0.0)
+    still = Signal(u.stamp_ns, u.names, u.values * np.array([1.0, 1.0, 0.0, 1.0]))
+    with pytest.raises(ParameterError, match=r"u\.rudder of the log: found a value that never changes"):
+        estimate(y, still, OUTPUTS, INPUTS)
+    with pytest.raises(ParameterError, match=r"the log: found 2 intervals"):
+        estimate(y, u.until(nanoseconds(0.12)), OUTPUTS, INPUTS)

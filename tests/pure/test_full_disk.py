@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A disk that runs full under a log: it is finished all the same, or stays readable to its last whole chunk."""
+
+import errno
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from tests.joint_states import JOINT_STATE, vector
+from tests.small_disk import fill, small_disk
+
+from flight_analysis.bag_reader import read_run
+from flight_analysis.bag_writer import write_run
+from flight_analysis.scenario import Scenario
+from flight_analysis.simulate import simulate
+from flight_core.parameters import ParameterError
+from flight_recorder.bag import END_BYTES, BagWriter, Channel, Enclosed
+from flight_recorder.disk import ReservedFile, free_bytes
+
+SIZE = 2_000_000
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 2 MB."""
+    with small_disk(tmp_path / "disk", SIZE) as folder:
+        yield folder
+
+
+NAMES = [f"channel.{k}" for k in range(40)]
+GENERATOR = np.random.default_rng(1)
+
+
+def write(bag: BagWriter, channel: Channel, count: int) -> None:
+    """So many messages of 40 noisy channels, which do not compress; a chunk each tenth of them, as at 1 kHz and 0.1 s."""
+    for _ in range(count):
+        stamp_ns = 1_000_000 * (channel.messages + 1)
+        bag.write(
+            channel, stamp_ns, stamp_ns, channel.messages + 1, vector(stamp_ns, NAMES, GENERATOR.normal(size=40).tolist())
+        )
+        if channel.messages % 10 == 0:
+            bag.flush()
+
+
+def write_until_full(bag: BagWriter, channel: Channel) -> None:
+    while not bag.full:
+        write(bag, channel, 1)
+
+
+def test_a_log_on_a_disk_that_runs_full_is_finished_and_nothing_is_lost(disk: Path) -> None:
+    bag = BagWriter(disk / "run")
+    channel = bag.add_topic("/y", JOINT_STATE, "")
+    write_until_full(bag, channel)
+    bag.close()
+    assert channel.messages > 1000
+    with AnyReader([disk / "run"]) as reader:
+        assert reader.message_count == channel.messages
+        assert sum(1 for _ in reader.messages()) == channel.messages
+    assert read_run(disk / "run").tape.notes == ()
+
+
+def test_the_room_held_for_the_end_is_used_by_nothing_else_before(disk: Path) -> None:
+    with BagWriter(disk / "run"):
+        assert SIZE - free_bytes(disk) >= END_BYTES
+    assert SIZE - free_bytes(disk) < 50_000  # given back; a file without messages and metadata.yaml are left
+
+
+def test_a_disk_that_somebody_else_fills_leaves_the_log_finished(disk: Path) -> None:
+    bag = BagWriter(disk / "run")
+    channel = bag.add_topic("/y", JOINT_STATE, "")
+    write(bag, channel, 300)
+    fill(disk / "other")
+    write_until_full(bag, channel)
+    bag.close()
+    with AnyReader([disk / "run"]) as reader:
+        assert reader.message_count == channel.messages >= 300
+
+
+def test_without_any_room_the_log_stays_readable_to_its_last_whole_chunk(disk: Path) -> None:
+    bag = BagWriter(disk / "run")
+    channel = bag.add_topic("/y", JOINT_STATE, "")
+    write_until_full(bag, channel)
+    written = channel.messages
+    fill(disk / "other")  # somebody takes what was given up
+    with pytest.raises(OSError, match="No space left"):
+        write(bag, channel, 10_000)
+    with pytest.raises(OSError, match="No space left"):
+        bag.close()
+    back = read_run(disk / "run").tape
+    assert len(back["y"].stamp_ns) >= written - 10
+    assert back["y"].stamp_ns.tolist() == [1_000_000 * (k + 1) for k in range(len(back["y"].stamp_ns))]
+    assert "run_0.mcap has no end: read up to its last whole chunk" in back.notes[0]
+
+
+def test_a_fault_of_the_disk_is_not_taken_for_a_full_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = ReservedFile(tmp_path / "file")
+
+    def fails(descriptor: int, data: bytes) -> int:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "write", fails)
+    with pytest.raises(OSError, match="Input/output error"):
+        file.write(b"x")
+    assert not file.full
+    file.close()
+
+
+def test_short_writes_are_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, write_all = ReservedFile(tmp_path / "file"), os.write
+    monkeypatch.setattr(os, "write", lambda descriptor, data: write_all(descriptor, data[:3]))
+    file.write(b"0123456789")
+    assert file.tell() == 10
+    file.close()
+    assert (tmp_path / "file").read_bytes() == b"0123456789"
+
+
+def test_a_flight_in_one_process_that_finds_no_space_is_one_sentence(disk: Path, osprey_gust: Scenario) -> None:
+    fill(disk / "other")
+    with pytest.raises(ParameterError, match=r"disk/run: cannot be written \(No space left on device\)"):
+        write_run(simulate(osprey_gust.vary(flight={"duration": 0.1})), disk / "run", Enclosed(osprey_gust.path))

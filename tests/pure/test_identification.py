@@ -1,0 +1,259 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Identification by step tests: systems whose answer is known in closed form, then an aircraft of JSBSim from end to end."""
+
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flight_analysis.identification import (
+    HEIGHTS,
+    PART,
+    SIZES,
+    SPAN,
+    Fly,
+    Identified,
+    fly_all,
+    identify,
+    moderate,
+    reference,
+    responses,
+    tangent,
+)
+from flight_bringup.scenarios import find_scenario
+from flight_core.outcome import COMPLETED, FlightEnded
+from flight_core.units import GRAVITY
+from flight_core.vectors import FloatArray
+from reference_model import model
+from reference_model.command import command
+from reference_model.params import ReferenceModelParameters, zero_state
+
+DT = 0.005
+WIDE = np.full(2, 10.0)
+PROTOTYPE = {  # rms in rad/s and m/s of a prototype of this law with K = (6, 0.4, 6, 3) 1/s, calm and in a gust of 5 m/s
+    "jsbsim_c172p": ({"q": 0.85e-3, "V": 0.45, "p": 2.0e-3, "r": 0.66e-3}, {"q": 6.0e-3, "V": 0.41, "p": 1.9e-3, "r": 0.65e-3}),
+    "jsbsim_f16": ({"q": 0.62e-3, "V": 0.46, "p": 2.2e-3, "r": 0.57e-3}, {"q": 0.64e-3, "V": 0.46, "p": 2.2e-3, "r": 0.57e-3}),
+}
+
+
+def lagged(Omega: FloatArray, lag: FloatArray) -> Fly:
+    """y_dot = Omega v, lag v_dot = u - v from rest: y = Omega (t - lag (1 - exp(-t / lag))) u."""
+
+    def fly(u: FloatArray, duration: float) -> FloatArray:
+        t = DT * np.arange(round(duration / DT) + 1)[:, None]
+        return np.asarray((t - lag * (1.0 - np.exp(-t / lag))) * u @ Omega.T)
+
+    return fly
+
+
+# Closed forms
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    Omega=st.lists(st.floats(0.1, 10.0), min_size=2, max_size=2),
+    signs=st.lists(st.sampled_from((-1.0, 1.0)), min_size=2, max_size=2),
+    coupled=st.floats(-0.5, 0.5),
+    lag=st.lists(st.floats(0.01, 0.1), min_size=2, max_size=2),
+)
+def test_a_linear_system_gives_back_its_omega_and_its_lags(
+    Omega: list[float], signs: list[float], coupled: float, lag: list[float]
+) -> None:
+    # The last chord begins 0.5 - 0.025 s after the step: what is left of the lag there is exp(-4.75) = 0.9 % of the slope,
+    # and (0.475 + 0.1) / 0.1 times that of the lag.
+    known = np.diag(np.array(Omega) * signs) @ np.array([[1.0, coupled], [coupled, 1.0]])
+    found = responses(lagged(known, np.array(lag)), -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+    assert found.Omega == pytest.approx(known, rel=0.015, abs=1e-6)
+    assert found.lag == pytest.approx(np.array(lag), rel=0.06)
+    assert found.spread == pytest.approx(np.ones(2))
+    assert found.rejected == ()
+
+
+def test_a_damped_rate_shows_its_first_slope() -> None:
+    # y = b/a (1 - exp(-a t)): the first chord of s = 25 ms has the slope b (1 - exp(-a s)) / (a s) and, at its middle, no lag.
+    a, b = 8.0, -5.0
+    t = DT * np.arange(101)
+    found = tangent(b / a * (1.0 - np.exp(-a * t)), DT)
+    assert found is not None
+    assert found.slope == pytest.approx(b * (1.0 - math.exp(-a * SPAN)) / (a * SPAN))
+    assert found.lag == 0.0
+    assert found.first == 0
+
+
+def test_the_first_maximum_of_the_slope_counts() -> None:
+    # A slope of 1 that fades, and one of -50 that comes after it, as when the aircraft answers to its own change of path.
+    t = DT * np.arange(2001)
+    y = np.sin(t) * (t < 6.0) - 50.0 * np.maximum(t - 6.0, 0.0)
+    found = tangent(y, DT)
+    assert found is not None
+    assert found.slope == pytest.approx(1.0, rel=1e-3)
+
+
+def test_nothing_that_moves_has_no_tangent() -> None:
+    assert tangent(np.zeros(101), DT) is None
+
+
+def test_drift_and_all_that_is_even_drop_out() -> None:
+    known, lag = np.diag([3.0, -2.0]), np.array([0.05, 0.02])
+    straight = lagged(known, lag)
+
+    def drifting(u: FloatArray, duration: float) -> FloatArray:
+        t = DT * np.arange(round(duration / DT) + 1)[:, None]
+        return np.asarray(straight(u, duration) + 0.3 * t**2 + 5.0 * t * (u @ u))
+
+    ends = (-WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+    found, clean = responses(drifting, *ends), responses(straight, *ends)
+    assert found.Omega == pytest.approx(clean.Omega, abs=1e-9)
+    assert found.lag == pytest.approx(clean.lag, abs=1e-9)
+
+
+def test_of_a_dead_zone_the_largest_step_counts() -> None:
+    # Half a dead zone of 0.06 hides the step of 0.05 and takes 30 % of that of 0.2: the slope seen is 0.7 of the true one.
+    straight = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
+
+    def dead(u: FloatArray, duration: float) -> FloatArray:
+        return straight(u - np.clip(u, -0.06, 0.06), duration)
+
+    found = responses(dead, -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+    assert found.size == pytest.approx([SIZES[-1]] * 2)
+    assert np.diag(found.Omega) == pytest.approx([0.7 * 3.0] * 2, rel=0.01)
+    assert found.rejected == ("elevator by 0.05: q does not move", "aileron by 0.05: p does not move")
+
+
+def test_steps_stay_inside_the_stops() -> None:
+    asked: list[float] = []
+    straight = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
+
+    def fly(u: FloatArray, duration: float) -> FloatArray:
+        asked.append(float(np.max(np.abs(u))))
+        return straight(u, duration)
+
+    responses(fly, -WIDE, np.array([0.1, 10.0]), ("q", "p"), ("elevator", "aileron"), DT)
+    assert sorted(set(asked)) == pytest.approx([0.05, 0.09, 0.1, 0.2])
+
+
+def test_a_step_that_ends_the_flight_is_left_out_and_told() -> None:
+    straight = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
+
+    def fragile(u: FloatArray, duration: float) -> FloatArray:
+        if np.max(np.abs(u)) > 0.15:
+            raise FlightEnded("gave up at t = 0.10 s")
+        return straight(u, duration)
+
+    found = responses(fragile, -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+    assert np.diag(found.Omega) == pytest.approx([3.0, 3.0], rel=0.01)
+    assert found.rejected == ("elevator by 0.2: gave up at t = 0.10 s", "aileron by 0.2: gave up at t = 0.10 s")
+
+
+def test_an_output_that_answers_to_nothing_ends_the_identification() -> None:
+    with pytest.raises(FlightEnded, match=r"^p does not answer to aileron: .*p does not move"):
+        responses(lagged(np.diag([3.0, 0.0]), np.full(2, 0.02)), -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+
+
+# The manoeuvre
+
+
+@pytest.mark.parametrize(("speed", "authority"), [(30.0, 0.8), (150.0, 2.5), (250.0, 0.4)])
+def test_the_commanded_airspeed_asks_for_a_third_of_the_throttle(speed: float, authority: float) -> None:
+    # The filter's answer to a step, 2 m/s (1 - (1 + w t) exp(-w t)), is steepest at t = 1/w: 2 m/s w / e. The pulse's edge of
+    # 0.1 s rounds that off by less than 1 %.
+    params = ReferenceModelParameters.validate_mapping(reference(speed, authority), "reference_model")
+    matrices, profile, row = params.model(), params.profile(), list(params.outputs).index("V")
+    x, steepest = zero_state(matrices), 0.0
+    for k in range(3000):
+        before = model.output(x, matrices)
+        x = model.step(0.01 * k, x, lambda t: command(t, profile), 0.01, matrices)
+        steepest = max(steepest, abs(float((model.output(x, matrices) - before)[row])) / 0.01)
+    assert steepest <= min(PART * authority, 1.2 * HEIGHTS["V"] / math.e) * 1.001
+    assert steepest == pytest.approx(min(PART * authority, 1.2 * HEIGHTS["V"] / math.e), rel=0.02)
+    assert max(params.pulses["q"].value) * speed <= GRAVITY * (1.0 + 1e-9)  # no more than 1 g beside its own
+
+
+@pytest.mark.parametrize(("altitude", "keys"), [(100.0, {"wind"}), (500.0, {"wind", "sigma"}), (3000.0, {"sigma"})])
+def test_moderate_turbulence_is_stated_as_its_altitude_asks(altitude: float, keys: set[str]) -> None:
+    assert set(moderate(altitude)) == {"altitude", "seed"} | keys
+    section = {"airframe": "jsbsim:c172p", "speed": 46.3, "altitude": altitude, "rate": 200.0, "step": 0.005}
+    find_scenario("jsbsim_c172p").vary(aircraft=section | {"turbulence": moderate(altitude)})  # is accepted
+
+
+# An aircraft
+
+
+@pytest.fixture(scope="module")
+def cessna() -> Identified:
+    return identify("c172p", 46.3, 1219.2)
+
+
+def test_signs_and_pairing_of_an_aircraft_are_found(cessna: Identified) -> None:
+    # Elevator and rudder of JSBSim's convention turn nose down and nose left: the signs of all its conventional aircraft.
+    assert cessna.D == (-1, 1, 1, -1)
+    assert cessna.coupling < 1.0
+    assert cessna.zero < 0.0
+    # Its surfaces act one step of 5 ms later; its engine has to speed up the propeller, which takes about a second.
+    assert cessna.responses.lag[[0, 2, 3]] == pytest.approx([DT] * 3, abs=1e-3)
+    assert 0.5 < cessna.responses.lag[1] < 2.0
+    assert cessna.lost == ""
+
+
+def test_the_scenario_that_ships_is_what_the_command_writes(cessna: Identified) -> None:
+    # Numbers in the file have six digits; other machines may round the last ones of a flight differently.
+    shipped = yaml.safe_load(find_scenario("jsbsim_c172p").path.read_text(encoding="utf-8"))
+    written = yaml.safe_load(cessna.text)
+    assert shipped.keys() == written.keys()
+    for section, content in written.items():
+        for key, value in content["ros__parameters"].items():
+            found = shipped[section]["ros__parameters"][key]
+            numbers = isinstance(value, float) or (isinstance(value, list) and isinstance(value[0], float))
+            assert found == (pytest.approx(value, rel=1e-3, abs=1e-6) if numbers else value), key
+
+
+@pytest.mark.parametrize("name", PROTOTYPE)
+def test_shipped_aircraft_fly_closer_than_the_prototype_did(name: str) -> None:
+    calm, gust = PROTOTYPE[name]
+    flights = fly_all(find_scenario(name))
+    assert [one.outcome for one in flights.values()] == [COMPLETED] * 3
+    for output in calm:
+        assert flights["calm"].rms[output] <= calm[output]
+        assert flights["gust"].rms[output] <= gust[output]
+    # In turbulence the airspeed's error is the turbulence itself, 3 m/s rms; the rates stay near their references.
+    assert flights["turbulence"].rms["V"] < 3.05
+    assert max(flights["turbulence"].rms[output] for output in ("q", "p", "r")) < 0.01
+
+
+# The command
+
+
+def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command_ = [sys.executable, "-m", "flight_bringup.cli", "identify", *arguments]
+    return subprocess.run(command_, cwd=cwd, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.parametrize(
+    ("airframe", "status", "sentence"),
+    [
+        ("osprey", 2, "error: airframe: found 'osprey', expected an aircraft of JSBSim, jsbsim:NAME"),
+        ("jsbsim:f61", 2, "error: airframe: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim: and another of 737, "),
+        ("jsbsim:dr1", 3, "error: jsbsim:dr1 does not trim at 46 m/s and 900 m: its model needs the property "),
+    ],
+)
+def test_what_cannot_be_identified_ends_in_one_sentence(airframe: str, status: int, sentence: str, tmp_path: Path) -> None:
+    done = rise_di(airframe, "--speed", "46", "--altitude", "900", cwd=tmp_path)
+    assert done.returncode == status
+    assert done.stderr.startswith(sentence)
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_file_is_written_over_unless_it_is_named(tmp_path: Path) -> None:
+    (tmp_path / "jsbsim_c172p.yaml").write_text("mine\n", encoding="utf-8")
+    done = rise_di("jsbsim:c172p", "--speed", "46", "--altitude", "900", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "jsbsim_c172p.yaml exists" in done.stderr
+    assert (tmp_path / "jsbsim_c172p.yaml").read_text(encoding="utf-8") == "mine\n"

@@ -1,0 +1,318 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Aircraft of JSBSim behind the vehicle's interface: trim, signs, wind, repeatability, and every way it can go wrong."""
+
+import ctypes
+import math
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aircraft_sim import guarded, jsbsim_plant
+from aircraft_sim.actuators import Actuators
+from aircraft_sim.disturbance import AXES, Gusts
+from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, STATES, Air, Command, JsbsimVehicle, Point, sideslip_zero
+from aircraft_sim.params import AircraftParameters
+from aircraft_sim.simulator import Simulator
+from flight_analysis.simulate import simulate
+from flight_bringup.scenarios import find_scenario
+from flight_core.outcome import FlightEnded
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+
+STEP_NS = 5_000_000
+CESSNA = Point("c172p", 46.3, 1219.2, STEP_NS)
+NONE = np.zeros(len(AXES))
+STILL = Air(Gusts(NONE, NONE, NONE + 1.0), None)
+SECTION: dict[str, Any] = {"airframe": "jsbsim:c172p", "speed": 46.3, "altitude": 1219.2, "rate": 200.0, "step": 0.005}
+
+
+def cessna(air: Air = STILL, point: Point = CESSNA) -> JsbsimVehicle:
+    return JsbsimVehicle(point, Actuators(), air)
+
+
+def flown(vehicle: JsbsimVehicle, u: FloatArray, duration: float) -> dict[str, FloatArray]:
+    """Truth by channel, one row a step, with u held."""
+    rows = [vehicle.truth(0)]
+    for k in range(round(duration * 1e9) // STEP_NS):
+        vehicle.advance(k * STEP_NS, u, STEP_NS)
+        rows.append(vehicle.truth((k + 1) * STEP_NS))
+    return dict(zip(vehicle.truth_names, np.array(rows).T, strict=True))
+
+
+def command(**values: float) -> FloatArray:
+    return np.array([values.get(name, 0.0) for name in INPUTS])
+
+
+def one_gust(axis: str, speed: float, length: float) -> Air:
+    strength = np.array([speed * (name == axis) for name in AXES])
+    return Air(Gusts(NONE, strength, NONE + length), None)
+
+
+# Trim
+
+
+@pytest.mark.parametrize(
+    "point",
+    # JSBSim's own trim; and two that it does not find: c182 because its mixture floods the engine, DHC6 because its
+    # turboprops are not settled.
+    [CESSNA, Point("c182", 56.6, 1219.2, STEP_NS), Point("DHC6", 66.9, 1828.8, STEP_NS)],
+    ids=lambda point: point.name,
+)
+def test_trim_is_an_equilibrium_that_lasts(point: Point) -> None:
+    # JSBSim's own trim stops at 3e-4 m/s^2 and 1e-4 rad/s^2. Left alone for 5 s, residuals of that size come to 1e-3 m/s and
+    # 5e-4 rad/s at most, and 4 mm to a few cm of altitude; where DHC6 is left in JSBSim's own trim it loses 1 m/s.
+    vehicle = cessna(point=point)
+    assert np.max(np.abs(vehicle.trim.residuals[:3])) < 3e-3
+    assert np.max(np.abs(vehicle.trim.residuals[3:])) < 3e-4
+    truth = flown(vehicle, command(), 5.0)
+    assert np.max(np.abs(truth["x.V"])) < 0.01
+    assert max(np.max(np.abs(truth[f"x.{name}"])) for name in ("p", "q", "r")) < 5e-4
+    assert np.max(np.abs(truth["x.altitude"])) < 0.1
+
+
+def test_in_trim_every_deviation_is_zero() -> None:
+    vehicle = cessna()
+    # To rounding: altitude is a difference of radii of 6.4e6 m, whose last digit is 1e-9 m.
+    assert np.max(np.abs(vehicle.y())) < 1e-12
+    assert np.max(np.abs(vehicle.truth(0))) < 1e-8
+    assert vehicle.trim.states[list(STATES).index("V")] == pytest.approx(46.3, rel=1e-6)
+    assert vehicle.trim.states[list(STATES).index("altitude")] == pytest.approx(1219.2, rel=1e-6)
+
+
+def test_end_stops_are_those_of_the_whole_command() -> None:
+    trim = cessna().trim
+    assert trim.commands + trim.upper == pytest.approx([1.0, 1.0, 1.0, 1.0])  # the nose-down pitch trim takes of the elevator
+    assert trim.commands[1] + trim.lower[1] == pytest.approx(0.0)
+    assert trim.lower[0] == -1.0  # the other way the stick itself is at its stop first
+
+
+# The channel map
+
+
+@pytest.mark.parametrize(
+    ("name", "output", "sign", "duration"),
+    [
+        ("elevator", "q", -1.0, 0.2),  # nose down
+        ("throttle", "V", 1.0, 1.0),  # more thrust
+        ("aileron", "p", 1.0, 0.2),  # roll right
+        ("rudder", "r", -1.0, 0.2),  # nose left
+    ],
+)
+def test_a_positive_command_does_what_the_table_says(name: str, output: str, sign: float, duration: float) -> None:
+    truth = flown(cessna(), command(**{name: 0.1}), duration)
+    own = sign * truth[f"x.{output}"][-1]
+    # A tenth of the travel for this long moves its own output by 0.016 (the rudder's) to 0.08 rad/s, or 0.07 m/s.
+    assert own > 0.01
+    rates = {one: abs(truth[f"x.{one}"][-1]) for one in ("q", "p", "r")}
+    assert output == "V" or max(rates, key=lambda one: rates[one]) == output
+
+
+def test_every_engine_gets_the_throttle() -> None:
+    # On a twin one engine alone would yaw: both at once leave r where it was.
+    truth = flown(cessna(point=Point("737", 154.3, 6096.0, STEP_NS)), command(throttle=0.1), 1.0)
+    assert truth["x.V"][-1] > 0.05
+    assert np.max(np.abs(truth["x.r"])) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("axis", "state", "scale"),
+    # A wind w along x, y, z of the flight path is -w of airspeed, -w/V0 of sideslip, -w/V0 of alpha.
+    [("longitudinal", "V", -1.0), ("lateral", "beta", -1.0 / 46.3), ("vertical", "alpha", -1.0 / 46.3)],
+)
+def test_wind_is_felt_along_the_axes_of_trim(axis: str, state: str, scale: float) -> None:
+    # The whole gust is passed within 0.1 s: at its peak the aircraft itself has hardly moved (alpha' about 4 1/s: a fifth).
+    truth = flown(cessna(one_gust(axis, 2.0, 46.3 * 0.05)), command(), 0.05)
+    peak = truth[f"gust.{axis}"][-1]
+    assert peak == pytest.approx(2.0, rel=0.01)
+    assert truth[f"x.{state}"][-1] == pytest.approx(scale * peak, rel=0.2)
+    others = [name for name in AXES if name != axis]
+    assert not any(truth[f"gust.{name}"].any() for name in others)
+
+
+def test_the_wind_turns_with_the_heading() -> None:
+    vehicle = cessna(one_gust("lateral", 2.0, 46.3 * 0.05))
+    node = vehicle._node("attitude/psi-rad")
+    vehicle._fdm["ic/psi-true-deg"] = 90.0
+    vehicle._fdm.run_ic()
+    assert node.get_double_value() == pytest.approx(math.pi / 2.0)
+    vehicle.advance(0, command(), 10 * STEP_NS)
+    # Heading east, wind to the right is wind to the south.
+    assert vehicle._fdm["atmosphere/wind-north-fps"] * jsbsim_plant.FOOT == pytest.approx(-2.0, rel=0.01)
+    assert vehicle._fdm["atmosphere/wind-east-fps"] == pytest.approx(0.0, abs=1e-2)
+
+
+def test_turbulence_is_felt_from_the_first_sample_on() -> None:
+    values = SECTION | {"turbulence": {"altitude": 1219.2, "sigma": 3.05, "seed": 1}}
+    simulator = Simulator(AircraftParameters.validate_mapping(values, "aircraft"))
+    simulator.sample(0, command())
+    truth = dict(zip(simulator.truth_names, simulator.truth(), strict=True))
+    assert abs(truth["gust.longitudinal"]) > 0.1
+    # Airspeed is the length of flight less wind, flight being 46.3 m/s along the first axis.
+    wind = np.array([truth[f"gust.{axis}"] for axis in AXES])
+    assert 46.3 + truth["x.V"] == pytest.approx(float(np.linalg.norm([46.3, 0.0, 0.0] - wind)), rel=1e-3)
+
+
+def test_actuators_stand_before_the_aircraft() -> None:
+    # Stuck from the start, the aileron does nothing; a lag of 0.1 s has let 63 % through after 0.1 s.
+    stuck = JsbsimVehicle(CESSNA, Actuators(stuck_at=np.array([np.inf, np.inf, 0.0, np.inf])), STILL)
+    truth = flown(stuck, command(aileron=0.1), 0.5)
+    assert np.max(np.abs(truth["x.p"])) < 1e-4
+    slow = JsbsimVehicle(CESSNA, Actuators(lag=np.full(4, 0.1)), STILL)
+    assert flown(slow, command(aileron=0.1), 0.1)["actuator.aileron"][-1] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)))
+
+
+# Repeatability, silence
+
+
+def test_two_flights_agree_to_the_last_bit() -> None:
+    u = command(elevator=-0.05, throttle=0.1, aileron=0.1, rudder=0.02)
+    first, second = (flown(cessna(one_gust("vertical", 5.0, 30.0)), u, 3.0) for _ in range(2))
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+
+
+def test_a_flight_in_another_process_agrees_to_the_last_bit() -> None:
+    # c182 needs the solver's trim: it is found in a third process, and both follow what that found.
+    code = (
+        "from tests.pure.test_jsbsim import *\n"
+        "truth = flown(cessna(point=Point('c182', 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)\n"
+        "print(np.array(list(truth.values())).tobytes().hex())\n"
+    )
+    root = Path(__file__).resolve().parents[2]
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root).stdout
+    truth = flown(cessna(point=Point("c182", 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)
+    assert said.strip() == np.array(list(truth.values())).tobytes().hex()
+
+
+def test_nothing_is_printed_and_nothing_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    flown(cessna(point=Point("global5000", 169.8, 7620.0, STEP_NS)), command(), 0.1)  # writes a table if it is let
+    assert not list(tmp_path.iterdir())
+    assert capfd.readouterr() == ("", "")
+
+
+# What can go wrong
+
+
+def test_a_crash_in_the_guarded_process_is_survived() -> None:
+    with pytest.raises(guarded.Crashed, match="died of SIGSEGV"):
+        guarded.call(ctypes.string_at, 0, timeout=30.0)
+
+
+def test_a_hang_in_the_guarded_process_is_survived() -> None:
+    started = time.monotonic()
+    with pytest.raises(guarded.Crashed, match=r"gave no answer within 2 s"):
+        guarded.call(time.sleep, 60, timeout=2.0)
+    assert time.monotonic() - started < 20.0
+
+
+def test_an_exception_or_an_exit_in_the_guarded_process_is_told() -> None:
+    with pytest.raises(guarded.Crashed, match=r"ended with status 1 \(ValueError: "):
+        guarded.call(math.sqrt, -1.0, timeout=30.0)
+    with pytest.raises(guarded.Crashed, match=r"ended with status 5"):
+        guarded.call(os._exit, 5, timeout=30.0)
+    assert guarded.call(math.hypot, 3.0, 4.0, timeout=30.0) == 5.0
+
+
+def test_a_flight_in_one_process_survives_an_aircraft_that_crashes(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = guarded.call
+    monkeypatch.setattr(guarded, "call", lambda *_, timeout: real(ctypes.string_at, 0, timeout=timeout))
+    scenario = find_scenario("jsbsim_c172p").vary(aircraft={"speed": 47.11})  # a condition that no other test has trimmed
+    assert simulate(scenario).outcome == "jsbsim:c172p cannot be flown: JSBSim died of SIGSEGV"
+
+
+@pytest.mark.parametrize(
+    ("point", "sentence"),
+    [
+        (
+            CESSNA._replace(speed=20.0),
+            r"^jsbsim:c172p does not trim at 20 m/s and 1219.2 m: accelerations of .* are left at best",
+        ),
+        (Point("pa28", 51.0, 1219.2, STEP_NS), r"^jsbsim:pa28 does not trim at .*: engine 1 cannot be started$"),
+        (
+            Point("SGS", 25.0, 900.0, STEP_NS),
+            r"^jsbsim:SGS has no engine, so nothing to fly V with: no fcs/throttle-cmd-norm\[0\]$",
+        ),
+        (
+            Point("dr1", 41.0, 900.0, STEP_NS),
+            r"^jsbsim:dr1 .*: its model needs the property /sim/model/pushback/position-norm, which JSBSim alone ",
+        ),
+        (Point("blank", 41.0, 900.0, STEP_NS), r"^jsbsim:blank cannot be loaded: "),
+    ],
+    ids=["stalled", "engine", "glider", "property", "empty"],
+)
+def test_what_does_not_trim_ends_in_one_sentence(point: Point, sentence: str) -> None:
+    with pytest.raises(FlightEnded, match=sentence) as ended:
+        cessna(point=point)
+    assert "\n" not in str(ended.value)
+
+
+def test_a_property_that_does_not_exist_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    cessna()  # the recipe is found with the real table
+    wrong = dict(INPUTS) | {"rudder": Command("fcs/ruder-cmd-norm", None, -1.0, 1.0, False, "nose left")}
+    monkeypatch.setattr(jsbsim_plant, "INPUTS", wrong)
+    with pytest.raises(FlightEnded, match=r"^jsbsim:c172p cannot be flown: it has no property fcs/ruder-cmd-norm$"):
+        cessna()
+
+
+def test_the_ground_ends_a_flight() -> None:
+    with pytest.raises(FlightEnded, match=r"^jsbsim:c172p hit the ground at t = \d"):
+        flown(cessna(point=CESSNA._replace(altitude=15.0)), command(elevator=0.3), 10.0)
+
+
+def test_an_engine_that_stops_ends_a_flight() -> None:
+    vehicle = cessna()
+    for i in range(2):
+        vehicle._fdm[f"propulsion/tank[{i}]/contents-lbs"] = 0.0
+    with pytest.raises(FlightEnded, match=r"^jsbsim:c172p: engine 1 stopped at t = \d"):
+        flown(vehicle, command(), 1.0)
+
+
+def test_a_state_beyond_anything_counts_as_diverged() -> None:
+    vehicle = cessna()
+    assert not vehicle.diverged()
+    vehicle._x = np.array([np.nan, *np.zeros(len(STATES) - 1)])
+    assert vehicle.diverged()
+
+
+# Parameters
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"airframe": "jsbsim:c172q"}, r"airframe: found 'jsbsim:c172q', expected jsbsim:c172\w perhaps, .* another of 737, "),
+        ({"airframe": "jsbsim:../c172p"}, r"airframe: found 'jsbsim:../c172p', expected jsbsim:c172p perhaps"),
+        ({"speed": None}, r"speed: found none, expected the true airspeed to trim at, m/s"),
+        ({"altitude": None}, r"altitude: found none, expected the altitude to trim at, m"),
+        ({"bias": {"q": {"start": 0.0, "value": 1.0, "rise": 1.0}}}, r"bias: found it, expected none: jsbsim:c172p has no"),
+        ({"uncertainty": {"A": 0.1}}, r"uncertainty: found it, expected none: jsbsim:c172p has no matrices"),
+        ({"gusts": {"up": {"start": 0.0, "speed": 1.0, "length": 1.0}}}, r"gusts.up: found 'up', expected an axis of the wind"),
+        ({"actuators": {"lag": [0.1]}}, r"actuators.lag: found 1 values, expected 4, one for each of elevator, throttle, "),
+        ({"airframe": "osprey"}, r"speed: found 46.3, expected none: the airframe osprey is what it is in one trim"),
+    ],
+)
+def test_parameters_that_do_not_fit_are_refused(changes: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=f"^aircraft.{sentence}"):
+        AircraftParameters.validate_mapping(SECTION | changes, "aircraft")
+
+
+def test_channels_are_those_of_the_tables() -> None:
+    channels = AircraftParameters.validate_mapping(SECTION, "aircraft").channels()
+    assert list(channels.outputs) == list(OUTPUTS) == ["q", "V", "p", "r"]
+    assert channels.inputs == {"elevator": "1", "throttle": "1", "aileron": "1", "rudder": "1"}
+    assert channels.speed == 46.3
+
+
+def test_sideslip_of_the_f15_grows_when_its_rates_are_held() -> None:
+    # Flown with p and r held (docs/experiments.md), its sideslip goes from 0.023 to 0.063 rad in 5 s: 0.20 1/s.
+    assert sideslip_zero(Point("f15", 180.06, 4572.0, STEP_NS)) == pytest.approx(0.20, abs=0.05)
+    assert sideslip_zero(CESSNA) < 0.0

@@ -1,0 +1,140 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A log as messages to be sent again: which, in which order, and when."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from flight_analysis.bag_writer import write_run
+from flight_analysis.named_vectors import JOINT_STATE
+from flight_analysis.playback import begins_with_stamp, read_playback
+from flight_analysis.scenario import Scenario
+from flight_analysis.simulate import simulate
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
+from flight_recorder.bag import BagWriter, Enclosed
+from flight_recorder.definitions import definition
+
+MS = 1_000_000
+EPOCH = 1_790_000_000_000 * MS
+STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+@pytest.fixture(scope="module")
+def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One second in one process: y, y_m and truth at 500 Hz, u and internals at 100 Hz, from t = 0 to 1 s."""
+    tape = simulate(osprey_gust.vary(flight={"duration": 1.0}))
+    return write_run(tape, tmp_path_factory.mktemp("playback") / "run", Enclosed(osprey_gust.path)).parent
+
+
+def test_every_message_of_a_flight_in_one_process_is_due_at_its_stamp(run: Path) -> None:
+    playback = read_playback(run)
+    assert len(playback.messages) == 3 * 501 + 2 * 101
+    assert dict.fromkeys(playback.types.values()) == {JOINT_STATE: None}
+    assert list(playback.types) == ["/internals", "/truth", "/u", "/y", "/y_m"]
+    for message in playback.messages:
+        stamp = STORE.deserialize_cdr(message.data, JOINT_STATE).header.stamp  # type: ignore[attr-defined] # made at run time
+        assert message.stamped
+        assert message.due_ns == stamp.sec * NANOSECONDS + stamp.nanosec
+    due = [message.due_ns for message in playback.messages]
+    assert due == sorted(due)
+    assert (playback.t(due[0]), playback.t(due[-1])) == (0.0, 1.0)
+
+
+def test_topics_are_chosen_by_full_or_last_name_and_the_beginning_by_flight_time(run: Path) -> None:
+    playback = read_playback(run, ["y", "/u"], start=0.5)
+    assert list(playback.types) == ["/u", "/y"]
+    assert len(playback.messages) == 251 + 51
+    assert playback.t(playback.messages[0].due_ns) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("topics", "start", "sentence"),
+    [
+        (["y", "z"], 0.0, r"run: found no message of z, expected some of /internals, /truth, /u, /y, /y_m"),
+        ([], 1.5, r"start: found 1.5 s, expected a flight time before the end of the log, 1 s"),
+    ],
+)
+def test_what_the_log_does_not_hold_is_refused(topics: list[str], start: float, sentence: str, run: Path) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        read_playback(run, topics, start)
+
+
+def test_a_log_without_messages_is_refused(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "run") as bag:
+        bag.add_topic("/y", JOINT_STATE, "")
+    with pytest.raises(ParameterError, match="found no message, expected a recorded flight"):
+        read_playback(tmp_path / "run")
+
+
+def bag_of(folder: Path, sent: list[tuple[str, int, int, float]]) -> Path:
+    """A log of (topic, sent, stamp, value), received in this order; `truth` has the channel t."""
+    types: dict[str, Any] = STORE.types
+    with BagWriter(folder) as bag:
+        channels = {topic: bag.add_topic(topic, JOINT_STATE, "") for topic in dict.fromkeys(one[0] for one in sent)}
+        for number, (topic, sent_ns, stamp_ns, value) in enumerate(sent, start=1):
+            name = "t" if topic == "/truth" else "q"
+            stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
+            header = types["std_msgs/msg/Header"](stamp, "peer")
+            message = types[JOINT_STATE](header, [name], np.array([value]), np.zeros(0), np.zeros(0))
+            bag.write(channels[topic], EPOCH + number * MS, sent_ns, number, bytes(STORE.serialize_cdr(message, JOINT_STATE)))
+    return folder
+
+
+def test_in_real_time_a_message_is_due_when_it_was_sent_not_when_it_was_received(tmp_path: Path) -> None:
+    begin = EPOCH - 5_000 * MS  # t = 0
+    sent = [
+        ("/truth", begin + 2001 * MS, begin + 2000 * MS, 2.0),
+        ("/y", begin + 2006 * MS, begin + 1990 * MS, 0.2),  # 16 ms old when it was sent
+        ("/y", begin + 2003 * MS, begin + 1985 * MS, 0.1),
+    ]
+    playback = read_playback(bag_of(tmp_path / "run", sent))
+    assert [round(playback.t(message.due_ns), 6) for message in playback.messages] == [2.001, 2.003, 2.006]
+
+
+def test_in_lockstep_a_message_is_due_at_its_stamp_but_not_before_those_sent_before_it(tmp_path: Path) -> None:
+    # The machine sent all of it within 3 ms; the second y comes 20 ms late, and the log of its node is in the machine's time.
+    sent = [
+        ("/truth", EPOCH + MS, 0, 0.0),
+        ("/y", EPOCH + 2 * MS, 0, 0.1),
+        ("/truth", EPOCH + 3 * MS, 30 * MS, 0.03),
+        ("/y", EPOCH + 4 * MS, 10 * MS, 0.2),
+        ("/other", EPOCH + 5 * MS, EPOCH + 5 * MS, 0.0),
+    ]
+    playback = read_playback(bag_of(tmp_path / "run", sent))
+    assert [(message.topic, message.due_ns, message.stamped) for message in playback.messages] == [
+        ("/truth", 0, True),
+        ("/y", 0, True),
+        ("/truth", 30 * MS, True),
+        ("/y", 30 * MS, True),
+        ("/other", 30 * MS, False),  # a stamp that cannot be moved with the others
+    ]
+
+
+def test_a_clock_in_the_log_is_not_played_and_what_all_nodes_share_only_where_it_is_asked_for(tmp_path: Path) -> None:
+    topics = ("/clock", "/y", "/diagnostics", "/rosout")
+    bag = bag_of(tmp_path / "run", [(topic, EPOCH + k * MS, EPOCH + k * MS, 0.0) for k, topic in enumerate(topics)])
+    assert list(read_playback(bag).types) == ["/y"]
+    assert list(read_playback(bag, ["y", "rosout"]).types) == ["/rosout", "/y"]
+    with pytest.raises(ParameterError, match="found no message of /clock, expected some of /diagnostics, /rosout, /y"):
+        read_playback(bag, ["/clock"])
+
+
+@pytest.mark.parametrize(
+    ("type_name", "expected"),
+    [
+        (JOINT_STATE, True),
+        ("diagnostic_msgs/msg/DiagnosticArray", True),
+        ("rcl_interfaces/msg/ParameterEvent", True),
+        ("rcl_interfaces/msg/Log", True),
+        ("rosgraph_msgs/msg/Clock", True),
+        ("std_msgs/msg/Float64MultiArray", False),
+        ("std_msgs/msg/Empty", False),
+    ],
+)
+def test_a_stamp_is_found_where_a_type_begins_with_one(type_name: str, expected: bool) -> None:
+    assert begins_with_stamp(definition(type_name).text) is expected

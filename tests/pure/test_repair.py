@@ -1,0 +1,228 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A damaged log made whole: what is kept, what is said, and that an intact one is left alone."""
+
+import fcntl
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+
+from flight_analysis.bag_reader import read_run
+from flight_analysis.bag_writer import write_run
+from flight_analysis.scenario import Scenario
+from flight_analysis.simulate import simulate
+from flight_bringup.graph import enclosed
+from flight_core.parameters import ParameterError
+from flight_recorder.repair import repair
+
+DURATION = 2.0
+
+
+@pytest.fixture(scope="module")
+def recorded(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    scenario = osprey_gust.vary(flight={"duration": DURATION})
+    folder = tmp_path_factory.mktemp("recorded") / "run"
+    folder.mkdir()
+    write_run(simulate(scenario), folder, enclosed(scenario, folder))
+    return folder
+
+
+@pytest.fixture
+def run(recorded: Path, tmp_path: Path) -> Path:
+    """A copy to damage."""
+    shutil.copytree(recorded, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def state(folder: Path) -> dict[str, tuple[bytes, int]]:
+    """Content and time of change of every file."""
+    return {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
+
+
+def cut(run: Path, share: float) -> bytes:
+    """As a recorder that was killed leaves it: a part of the file, which is returned, and no metadata.yaml."""
+    file = run / "run_0.mcap"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: int(len(whole) * share)])
+    (run / "metadata.yaml").unlink()
+    return file.read_bytes()
+
+
+def last(run: Path) -> float:
+    """Flight time of the last sample of all."""
+    tape = read_run(run).tape
+    return float(max(tape.time(name)[-1] for name in tape.signals))
+
+
+def messages(run: Path) -> list[tuple[str, int, bytes]]:
+    """All messages as rosbags reads them."""
+    with AnyReader([run]) as reader:
+        assert sum(one.msgcount for one in reader.connections) == reader.message_count
+        found = [(one.topic, stamp_ns, data) for one, stamp_ns, data in reader.messages()]
+        for one, _, data in reader.messages():
+            reader.deserialize(data, one.msgtype)
+    return found
+
+
+@pytest.mark.parametrize("share", [0.35, 0.6, 0.9, 0.999])
+def test_a_cut_log_becomes_one_that_rosbags_reads_in_full(share: float, recorded: Path, run: Path) -> None:
+    before = cut(run, share)
+    readable = read_run(run)
+    done = repair(run)
+    assert done.files[0].damaged == run / "run_0.mcap.damaged"
+    assert done.files[0].damaged.read_bytes() == before
+    found = messages(run)
+    assert len(found) == done.files[0].kept > 0
+    every = messages(recorded)
+    assert found == every[: len(found)]
+    after = read_run(run)
+    assert after.tape.notes == ()
+    assert after.tape.time("truth")[-1] == readable.tape.time("truth")[-1]
+    assert (after.scenario, after.attachments) == (readable.scenario, readable.attachments)
+    assert after.metadata["rise_di_host"] == readable.metadata["rise_di_host"]
+    with (run / "run_0.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == len(found)
+    assert not list(run.glob("*.new"))
+
+
+def test_an_intact_log_is_left_alone(run: Path) -> None:
+    before = state(run)
+    done = repair(run)
+    assert not done.wrote_metadata
+    assert state(run) == before
+
+
+def test_a_repaired_log_is_intact(run: Path) -> None:
+    cut(run, 0.5)
+    repair(run)
+    before = state(run)
+    assert not repair(run).wrote_metadata
+    assert state(run) == before
+
+
+@pytest.mark.parametrize("content", [None, "", "rosbag2_bagfile_information: 3\n", "{"])
+def test_metadata_that_are_missing_or_damaged_are_written_as_they_were(content: str | None, recorded: Path, run: Path) -> None:
+    (run / "metadata.yaml").unlink()
+    if content is not None:
+        (run / "metadata.yaml").write_text(content, encoding="utf-8")
+    before = (run / "run_0.mcap").stat().st_mtime_ns
+    done = repair(run)
+    assert done.wrote_metadata
+    assert done.files[0].damaged is None
+    assert (run / "run_0.mcap").stat().st_mtime_ns == before
+    assert (run / "metadata.yaml").read_text("utf-8") == (recorded / "metadata.yaml").read_text("utf-8")
+
+
+def test_damage_inside_takes_no_more_than_its_chunk(recorded: Path, run: Path) -> None:
+    file = run / "run_0.mcap"
+    with file.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[1]
+    content = bytearray(file.read_bytes())
+    content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+    file.write_bytes(content)
+    done = repair(run)
+    assert done.files[0].faults == "1 damaged parts"
+    kept, every = set(messages(run)), set(messages(recorded))
+    assert kept < every
+    assert all(chunk.message_start_time <= stamp_ns <= chunk.message_end_time for _, stamp_ns, _ in every - kept)
+
+
+def test_a_log_that_is_being_recorded_is_not_touched(run: Path) -> None:
+    cut(run, 0.5)
+    before = state(run)
+    with (run / "run_0.mcap").open("ab") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        with pytest.raises(ParameterError, match="found a recorder that is writing it, expected one that has ended"):
+            repair(run)
+    assert state(run) == before
+
+
+def test_a_repair_that_fails_half_way_changes_nothing(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cut(run, 0.5)
+    before = state(run)
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ParameterError, match=r"cannot be repaired \(No space left on device\)"):
+        repair(run)
+    assert state(run) == before
+
+
+@pytest.mark.parametrize("size", [0, 30, 500])
+def test_a_log_without_a_message_is_refused_and_left(size: int, run: Path) -> None:
+    file = run / "run_0.mcap"
+    file.write_bytes(file.read_bytes()[:size])
+    before = state(run)
+    with pytest.raises(ParameterError, match="found no message that could be read"):
+        repair(run)
+    assert state(run) == before
+
+
+def test_changed_bytes_never_end_in_a_traceback_or_in_messages_that_never_were(recorded: Path, run: Path) -> None:
+    file, generator = run / "run_0.mcap", np.random.default_rng(2)
+    whole, every, repaired = file.read_bytes(), set(messages(recorded)), 0
+    for _ in range(40):
+        damaged = bytearray(whole)
+        for place in generator.integers(0, len(whole), 3):
+            damaged[place] ^= 1 << generator.integers(0, 8)
+        file.write_bytes(damaged)
+        try:
+            done = repair(run)
+        except ParameterError:
+            continue
+        if done.files[0].damaged is not None:
+            repaired += 1
+            data = {(topic, bytes_) for topic, _, bytes_ in every}
+            assert {(topic, bytes_) for topic, _, bytes_ in messages(run)} <= data
+    assert repaired > 10
+
+
+def test_an_earlier_damaged_file_is_kept_too(run: Path) -> None:
+    first = cut(run, 0.9)
+    repair(run)
+    second = cut(run, 0.5)
+    repair(run)
+    assert (run / "run_0.mcap.damaged").read_bytes() == first
+    assert (run / "run_0.mcap.damaged-2").read_bytes() == second
+
+
+def test_the_command_says_what_was_kept_and_how_much_is_missing(run: Path) -> None:
+    def command() -> str:
+        shown = subprocess.run(
+            [sys.executable, "-m", "flight_bringup.cli", "repair", "run"],
+            cwd=run.parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return shown.stdout
+
+    assert command() == "run is intact: nothing to repair\n"
+    metadata = (run / "metadata.yaml").read_bytes()
+    cut(run, 0.5)
+    end = last(run)
+    kept = r"run_0.mcap had no end: (\d+) messages kept; as it was: run_0.mcap.damaged\n"
+    said = rf"metadata.yaml written; the log ends at t = {end:.3f} s of the {DURATION:g} s that were to be flown\n"
+    assert re.fullmatch(kept + said, command())
+    cut(run, 0.5)
+    (run / "metadata.yaml").write_bytes(metadata)  # which knows when the last message came
+    end = last(run)
+    assert f"{DURATION - end:.3f} s are missing at its end" in command()
+    information = yaml.safe_load((run / "metadata.yaml").read_text("utf-8"))["rosbag2_bagfile_information"]
+    assert information["message_count"] == len(messages(run))

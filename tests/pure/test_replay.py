@@ -1,0 +1,591 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A recorded flight computed again: equal to the last bit whatever happened in it, and one bit elsewhere is found."""
+
+import contextlib
+import csv
+import json
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+from typer.testing import CliRunner, Result
+
+from aircraft_sim.airframe import load_airframe
+from flight_analysis.bag_reader import read_run
+from flight_analysis.bag_writer import write_run
+from flight_analysis.gain_selection import with_feedforward
+from flight_analysis.replay import OPEN_LOOP, Replayed, replay, vary
+from flight_analysis.scenario import load_scenario
+from flight_analysis.simulate import simulate
+from flight_analysis.stored_messages import PARAMETER_EVENT, parameter_changes
+from flight_bringup.cli import app
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import ChannelError, FloatArray
+from flight_recorder.bag import BagWriter, Enclosed
+from rise_di_controller.controller import Controller
+from rise_di_controller.guard import Mode, Sample
+from rise_di_controller.params import ControllerParameters
+
+MS = 1_000_000
+EPOCH = 1_790_000_000_000_000_000  # stamps of a flight in real time, where float64 no longer knows the nanoseconds
+GUST = find_scenario("osprey_gust").vary(
+    flight={"duration": 4.0}, aircraft={"gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}}
+)
+SERVO = find_scenario("osprey_servo").vary(flight={"duration": 4.0})
+LEADING = with_feedforward(SERVO.controller, load_airframe("osprey"))
+LOST = {"noise": [0.0017, 0.03, 0.0017, 0.0017], "delay": 0.01, "dropout": 0.6, "seed": 3}
+
+SCENARIOS = {
+    "osprey_gust": GUST,
+    "osprey_servo": SERVO,
+    "literal sign": GUST.vary(controller={"sign": "literal"}),
+    "feedforward": SERVO.vary(controller=LEADING.model_dump()),
+    "all limits reached": GUST.vary(controller={"lower": [-0.01] * 4, "upper": [0.002] * 4, "slew": [0.05, 0.05, 0.05, 0.02]}),
+    "samples late and lost": SERVO.vary(
+        aircraft={"rate": 100.0, "sensors": LOST}, controller={"max_age": 0.025, "hold": 0.01, "ramp": 0.03}
+    ),
+    "feedforward, samples late and lost": SERVO.vary(
+        aircraft={"rate": 100.0, "sensors": LOST},
+        controller=LEADING.model_dump() | {"max_age": 0.025, "hold": 0.01, "ramp": 0.03},
+    ),
+}
+
+
+def equal(result: Replayed) -> bool:
+    return result.equal() and bool(result.checked.all())
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_every_bit_of_a_flight_comes_again(name: str) -> None:
+    scenario = SCENARIOS[name]
+    tape = simulate(scenario)
+    result = replay(tape, scenario.controller)
+    assert equal(result), result.first()
+    assert len(result.number) == len(tape["internals"].stamp_ns) > 100
+    assert result.notes == ()
+    # the flights do what they are named after
+    log = tape["internals"]
+    if "limits" in name:
+        assert set(log.group("limited").values.ravel()) == {0.0, 1.0, 2.0}
+    if "lost" in name:
+        assert set(log["mode"]) == {Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.TRIM}
+        assert (log["dt"] == 0).sum() > 5
+    assert bool(log.group("u_ff").values.any()) is ("feedforward" in name)
+
+
+# What else can happen to a controller in real time
+
+
+class Tick(NamedTuple):
+    """What happens before one tick and at it."""
+
+    y_age: int | None = 2  # ms, of the y that has come; None where none has
+    y_m_age: int | None = 0
+    late: int = 0  # us
+    active: bool = True
+    event: str = ""  # "configured": anew; "replaced": by another controller
+    changes: tuple[Mapping[str, Any], ...] = ()  # of the parameters, one after the other
+
+
+def driven(parameters: ControllerParameters, ticks: Sequence[Tick], start_ns: int = EPOCH) -> Tape:
+    """The tape of a controller among such events."""
+    outputs, controller = parameters.outputs, Controller(parameters)
+    rows: dict[str, list[tuple[int, FloatArray]]] = {"y": [], "y_m": [], "u": [], "internals": []}
+    for k, tick in enumerate(ticks):
+        now_ns = start_ns + k * controller.period_ns + tick.late * 1000
+        for name, age, take in (("y", tick.y_age, controller.take_y), ("y_m", tick.y_m_age, controller.take_y_m)):
+            if age is None:
+                continue
+            t = k / parameters.rate - age / 1e3
+            phase = 1.0 if name == "y" else 0.9
+            sample = Sample(now_ns - age * MS, 0.05 * np.sin(7.0 * t * phase + np.arange(len(outputs))))
+            rows[name].append(sample)
+            with contextlib.suppress(ChannelError):  # out of order
+                take(sample, now_ns)
+        if tick.event == "configured":
+            controller.restart()
+        elif tick.event == "replaced":
+            controller = Controller(parameters)
+        for change in tick.changes:
+            parameters = vary(parameters, change)
+            controller.retune(parameters)
+        commanded = controller.tick(now_ns, tick.late * 1000, active=tick.active)
+        if commanded is not None:
+            rows["u"].append((commanded.stamp_ns, commanded.u))
+            rows["internals"].append((commanded.stamp_ns, commanded.internals))
+    names = {"y": outputs, "y_m": outputs, "u": parameters.inputs, "internals": controller.names}
+    return Tape({name: signal(names[name], samples) for name, samples in rows.items() if samples}, start_ns)
+
+
+def signal(names: Sequence[str], samples: Sequence[tuple[int, FloatArray]]) -> Signal:
+    """Samples sorted by stamp, as the reader of logs returns them."""
+    stamps = np.array([stamp for stamp, _ in samples], dtype=np.int64)
+    order = np.argsort(stamps, kind="stable")
+    return Signal(stamps[order], tuple(names), np.array([value for _, value in samples])[order])
+
+
+FLY, LOST_Y, LOST_Y_M, OFF = Tick(), Tick(y_age=None), Tick(y_m_age=None), Tick(active=False)
+AGES = st.one_of(st.none(), st.integers(0, 30))
+EVENTS = st.sampled_from(["", "", "", "", "configured", "replaced"])
+ACTIVE = st.sampled_from([True, True, True, False])
+TICKS = st.lists(st.builds(Tick, AGES, AGES, st.integers(0, 9000), ACTIVE, EVENTS, st.just(())), min_size=2)
+QUICK = {"max_age": 0.03, "hold": 0.02, "ramp": 0.03}
+
+
+@settings(deadline=None)
+@given(ticks=TICKS, hold=st.booleans(), with_feedforward=st.booleans())
+def test_whatever_comes_late_or_not_at_all_every_bit_comes_again(ticks: list[Tick], hold: bool, with_feedforward: bool) -> None:
+    changes = QUICK | {"on_deactivate": "hold" if hold else "trim", "slew": [0.3] * 4}
+    parameters = vary(LEADING if with_feedforward else GUST.controller, changes)
+    tape = driven(parameters, [FLY, FLY, *ticks])
+    result = replay(tape, parameters)
+    assert equal(result), result.first()
+
+
+@pytest.mark.parametrize(
+    ("events", "modes"),
+    [
+        ([LOST_Y] * 40 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.TRIM, Mode.ENGAGED]),
+        ([LOST_Y_M] * 8 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]),  # y is fresh, and yet not used
+        ([OFF] * 4 + [FLY] * 3, [Mode.ENGAGED, Mode.INACTIVE, Mode.ENGAGED]),
+        (
+            [Tick(y_age=None, active=False)] * 5 + [LOST_Y] * 2 + [FLY] * 3,
+            [Mode.ENGAGED, Mode.INACTIVE, Mode.HOLD, Mode.ENGAGED],
+        ),
+        (
+            [LOST_Y] * 5 + [Tick(y_age=20, y_m_age=20)] * 3,
+            [Mode.ENGAGED, Mode.HOLD, Mode.ENGAGED],
+        ),  # its stamp is the older one
+        ([Tick(event="configured")] + [FLY] * 3, [Mode.ENGAGED]),
+        ([Tick(late=8000), LOST_Y, LOST_Y, FLY], [Mode.ENGAGED]),  # dt of 38 ms
+    ],
+    ids=["y lost", "y_m lost", "deactivated", "activated without y", "engaged by a late y", "configured anew", "late"],
+)
+def test_modes_come_again(events: list[Tick], modes: list[Mode]) -> None:
+    parameters = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
+    tape = driven(parameters, [FLY] * 20 + events)
+    result = replay(tape, parameters)
+    assert equal(result), result.first()
+    found = result.recorded[:, result.names.index("mode")].tolist()
+    assert [mode for k, mode in enumerate(found) if k == 0 or found[k - 1] != mode] == modes
+
+
+def test_another_controller_that_takes_over_is_said() -> None:
+    tape = driven(GUST.controller, [FLY] * 20 + [Tick(event="replaced")] + [FLY] * 20)
+    result = replay(tape, GUST.controller)
+    assert result.first() is None
+    assert result.notes == ("another controller begins at t = 0.22 s",)
+
+
+# What is found
+
+
+def flipped(value: float) -> float:
+    """The float64 with the lowest bit of its fraction changed."""
+    return float((np.array([value]).view(np.int64) ^ 1).view(np.float64)[0])
+
+
+@pytest.mark.parametrize("name", ["osprey_gust", "osprey_servo", "feedforward"])
+@pytest.mark.parametrize("channel", range(4))
+def test_one_bit_of_one_gain_is_found(name: str, channel: int) -> None:
+    scenario = SCENARIOS[name].vary(reference_model={"pulses": BUSY})
+    gains = list(scenario.controller.Lambda)
+    gains[channel] = flipped(gains[channel])
+    tape = simulate(scenario)
+    assert equal(replay(tape, scenario.controller))
+    for result in (
+        replay(tape, vary(scenario.controller, {"Lambda": gains})),
+        replay(tape, scenario.controller, vary(scenario.controller, {"Lambda": gains})),
+    ):
+        assert not result.equal()
+        assert result.other_parameters.all()  # known from the first tick on, even where rounding hides the bit from all of u
+        first = result.first()
+        if scenario.controller.outputs[channel] == "V":
+            continue  # where Lambda e is 1e-3 of what u is made of, and its last bit may be in no u at all
+        assert first is not None
+        assert first.ulps is not None
+        assert first.ulps > 0
+        assert first.channel == f"u.{scenario.controller.inputs[channel]}"
+        assert not result.different()[result.number < first.number].any()
+
+
+BUSY = {
+    "q": {"start": [0.5], "stop": [1.5], "value": [0.1]},
+    "V": {"start": [0.2], "stop": [3.0], "value": [1.5]},
+    "p": {"start": [0.3], "stop": [1.8], "value": [0.4]},
+    "r": {"start": [0.4], "stop": [1.4], "value": [0.03]},
+}
+
+
+@pytest.mark.parametrize(
+    ("topic", "channels"),
+    [
+        ("internals", ["dt", "u.rudder", "u_free.rudder", "u_trim.rudder", "Pi.r", "integral_e.r", "e.r", "e_0.r", "y.r"]),
+        ("u", ["rudder"]),
+        ("y", ["r"]),
+    ],
+)
+def test_one_bit_of_one_sample_is_found_and_only_there(topic: str, channels: list[str]) -> None:
+    tape = simulate(GUST.vary(reference_model={"pulses": BUSY}))
+    for channel in channels:
+        row = np.searchsorted(tape[topic].stamp_ns, 1_000 * MS)
+        values = tape[topic].values.copy()
+        column = tape[topic].names.index(channel)
+        values[row, column] = flipped(values[row, column])
+        damaged = replace(tape, signals={**tape.signals, topic: replace(tape[topic], values=values)})
+        result = replay(damaged, GUST.controller)
+        first = result.first()
+        assert first is not None
+        assert (first.number, first.t) == (101, 1.0)
+        assert first.ulps == 1 or topic == "y" or channel == "y.r"  # one of y is more in u
+        # and in the tick behind it, which starts from the state in the log
+        assert result.number[result.different().any(axis=1)].max() <= 102
+
+
+def test_the_difference_between_two_numbers_is_counted_in_those_between_them() -> None:
+    for recorded, computed, ulps in (
+        (1.0, math.nextafter(1.0, 2), 1),
+        (-5e-324, 5e-324, 2),
+        (0.0, -0.0, 0),
+        (1.0, math.nan, None),
+    ):
+        yes = np.ones(1, dtype=bool)
+        pair = np.array([[recorded]]), np.array([[computed]])
+        result = Replayed(("u.a",), np.ones(1, dtype=np.int64), np.zeros(1), *pair, yes, ~yes, ())
+        first = result.first()
+        assert first is not None  # a zero with another sign is another number, too
+        assert first.ulps == ulps
+
+
+# What is not in the log
+
+
+def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
+    """The tape without some samples of `internals`, by number, and of `u` with them."""
+    kept = np.asarray(keep(tape["internals"]["number"]), dtype=bool)
+    signals = dict(tape.signals)
+    for name in ("internals", "u"):
+        signals[name] = Signal(tape[name].stamp_ns[kept], tape[name].names, tape[name].values[kept])
+    return replace(tape, signals=signals)
+
+
+@pytest.mark.parametrize("name", ["osprey_gust", "feedforward"])
+def test_a_log_without_its_beginning_is_checked_from_its_first_tick_on(name: str) -> None:
+    scenario = SCENARIOS[name]
+    result = replay(without(simulate(scenario), lambda number: number > 100), scenario.controller)
+    assert result.first() is None
+    assert result.checked.tolist() == [False] + [True] * 300
+    assert result.notes == (
+        "the log begins with sample 101 of internals: those before it are not in it",
+        "1 ticks not checked, for the log does not hold the state before them",
+    )
+
+
+@pytest.mark.parametrize("name", ["osprey_gust", "feedforward"])
+def test_behind_a_gap_one_bit_of_one_gain_is_still_found(name: str) -> None:
+    scenario = SCENARIOS[name].vary(reference_model={"pulses": BUSY})
+    tape = without(simulate(scenario), lambda number: (number < 60) | (number > 70))
+    result = replay(tape, scenario.controller)
+    assert result.first() is None
+    assert (~result.checked).sum() == 1
+    assert "11 samples of internals are not in the log: a gap before t = 0.70 s" in result.notes
+    gains = list(scenario.controller.beta)
+    assert replay(tape, vary(scenario.controller, {"beta": [flipped(gains[0]), *gains[1:]]})).first() is not None
+
+
+def test_a_gap_in_which_the_inputs_were_lost_is_gone_over_at_the_next_engagement() -> None:
+    parameters = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
+    tape = driven(parameters, [FLY] * 20 + [LOST_Y] * 20 + [FLY] * 20 + [LOST_Y] * 20)
+    whole = replay(tape, parameters)
+    first_held = int(whole.number[whole.recorded[:, 0] != Mode.ENGAGED][0])
+    # when they were lost is then not known
+    result = replay(without(tape, lambda number: number != first_held), parameters)
+    assert result.first() is None
+    unchecked = result.number[~result.checked]
+    modes = result.recorded[~result.checked, 0]
+    assert unchecked.tolist() == list(range(first_held + 1, int(unchecked[-1]) + 1))
+    assert set(modes[:-1]) == {Mode.HOLD, Mode.RAMP}
+    assert modes[-1] == Mode.ENGAGED
+
+
+@settings(deadline=None, max_examples=50)
+@given(ticks=TICKS, lost=st.sets(st.integers(1, 60)), leading=st.booleans())
+def test_whatever_is_lost_of_a_log_nothing_differs(ticks: list[Tick], lost: set[int], leading: bool) -> None:
+    parameters = vary(LEADING if leading else GUST.controller, QUICK)
+    tape = without(driven(parameters, [FLY, FLY, *ticks]), lambda number: ~np.isin(number, list(lost)))
+    if len(tape["internals"].stamp_ns):
+        assert replay(tape, parameters).first() is None
+
+
+# Parameters changed in flight
+
+
+def test_gains_changed_in_flight_differ_from_the_tick_of_the_change_on() -> None:
+    tuned = {"k_g": 2.0, "Lambda": [3.0, 4.0, 2.0, 1.0], "upper": [0.02] * 4}
+    tape = driven(GUST.controller, [FLY] * 30 + [Tick(changes=(tuned,))] + [FLY] * 30)
+    result = replay(tape, GUST.controller)
+    first = result.first()
+    assert first is not None
+    assert first.number == 30
+    assert (~result.other_parameters).tolist() == [True] * 29 + [False] * 31
+    # and where the log holds the change, every bit comes again
+    result = replay(tape, GUST.controller, changes=[tuned])
+    assert equal(result), result.first()
+    assert result.notes == ("parameters changed before tick 30: Lambda, k_g, upper",)
+
+
+def test_gains_changed_one_by_one_come_again_each_with_its_own_rounding() -> None:
+    changes: list[dict[str, Any]] = [
+        {"k_g": 2.0},
+        {"Lambda": [3.0, 4.0, 2.0, 1.0]},
+        {"k_g": 3.3},
+        {"slew": [0.2] * 4},
+        {"k_g": 1.0},
+    ]
+    ticks = [FLY] * 30 + [Tick(changes=(*changes[:3],))] + [FLY] * 10 + [Tick(changes=(change,)) for change in changes[3:]]
+    result = replay(driven(GUST.controller, ticks + [FLY] * 5), GUST.controller, changes=changes)
+    assert equal(result), result.first()
+    assert [note.split(": ")[1] for note in result.notes] == ["Lambda, k_g", "slew", "k_g"]
+    # a change that the log lost is not made up for
+    lost = replay(driven(GUST.controller, ticks), GUST.controller, changes=changes[2:])
+    assert not lost.equal()
+    assert lost.notes == ()
+
+
+# Open loop
+
+
+def test_other_gains_on_the_recorded_inputs_give_what_the_controller_gives_on_them() -> None:
+    others = vary(GUST.controller, {"Lambda": [3.0, 3.0, 3.0, 1.0], "beta": [20.0, 20.0, 8.0, 6.0], "upper": [0.01] * 4})
+    tape = simulate(GUST)
+    controller, us = Controller(others), []
+    for number, (stamp_ns, y) in enumerate(zip(tape["y"].stamp_ns.tolist(), tape["y"].values, strict=True)):
+        order = [tape["y"].names.index(name) for name in others.outputs]
+        controller.take_y(Sample(stamp_ns, y[order]), stamp_ns)
+        controller.take_y_m(Sample(stamp_ns, tape["y_m"].values[number][order]), stamp_ns)
+        if stamp_ns % controller.period_ns == 0 and (commanded := controller.tick(stamp_ns)) is not None:
+            us.append(commanded.u)
+    result = replay(tape, GUST.controller, others)
+    assert result.group(result.computed, "u").values.tobytes() == np.array(us).tobytes()
+    assert result.notes == (OPEN_LOOP,)
+    assert np.abs(result.group(result.computed, "u").values - result.group(result.recorded, "u").values).max() > 1e-3
+
+
+def test_an_open_loop_goes_on_over_gaps_and_through_lost_inputs() -> None:
+    parameters = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
+    tape = driven(parameters, [FLY] * 20 + [LOST_Y] * 20 + [FLY] * 20)
+    tape = without(tape, lambda number: (number > 5) & (number != 15))
+    result = replay(tape, parameters, vary(parameters, {"k_g": 3.0}))
+    assert result.checked.all()
+    assert np.isfinite(result.computed).all()
+    u = result.group(result.computed, "u").values
+    assert (u[0] == result.group(result.recorded, "u").values[0]).all()  # it begins where the recorded u is
+
+
+# What is refused
+
+
+def test_a_log_of_other_channels_is_refused() -> None:
+    tape = simulate(GUST.vary(flight={"duration": 0.1}))
+    log = tape["internals"]
+    less = replace(tape, signals={"internals": Signal(log.stamp_ns, ("mood", *log.names[1:]), log.values)})
+    with pytest.raises(
+        ParameterError, match="internals: found no mode, also mood, expected the channels of the scenario in the log"
+    ):
+        replay(less, GUST.controller)
+    with pytest.raises(ParameterError, match="the log: found no sample of internals"):
+        replay(Tape({"y": tape["y"]}), GUST.controller)
+    other = vary(GUST.controller, {"outputs": ["p", "q", "r", "V"]})
+    with pytest.raises(ParameterError, match=r"controller.outputs: found p, q, r, V, expected q, p, r, V, as recorded"):
+        replay(tape, GUST.controller, other)
+
+
+def test_parameters_are_varied_by_dotted_name_and_checked_as_a_whole() -> None:
+    assert vary(SERVO.controller, {"upper": None}).upper is None
+    assert vary(LEADING, {"feedforward": None}).feedforward is None
+    leads = vary(LEADING, {"feedforward.lead": [0.0] * 4}).feedforward
+    assert leads is not None
+    assert leads.lead == (0.0,) * 4
+    with pytest.raises(ParameterError, match=r"controller.upper\[0\]: found -1.0, expected at least 0"):
+        vary(SERVO.controller, {"upper": [-1, 1, 1, 1], "lower": [-2, -1, -1, -1]})
+    with pytest.raises(ParameterError, match=r"controller\.kg: unknown key"):
+        vary(SERVO.controller, {"kg": 1.0})
+
+
+def test_parameters_that_stay_what_they_are_leave_every_bit_as_it_is() -> None:
+    # a retune solves for Pi, which rounds
+    set_again = driven(GUST.controller, [FLY] * 20 + [Tick(changes=({"k_g": 1.0},))] + [FLY] * 20)
+    left_alone = driven(GUST.controller, [FLY] * 41)
+    assert set_again["internals"].values.tobytes() == left_alone["internals"].values.tobytes()
+
+
+def test_what_flies_has_a_number_of_its_own() -> None:
+    digest = GUST.controller.digest()
+    assert 0 <= digest < 2**48
+    assert int(float(digest)) == digest
+    assert vary(GUST.controller, {"lockstep": True, "y_rate": 500.0, "autostart": False}).digest() == digest
+    others = [
+        vary(GUST.controller, {"k_g": flipped(1.0)}),
+        vary(GUST.controller, {"upper": [1.0] * 4}),
+        vary(GUST.controller, {"sign": "implicit"}),
+        SERVO.controller,
+        LEADING,
+    ]
+    assert len({digest, *(other.digest() for other in others)}) == 6
+
+
+# The command
+
+
+def scenario_file(folder: Path, **sections: Mapping[str, Any]) -> Path:
+    """The default scenario with a busy manoeuvre of 2 s, and with changes."""
+    tree = yaml.safe_load(GUST.path.read_text(encoding="utf-8"))
+    tree["/**/flight"]["ros__parameters"]["duration"] = 2.0
+    tree["/**/reference_model"]["ros__parameters"]["pulses"] = BUSY
+    for name, changes in sections.items():
+        tree[f"/**/{name}"]["ros__parameters"] |= changes
+    path = folder / "busy.yaml"
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def tape(tmp_path_factory: pytest.TempPathFactory) -> Tape:
+    return simulate(load_scenario(scenario_file(tmp_path_factory.mktemp("scenario"))))
+
+
+@pytest.fixture
+def run(tape: Tape, tmp_path: Path) -> Path:
+    return write_run(tape, tmp_path / "run", Enclosed(scenario_file(tmp_path))).parent
+
+
+def command(*arguments: str) -> Result:
+    return CliRunner().invoke(app, ["replay", *arguments])
+
+
+def test_the_command_counts_the_ticks(run: Path) -> None:
+    shown = command(str(run))
+    assert (shown.exit_code, shown.stdout) == (0, "201 ticks, every bit equal\n")
+
+
+def test_the_command_finds_one_bit_of_one_gain_in_the_scenario_of_the_log(tape: Tape, tmp_path: Path) -> None:
+    gains = [flipped(5.0), 5.0, 3.0, 0.5]
+    run = write_run(tape, tmp_path / "run", Enclosed(scenario_file(tmp_path, controller={"Lambda": gains}))).parent
+    shown = command(str(run))
+    assert shown.exit_code == 1
+    first, count, note = shown.stdout.splitlines()
+    number = re.match(r"tick (\d+) differs first, at t = .* s: u.elevator recorded .*, computed .*, [1-9]\d* ULP$", first)
+    assert number is not None
+    assert re.match(r"201 ticks, \d+ differ, the last at t = .* s; u_free in \d+, u in \d+", count)
+    assert note.startswith(
+        "note: 201 ticks, from tick 1 at t = 0 s on, flew with other parameters than the log holds: changed in"
+    )
+    # the same by --set, on the log with the right ones, and as JSON
+    right = write_run(tape, tmp_path / "right", Enclosed(scenario_file(tmp_path))).parent
+    shown = command(str(right), "--set", f"controller.Lambda={gains}", "--json")
+    assert shown.exit_code == 1
+    found = json.loads(shown.stdout)
+    assert (found["equal"], found["open_loop"], found["ticks"]) == (False, True, 201)
+    assert found["first"]["number"] == int(number[1])
+
+
+def test_a_log_cut_short_is_checked_as_far_as_it_goes(run: Path) -> None:
+    file = run / "run_0.mcap"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) * 3 // 4])
+    (run / "metadata.yaml").unlink()
+    found = json.loads(command(str(run), "--json").stdout)
+    assert found["equal"]
+    assert 20 < found["ticks"] == found["checked"] < 201
+    assert any("has no end" in note for note in found["notes"])
+
+
+def test_other_gains_are_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -> None:
+    csv_file = tmp_path / "u.csv"
+    shown = command(
+        str(run), "--set", "controller.k_g=3.0", "--set", "controller.upper=[0.01, 1, 1, 1]", "--csv", str(csv_file)
+    )
+    assert shown.exit_code == 1
+    assert shown.stdout.count(OPEN_LOOP) == 2  # over the table, and in the notes
+    assert re.search(r"^ *elevator( +[\d.e-]+){4} *$", shown.stdout, re.MULTILINE)
+    with csv_file.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    log = read_run(run).tape["internals"]
+    assert [float(row["u.elevator.recorded"]) for row in rows] == log["u.elevator"].tolist()
+    assert max(float(row["u.elevator.computed"]) for row in rows) == 0.01
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("controller.kg=1", "controller.kg: unknown key, expected k_g perhaps"),
+        ("controller.k_g=-1", "controller.k_g: found -1, expected greater than 0"),
+        ("controller.k_g", "--set: found 'controller.k_g', expected a parameter of the controller and its value"),
+        ("aircraft.rate=1", "--set: found 'aircraft.rate=1', expected a parameter of the controller and its value"),
+        ("controller.Lambda=[1", "--set: 'controller.Lambda=[1' is not valid YAML"),
+    ],
+)
+def test_a_setting_that_is_none_is_one_sentence(setting: str, sentence: str, run: Path) -> None:
+    shown = command(str(run), "--set", setting)
+    assert isinstance(shown.exception, ParameterError)
+    assert str(shown.exception).startswith(sentence)
+    assert len(str(shown.exception).splitlines()) == 1
+
+
+def test_a_log_without_scenario_or_controller_is_one_sentence(tape: Tape, tmp_path: Path) -> None:
+    scenario = scenario_file(tmp_path)
+    alone = write_run(Tape({"y": tape["y"]}), tmp_path / "alone", Enclosed(scenario)).parent
+    short = Tape({name: one.until(0) for name, one in tape.signals.items()})
+    for run, sentence in (
+        (alone, "the log: found no sample of internals"),
+        (
+            write_run(without(short, lambda number: number < 1), tmp_path / "none", Enclosed(scenario)).parent,
+            "the log: found no sample",
+        ),
+    ):
+        shown = command(str(run))
+        assert isinstance(shown.exception, ParameterError)
+        assert str(shown.exception).startswith(sentence)
+
+
+def test_changes_of_parameters_are_read_from_the_log(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types: dict[str, Any] = store.types
+    time, value = types["builtin_interfaces/msg/Time"], types["rcl_interfaces/msg/ParameterValue"]
+    parameter, event = types["rcl_interfaces/msg/Parameter"], types[PARAMETER_EVENT]
+    none: dict[str, Any] = {"bool_value": False, "integer_value": 0, "double_value": 0.0, "string_value": ""}
+    none |= {
+        f"{kind}_array_value": np.zeros(0, dtype) for kind, dtype in (("byte", np.uint8), ("bool", bool), ("integer", np.int64))
+    }
+    none |= {"double_array_value": np.zeros(0), "string_array_value": []}
+
+    def one(name: str, kind: int, **field: Any) -> Any:
+        return parameter(name, value(**(none | {"type": kind} | field)))
+
+    k_g, sign = one("k_g", 3, double_value=2.5), one("sign", 4, string_value="soft")
+    gains, clock = one("Lambda", 8, double_array_value=np.array([1.0, 2.0])), one("use_sim_time", 1, bool_value=True)
+    limits = one("upper", 0)
+    events = [
+        event(time(2, 0), "/one/controller", [], [gains, clock], []),  # not in the order of their stamps
+        event(time(1, 5), "/controller", [k_g], [sign], [limits]),
+        event(time(0, 1), "/aircraft", [], [one("k_g", 3, double_value=9.0)], []),
+        event(time(0, 2), "/controller", [clock], [], []),
+    ]
+    with BagWriter(tmp_path / "run") as bag:
+        channel = bag.add_topic("/parameter_events", PARAMETER_EVENT, "")
+        for number, message in enumerate(events):
+            bag.write(channel, number, number, number, bytes(store.serialize_cdr(message, PARAMETER_EVENT)))
+    changes = parameter_changes(tmp_path / "run", "controller", ControllerParameters.model_fields)
+    assert changes == [{"k_g": 2.5, "sign": "soft", "upper": None}, {"Lambda": [1.0, 2.0]}]

@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di report`: of one run or several, as page, picture, table and JSON."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.joint_states import JOINT_STATE, vector
+
+from flight_analysis.latency import latency
+from flight_analysis.summary import summarise_unflown
+from flight_bringup import fly as flying
+from flight_bringup.report_command import report
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError
+from flight_recorder.bag import BagWriter
+
+MS = 1_000_000
+EPOCH = 1_795_000_000_000_000_000
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two flights of two seconds, of different scenarios."""
+    where, flown = tmp_path_factory.mktemp("runs"), []
+    for name in ("osprey_gust", "osprey_servo"):
+        scenario = find_scenario(name).vary(flight={"duration": 2.0})
+        run = flying.new_run(scenario, where)
+        flying.conclude(run, flying.fly_in_process(scenario, run, lambda t, shown: None))
+        flown.append(run)
+    return flown
+
+
+def test_one_run_as_picture_tables_and_json(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    png, csv, parquet = (tmp_path / f"flown.{suffix}" for suffix in ("png", "csv", "parquet"))
+    report(runs[:1], png=png, csv=csv, parquet=parquet, as_json=True)
+    assert json.loads(capsys.readouterr().out) == json.loads((runs[0] / "summary.json").read_text(encoding="utf-8"))
+    assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert csv.read_bytes()[:8] == b"stamp_ns"
+    assert parquet.read_bytes()[:4] == b"PAR1"
+
+
+def test_two_runs_are_compared(
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = (runs[0] / "report.html").read_bytes()
+    report(runs, html=Path("two.html"))
+    shown = capsys.readouterr().out
+    assert "2 flights compared" in (tmp_path / "two.html").read_text(encoding="utf-8")
+    assert f"1: {runs[0].name}, completed" in shown
+    assert "settling" not in shown  # a terminal has the errors alone
+    assert shown.splitlines()[-1] == "report:  two.html"
+    assert (runs[0] / "report.html").read_bytes() == before
+    report(runs, as_json=True)
+    assert [one["scenario"] for one in json.loads(capsys.readouterr().out)] == ["osprey_gust", "osprey_servo"]
+    assert (runs[0].parent / "comparison.html").is_file()
+
+
+def test_the_tables_fit_a_terminal_of_eighty_columns(
+    runs: list[Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    report(runs[1:])
+    lines = capsys.readouterr().out.splitlines()
+    assert len([line for line in lines if line.startswith((" q", " V", " elevator", " thrust"))]) == 4
+    assert not [line for line in lines if "…" in line]
+
+
+@pytest.mark.parametrize("option", ["html", "png", "csv", "parquet"])
+def test_a_file_that_cannot_be_written_is_one_sentence(runs: list[Path], option: str) -> None:
+    nowhere: dict[str, Any] = {option: Path("/proc/none/file")}
+    with pytest.raises(ParameterError, match=f"^--{option}: /proc/none/file cannot be written "):
+        report(runs[:1], **nowhere)
+
+
+def test_a_flight_that_never_began_has_a_summary_with_the_same_keys(runs: list[Path]) -> None:
+    unflown = summarise_unflown(find_scenario("osprey_gust"), "stuck")
+    assert unflown.keys() == json.loads((runs[0] / "summary.json").read_text(encoding="utf-8")).keys()
+
+
+def test_latency_is_the_time_between_the_sending_of_y_and_of_its_u(tmp_path: Path) -> None:
+    sent = {"/y": {0: 1, 10: 11, 20: 21}, "/u": {0: 3, 20: 26}}  # ms, by stamp; y(10) was not answered
+    with BagWriter(tmp_path / "run") as bag:
+        for topic, instants in sent.items():
+            channel = bag.add_topic(topic, JOINT_STATE, "")
+            for stamp, at in instants.items():
+                message = vector(EPOCH + stamp * MS, ["q"], [1.0])
+                bag.write(channel, EPOCH + 99 * MS, EPOCH + at * MS, 1, message)
+    found = latency(tmp_path / "run")
+    assert found is not None
+    assert (found.stamp_ns - EPOCH).tolist() == [0, 20 * MS]
+    assert found["y_to_u"].tolist() == [2e-3, 5e-3]
+
+
+def test_a_flight_in_one_process_has_no_latency(runs: list[Path]) -> None:
+    assert latency(runs[0]) is None

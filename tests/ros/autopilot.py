@@ -1,0 +1,89 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A stand-in for ArduPilot's DDS interface, a process of its own: python -m tests.ros.autopilot SCENARIO RELEASE_AFTER.
+
+It flies what the scenario's aircraft section says at its rate, says it as AP_DDS does (ENU and FLU, best effort, of the last
+five) and takes Joy as AP_DDS does: axes scaled to full deflection, NaN gives a channel back at once, silence does after
+RELEASE_AFTER seconds; a channel that is given back is at trim. Nothing here is of the bridge. It prints "y STAMP q V p r"
+without noise, and "given back" when it has waited in vain.
+"""
+
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import TwistStamped, Vector3Stamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Joy
+
+from aircraft_sim.simulator import Simulator
+from flight_analysis.scenario import load_scenario
+from flight_ros import transport
+
+QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+SPEED = 25.0  # m/s, trim
+FULL = math.radians(30.0)  # of the surfaces
+
+
+class Autopilot:
+    """The aircraft and its two ends."""
+
+    def __init__(self, scenario: Path, release_after: float) -> None:
+        self._simulator = Simulator(load_scenario(scenario).aircraft)
+        self._release_after = release_after
+        self.node = Node("ap")
+        self._twist = self.node.create_publisher(TwistStamped, "/ap/twist/filtered", QOS)
+        self._airspeed = self.node.create_publisher(Vector3Stamped, "/ap/airspeed", QOS)
+        self.node.create_subscription(Joy, "/ap/joy", self._on_joy, QOS)
+        self._axes = [math.nan] * 4
+        self._heard = 0.0
+
+    def _on_joy(self, message: Joy) -> None:
+        if len(message.axes) >= 4:  # those with fewer are ignored
+            self._axes, self._heard = [float(axis) for axis in message.axes[:4]], time.monotonic()
+
+    def _u(self) -> list[float]:
+        """Elevator, thrust, aileron, rudder from trim: rad, and throttle of which half is trim."""
+        if any(math.isfinite(axis) for axis in self._axes) and time.monotonic() - self._heard > self._release_after:
+            self._axes = [math.nan] * 4
+            print("given back", flush=True)
+        roll, pitch, throttle, yaw = self._axes
+        u = [pitch * FULL, (throttle + 1.0) / 2.0 - 0.5, roll * FULL, yaw * FULL]
+        return [one if math.isfinite(one) else 0.0 for one in u]
+
+    def fly(self) -> None:
+        """Sample after sample, until it is ended."""
+        period = self._simulator.period_ns / 1e9
+        begin = time.monotonic()
+        places = [self._simulator.truth_names.index(f"x.{name}") for name in ("q", "V", "p", "r")]
+        number = 0
+        while True:
+            while (rest := begin + number * period - time.monotonic()) > 0.0:
+                rclpy.spin_once(self.node, timeout_sec=rest)
+            (sample,) = self._simulator.sample(number, np.array(self._u()))
+            self._say(*sample.y.tolist())
+            truth = self._simulator.truth()[places]
+            print("y", time.time_ns(), *truth.tolist(), flush=True)
+            number = max(number + 1, int((time.monotonic() - begin) / period))  # it may have been stopped for a while
+
+    def _say(self, q: float, V: float, p: float, r: float) -> None:
+        twist, airspeed = TwistStamped(), Vector3Stamped()
+        for message in (twist, airspeed):
+            message.header.stamp.sec = 12  # the time since boot, say: not to be relied upon
+            message.header.frame_id = "base_link"
+        twist.twist.linear.y = SPEED + V  # north, in ENU
+        twist.twist.angular.x, twist.twist.angular.y, twist.twist.angular.z = p, -q, -r
+        alpha = 0.05
+        airspeed.vector.x, airspeed.vector.z = (SPEED + V) * math.cos(alpha), (SPEED + V) * math.sin(alpha)
+        self._twist.publish(twist)
+        self._airspeed.publish(airspeed)
+
+
+if __name__ == "__main__":
+    transport.prepare()
+    rclpy.init()
+    Autopilot(Path(sys.argv[1]), float(sys.argv[2])).fly()

@@ -1,0 +1,335 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The recorder: what it takes, what it says of what it cannot take, what is left when it is killed or the disk is full."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from builtin_interfaces.msg import Time
+from lifecycle_msgs.msg import State
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.highlevel import AnyReader
+from sensor_msgs.msg import FluidPressure, JointState, Temperature
+from std_msgs.msg import String
+from tests.conftest import REPOSITORY
+from tests.ros.conftest import Process, Start
+from tests.ros.peer import Peer, peer
+from tests.small_disk import small_disk
+
+from flight_analysis.bag_reader import read_run
+from flight_analysis.scenario import Scenario
+from flight_core.rates import NANOSECONDS
+from flight_ros.messages import to_message
+from flight_ros.topics import PUBLISH
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+@pytest.fixture
+def someone() -> Iterator[Peer]:
+    with peer(listen=("/diagnostics",)) as made:
+        yield made
+
+
+def recorder(start: Start, scenario: Scenario, folder: Path | str, *parameters: str) -> Process:
+    arguments = [word for one in (f"directory:={folder}", *parameters) for word in ("-p", one)]
+    return start("flight_recorder.node", "--ros-args", "--params-file", str(scenario.path), *arguments)
+
+
+def stop(process: Process) -> None:
+    process.interrupt()
+    assert process.end() == 0, process.output
+
+
+def said(someone: Peer) -> tuple[int, str, dict[str, str]]:
+    """Level, sentence and figures of the recorder's newest diagnostics."""
+    for message in reversed(someone.heard["/diagnostics"]):
+        if message.status[0].name == "/recorder":
+            status = message.status[0]
+            return status.level[0], status.message, {one.key: one.value for one in status.values}
+    return -1, "", {}
+
+
+def recorded(someone: Peer, topic: str) -> int:
+    return int(said(someone)[2].get(f"messages {topic}", 0))
+
+
+def messages(run: Path) -> dict[str, list[tuple[int, bytes]]]:
+    """Log time and bytes of all messages, by topic, as rosbags reads them."""
+    found: dict[str, list[tuple[int, bytes]]] = {}
+    with AnyReader([run]) as reader:
+        for one, stamp_ns, data in reader.messages():
+            found.setdefault(one.topic, []).append((stamp_ns, data))
+            reader.deserialize(data, one.msgtype)
+    return found
+
+
+def errors(process: Process) -> list[str]:
+    return [line for line in process.lines if "[ERROR]" in line or line.startswith("error:")]
+
+
+# What it takes
+
+
+def test_logs_and_changes_of_parameters_are_recorded(
+    start: Start, osprey_gust: Scenario, someone: Peer, tmp_path: Path
+) -> None:
+    someone.node.get_logger().info("said before there was a recorder")
+    process = recorder(start, osprey_gust, "run")
+    someone.until(lambda: recorded(someone, "/rosout") > 1)
+    someone.node.declare_parameter("gain", 3.0)
+    someone.until(lambda: recorded(someone, "/parameter_events") > 0)
+    stop(process)
+    with AnyReader([tmp_path / "run"]) as reader:
+        found = [(one.topic, reader.deserialize(data, one.msgtype)) for one, _, data in reader.messages()]
+    texts = [message.msg for topic, message in found if topic == "/rosout"]  # type: ignore[attr-defined]
+    assert "said before there was a recorder" in texts
+    assert any("recording to" in text for text in texts)
+    events = [message for topic, message in found if topic == "/parameter_events"]
+    assert [one.name for event in events for one in event.new_parameters if event.node == "/peer"] == ["gain"]  # type: ignore[attr-defined]
+
+
+def test_further_topics_are_recorded_whatever_their_publishers_offer(
+    start: Start, osprey_gust: Scenario, someone: Peer, tmp_path: Path
+) -> None:
+    latched = someone.node.create_publisher(String, "/latched", LATCHED)
+    latched.publish(String(data="before"))
+    process = recorder(start, osprey_gust, "run", "topics:=[/latched, relative/pressure, /late, /y]")
+    process.wait_for("ready")
+    weak = someone.node.create_publisher(FluidPressure, "/relative/pressure", BEST_EFFORT)
+    someone.until(lambda: recorded(someone, "/relative/pressure") > 2, each=lambda: weak.publish(FluidPressure()))
+    late = someone.node.create_publisher(Temperature, "/late", QoSProfile(depth=5))
+    someone.until(lambda: recorded(someone, "/late") > 2, each=lambda: late.publish(Temperature(temperature=1.0)))
+    someone.until(lambda: recorded(someone, "/latched") > 0)
+    stop(process)
+    found = messages(tmp_path / "run")
+    assert len(found["/latched"]) == 1  # sent before the recorder was there
+    assert len(found["/relative/pressure"]) > 2
+    assert len(found["/late"]) > 2
+    assert errors(process) == []
+
+
+def test_a_weaker_publisher_that_comes_later_is_recorded_too(
+    start: Start, osprey_gust: Scenario, someone: Peer, tmp_path: Path
+) -> None:
+    strong = someone.node.create_publisher(String, "/mixed", LATCHED)
+    strong.publish(String(data="strong"))
+    process = recorder(start, osprey_gust, "run", "topics:=[/mixed]")
+    someone.until(lambda: recorded(someone, "/mixed") == 1)
+    weak = someone.node.create_publisher(String, "/mixed", BEST_EFFORT)
+    process.wait_for("/mixed: now recorded with best_effort")
+    someone.until(lambda: recorded(someone, "/mixed") > 3, each=lambda: weak.publish(String(data="weak")))
+    stop(process)
+    texts = [data for _, data in messages(tmp_path / "run")["/mixed"]]
+    assert sum(b"strong" in text for text in texts) == 1
+    assert sum(b"weak" in text for text in texts) > 2
+
+
+def test_a_topic_that_never_appears_is_named(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+    process = recorder(start, osprey_gust, "run", "topics:=[/never]")
+    process.wait_for("nobody publishes /never; recorded as soon as somebody does")
+    someone.until(lambda: said(someone)[2].get("missing /never") == "nobody publishes it")
+    stop(process)
+    assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: nobody published it" in line)
+
+
+def test_a_topic_whose_type_is_not_installed_is_named(
+    start: Start, osprey_gust: Scenario, someone: Peer, tmp_path: Path
+) -> None:
+    # The recorder runs in this folder, whose packages come first: there lifecycle_msgs has no messages.
+    (tmp_path / "lifecycle_msgs").mkdir()
+    (tmp_path / "lifecycle_msgs" / "__init__.py").touch()
+    someone.node.create_publisher(State, "/strange", LATCHED)
+    process = recorder(start, osprey_gust, "run", "topics:=[/strange]")
+    process.wait_for("/strange is not recorded: its type lifecycle_msgs/msg/State is not installed")
+    stop(process)
+
+
+def test_a_publisher_of_another_type_is_named(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+    someone.node.create_publisher(String, "/u_m", LATCHED)
+    process = recorder(start, osprey_gust, "run")
+    process.wait_for("/u_m: /peer publishes std_msgs/msg/String, expected sensor_msgs/msg/JointState")
+    stop(process)
+
+
+def test_a_topic_that_cannot_be_one_is_refused(start: Start, osprey_gust: Scenario, tmp_path: Path) -> None:
+    process = recorder(start, osprey_gust, "run", "topics:=[a topic]")
+    assert process.end() == 2
+    assert errors(process) == ["error: recorder.topics: found 'a topic', expected the name of a topic"]
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_lost_is_counted_and_said(start: Start, osprey_gust: Scenario, someone: Peer, tmp_path: Path) -> None:
+    process = recorder(start, osprey_gust, "run")
+    process.wait_for("ready")
+    names, sent = [f"x.{k}" for k in range(100)], 0
+    publisher = someone.node.create_publisher(JointState, "truth", PUBLISH)
+    someone.until(lambda: publisher.get_subscription_count() == 1)
+
+    def send(count: int) -> None:
+        nonlocal sent
+        for _ in range(count):
+            sent += 1
+            publisher.publish(to_message(sent, names, np.full(100, float(sent)), "peer"))
+
+    send(10)
+    someone.until(lambda: recorded(someone, "/truth") == 10)
+    stopped = psutil.Process(process.popen.pid)
+    stopped.suspend()
+    send(6000)  # a publisher keeps 500, and what the socket holds is less than the rest
+    stopped.resume()
+    someone.until(lambda: int(said(someone)[2].get("lost /truth", 0)) > 0)
+    someone.until(lambda: sent == recorded(someone, "/truth") + int(said(someone)[2]["lost /truth"]))
+    stop(process)
+    run = read_run(tmp_path / "run")
+    lost = int(run.metadata["rise_di_lost"]["/truth"])
+    assert lost > 0
+    assert len(run.tape["truth"].stamp_ns) + lost == sent
+    assert f"/truth: {lost} messages lost on the way to the recorder" in run.tape.notes
+
+
+# A disk without space
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    with small_disk(tmp_path / "disk", 3_000_000) as folder:
+        yield folder
+
+
+@pytest.fixture
+def publisher(domain: int) -> Iterator[subprocess.Popen[str]]:
+    """Six topics at 1 kHz, as wide as those of a flight, until the test ends."""
+    command = [sys.executable, str(REPOSITORY / "benchmarks" / "recorder.py"), "--publish", "--duration=120"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    yield process
+    process.terminate()
+    process.communicate(timeout=20.0)
+
+
+@pytest.mark.parametrize(
+    ("least", "reason"),
+    [("0.0", "no space left for "), ("1.2", r"min_free: found \d\.\d MB free in .*, expected at least 1.2 MB")],
+)
+def test_a_full_disk_ends_the_log_with_one_error_and_not_the_flight(
+    least: str,
+    reason: str,
+    start: Start,
+    osprey_gust: Scenario,
+    someone: Peer,
+    disk: Path,
+    publisher: subprocess.Popen[str],
+) -> None:
+    process = recorder(start, osprey_gust, disk / "run", f"min_free:={least}", "lockstep:=true")
+    process.wait_for("recording ended")
+    someone.until(lambda: said(someone)[0] == 2)
+    _, sentence, figures = said(someone)
+    assert re.match(f"recording ended: {reason}", sentence)
+    # It goes on listening: in lockstep the aircraft would otherwise wait for it.
+    heard: list[object] = []
+    someone.node.create_subscription(Time, "recorded", heard.append, QoSProfile(depth=10))
+    someone.until(lambda: len(heard) > 5)
+    stop(process)
+    assert len([line for line in errors(process) if "recording ended" in line]) == 1
+    assert len(errors(process)) == 1
+    found = messages(disk / "run")
+    assert {topic: str(len(those)) for topic, those in found.items()} == {
+        key.removeprefix("messages "): value for key, value in figures.items() if key.startswith("messages ") and value != "0"
+    }
+    assert read_run(disk / "run").tape.notes == ()
+
+
+def test_too_little_space_at_the_start_is_refused(start: Start, osprey_gust: Scenario, disk: Path) -> None:
+    process = recorder(start, osprey_gust, disk / "run")
+    assert process.end() == 2
+    assert re.fullmatch(
+        r"error: recorder.min_free: found 3.0 MB free in .*/disk/run, expected at least 100 MB", process.lines[-1]
+    )
+
+
+# A recorder that is killed
+
+
+def size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*.mcap"))
+
+
+def wait_for_size(folder: Path, least: int, process: Process) -> None:
+    deadline = time.monotonic() + 30.0
+    while size(folder) < least:
+        assert time.monotonic() < deadline, process.output
+        assert process.popen.poll() is None, process.output
+        time.sleep(0.005)  # the file is the event; there is nothing to be told of it by
+
+
+def test_twenty_kills_cost_three_tenths_of_a_second_at_most(
+    start: Start, osprey_gust: Scenario, tmp_path: Path, publisher: subprocess.Popen[str]
+) -> None:
+    generator = np.random.default_rng(1)
+    missing = []
+    following = recorder(start, osprey_gust, "run0")
+    for k in range(20):
+        process, folder = following, tmp_path / f"run{k}"
+        wait_for_size(folder, 200_000, process)
+        if k < 19:
+            following = recorder(start, osprey_gust, f"run{k + 1}")  # starts meanwhile
+        with pytest.raises(subprocess.TimeoutExpired):  # not an event to wait for: the instant is the case
+            process.popen.wait(float(generator.uniform(0.0, 0.3)))
+        killed_ns = time.time_ns()
+        process.popen.kill()
+        assert process.end() == -signal.SIGKILL
+        assert not (folder / "metadata.yaml").exists()
+        tape = read_run(folder).tape
+        last_ns = tape["y"].stamp_ns[-1]
+        missing.append((killed_ns - last_ns) / NANOSECONDS)
+        end = max(tape.time(name)[-1] for name in tape.signals)
+        assert tape.notes[0] == f"run{k}_0.mcap has no end: read up to its last whole chunk, t = {end:.3f} s"
+        assert tape.notes[1] == f"metadata.yaml is missing: rise-di repair {folder}"
+        for name in ("y", "y_m", "u", "internals", "truth"):
+            assert np.diff(tape[name].stamp_ns).max() < 0.2 * NANOSECONDS, name  # nothing is missing before
+    assert max(missing) < 0.3, missing
+
+
+def test_a_flight_whose_recorder_is_killed_has_a_report_and_a_log_that_can_be_repaired(
+    start: Start, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    flight = start("flight_bringup.cli", "fly", str(osprey_gust.path), "--duration", "30")
+    wait_for_size(tmp_path / "runs", 150_000, flight)
+    node = next(child for child in flight.children() if "flight_recorder.node" in child.cmdline())
+    killed_ns = time.time_ns()
+    node.kill()
+    assert flight.end(60.0) == 3, flight.output
+    assert "outcome: recorder was killed by SIGKILL" in flight.output
+    run = (tmp_path / "runs" / "latest").resolve()
+    before = read_run(run)
+    assert (killed_ns - before.tape["y"].stamp_ns[-1]) / NANOSECONDS < 0.3
+    assert before.scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
+    assert {stored.name for stored in before.attachments} == {"parameters.yaml", "airframe.yaml"}
+    assert {name for name in before.metadata if before.metadata[name]} >= {
+        "rise_di_flight",
+        "rise_di_host",
+        "rise_di_versions",
+    }
+    report = start("flight_bringup.cli", "report", str(run))
+    assert report.end(60.0) == 0, report.output
+    assert "has no end: read up to its last whole chunk, t = " in " ".join(report.output.split())
+    assert (run / "report.html").stat().st_size > 10_000
+    repair = start("flight_bringup.cli", "repair", str(run))
+    assert repair.end(60.0) == 0, repair.output
+    assert "of the 30 s that were to be flown" in repair.output
+    counts = {topic: len(those) for topic, those in messages(run).items()}
+    assert counts["/y"] == len(before.tape["y"].stamp_ns)
+    after = read_run(run)
+    assert after.tape.notes == ()
+    assert after.tape["y"].values.tobytes() == before.tape["y"].values.tobytes()
+    assert json.loads((run / "summary.json").read_text(encoding="utf-8"))["outcome"] == "recorder was killed by SIGKILL"

@@ -1,0 +1,143 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Flights over real DDS computed again from their logs: every bit, whatever happened to the controller or to the recorder."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from lifecycle_msgs.msg import Transition
+from tests.ros.conftest import Process, Start
+from tests.ros.peer import Peer, peer
+from tests.ros.test_controller import set_parameters, transition
+from tests.ros.test_lockstep import ROUGH, both_cores_busy, scenario_file
+
+from aircraft_sim.airframe import load_airframe
+from flight_analysis.bag_reader import read_run
+from flight_analysis.gain_selection import with_feedforward
+from flight_analysis.scenario import load_scenario
+from flight_core.parameters import flatten, nest
+from rise_di_controller.guard import Mode
+
+
+@pytest.fixture
+def someone() -> Iterator[Peer]:
+    with peer(("internals",)) as made:
+        yield made
+
+
+def replayed(start: Start, run: Path, *settings: str, status: int = 0) -> dict[str, Any]:
+    """What `rise-di replay` says of a run."""
+    process = start("flight_bringup.cli", "replay", str(run), "--json", *settings)
+    assert process.end() == status, process.output
+    found: dict[str, Any] = json.loads(process.output)
+    assert found["equal"] is (status == 0)
+    return found
+
+
+def fly(start: Start, scenario: Path, *options: str) -> Process:
+    return start("flight_bringup.cli", "fly", str(scenario), *options)
+
+
+def with_limits(path: Path) -> Path:
+    """The scenario with feedforward and with limits of magnitude and rate that it reaches."""
+    controller = with_feedforward(load_scenario(path).controller, load_airframe("osprey"))
+    limits = {"lower": [-0.05] * 4, "upper": [0.01] * 4, "slew": [0.3] * 4}
+    tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    plain = json.loads(json.dumps(nest(dict(flatten(controller.model_dump())))))
+    tree["/**/controller"]["ros__parameters"] = plain | limits
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("options", [("--lockstep",), ("--one-process",)])
+def test_lockstep_with_feedforward_limits_and_lost_samples_comes_again(
+    options: tuple[str, ...], start: Start, tmp_path: Path
+) -> None:
+    flight = fly(start, with_limits(scenario_file(tmp_path, 4.0, aircraft=ROUGH)), *options)
+    assert flight.end(timeout=120) == 0, flight.output
+    run = tmp_path / "runs" / "latest"
+    found = replayed(start, run)
+    assert found["ticks"] == found["checked"] > 300
+    assert found["notes"] == []
+    log = read_run(run).tape["internals"]
+    assert set(log.group("limited").values.ravel()) == {0.0, 1.0, 2.0}
+    assert log.group("u_ff").values.any()
+
+
+def test_a_flight_in_real_time_comes_again_through_changes_outages_and_a_busy_machine(
+    start: Start, tmp_path: Path, someone: Peer
+) -> None:
+    flight = fly(start, scenario_file(tmp_path, 120.0, "osprey_gust"))  # ended below
+
+    def modes() -> list[int]:
+        return someone.modes()[-1:]
+
+    def more(count: int) -> None:
+        until = len(someone.heard["internals"]) + count
+        someone.until(lambda: len(someone.heard["internals"]) >= until, timeout=60.0)
+
+    someone.until(lambda: modes() == [Mode.ENGAGED], timeout=60.0)
+    assert set_parameters(someone, k_g=1.5, Lambda=[4.0, 4.0, 2.0, 0.4])[0]
+    more(50)
+    assert set_parameters(someone, upper=[0.01] * 4)[0]
+    with both_cores_busy():  # ticks are late, and some are missed
+        more(50)
+    assert transition(someone, Transition.TRANSITION_DEACTIVATE)
+    someone.until(lambda: modes() == [Mode.INACTIVE])
+    more(20)
+    assert transition(someone, Transition.TRANSITION_CLEANUP)
+    assert transition(someone, Transition.TRANSITION_CONFIGURE)  # the law starts anew from the u that it was at
+    assert transition(someone, Transition.TRANSITION_ACTIVATE)
+    someone.until(lambda: modes() == [Mode.ENGAGED])
+    more(50)
+    flight.interrupt()
+    assert flight.end(timeout=60) == 130, flight.output
+    run = tmp_path / "runs" / "latest"
+    found = replayed(start, run)
+    assert found["ticks"] == found["checked"] > 150
+    changes = [note.split(": ")[1] for note in found["notes"] if note.startswith("parameters changed before tick")]
+    assert changes == ["Lambda, k_g", "upper"]
+    # and one bit of one gain is found in it
+    assert replayed(start, run, "--set", "controller.k_g=1.0000000000000002", status=1)["open_loop"]
+
+
+def test_what_a_killed_recorder_left_comes_again(start: Start, tmp_path: Path) -> None:
+    flight = fly(start, scenario_file(tmp_path, 30.0, "osprey_gust"), "--lockstep")
+    log: list[Path] = []
+
+    def written() -> bool:
+        log[:] = tmp_path.rglob("*.mcap")
+        return bool(log) and log[0].stat().st_size > 200_000
+
+    with peer(()) as someone:
+        someone.until(written, timeout=60.0)
+    next(one for one in flight.children() if "flight_recorder.node" in one.cmdline()).kill()
+    assert flight.end(timeout=60) == 3, flight.output
+    found = replayed(start, log[0].parent)
+    assert found["ticks"] == found["checked"] > 100
+    assert any("has no end" in note for note in found["notes"])
+
+
+def test_a_recorder_that_comes_late_leaves_its_first_tick_unchecked_and_says_what_is_missing(
+    start: Start, tmp_path: Path, someone: Peer
+) -> None:
+    scenario = scenario_file(tmp_path, 1e3, "osprey_gust")
+    for module in ("rise_di_controller", "aircraft_sim", "reference_model"):
+        start(f"{module}.node", "--ros-args", "--params-file", str(scenario))
+    someone.until(lambda: len(someone.heard["internals"]) > 700, timeout=60.0)  # more than a publisher keeps
+    recorder = start(
+        *("flight_recorder.node", "--ros-args", "--params-file", str(scenario)),
+        *("-p", f"scenario_file:={scenario}", "-p", "directory:=run"),
+    )
+    recorder.wait_for("recording to")
+    count = len(someone.heard["internals"])
+    someone.until(lambda: len(someone.heard["internals"]) > count + 200)
+    recorder.interrupt()
+    assert recorder.end() == 0, recorder.output
+    found = replayed(start, tmp_path / "run")
+    assert found["checked"] == found["ticks"] - 1 > 200
+    assert any(note.startswith("the log begins with sample ") for note in found["notes"])
