@@ -61,7 +61,9 @@ def _write(option: str, path: Path, write: Callable[[Path, Sequence[Recorded]], 
     try:
         write(path, flights)
     except OSError as error:
-        raise ParameterError(f"{option}: {path} cannot be written ({error.strerror or error}), expected the path of a file") from None
+        raise ParameterError(
+            f"{option}: {path} cannot be written ({error.strerror or error}), expected the path of a file"
+        ) from None
 
 
 def show(console: Console, flight: Recorded) -> None:
