@@ -404,6 +404,22 @@ def test_a_reference_of_its_own_is_drawn_for_each_flight(pair: list[Recorded], s
     assert [trace.name for trace in drawn.data if trace.yaxis == "y"] == ["y_m a", "y_m c", "a", "b", "c"]
 
 
+def test_every_flight_is_in_the_legend_once_whatever_channels_it_has(servo: Scenario) -> None:
+    def only(*names: str) -> Tape:
+        y = signal([10.0 * k for k in range(101)], **{name: [1.0] * 101 for name in names})
+        return Tape({"y": y, "y_m": y, "u": y, "latency": signal([0, 10], y_to_u=[1e-3, 2e-3])}, EPOCH)
+
+    two = [recorded("a", servo, only("q", "V")), recorded("b", servo, only("V", "p"))]
+    shared = comparison.scene(two)
+    for drawn in (
+        comparison.error_picture(shared, two),
+        comparison.spectrum_picture(shared, two),
+        comparison.timing_picture(two),
+    ):
+        assert drawn is not None
+        assert [trace.name for trace in drawn.data if trace.showlegend] == ["a", "b"]
+
+
 def test_flights_of_one_name_are_numbered(pair: list[Recorded]) -> None:
     assert comparison.labels([pair[0], pair[1], pair[0]]) == ["a (1)", "b", "a (3)"]
 

@@ -182,12 +182,16 @@ def test_what_is_lost_is_counted_and_said(start: Start, osprey_gust: Scenario, s
             sent += 1
             publisher.publish(to_message(sent, names, np.full(100, float(sent)), "peer"))
 
-    send(10)
-    someone.until(lambda: recorded(someone, "/truth") == 10)
-    stopped = psutil.Process(process.popen.pid)
-    stopped.suspend()
-    send(6000)  # a publisher keeps 500, and what the socket holds is less than the rest
-    stopped.resume()
+    def send_to_one_that_stands_still(count: int) -> None:
+        recording = psutil.Process(process.popen.pid)
+        recording.suspend()
+        send(count)
+        recording.resume()
+
+    send_to_one_that_stands_still(1500)  # a publisher keeps 2000
+    someone.until(lambda: recorded(someone, "/truth") == sent)
+    assert "lost /truth" not in said(someone)[2]
+    send_to_one_that_stands_still(8000)  # and what the socket holds is less than the rest
     someone.until(lambda: int(said(someone)[2].get("lost /truth", 0)) > 0)
     someone.until(lambda: sent == recorded(someone, "/truth") + int(said(someone)[2]["lost /truth"]))
     stop(process)

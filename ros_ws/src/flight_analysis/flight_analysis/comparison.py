@@ -9,13 +9,14 @@ import numpy as np
 import plotly.graph_objects as go
 
 from flight_analysis import pictures
-from flight_analysis.drawing import PLAIN, Band, Curve, Samples, Scene, stack
+from flight_analysis.drawing import Band, Curve, Samples, Scene, stack
 from flight_analysis.metrics import known_error
 from flight_analysis.recorded import Recorded
 from flight_analysis.summary import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
     NONE,
+    PLAIN,
     SWITCHES,
     Column,
     Shown,
@@ -23,8 +24,8 @@ from flight_analysis.summary import (
     figure,
     shown_units,
     slowest,
+    titled,
 )
-from flight_core.rates import period_ns
 from flight_core.tape import Signal, Tape
 
 # Okabe and Ito 2008, told apart by the colour blind too; lighter on a dark ground.
@@ -81,15 +82,13 @@ def blocks(flights: Sequence[Recorded], key: str, columns: Sequence[Column], *, 
     """Figures of "errors" or "inputs" of the summaries: a block a channel, a row for each of the columns that has any."""
     shown, found = units(flights), []
     for channel in dict.fromkeys(name for flight in flights for name in flight.summary[key]):
-        unit, factor = shown.get(channel, PLAIN)
+        factor = shown.get(channel, PLAIN).factor
         rows = [
-            _row(
-                flights, f"{column.group} {column.head}".strip(), (key, channel, *column.path), factor if column.scaled else 1.0
-            )
-            for column in columns
+            _row(flights, f"{one.group} {one.head}".strip(), (key, channel, *one.path), factor if one.scaled else 1.0)
+            for one in columns
         ]
         told = tuple(row._replace(judged=judged) for row in rows if set(row.texts) != {NONE})
-        found.append(Block(f"{channel} ({unit})", told, channel))
+        found.append(Block(titled(channel, shown), told, channel))
     return found
 
 
@@ -142,7 +141,7 @@ def tracking_picture(scene: Scene, flights: Sequence[Recorded]) -> go.Figure:
     """Y of every flight over the reference of each that has one of its own."""
     references: dict[str, Signal] = {}
     for label, flight in zip(labels(flights), flights, strict=True):
-        y_m = _from_zero(flight.tape, "y_m")
+        y_m = _from_zero(flight.tape["y_m"], flight)
         alike = next((other for other, known in references.items() if _same(known, y_m)), None)
         if alike is None:
             references[label] = y_m
@@ -153,24 +152,24 @@ def tracking_picture(scene: Scene, flights: Sequence[Recorded]) -> go.Figure:
     if len(references) == 1:
         (curve,) = curves.values()
         curves = {"y_m": curve._replace(colour=pictures.REFERENCE, width=6.0, pale=False)}
-    return stack(scene, curves | _curves(flights, lambda flight: _from_zero(flight.tape, "y")))
+    return stack(scene, curves | _curves(flights, "y", lambda tape: tape["y"]))
 
 
 def error_picture(scene: Scene, flights: Sequence[Recorded]) -> go.Figure:
     """The best known error of every flight."""
-    return stack(scene, _curves(flights, lambda flight: _shifted(known_error(flight.tape)[1], flight.tape)), height=120)
+    return stack(scene, _curves(flights, "y", lambda tape: known_error(tape)[1]), height=120)
 
 
 def input_picture(scene: Scene, flights: Sequence[Recorded]) -> go.Figure | None:
     """U of every flight."""
-    flown = [flight for flight in flights if "u" in flight.tape]
-    return stack(scene, _curves(flights, lambda flight: _from_zero(flight.tape, "u"), "u", held=True)) if flown else None
+    curves = _curves(flights, "u", lambda tape: tape["u"], held=True)
+    return stack(scene, curves) if curves else None
 
 
 def spectrum_picture(scene: Scene, flights: Sequence[Recorded]) -> go.Figure | None:
     """Spectra of u of every flight that has enough samples."""
     of = {
-        label: (flight.tape["u"], period_ns(flight.scenario.controller.rate, "controller.rate"))
+        label: (flight.tape["u"], flight.period_ns)
         for label, flight in zip(labels(flights), flights, strict=True)
         if "u" in flight.tape and len(flight.tape["u"].stamp_ns) >= pictures.FEWEST
     }
@@ -179,29 +178,23 @@ def spectrum_picture(scene: Scene, flights: Sequence[Recorded]) -> go.Figure | N
 
 def timing_picture(flights: Sequence[Recorded]) -> go.Figure | None:
     """How the time of every controller was spread."""
-    of = {
-        label: pictures.timing(flight.tape, period_ns(flight.scenario.controller.rate, "controller.rate"))
-        for label, flight in zip(labels(flights), flights, strict=True)
-    }
+    named = zip(labels(flights), flights, strict=True)
+    of = {label: pictures.timing(flight.tape, flight.period_ns) for label, flight in named}
     return pictures.draw_histograms(of, colours(flights)) if any(of.values()) else None
 
 
-def _curves(flights: Sequence[Recorded], of: Callable[[Recorded], Signal], topic: str = "y", **look: Any) -> dict[str, Curve]:
-    palette = colours(flights)
+def _curves(flights: Sequence[Recorded], topic: str, of: Callable[[Tape], Signal], **look: Any) -> dict[str, Curve]:
+    """A curve of each flight that has a topic, in its colour."""
     return {
-        label: Curve(of(flight), palette[label], **look)
-        for label, flight in zip(labels(flights), flights, strict=True)
+        label: Curve(_from_zero(of(flight.tape), flight), colour, **look)
+        for (label, colour), flight in zip(colours(flights).items(), flights, strict=True)
         if topic in flight.tape
     }
 
 
-def _from_zero(tape: Tape, topic: str) -> Signal:
-    return _shifted(tape[topic], tape)
-
-
-def _shifted(signal: Signal, tape: Tape) -> Signal:
+def _from_zero(signal: Signal, flight: Recorded) -> Signal:
     """The signal with the flight time in ns as its stamps."""
-    return Signal(signal.stamp_ns - tape.start_ns, signal.names, signal.values)
+    return Signal(signal.stamp_ns - flight.tape.start_ns, signal.names, signal.values)
 
 
 def _same(one: Signal, other: Signal) -> bool:

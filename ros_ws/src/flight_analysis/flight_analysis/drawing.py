@@ -17,12 +17,11 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from flight_analysis.summary import Shown
+from flight_analysis.summary import PLAIN, Shown, titled
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
-PLAIN = Shown("", 1.0)  # a channel whose unit is not known is shown in SI
 MOST_POINTS = 2400  # of a curve over the page's width: the smallest and the largest value of each pixel, and some to spare
 GAP = 10.0  # times the median period: a curve is broken where as much is missing
 SHADE = 0.25  # opacity of bands
@@ -90,7 +89,7 @@ class Curve(NamedTuple):
     colour: str
     width: float = 1.4
     held: bool = False  # from one sample to the next, as u is
-    pale: bool = False
+    pale: bool = False  # under others of its colour
 
 
 def drawn_points(values: FloatArray, most: int = MOST_POINTS) -> NDArray[np.int64]:
@@ -137,9 +136,9 @@ def stack(scene: Scene, curves: Mapping[str, Curve], *, columns: int = 1, height
         for label, curve in curves.items():
             if channel in curve.signal.names:
                 trace = _trace(scene, curve, channel, factor, MOST_POINTS // columns)
-                trace.update(name=label, legendgroup=label, showlegend=place == 0 and len(curves) > 1)
+                trace.update(name=label, legendgroup=label, showlegend=len(curves) > 1 and is_new(figure, label))
                 figure.add_trace(trace.update(hovertemplate=f"%{{y:.4g}} {unit}"), **at)
-        figure.update_yaxes(title_text=f"{channel} ({unit})" if unit else channel, **at)
+        figure.update_yaxes(title_text=titled(channel, scene.units), **at)
     figure.update_xaxes(range=[0.0, scene.end], showticklabels=False)
     for col in range(columns):
         last = -(-(len(channels) - col) // columns)  # row of the lowest cell of the column
@@ -181,15 +180,19 @@ def framed(figure: go.Figure, height: int, labels: int = 6, below: int = 40) -> 
     )
 
 
+def is_new(figure: go.Figure, label: str) -> bool:
+    """Whether the figure has nothing yet under a label, which the legend shows once."""
+    return all(trace.name != label for trace in figure.data)
+
+
 def add_line(
     figure: go.Figure, row: int, label: str, x: Sequence[float | None], y: Sequence[float], look: Mapping[str, Any]
 ) -> None:
     """Add a line that is no signal to a row, once to the legend; it is broken where x is None."""
     if not x:
         return
-    known = any(trace.name == label for trace in figure.data)
-    trace = go.Scatter(x=x, y=y, mode="lines", name=label, legendgroup=label, showlegend=not known, line=dict(look))
-    figure.add_trace(trace.update(hoverinfo="skip"), row=row, col=1)
+    trace = go.Scatter(x=x, y=y, mode="lines", name=label, legendgroup=label, line=dict(look), hoverinfo="skip")
+    figure.add_trace(trace.update(showlegend=is_new(figure, label)), row=row, col=1)
 
 
 def _trace(scene: Scene, curve: Curve, channel: str, factor: float, most: int) -> go.Scatter:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from flight_analysis import comparison
-from flight_analysis.drawing import PLAIN
 from flight_analysis.metrics import known_error
 from flight_analysis.pictures import GUST, REFERENCE, flight_end, gust_bands
 from flight_analysis.recorded import Recorded
+from flight_analysis.summary import PLAIN, titled
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 
@@ -119,7 +119,8 @@ def _names(flights: Sequence[Recorded], topic: str) -> list[str]:
 
 def _draw(axes: "Axes", flights: Sequence[Recorded], column: _Column, name: str) -> None:
     """One channel of all flights that have it, with the reference and the gusts of the first."""
-    unit, factor = comparison.units(flights).get(name, PLAIN)
+    units = comparison.units(flights)
+    factor = units.get(name, PLAIN).factor
 
     def draw(tape: Tape, signal: Signal, **look: Any) -> None:
         axes.plot((signal.stamp_ns - tape.start_ns) / NANOSECONDS, signal[name] * factor, **look)
@@ -132,6 +133,6 @@ def _draw(axes: "Axes", flights: Sequence[Recorded], column: _Column, name: str)
     for (label, colour), (_, _, tape, _) in zip(comparison.colours(flights).items(), flights, strict=True):
         if column.topic in tape and name in tape[column.topic].names:
             draw(tape, column.of(tape), color=colour, linewidth=1.0, label=label, **column.look)
-    axes.set_ylabel(f"{name} ({unit})")
+    axes.set_ylabel(titled(name, units))
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)

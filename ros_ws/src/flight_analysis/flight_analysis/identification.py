@@ -58,7 +58,7 @@ PAST = 0.7  # a slope that has fallen to this part of the largest so far is past
 
 RATE, CONTROL_RATE, STEP = 200.0, 100.0, 0.005  # Hz, Hz, s: of y, of the law, of the integration
 SOFTENING = 2.75  # 1, width of the softened sign in total lags, that of osprey_servo
-SAMPLES = 20  # uncertain aircraft around the one found: no more than its largest response is wanted of them
+SAMPLES = 5  # uncertain aircraft around the one found: no more than its largest response is wanted of them
 DELAY = 0.006  # s, topics: a tick finds y at most 5 ms old, u waits at most 5 ms; half of both, and the way
 
 Fly = Callable[[FloatArray, float], FloatArray]

@@ -146,4 +146,10 @@ async function start() {
   addEventListener("afterprint", showAll);
 }
 
-start();
+start().catch(error => {
+  const said = document.createElement("p");
+  said.className = "note";
+  said.textContent = `The pictures cannot be drawn: ${error}. They need a browser of 2023 or newer.`;
+  document.querySelector("h1").after(said);
+  throw error;
+});

@@ -11,17 +11,26 @@ import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
-from flight_analysis.drawing import PLAIN, Band, Curve, Samples, Scene, add_line, cell, framed, grid, spans, stack
+from flight_analysis.drawing import Band, Curve, Samples, Scene, add_line, cell, framed, grid, is_new, spans, stack
 from flight_analysis.metrics import Windows, spectra, tick_periods, tracking_error, true_error
 from flight_analysis.scenario import Scenario
-from flight_analysis.summary import Shown
+from flight_analysis.summary import PLAIN, Shown
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.guard import Mode
 from rise_di_controller.internals import Limited
 
 PLANT, REFERENCE, ERROR, MEASURED, WIND, GUST = "#123c52", "#f6a85f", "#8b1f4f", "#e3b6c9", "#2a7f62", "#7f7f7f"
-DARK = {PLANT: "#9edbff", REFERENCE: "#8f5820", ERROR: "#f285b3", MEASURED: "#70405a", WIND: "#63cba6"}
+END_STOP, LIMIT = "#bbbbbb", "#444444"
+DARK = {
+    PLANT: "#9edbff",
+    REFERENCE: "#8f5820",
+    ERROR: "#f285b3",
+    MEASURED: "#70405a",
+    WIND: "#63cba6",
+    END_STOP: "#555c64",
+    LIMIT: "#b9c0c7",
+}
 """Colours of curves, and what the page draws in their place on a dark ground."""
 MODE_COLOURS = {
     Mode.WAITING: "#b0b0b0",
@@ -31,9 +40,8 @@ MODE_COLOURS = {
     Mode.INACTIVE: "#5f6b73",
 }
 LIMITED_COLOURS = {Limited.MAGNITUDE: "#d62728", Limited.RATE: "#8a63b8"}
-LIMIT_LINES = ({"color": "#bbbbbb", "width": 4}, {"color": "#444444", "width": 1.2, "dash": "dash"})
-DARK |= {"#bbbbbb": "#555c64", "#444444": "#b9c0c7"}
-FLOOR_LINE = {"color": "#444444", "width": 1.0, "dash": "dot"}
+LIMIT_LINES = ({"color": END_STOP, "width": 4}, {"color": LIMIT, "width": 1.2, "dash": "dash"})
+FLOOR_LINE = {"color": LIMIT, "width": 1.0, "dash": "dot"}
 INTEGRALS = {"integral_e": "∫e", "Pi": "Pi"}  # groups of `internals`, and what their rows are called
 FEWEST = 64  # samples that a spectrum is drawn of
 BINS = 80  # of a histogram
@@ -170,8 +178,11 @@ def draw_spectra(runs: Mapping[str, tuple[Signal, int]], colours: Mapping[str, s
             line = go.Scatter(
                 x=frequency, y=density * factor, mode="lines", name=label, line={"color": colours[label], "width": 1.4}
             )
-            first = name == channels[0] and len(runs) > 1
-            line.update(legendgroup=label, showlegend=first, hovertemplate=f"%{{y:.3g}} {unit}/√Hz at %{{x:.3g}} Hz")
+            line.update(
+                legendgroup=label,
+                showlegend=len(runs) > 1 and is_new(figure, label),
+                hovertemplate=f"%{{y:.3g}} {unit}/√Hz at %{{x:.3g}} Hz",
+            )
             figure.add_trace(line, **cell(channels.index(name), columns))
     for place, name in enumerate(channels):
         unit = units.get(name, PLAIN).unit
@@ -211,7 +222,8 @@ def draw_histograms(runs: Mapping[str, Mapping[str, FloatArray]], colours: Mappi
         for label, values in of.items():
             counts, width = np.histogram(values, edges)[0].astype(float), edges[1] - edges[0]
             bars = go.Bar(x=edges[:-1] + width / 2.0, y=counts, width=width, name=label, marker={"color": colours[label]})
-            bars.update(legendgroup=label, showlegend=place == 0 and len(runs) > 1, opacity=1.0 if len(runs) == 1 else 0.6)
+            bars.update(legendgroup=label, showlegend=len(runs) > 1 and is_new(figure, label))
+            bars.update(opacity=1.0 if len(runs) == 1 else 0.6)
             figure.add_trace(bars.update(hovertemplate="%{y} ticks around %{x:.4g} ms"), **cell(place, columns))
         figure.update_xaxes(title_text=f"{what} (ms)", **cell(place, columns))
     figure.update_yaxes(type="log", title_text="ticks")

@@ -5,6 +5,7 @@
 from typing import Any, NamedTuple
 
 from flight_analysis.scenario import Scenario
+from flight_core.rates import period_ns
 from flight_core.tape import Tape
 
 
@@ -15,3 +16,8 @@ class Recorded(NamedTuple):
     scenario: Scenario
     tape: Tape
     summary: dict[str, Any]  # `summary.summarise`
+
+    @property
+    def period_ns(self) -> int:
+        """Period of the controller's ticks, ns."""
+        return period_ns(self.scenario.controller.rate, "controller.rate")

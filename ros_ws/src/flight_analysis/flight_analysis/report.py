@@ -17,7 +17,6 @@ from flight_analysis.drawing import Samples, Scene, pack
 from flight_analysis.recorded import Recorded
 from flight_analysis.summary import shown_units
 from flight_core.outcome import COMPLETED
-from flight_core.rates import period_ns
 
 HERE = Path(__file__).parent
 
@@ -102,7 +101,6 @@ def _outcome(flight: Recorded) -> str:
 
 
 def _sections(flight: Recorded, scene: Scene) -> list[Section]:
-    period = period_ns(flight.scenario.controller.rate, "controller.rate")
     floors = {name: of["floor"] for name, of in flight.summary["errors"].items()}
     limits = pictures.known_limits(flight.scenario, flight.tape)
     return [
@@ -125,13 +123,15 @@ def _sections(flight: Recorded, scene: Scene) -> list[Section]:
             pictures.integral_picture(scene),
         ),
         Section("Error of the sensors", "y less the true output", pictures.sensor_picture(scene)),
-        Section("Spectrum of u", "amplitude spectral density", pictures.spectrum_picture(scene, period), over_time=False),
+        Section(
+            "Spectrum of u", "amplitude spectral density", pictures.spectrum_picture(scene, flight.period_ns), over_time=False
+        ),
         Section(
             "Ticks of the controller",
             "late: after its deadline; age: of y at the tick; dt: as integrated",
             pictures.tick_picture(scene),
         ),
-        Section("How the ticks were spread", "", pictures.timing_picture(scene, period), over_time=False),
+        Section("How the ticks were spread", "", pictures.timing_picture(scene, flight.period_ns), over_time=False),
     ]
 
 

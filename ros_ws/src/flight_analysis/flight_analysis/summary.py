@@ -37,6 +37,16 @@ class Shown(NamedTuple):
     factor: float
 
 
+PLAIN = Shown("", 1.0)
+"""That of a channel whose unit is not known: SI, and none is said."""
+
+
+def titled(name: str, units: Mapping[str, Shown]) -> str:
+    """The name of a channel with its unit."""
+    unit = units.get(name, PLAIN).unit
+    return f"{name} ({unit})" if unit else name
+
+
 def shown_units(scenario: Scenario) -> dict[str, Shown]:
     """Units for tables and pictures by channel of y and u: angular rates in mrad/s, inputs as the airframe file has them."""
     channels = scenario.aircraft.channels()
@@ -163,8 +173,8 @@ INPUT_COLUMNS = (
     Column("rms", "command", ("command", "rms")),
     Column("rms", "gust", ("gust", "rms")),
     Column("", "max", ("whole", "max")),
-    Column("rate (1/s)", "whole", ("whole", "rate")),
-    Column("rate (1/s)", "calm", ("calm", "rate")),
+    Column("rate", "whole", ("whole", "rate")),
+    Column("rate", "calm", ("calm", "rate")),
 )
 """What every table of inputs shows, but for how long each was limited."""
 
@@ -186,8 +196,8 @@ def figure_rows(figures: Mapping[str, Any], columns: Sequence[Column], units: Ma
     """Rows for people of "errors" or "inputs" of a summary: the channel with its unit, then a cell a column."""
     return [
         [
-            f"{name} ({units[name].unit})",
-            *(cell(figure(of, *column.path), units[name].factor if column.scaled else 1.0) for column in columns),
+            titled(name, units),
+            *(cell(figure(of, *column.path), units.get(name, PLAIN).factor if column.scaled else 1.0) for column in columns),
         ]
         for name, of in figures.items()
     ]

@@ -80,7 +80,7 @@ def input_table(summary: Mapping[str, Any], units: Mapping[str, Shown]) -> str:
         [*row, limited_cell(of)]
         for row, of in zip(figure_rows(summary["inputs"], INPUT_COLUMNS, units), summary["inputs"].values(), strict=True)
     ]
-    return _table("Inputs", (*INPUT_COLUMNS, Column("", "limited (%)", ())), rows, INPUT_READING + LIMITED_READING)
+    return _table("Inputs", (*INPUT_COLUMNS, Column("limited", "%", ())), rows, INPUT_READING + LIMITED_READING)
 
 
 def event_table(happened: Sequence[Event]) -> str:

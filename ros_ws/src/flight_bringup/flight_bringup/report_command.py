@@ -80,8 +80,15 @@ def show(console: Console, flight: Recorded) -> None:
     rows = figure_rows(summary["inputs"], INPUT_COLUMNS, units)
     limited = [limited_cell(of) for of in summary["inputs"].values()]
     if rows:
-        columns = (*INPUT_COLUMNS, Column("", "limited (%)", ()))
-        console.print(_table("Inputs", "input", columns, [[*row, share] for row, share in zip(rows, limited, strict=True)]))
+        columns = (*INPUT_COLUMNS, Column("limited", "%", ()))
+        console.print(
+            _table(
+                "Inputs about trim, and mean abs(u_dot) a second",
+                "input",
+                columns,
+                [[*row, share] for row, share in zip(rows, limited, strict=True)],
+            )
+        )
     console.print(f"{PARTS}. bound: the largest error in calm", style="dim", highlight=False)
     for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"])):
         console.print(line, highlight=False)

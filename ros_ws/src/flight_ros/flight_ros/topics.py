@@ -12,8 +12,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 # Publishers are reliable and keep their last samples, so that a recorder that is matched a moment late, or held up, loses
-# nothing; the depth covers half a second at 1 kHz.
-PUBLISH = QoSProfile(depth=500, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# nothing; the depth covers two seconds at 1 kHz, as that of the recorder does.
+PUBLISH = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Control loops want the newest samples and never a retransmission. The depth covers the samples between two ticks
 # that are needed to bring y_m to the stamp of y.
 LISTEN = QoSProfile(depth=16, reliability=ReliabilityPolicy.BEST_EFFORT)
