@@ -94,18 +94,8 @@ def main() -> None:
         rows.append(_row(name, where, found))
         if found.lost:
             reasons.append(f"| {name} | {where.speed:g} kt, {where.altitude:g} ft | {found.lost} |")
-    headings = (
-        "aircraft",
-        "Omega of q, V, p, r",
-        "D",
-        "lag (s)",
-        "zero (1/s)",
-        "calm",
-        "gust",
-        "turbulence",
-        "without beta",
-        "largest u",
-    )
+    flights = [f"{title}{law}" for title in ("calm", "gust", "turbulence") for law in ("", ", PI")]
+    headings = ("aircraft", "Omega_ii", "D", "lag (s)", "zero (1/s)", *flights, "largest u")
     print(f"| {' | '.join(headings)} |\n|{'---|' * len(headings)}")
     print("\n".join(rows))
     print("\n| aircraft | at | why it does not fly |\n|---|---|---|")
@@ -122,8 +112,7 @@ def _row(name: str, where: Condition, found: Identified) -> str:
             " ".join(f"{sign:+d}"[0] for sign in found.D),
             " / ".join(f"{lag:.2g}" for lag in steps.lag),
             f"{found.zero:.2g}",
-            *(_errors(found.flights[title]) for title in found.flights),
-            ", ".join(_errors(one) for one in pi.values()),
+            *(_errors(one) for title in found.flights for one in (found.flights[title], pi[title])),
             " / ".join(f"{found.flights['turbulence'].largest[one]:.2g}" for one in INPUTS) + " |",
         )
     )

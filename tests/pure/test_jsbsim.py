@@ -60,8 +60,8 @@ def one_gust(axis: str, speed: float, length: float) -> Air:
 
 @pytest.mark.parametrize(
     "point",
-    # JSBSim's own trim; and two that it does not find: c182 because its mixture floods the engine, DHC6 because its
-    # turboprops are not settled.
+    # JSBSim's own trim; one that it does not find, for the engine of c182 does not run in it; and DHC6, where what it finds
+    # does not last, for the turboprops are not settled.
     [CESSNA, Point("c182", 56.6, 1219.2, STEP_NS), Point("DHC6", 66.9, 1828.8, STEP_NS)],
     ids=lambda point: point.name,
 )

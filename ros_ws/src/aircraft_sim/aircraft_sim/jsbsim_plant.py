@@ -101,7 +101,7 @@ FROZEN: Mapping[str, float] = {
 }
 """What makes flight stand still while engines and flight control systems run."""
 
-MIXTURES = (0.9, 0.8)  # of piston engines: rich, and less so for those which that floods
+MIXTURE = 0.9  # of piston engines: rich
 SETTLE, SPIN_UP = 10.0, 30.0  # s of frozen flight: for engines that run, and for those that have just been started
 START = np.array([0.05, 0.7, 0.0, 0.0, 0.0, 0.0])  # alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad)
 SCALE = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.1])  # what they are scaled with for the solver
@@ -126,11 +126,11 @@ class Point(NamedTuple):
         return f"{PREFIX}{self.name}"
 
 
-class Recipe(NamedTuple):
-    """How an aircraft comes into trim: found once, in a process of its own; following it leads to the same bits anywhere."""
+Recipe = tuple[float, ...] | None
+"""How an aircraft comes into trim: the unknowns of frozen flight, scaled, or None where JSBSim's own trim does it.
 
-    mixture: float  # of piston engines
-    unknowns: tuple[float, ...] | None  # of frozen flight, scaled; None: JSBSim's own trim does it
+Found once, in a process of its own; following it leads to the same bits anywhere.
+"""
 
 
 class Trim(NamedTuple):
@@ -221,6 +221,7 @@ class JsbsimVehicle:
         self._heading, self._height, self._contact = (self._node(path) for path in (HEADING, HEIGHT, CONTACT))
         self._engines = [self._node(_running(i)) for i in range(_engines(self._fdm))]
         self._moves, self._air = moves, air
+        self._still = air.turbulence is None and not air.gusts.speed.any()
         self._z = None if air.turbulence is None else turbulence.start(air.turbulence)
         self._position = np.zeros(len(INPUTS))
         self._blow(self._wind(0))
@@ -250,14 +251,15 @@ class JsbsimVehicle:
             if air is not None:
                 self._z = turbulence.step(self._z, normals[k], air)
             after_ns = t_ns + (k + 1) * step_ns
-            self._blow(self._wind(after_ns))
+            if not self._still:
+                self._blow(self._wind(after_ns))
             try:
                 self._fdm.run()
             except jsbsim.BaseError as error:
                 raise FlightEnded(f"{self.point.title} gave up at t = {seconds(after_ns):.2f} s: {_reason(error)}") from None
         self._x = self._deviations()
         now = f"at t = {seconds(t_ns + duration_ns):.2f} s"
-        if self._height.get_double_value() < 0.0 or self._contact.get_double_value() != 0.0:
+        if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
             raise FlightEnded(f"{self.point.title} hit the ground {now}")
         if stopped := [str(i + 1) for i, node in enumerate(self._engines) if not node.get_double_value()]:
             raise FlightEnded(f"{self.point.title}: engine {', '.join(stopped)} stopped {now}")
@@ -306,10 +308,10 @@ def recipe(point: Point) -> Recipe:
     Raises FlightEnded.
     """
     try:
-        mixture, unknowns = guarded.call(try_out, *point, timeout=TIMEOUT)
+        unknowns = guarded.call(try_out, *point, timeout=TIMEOUT)
     except guarded.Crashed as error:
         raise FlightEnded(f"{point.title} cannot be flown: JSBSim {error}") from None
-    return Recipe(mixture, None if unknowns is None else tuple(unknowns))
+    return None if unknowns is None else tuple(unknowns)
 
 
 def try_out(name: str, speed: float, altitude: float, step_ns: int) -> Recipe:
@@ -394,37 +396,35 @@ def _search(point: Point) -> Recipe:
     unknowns (alpha, throttle, pitch trim, aileron, rudder, bank) are solved for in frozen flight, where everything is settled.
     Raises FlightEnded with one sentence where there is no trim.
     """
-    problem = ""
-    for mixture in MIXTURES:
-        fdm = _loaded(point, mixture)
-        try:
-            if _own_trim(fdm):
-                return Recipe(mixture, None)
-            unknowns = _solve(fdm)
-            fdm, _ = _follow(point, Recipe(mixture, unknowns))
-        except jsbsim.BaseError as error:
-            problem = problem or _reason(error)
-            break
+    fdm = _loaded(point)
+    try:
+        if _own_trim(fdm):
+            return None
+        unknowns = _solve(fdm)
+        fdm, _ = _follow(point, unknowns)
+    except jsbsim.BaseError as error:
+        problem = _reason(error)
+    else:
         if _at_rest(fdm):
-            return Recipe(mixture, unknowns)
-        problem = problem or _what_is_left(fdm)
+            return unknowns
+        problem = _what_is_left(fdm)
     raise FlightEnded(f"{point.title} does not trim at {point.speed:g} m/s and {point.altitude:g} m: {problem}")
 
 
 def _follow(point: Point, way: Recipe) -> tuple[jsbsim.FGFDMExec, Trim]:
     """The aircraft where the recipe leads. Raises FlightEnded where it cannot be loaded."""
-    fdm = _loaded(point, way.mixture)
-    if way.unknowns is None:
+    fdm = _loaded(point)
+    if way is None:
         _own_trim(fdm)
     else:
         _start_engines(fdm)
-        _place(fdm, np.array(way.unknowns))
+        _place(fdm, np.array(way))
         _settle(fdm, SPIN_UP)
     states = np.array([fdm[one.property] * one.si for one in STATES.values()])
     return fdm, Trim(*_commanded(fdm), states, _residuals(fdm))
 
 
-def _loaded(point: Point, mixture: float) -> jsbsim.FGFDMExec:
+def _loaded(point: Point) -> jsbsim.FGFDMExec:
     log = _Log()
     jsbsim.set_logger(log)  # of this thread
     fdm = jsbsim.FGFDMExec(None)
@@ -448,7 +448,7 @@ def _loaded(point: Point, mixture: float) -> jsbsim.FGFDMExec:
     fdm["ic/gamma-deg"] = fdm["ic/psi-true-deg"] = 0.0
     fdm["gear/gear-cmd-norm"] = fdm["gear/gear-pos-norm"] = 0.0  # up
     for i in range(engines):
-        fdm[f"fcs/mixture-cmd-norm[{i}]"] = mixture
+        fdm[f"fcs/mixture-cmd-norm[{i}]"] = MIXTURE
         fdm[f"fcs/throttle-cmd-norm[{i}]"] = START[1]
         fdm[f"fcs/advance-cmd-norm[{i}]"] = 1.0  # propellers at fine pitch
     return fdm

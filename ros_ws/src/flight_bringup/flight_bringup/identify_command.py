@@ -80,14 +80,18 @@ def _show(console: Console, found: Identified) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    table = _table("Commands: in trim, and how far down and up from there; Omega per unit of command, rad/s^2 and m/s^2")
-    for heading in ("input", "trim", "down", "up", "steps of", *(f"{name}_dot" for name in OUTPUTS), "lag, s", "D"):
-        table.add_column(heading, justify="left" if heading == "input" else "right", no_wrap=True)
+    stops = _table("Commands: in trim, and how far down and up from there")
+    for heading in ("input", "trim", "down", "up"):
+        stops.add_column(heading, justify="left" if heading == "input" else "right", no_wrap=True)
+    answers = _table("What steps of a command change: Omega per unit of it, rad/s^2 and m/s^2")
+    for heading in ("input", "steps of", *(f"{name}_dot" for name in OUTPUTS), "lag, s", "D"):
+        answers.add_column(heading, justify="left" if heading == "input" else "right", no_wrap=True)
     for j, name in enumerate(INPUTS):
-        values = [f"{value + 0.0:.3f}" for value in (trim.commands[j], trim.lower[j], trim.upper[j])]
+        stops.add_row(name, *(f"{value + 0.0:.3f}" for value in (trim.commands[j], trim.lower[j], trim.upper[j])))
         column = [f"{value:.3g}" if abs(value) > 1e-3 else "0" for value in steps.Omega[:, j]]
-        table.add_row(name, *values, f"{steps.size[j]:.3g}", *column, f"{steps.lag[j]:.3f}", f"{found.D[j]:+d}")
-    console.print(table)
+        answers.add_row(name, f"{steps.size[j]:.3g}", *column, f"{steps.lag[j]:.3f}", f"{found.D[j]:+d}")
+    console.print(stops)
+    console.print(answers)
     for name, spread in zip(INPUTS, steps.spread, strict=True):
         if spread < LINEAR:
             console.print(
@@ -114,18 +118,25 @@ def _show(console: Console, found: Identified) -> None:
             soft_wrap=True,
         )
     console.print(f"coupling max abs(U - I) = {found.coupling:.2g}; {params.sign.name.lower()} sign{margin}", highlight=False)
+    _show_flights(console, found)
 
-    table = _table("Flown for 60 s in one process: rms of the error, largest deviation of a command from trim")
-    table.add_column("flight", no_wrap=True)
+
+def _show_flights(console: Console, found: Identified) -> None:
+    flights = _table("Flown for 60 s in one process: rms of the error, and how it ended")
+    largest = _table("Largest deviation of a command from trim")
+    for table in (flights, largest):
+        table.add_column("flight", no_wrap=True)
     for name, unit in OUTPUTS.items():
-        table.add_column(f"{name}\n{UNITS[unit][0]}", justify="right", no_wrap=True)
+        flights.add_column(f"{name}\n{UNITS[unit][0]}", justify="right", no_wrap=True)
+    flights.add_column("outcome")
     for name in INPUTS:
-        table.add_column(f"{name}\n1", justify="right", no_wrap=True)
-    table.add_column("outcome")
+        largest.add_column(name, justify="right", no_wrap=True)
     for title, one in found.flights.items():
         errors = [f"{one.rms[name] * UNITS[unit][1]:.3g}" for name, unit in OUTPUTS.items()]
-        table.add_row(title, *errors, *(f"{one.largest[name]:.2g}" for name in INPUTS), one.outcome)
-    console.print(table)
+        flights.add_row(title, *errors, one.outcome)
+        largest.add_row(title, *(f"{one.largest[name]:.2g}" for name in INPUTS))
+    console.print(flights)
+    console.print(largest)
 
 
 def _table(title: str) -> Table:
