@@ -55,9 +55,13 @@ class Company:
         return self._left
 
     def _changed(self, role: str, event: Any) -> None:
-        if event.not_alive_count_change > 0:
+        if event.alive_count > 0:  # one of the role lives: perhaps a new one, after that of a flight before
+            self._dead = "" if self._dead == role else self._dead
+        elif event.not_alive_count_change > 0:
             self._dead = self._dead or role
 
     def _matched(self, role: str, event: Any) -> None:
-        if event.current_count == 0 and event.current_count_change < 0 and not self._left:
+        if event.current_count > 0:
+            self._left = "" if self._left == role else self._left
+        elif event.current_count_change < 0 and not self._left:
             self._left, self._left_ns = role, time.monotonic_ns()
