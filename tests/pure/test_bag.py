@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap.records import Message
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -24,8 +25,9 @@ from flight_analysis.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
-from flight_recorder.bag import Enclosed
+from flight_recorder.bag import BagWriter, Enclosed
 from flight_recorder.definitions import definition
+from flight_recorder.scan import Scan
 
 
 @pytest.fixture(scope="module")
@@ -180,6 +182,24 @@ def test_a_file_with_changed_bytes_gives_true_samples_or_is_refused(tape: Tape, 
             read += 1
             assert set(zip(back["y"].stamp_ns.tolist(), map(bytes, back["y"].values), strict=True)) <= true
     assert read > 10  # of 60: the samples lie in two chunks, one of which three changed bytes spare now and then
+
+
+def test_a_file_that_grows_while_it_is_read_is_read_as_it_was_at_first(tmp_path: Path) -> None:
+    bag = BagWriter(tmp_path / "run")
+    channel = bag.add_topic("/y", JOINT_STATE, "")
+    for number, message in enumerate(SAMPLES):
+        bag.write(channel, number, number, number, message)
+    bag.flush()
+    scan = Scan(bag.path)
+    records = scan.records()
+    first = next(records)
+    for number, message in enumerate(SAMPLES):
+        bag.write(channel, number, number, number, message)
+    bag.close()
+    found = [first, *records]
+    assert sum(isinstance(one, Message) for one in found) == len(SAMPLES)
+    assert not scan.whole
+    assert scan.damaged == 0
 
 
 def test_two_logs_in_a_folder_are_refused(run: Path) -> None:

@@ -140,14 +140,14 @@ def test_a_second_interrupt_does_not_stop_the_stopping(start: Start, short_scena
     assert read_run(next((tmp_path / "runs").glob("*-short"))).tape.notes == ()  # the recorder closed its file
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("seconds", [0.3, 1.0])  # earlier it is the interpreter itself that is interrupted
 def test_an_interrupt_before_the_flight_is_quiet(seconds: float, start: Start, short_scenario: Path, tmp_path: Path) -> None:
     flight = fly(start, short_scenario)
     with pytest.raises(subprocess.TimeoutExpired):  # not an event to wait for: the instant is the case
         flight.popen.wait(seconds + 0.05)
     nodes = children(flight)
     flight.interrupt()
-    assert flight.end() in {130, -signal.SIGINT}
+    assert flight.end() in {130, -signal.SIGINT}, flight.output
     assert "Traceback" not in flight.output
     assert not psutil.wait_procs(nodes, timeout=3.0)[1]
 

@@ -20,6 +20,7 @@ from flight_analysis.bag_reader import read_run
 from flight_analysis.gain_selection import with_feedforward
 from flight_analysis.scenario import load_scenario
 from flight_core.parameters import flatten, nest
+from flight_ros.topics import PUBLISH
 from rise_di_controller.guard import Mode
 
 
@@ -128,7 +129,8 @@ def test_a_recorder_that_comes_late_leaves_its_first_tick_unchecked_and_says_wha
     scenario = scenario_file(tmp_path, 1e3, "osprey_gust")
     for module in ("rise_di_controller", "aircraft_sim", "reference_model"):
         start(f"{module}.node", "--ros-args", "--params-file", str(scenario))
-    someone.until(lambda: len(someone.heard["internals"]) > 700, timeout=60.0)  # more than a publisher keeps
+    more_than_kept = PUBLISH.depth + 200
+    someone.until(lambda: len(someone.heard["internals"]) > more_than_kept, timeout=90.0)
     recorder = start(
         *("flight_recorder.node", "--ros-args", "--params-file", str(scenario)),
         *("-p", f"scenario_file:={scenario}", "-p", "directory:=run"),

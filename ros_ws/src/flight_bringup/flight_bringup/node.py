@@ -9,20 +9,15 @@ from typing import NamedTuple
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from aircraft_sim.node import AircraftNode
 from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import ChannelError, FloatArray
-from flight_recorder.node import RecorderNode
 from flight_ros import transport
 from flight_ros.inbox import Inbox
 from flight_ros.messages import Decoder, stamp_of
 from flight_ros.player import Player
-from flight_ros.runtime import run
 from flight_ros.topics import INTERNALS, LISTEN, RECORDED, STEP, Y_M, Y
-from reference_model.node import ReferenceModelNode
 from rise_di_controller.guard import Mode
-from rise_di_controller.node import ControllerNode
 
 MODES = {float(mode): mode.name for mode in Mode}
 
@@ -89,6 +84,13 @@ def player(types: Mapping[str, str], shared: Collection[str]) -> Player:
 
 def main() -> None:
     """The four nodes as objects in one process, in lockstep over the same topics."""
+    # Loaded here: the monitor of every flight is in this module too, and need not wait for them.
+    from aircraft_sim.node import AircraftNode  # noqa: PLC0415
+    from flight_recorder.node import RecorderNode  # noqa: PLC0415
+    from flight_ros.runtime import run  # noqa: PLC0415
+    from reference_model.node import ReferenceModelNode  # noqa: PLC0415
+    from rise_di_controller.node import ControllerNode  # noqa: PLC0415
+
     run(AircraftNode, ReferenceModelNode, ControllerNode, RecorderNode)
 
 

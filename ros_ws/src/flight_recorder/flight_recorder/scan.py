@@ -127,8 +127,8 @@ class Scan:
         if stream.read(place) != MCAP0_MAGIC:
             self.whole = False
             return
-        while len(head := stream.read(RECORD.size)) == RECORD.size:
-            opcode, length = RECORD.unpack(head)
+        while place + RECORD.size <= size:  # a file that is being written grows meanwhile
+            opcode, length = RECORD.unpack(stream.read(RECORD.size))
             ahead = known[bisect_right(known, place)]
             place += RECORD.size + length
             if place <= ahead:
