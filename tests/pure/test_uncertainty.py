@@ -101,7 +101,7 @@ def test_without_the_section_the_published_airframe_flies() -> None:
         ({"A": 1.0}, "aircraft.uncertainty.A: found 1.0, expected less than 1"),
         ({"B": -0.1}, "aircraft.uncertainty.B: found -0.1, expected greater than or equal to 0"),
         ({"seed": -1}, "aircraft.uncertainty.seed: found -1, expected greater than or equal to 0"),
-        ({"C": 0.1}, "aircraft.uncertainty.C: unknown key, expected one of A, B, seed"),
+        ({"C": 0.1}, "aircraft.uncertainty.C: unknown key, expected one of A, B, number, seed"),
     ],
 )
 def test_uncertainty_that_does_not_fit_is_refused_by_name(section: dict[str, Any], sentence: str) -> None:

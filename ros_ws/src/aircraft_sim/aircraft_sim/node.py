@@ -9,8 +9,9 @@ from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, FloatArray
-from flight_ros.messages import NO_CHANNELS, Decoder, Encoder, instant, stamp_of
+from flight_ros.messages import NO_CHANNELS, StampedVector, instant, stamp_of
 from flight_ros.runtime import FlightNode, run
+from flight_ros.source import Source
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, RECORDED, TRUTH, U, Y
 
@@ -29,19 +30,20 @@ class AircraftNode(FlightNode[AircraftParameters]):
         super().__init__("aircraft", AircraftParameters)
         self._simulator = Simulator(self.parameters)
         self._u = np.zeros(len(self._simulator.inputs))
-        self._u_from: str | None = None
-        self._u_ns = 0  # when the last u came
-        self._u_inbox, self._decoder = self.inbox(U), Decoder(self._simulator.inputs)
+        self._source = Source()
+        self._u_stamp_ns = 0  # of the last u
+        self._said_silent = False
+        self._u_inbox, self._decoder = self.inbox(U), self.decoder(U, self._simulator.inputs)
         self._publish_y, self._publish_truth = self.outlet(Y), self.outlet(TRUTH)
-        self._y_encoder = Encoder(self._simulator.outputs, self.instance)
-        self._truth_encoder = Encoder(self._simulator.truth_names, self.instance)
+        self._y_encoder = self.encoder(Y, self._simulator.outputs)
+        self._truth_encoder = self.encoder(TRUTH, self._simulator.truth_names)
         if self.parameters.lockstep:
             self._number = 0  # of the sample that comes next
             self._answered = True
             self._recorded_ns = 0
             self._control_ns = period_ns(self.parameters.control_rate, "control_rate")
             self._end_ns = nanoseconds(self.parameters.duration) or None
-            self._nothing = Encoder((), self.instance)
+            self._nothing = self.encoder(Y, ())
             self._recorded_inbox = self.inbox(RECORDED)
             self._publish_clock = self.outlet(CLOCK)
 
@@ -52,7 +54,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         return nanoseconds(self.parameters.start_time)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        share = self.parameters.commanded_share(now_ns - self._u_ns)
+        share = self.parameters.commanded_share(self._source.silence_ns(now_ns))
         self._publish(tick.number, now_ns - tick.number * self.period_ns(), self._u if share == 1.0 else share * self._u)
         self._take_u(now_ns)
 
@@ -98,33 +100,53 @@ class AircraftNode(FlightNode[AircraftParameters]):
         for received in self._u_inbox.take(1 if self.parameters.lockstep else None):  # in lockstep there is one answer
             try:
                 sample = self._decoder.decode(received.message)
+                if sample is not None and not self.parameters.lockstep:
+                    self._require_timely(sample, now_ns)
+                if sample is not None:
+                    self._source.require(sample.sender, now_ns, self._max_age_ns)
             except ChannelError as error:
                 self.reject(self._u_inbox, error.reason, str(error))
                 continue
-            if sample is None:  # the controller has nothing to say at this instant of a lockstep flight
-                came = True
-                continue
-            if sample.sender != self._u_from and not self._silent(now_ns):
-                self.reject(self._u_inbox, "sender", f"{sample.sender} commands too, beside {self._u_from}")
-                continue
             came = True
-            self._u, self._u_ns = sample.value, now_ns
-            if sample.sender != self._u_from:
-                self._u_from = sample.sender
-                self.get_logger().info(f"flown by {self._u_from}")
+            if sample is not None:  # else the controller has nothing to say at this instant of a lockstep flight
+                self._accept(sample, now_ns)
         if self._silent(now_ns):
             self.waiting_for(self._u_inbox)
+            if self._source.name is not None and not self._said_silent:
+                self._said_silent = True
+                self.get_logger().error(self._silence)
         return came
 
+    def _require_timely(self, sample: StampedVector, now_ns: int) -> None:
+        """Raise ChannelError where a u belongs to a time to come, or is older than the last one by more than a delay of y explains."""
+        ahead_ns, behind_ns = sample.stamp_ns - now_ns, self._u_stamp_ns - sample.stamp_ns
+        if ahead_ns > self._max_age_ns:
+            raise ChannelError("future", f"stamp {seconds(ahead_ns):g} s ahead of the clock")
+        if behind_ns > self._max_age_ns and not self._silent(now_ns):
+            raise ChannelError("order", f"stamp {seconds(behind_ns):g} s before the last one")
+
+    def _accept(self, sample: StampedVector, now_ns: int) -> None:
+        self._u, self._u_stamp_ns, self._said_silent = sample.value, sample.stamp_ns, False
+        if self._source.hear(sample.sender, now_ns):
+            self.get_logger().info(f"flown by {self._source.name}")
+
+    @property
+    def _max_age_ns(self) -> int:
+        return nanoseconds(self.parameters.max_age)
+
     def _silent(self, now_ns: int) -> bool:
-        return self._u_from is None or now_ns - self._u_ns > nanoseconds(self.parameters.max_age)
+        return self._source.silent(now_ns, self._max_age_ns)
+
+    @property
+    def _silence(self) -> str:
+        return f"{self._source.name} is silent: its last u is held, then let go to trim"
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
-        if self._u_from is None:
+        if self._source.name is None:
             return DiagnosticStatus.WARN, "no u yet, flying in trim", {}
-        if not self.parameters.lockstep and self._silent(self.get_clock().now().nanoseconds):
-            return DiagnosticStatus.ERROR, f"{self._u_from} is silent: its last u is held, then let go to trim", {}
-        return DiagnosticStatus.OK, f"flown by {self._u_from}", {}
+        if not self.parameters.lockstep and self._silent(self.now_ns()):
+            return DiagnosticStatus.ERROR, self._silence, {}
+        return DiagnosticStatus.OK, f"flown by {self._source.name}", {}
 
 
 def main() -> None:

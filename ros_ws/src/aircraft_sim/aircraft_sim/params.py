@@ -19,7 +19,7 @@ from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
 from flight_core.freshness import fade
 from flight_core.parameters import (
-    NodeParameters,
+    KeyedParameters,
     NonNegative,
     ParameterError,
     Parameters,
@@ -97,6 +97,7 @@ class UncertaintyParameters(Parameters):
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
+    number: int = Field(default=0, ge=0, lt=2**32, description="which of the seed's aircraft, from 0 on")
 
 
 # One value a channel, or none at all for an ideal one. A limit may be infinite (.inf in YAML): none on that channel.
@@ -136,7 +137,7 @@ class SensorParameters(Parameters):
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
 
-class AircraftParameters(NodeParameters):
+class AircraftParameters(KeyedParameters):
     """All parameters of the aircraft's node."""
 
     airframe: str = Field(
@@ -256,7 +257,8 @@ class AircraftParameters(NodeParameters):
 
     def drawn(self) -> Airframe:
         """The airframe that flies: the one named, or that of `uncertainty` around it."""
-        return uncertainty.draw(load_airframe(self.airframe), self.uncertainty.A, self.uncertainty.B, self.uncertainty.seed)
+        around = self.uncertainty
+        return uncertainty.draw(load_airframe(self.airframe), around.A, around.B, around.seed, around.number)
 
     def load(self) -> tuple[Airframe, Aircraft]:
         """The airframe that flies and the arrays of equation (1) in this disturbance, all axes of the wind that it knows."""

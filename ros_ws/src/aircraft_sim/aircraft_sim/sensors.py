@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim import draws
-from flight_core.vectors import FloatArray
+from flight_core.vectors import Array, FloatArray, array_namespace
 
 
 class Sensors(NamedTuple):
@@ -55,23 +55,32 @@ def start(params: Sensors) -> Drift:
 def measure(number: int, y: FloatArray, drift: Drift, params: Sensors) -> Measured:
     """What the sensors make of y = C x, shape (m,), at sample `number`, not before that of `drift`:
 
-        error    = bias + walk(number) + noise(number)
-        measured = y + error, then quantum round((y + error) / quantum), half to even
+        measured = quantised(y + error(number))
 
     The error of a quantised sample is its measured value less y, the whole of it. Ideal sensors give y to the last bit.
     """  # noqa: D400, D415 - what follows is an equation
-    drift = walk(number, drift, params)
-    error = noise(number, params)
-    if params.bias is not None:
-        error = error + params.bias
-    if params.drift is not None:
-        error = error + drift.value
-    measured = y + error
+    added, drift = error(number, drift, params)
+    measured = y + added
     if params.quantum is not None:
-        coarse = params.quantum > 0.0
-        measured = np.where(coarse, params.quantum * np.round(measured / np.where(coarse, params.quantum, 1.0)), measured)
-        error = np.where(coarse, measured - y, error)
-    return Measured(measured, error, drift)
+        measured = quantised(measured, params.quantum)
+        added = np.where(params.quantum > 0.0, measured - y, added)
+    return Measured(measured, added, drift)
+
+
+def error(number: int, drift: Drift, params: Sensors) -> tuple[FloatArray, Drift]:
+    """What is added to y at sample `number`, whatever y is: bias + walk(number) + noise(number), shape (m,); and the walk."""
+    drift = walk(number, drift, params)
+    added = noise(number, params)
+    if params.bias is not None:
+        added = added + params.bias
+    return (added if params.drift is None else added + drift.value), drift
+
+
+def quantised(measured: Array, quantum: Array) -> Array:
+    """Quantum round(measured / quantum), half to even; as measured where the quantum is 0. Works on any array type."""
+    xp = array_namespace(measured)
+    coarse = quantum > 0.0
+    return xp.where(coarse, quantum * xp.round(measured / xp.where(coarse, quantum, xp.ones_like(quantum))), measured)
 
 
 def noise(number: int, params: Sensors) -> FloatArray:

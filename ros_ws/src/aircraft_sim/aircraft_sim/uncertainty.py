@@ -5,6 +5,7 @@
 import numpy as np
 import yaml
 
+from aircraft_sim import draws
 from aircraft_sim.airframe import Airframe
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
@@ -14,37 +15,43 @@ KINEMATIC = ("theta", "phi", "psi")
 
 
 def uncertain(airframe: Airframe, uncertainty: float, samples: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: as published first, then uncertain ones.
+    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: as published first, then numbers 0, 1, ... of the seed.
 
-    Every entry is multiplied by 1 + d, d uniform in +-uncertainty and independent; the rows of angles stay. Raises
-    ParameterError for an uncertainty outside [0, 1).
+    Raises ParameterError for an uncertainty outside [0, 1).
     """
-    return _spread(airframe, uncertainty, uncertainty, samples, seed)
+    A, B = matrices(airframe, uncertainty, uncertainty, seed, 0, samples)
+    return np.concatenate([airframe.matrix_a()[None], A]), np.concatenate([airframe.matrix_b()[None], B])
 
 
-def draw(airframe: Airframe, of_A: float, of_B: float, seed: int) -> Airframe:
-    """The first uncertain airframe of `uncertain`, with an uncertainty of A and one of B; 0 and 0 leave it as published.
+def draw(airframe: Airframe, of_A: float, of_B: float, seed: int, number: int = 0) -> Airframe:
+    """Uncertain airframe `number` of a seed, with an uncertainty of A and one of B; 0 and 0 leave it as published.
 
     Its f, the gusts in it, is the published one. Raises ParameterError for an uncertainty outside [0, 1).
     """
-    A, B = _spread(airframe, of_A, of_B, 1, seed)
-    return airframe if of_A == of_B == 0.0 else airframe.with_matrices(A[1], B[1])
+    A, B = matrices(airframe, of_A, of_B, seed, number, 1)
+    return airframe if of_A == of_B == 0.0 else airframe.with_matrices(A[0], B[0])
+
+
+def matrices(
+    airframe: Airframe, of_A: float, of_B: float, seed: int, first: int, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """A and B of the aircraft first, first + 1, ... of a seed, shapes (count, n, n) and (count, n, m), SI.
+
+    Every entry is multiplied by 1 + d, d uniform in +-uncertainty and independent; the rows of angles stay. An aircraft
+    depends on its seed and number alone, not on how many are drawn. Raises ParameterError for an uncertainty outside [0, 1).
+    """
+    for part in (of_A, of_B):
+        require(0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1")
+    A, B = airframe.matrix_a(), airframe.matrix_b()
+    uniform = draws.uniform(first, count, A.size + B.size, draws.AIRFRAME, seed)
+    known = np.array([[float(state not in KINEMATIC)] for state in airframe.states])
+
+    def spread(matrix: FloatArray, uncertainty: float, numbers: FloatArray) -> FloatArray:
+        return np.asarray(matrix * (1.0 + known * uncertainty * (2.0 * numbers.reshape(count, *matrix.shape) - 1.0)))
+
+    return spread(A, of_A, uniform[:, : A.size]), spread(B, of_B, uniform[:, A.size :])
 
 
 def as_yaml(airframe: Airframe) -> str:
     """An airframe as the text of an airframe file, whose numbers read back as they are to the last bit."""
     return yaml.safe_dump(airframe.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=128)
-
-
-def _spread(airframe: Airframe, of_A: float, of_B: float, samples: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    for part in (of_A, of_B):
-        require(0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1")
-    generator = np.random.default_rng(seed)
-    known = np.array([[float(state not in KINEMATIC)] for state in airframe.states])
-
-    def spread(matrix: FloatArray, uncertainty: float) -> FloatArray:
-        part = uncertainty * generator.uniform(-1.0, 1.0, (1 + samples, *matrix.shape))
-        part[0] = 0.0
-        return np.asarray(matrix * (1.0 + known * part))
-
-    return spread(airframe.matrix_a(), of_A), spread(airframe.matrix_b(), of_B)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bag -> Tape, without ROS: of this stack and of `ros2 bag record`, also from files that were never finished."""
 
+import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
 from numpy.typing import NDArray
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import Reader
 
-from flight_analysis.named_vectors import Decoder, Samples, decoder
-from flight_core.files import is_file
+from flight_analysis.named_vectors import Decoder, Samples, decoder, flight_start_ns
+from flight_core.files import is_file, is_folder
 from flight_core.parameters import ParameterError, require
-from flight_core.rates import nanoseconds, seconds
+from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_recorder.bag import LOST, METADATA, SCENARIO, bag_files, read_information
@@ -24,6 +25,10 @@ BLOCK = 4096  # messages that are decoded together
 
 FLOWN = ("y", "y_m", "u", "u_m", "internals", "truth")
 """Topics that make a namespace that of an aircraft; any one of them does."""
+
+
+SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w.-]{0,99}\.yaml")
+"""Names under which a scenario of a log may be laid beside it: none of the log's own files, and nothing in another folder."""
 
 
 class StoredFile(NamedTuple):
@@ -148,11 +153,11 @@ class _Log:
         if isinstance(record, Metadata):
             self.metadata[record.name] = record.metadata
         elif isinstance(record, Attachment):
-            stored = StoredFile(Path(record.name).name, record.data)
+            name = Path(record.name).name
             if record.media_type == SCENARIO:
-                self.scenario = stored
+                self.scenario = StoredFile(name if SCENARIO_NAME.fullmatch(name) else "scenario.yaml", record.data)
             else:
-                self.attachments.append(stored)
+                self.attachments.append(StoredFile(name, record.data))
 
     def notes_at(self, end: float | None) -> list[str]:
         """The notes, given the flight time of the last sample in s, None where there is none."""
@@ -169,9 +174,9 @@ class _Log:
 def _read(run: Path) -> _Log:
     log = _Log()
     files = bag_files(run)
-    information = _information(run, log) if files and run.is_dir() else {}
+    information = _information(run, log) if files and is_folder(run) else {}
     packed = str(information.get("compression_mode") or "none").lower() != "none"
-    if packed or run.suffix == ".db3" or (not files and (run / METADATA).is_file()):
+    if packed or run.suffix == ".db3" or (not files and is_file(run / METADATA)):
         _read_other(run, log)
     else:
         require(bool(files), str(run), "no .mcap file", "the folder of a run or an MCAP file")
@@ -224,13 +229,15 @@ def _read_other(run: Path, log: _Log) -> None:
             for connection, _, message in reader.messages():
                 if (rows := log.rows_of(connection.topic, connection.msgtype)) is not None:
                     rows.add(bytes(message))
-    except (ReaderError, OSError) as error:
-        raise ParameterError(f"{run}: cannot be read ({error}), expected a bag of rosbag2") from None
+    except Exception as error:  # of SQLite, of YAML, of a decompressor: of its content anything may be wrong
+        raise ParameterError(f"{run}: cannot be read ({error or type(error).__name__}), expected a bag of rosbag2") from None
 
 
 def _start_ns(signals: Mapping[str, Signal]) -> int:
     """Stamp of flight time 0: what `truth` says, else the first sample of all."""
     truth = signals.get("truth")
     if truth is not None and "t" in truth.names:
-        return int(truth.stamp_ns[0]) - nanoseconds(float(truth["t"][0]))
+        start_ns = flight_start_ns(int(truth.stamp_ns[0]), float(truth["t"][0]))
+        if start_ns is not None:
+            return start_ns
     return min(int(signal.stamp_ns[0]) for signal in signals.values())

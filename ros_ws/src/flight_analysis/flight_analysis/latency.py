@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flight_analysis.named_vectors import STAMP
+from flight_analysis.named_vectors import JOINT_STATE, STAMP
 from flight_analysis.stored_messages import stored_messages
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
@@ -23,7 +23,8 @@ def latency(run: Path) -> Signal | None:
     """
     sent: dict[str, dict[int, int]] = {}  # by full topic name: instant of sending by stamp, ns
     for message in stored_messages(run) if bag_files(run) else ():
-        if message.topic.rpartition("/")[2] in ("y", "u"):
+        sample = message.type_name == JOINT_STATE and len(message.data) >= STAMP.stop
+        if sample and message.topic.rpartition("/")[2] in ("y", "u"):
             seconds, nanoseconds = np.frombuffer(message.data[STAMP], dtype="<u4").tolist()
             sent.setdefault(message.topic, {})[seconds * NANOSECONDS + nanoseconds] = message.sent_ns
     topics = {topic.rpartition("/")[2]: topic for topic in sent}

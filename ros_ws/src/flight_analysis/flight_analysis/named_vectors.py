@@ -7,19 +7,26 @@ the values alone. So the layout is learnt from one message, and all that share i
 """
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.serde.errors import SerdeError
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
-from flight_core.rates import NANOSECONDS
+from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.seal import mac_place
 from flight_core.vectors import FloatArray
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
 STAMP = slice(4, 12)  # int32 seconds and uint32 nanoseconds, behind the 4 bytes of the encapsulation
+
+
+LONGEST_FLIGHT = 1e9
+"""s. What says that more have passed is no flight time."""
 
 
 class Samples(NamedTuple):
@@ -40,6 +47,12 @@ class Decoded(NamedTuple):
 Decoder = Callable[[Sequence[bytes]], Decoded]
 
 
+@cache
+def typestore() -> Typestore:
+    """The message types of this ROS 2, made once: each takes 20 ms to be read for the first time."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
 def decoder(topic: str, type_name: str) -> Decoder | None:
     """What turns messages of a topic, by its full name, of a type into named vectors; None where they are none.
 
@@ -48,11 +61,16 @@ def decoder(topic: str, type_name: str) -> Decoder | None:
     return _JointStates() if type_name == JOINT_STATE else None
 
 
+def flight_start_ns(stamp_ns: int, t: float) -> int | None:
+    """The stamp of flight time 0, of a sample of `truth` and its t in s: stamp - t; None where t is no flight time."""
+    return stamp_ns - nanoseconds(t) if abs(t) <= LONGEST_FLIGHT else None
+
+
 class _JointStates:
     """sensor_msgs/JointState with names and positions."""
 
     def __init__(self) -> None:
-        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self._store = typestore()
         self._names: tuple[str, ...] = ()
         self._fixed = np.zeros(0, dtype=np.uint8)  # the message learnt from
         self._is_fixed = np.zeros(0, dtype=np.bool_)  # which of its bytes all messages of its layout share
@@ -112,3 +130,4 @@ class _JointStates:
         self._fixed = np.frombuffer(message, dtype=np.uint8)
         self._is_fixed = np.ones(len(message), dtype=np.bool_)
         self._is_fixed[STAMP] = self._is_fixed[self._values] = False
+        self._is_fixed[mac_place(message)] = False

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from flight_analysis.named_vectors import JOINT_STATE, STAMP, decoder
+from flight_analysis.named_vectors import JOINT_STATE, STAMP, decoder, flight_start_ns
 from flight_analysis.stored_messages import Stored, stored_messages
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
@@ -109,6 +109,6 @@ def _start_ns(stored: Sequence[Stored], otherwise: int) -> int:
     if truth is None or decode is None:
         return otherwise
     for names, stamp_ns, values in decode([truth.data]).samples:
-        if "t" in names:
-            return int(stamp_ns[0]) - nanoseconds(float(values[0, names.index("t")]))
+        if "t" in names and (start_ns := flight_start_ns(int(stamp_ns[0]), float(values[0, names.index("t")]))) is not None:
+            return start_ns
     return otherwise

@@ -43,7 +43,7 @@ class Page(NamedTuple):
 def write_page(path: Path, flights: Sequence[Recorded]) -> None:
     """Write the page of a flight, or of several, compared."""
     page = _flight_page(flights[0]) if len(flights) == 1 else _comparison_page(flights)
-    path.write_text(_html(page), encoding="utf-8")
+    path.write_text(page_html(page), encoding="utf-8")
 
 
 def _flight_page(flight: Recorded) -> Page:
@@ -135,7 +135,8 @@ def _sections(flight: Recorded, scene: Scene) -> list[Section]:
     ]
 
 
-def _html(page: Page) -> str:
+def page_html(page: Page) -> str:
+    """The page as HTML that needs nothing else."""
     parts = {
         "title": escape(page.title),
         "head": page.head,

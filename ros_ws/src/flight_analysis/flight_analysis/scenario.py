@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import yaml
 from pydantic import Field
 
 from aircraft_sim.params import AircraftParameters
@@ -47,7 +48,7 @@ class Scenario:
             for name, changes in sections.items()
         }
         varied = replace(self, **changed)
-        _check_together(varied)
+        check_together(varied)
         return varied
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
@@ -70,11 +71,34 @@ def load_scenario(path: Path) -> Scenario:
     sections = read_sections(path, tuple(SCHEMAS))
     checked = {name: schema.validate_mapping(sections[name], name) for name, schema in SCHEMAS.items()}
     scenario = Scenario(name=path.stem, path=path, **checked)  # type: ignore[arg-type]  # SCHEMAS says which type each has
-    _check_together(scenario)
+    check_together(scenario)
     return scenario
 
 
-def _check_together(scenario: Scenario) -> None:
+def scenario_yaml(scenario: Scenario, told: Mapping[str, Mapping[str, Any]] | None = None) -> str:
+    """A scenario as the text of a file with every parameter in it, those by default too, but for what `told` says otherwise.
+
+    What is none or empty is left out: it is so by default.
+    """
+    sections = {}
+    for name, schema in SCHEMAS.items():
+        given: Parameters = getattr(scenario, name)
+        flown = schema.validate_mapping(given.model_dump() | dict((told or {}).get(name, {})), name)
+        # The instant of t = 0 is not known before all nodes run; `truth` says it.
+        sections[f"/**/{name}"] = {"ros__parameters": _plain(flown.model_dump(exclude={"start_time"}))}
+    return yaml.safe_dump(sections, sort_keys=False, default_flow_style=None, width=128)
+
+
+def _plain(values: Any) -> Any:
+    """Values as YAML knows them, without those that stand for nothing: None, and empty texts, lists and mappings."""
+    if isinstance(values, Mapping):
+        plain = {key: _plain(value) for key, value in values.items()}
+        return {key: value for key, value in plain.items() if value not in (None, "", [], {})}
+    return [_plain(value) for value in values] if isinstance(values, tuple) else values
+
+
+def check_together(scenario: Scenario) -> None:
+    """Check the sections of a scenario against each other. Raises ParameterError."""
     channels = scenario.aircraft.channels()
     controller, reference = scenario.controller, scenario.reference_model
     for key, found, expected in (

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from mcap.records import Channel, Message, Schema
 from rosbags.serde.errors import SerdeError
-from rosbags.typesys import Stores, get_typestore
 
+from flight_analysis.named_vectors import typestore
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_recorder.bag import bag_files
@@ -72,7 +72,7 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
     Each a mapping from the dotted names of `known` parameters, or groups of them, to their values, None where one was taken
     away; SI as everywhere.
     """
-    store = get_typestore(Stores.ROS2_JAZZY)
+    store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []
     for stored in stored_messages(run):
         if stored.topic != PARAMETER_EVENTS or stored.type_name != PARAMETER_EVENT:

@@ -69,7 +69,7 @@ def error_table(summary: Mapping[str, Any], units: Mapping[str, Shown]) -> str:
         for channel, row in zip(summary["errors"], figure_rows(summary["errors"], columns, units), strict=True)
     ]
     settling = tuple(Column("settling (s)", head, ()) for head in ("command", "gust"))
-    return _table(f"Tracking error ({summary['error']})", columns + settling, rows, READING + FLOOR_READING)
+    return table(f"Tracking error ({summary['error']})", columns + settling, rows, READING + FLOOR_READING)
 
 
 def input_table(summary: Mapping[str, Any], units: Mapping[str, Shown]) -> str:
@@ -80,7 +80,7 @@ def input_table(summary: Mapping[str, Any], units: Mapping[str, Shown]) -> str:
         [*row, limited_cell(of)]
         for row, of in zip(figure_rows(summary["inputs"], INPUT_COLUMNS, units), summary["inputs"].values(), strict=True)
     ]
-    return _table("Inputs", (*INPUT_COLUMNS, Column("limited", "%", ())), rows, INPUT_READING + LIMITED_READING)
+    return table("Inputs", (*INPUT_COLUMNS, Column("limited", "%", ())), rows, INPUT_READING + LIMITED_READING)
 
 
 def event_table(happened: Sequence[Event]) -> str:
@@ -89,7 +89,7 @@ def event_table(happened: Sequence[Event]) -> str:
         return ""
     columns = [Column("", head, ()) for head in ("from (s)", "to (s)", "")]
     rows = [(event.what, f"{event.start:.2f}", f"{event.stop:.2f}", event.how_much) for event in happened]
-    return _table("What happened", columns, rows)
+    return table("What happened", columns, rows)
 
 
 def tick_table(summary: Mapping[str, Any]) -> str:
@@ -111,7 +111,7 @@ def tick_table(summary: Mapping[str, Any]) -> str:
     ]
     if latency is not None:
         rows.append(("y sent to u sent median / p99 / max (ms)", ms(*latency.values())))
-    return _table("Ticks of the controller", [Column("", "", ())], rows)
+    return table("Ticks of the controller", [Column("", "", ())], rows)
 
 
 def compared_tables(blocks: Sequence[Block], dots: Sequence[str]) -> str:
@@ -148,7 +148,7 @@ def _verdict(ratio: float | None, judged: bool) -> str:
     return "better" if ratio < 1.0 else "worse"
 
 
-def _table(caption: str, columns: Sequence[Column], rows: Iterable[Sequence[str]], said: str = "") -> str:
+def table(caption: str, columns: Sequence[Column], rows: Iterable[Sequence[str]], said: str = "") -> str:
     """A table whose first column is the rows' names; neighbours of one group share a head."""
     groups = [(group, len(list(of))) for group, of in groupby(columns, key=lambda column: column.group)]
     firsts = {k for k, column in enumerate(columns) if k == 0 or not column.group or column.group != columns[k - 1].group}

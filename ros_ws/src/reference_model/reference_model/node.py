@@ -4,7 +4,7 @@
 
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError
-from flight_ros.messages import Decoder, Encoder, stamp_of
+from flight_ros.messages import stamp_of
 from flight_ros.runtime import FlightNode, run
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, U_M, Y_M
@@ -22,12 +22,12 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
         super().__init__("reference_model", ReferenceModelParameters)
         self._reference = Reference(self.parameters)
         self._publish_y_m = self.outlet(Y_M)
-        self._encoder = Encoder(self.parameters.outputs, self.instance)
+        self._encoder = self.encoder(Y_M, self.parameters.outputs)
         if self.parameters.lockstep:
             self._number, self._next = 0, self._reference.sample(0)
             self._clock_inbox = self.inbox(CLOCK)
         else:
-            self._u_m_inbox, self._decoder = self.inbox(U_M), Decoder(self.parameters.outputs)
+            self._u_m_inbox, self._decoder = self.inbox(U_M), self.decoder(U_M, self.parameters.outputs)
 
     def period_ns(self) -> int:
         return self._reference.period_ns

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from flight_core.parameters import (
     Names,
-    NodeParameters,
+    KeyedParameters,
     Numbers,
     ParameterError,
     Parameters,
@@ -72,7 +72,7 @@ class Linear(Parameters):
     B_m: Numbers = Field(description="B_m row by row")
 
 
-class ReferenceModelParameters(NodeParameters):
+class ReferenceModelParameters(KeyedParameters):
     """All parameters of the reference model's node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y_m is published, Hz")

@@ -37,6 +37,14 @@ class Reference:
         y_m: FloatArray = model.output(self._x_m, self._model)
         return y_m
 
+    def rate(self) -> FloatArray:
+        """The derivative of y_m at the instant of the last sample, shape (m,): C x_m_dot, equation (2)."""
+        place = self._number % BLOCK
+        u_m = self._block(self._number)[0] if place == 0 else self._u_m[2 * place]
+        u_m = u_m if self.live is None else self.live
+        y_m_dot: FloatArray = model.output(model.x_m_dot(0.0, self._x_m, u_m, self._model), self._model)
+        return y_m_dot
+
     def _block(self, number: int) -> FloatArray:
         """The profile's commands at the beginnings, middles and ends of BLOCK steps, in a tenth of the time of one by one."""
         u_m: FloatArray = command(seconds(self.period_ns) * (number + np.arange(2 * BLOCK + 1) / 2.0), self._profile)

@@ -1,0 +1,214 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A campaign: thousands of uncertain aircraft through one scenario, chunk by chunk; what is done stays done.
+
+The folder of a campaign holds its definition, a file for each chunk that was flown, and in the end its figures and its page.
+"""
+
+import os
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import matrices
+from flight_analysis.scenario import SCHEMAS, Scenario, check_together
+from flight_campaign.course import Course, chart
+from flight_campaign.engines import Engine, Job
+from flight_campaign.laws import rise
+from flight_campaign.laws.rise import RiseParams
+from flight_campaign.statistics import Tally, score
+from flight_core.parameters import ParameterError, Parameters, require
+
+if TYPE_CHECKING:
+    from flight_campaign.fleet import Vehicle
+
+DEFINITION, CHUNKS = "campaign.json", "chunks"
+SWEPT = ("k_g", "k_d", "Lambda", "beta", "input_scale", "omega", "softening")
+"""Parameters of the controller that a sweep may multiply."""
+
+
+class Sweep(Parameters):
+    """One parameter of the controller times each of some factors; every aircraft flies with each."""
+
+    parameter: str
+    factors: tuple[float, ...] = Field(min_length=1)
+
+
+class Definition(Parameters):
+    """All that a campaign's figures depend on, but for the version of the stack and the machine's arithmetic."""
+
+    name: str  # of the scenario
+    sections: dict[str, object]  # of the scenario, every parameter
+    aircraft: int = Field(ge=1, description="how many aircraft fly")
+    uncertainty: float = Field(ge=0, lt=1, description="the largest part by which an entry of A and of B differs")
+    seed: int = Field(ge=0, lt=2**63, description="the seed of the aircraft")
+    chunk: int = Field(ge=1, description="how many of them fly at once")
+    sweep: Sweep | None = None
+
+    def scenario(self, case: int = 0) -> Scenario:
+        """The scenario of a case of the sweep, the airframe as published."""
+        sections = {name: schema.validate_mapping(_mapping(self.sections[name]), name) for name, schema in SCHEMAS.items()}
+        flown = Scenario(name=self.name, path=Path(self.name), **sections)  # type: ignore[arg-type]  # SCHEMAS says each type
+        check_together(flown)
+        if self.sweep is None:
+            return flown
+        value, factor = getattr(flown.controller, self.sweep.parameter), self.sweep.factors[case]
+        scaled = tuple(factor * one for one in value) if isinstance(value, tuple) else factor * value
+        return flown.vary(controller={self.sweep.parameter: scaled})
+
+    def aircraft_scenario(self, number: int, case: int = 0) -> Scenario:
+        """The scenario of one aircraft of the campaign, as `rise-di fly` flies it."""
+        drawn = {"A": self.uncertainty, "B": self.uncertainty, "seed": self.seed, "number": number}
+        return self.scenario(case).vary(aircraft={"uncertainty": drawn})
+
+    @property
+    def cases(self) -> int:
+        """How many times each aircraft flies."""
+        return 1 if self.sweep is None else len(self.sweep.factors)
+
+    def factor(self, case: int) -> float:
+        """By what the swept parameter is multiplied in a case."""
+        return 1.0 if self.sweep is None else self.sweep.factors[case]
+
+    def size(self, job: Job) -> int:
+        """How many aircraft a chunk has."""
+        return min(self.chunk, self.aircraft - job[1] * self.chunk)
+
+    def jobs(self) -> Iterator[Job]:
+        """The chunks, each (case, chunk)."""
+        chunks = -(-self.aircraft // self.chunk)
+        return ((case, chunk) for case in range(self.cases) for chunk in range(chunks))
+
+
+def _mapping(values: object) -> dict[str, object]:
+    require(isinstance(values, dict), DEFINITION, values, "a section of a scenario")
+    return dict(values)  # type: ignore[call-overload]  # it is one
+
+
+def define(
+    scenario: Scenario, aircraft: int, uncertainty: float, seed: int, chunk: int, sweep: Sweep | None = None
+) -> Definition:
+    """The definition of a campaign over a scenario. Raises ParameterError where a fleet cannot fly it."""
+    if sweep is not None:
+        known = ", ".join(SWEPT)
+        require(sweep.parameter in SWEPT, "--sweep", sweep.parameter, f"a parameter of the controller: {known}")
+        require(all(factor > 0.0 for factor in sweep.factors), "--sweep", sweep.factors, "factors above 0")
+    sections = {name: getattr(scenario, name).model_dump(mode="json") for name in SCHEMAS}
+    values = {"name": scenario.name, "sections": sections, "aircraft": aircraft, "uncertainty": uncertainty, "seed": seed}
+    definition = Definition.validate_mapping({**values, "chunk": chunk, "sweep": sweep}, "campaign")
+    for case in range(definition.cases):
+        definition.scenario(case)
+    return definition
+
+
+class _Prepared(NamedTuple):
+    """What all chunks of a case share."""
+
+    scenario: Scenario
+    course: Course
+    vehicle: "Vehicle"
+    params: RiseParams
+
+
+def fly_chunk(text: str, job: Job) -> str:
+    """Fly a chunk of a campaign: its definition as JSON, the job -> its Tally as JSON. It depends on nothing else."""
+    from flight_campaign import fleet  # noqa: PLC0415 - JAX, which the command needs only once it flies
+
+    definition = Definition.model_validate_json(text)
+    case, chunk = job
+    scenario, course, vehicle, params = _prepare(text, case)
+    first = chunk * definition.chunk
+    count = definition.size(job)
+    part = definition.uncertainty
+    # The last chunk flies as many as the others, so that nothing is compiled again; those beyond the campaign are left out.
+    A, B = matrices(load_airframe(scenario.aircraft.airframe), part, part, definition.seed, first, definition.chunk)
+    flying = fleet.assemble(A, B, scenario.aircraft.plant(), course)
+    flown = fleet.fly(flying, vehicle, course, rise.pilot(scenario.controller.law().sign), params)
+    rms, largest, slew = (np.asarray(part)[:, :count] for part in (flown.rms, flown.max, flown.slew))
+    outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
+    figures = {"score": score(rms, outputs, scenario.aircraft.channels().outputs)}
+    for kind, names, values in (("rms", outputs, rms), ("max", outputs, largest), ("slew", inputs, slew)):
+        figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
+    return Tally.of(first, np.asarray(flown.diverged)[:count], figures).model_dump_json()
+
+
+@lru_cache(maxsize=8)
+def _prepare(text: str, case: int) -> "_Prepared":
+    from flight_campaign import fleet  # noqa: PLC0415 - as above
+
+    scenario = Definition.model_validate_json(text).scenario(case)
+    return _Prepared(scenario, chart(scenario), fleet.vehicle(scenario), rise.params(scenario.controller))
+
+
+class Campaign:
+    """A campaign and its folder."""
+
+    def __init__(self, folder: Path, definition: Definition) -> None:
+        self.folder, self.definition = folder, definition
+        self._text = definition.model_dump_json()
+
+    @classmethod
+    def begin(cls, folder: Path, definition: Definition) -> "Campaign":
+        """A new one, in a folder that exists and is empty."""
+        campaign = cls(folder, definition)
+        (folder / CHUNKS).mkdir()
+        _write(folder / DEFINITION, definition.model_dump_json(indent=1))
+        return campaign
+
+    @classmethod
+    def resume(cls, folder: Path) -> "Campaign":
+        """One that was begun. Raises ParameterError where the folder holds none."""
+        try:
+            definition = Definition.model_validate_json((folder / DEFINITION).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            why = str(error).splitlines()[0]
+            raise ParameterError(f"{folder}: found no campaign ({why}), expected the folder of one") from None
+        (folder / CHUNKS).mkdir(exist_ok=True)
+        return cls(folder, definition)
+
+    def missing(self) -> list[Job]:
+        """The chunks that are not there yet."""
+        return [job for job in self.definition.jobs() if not self._path(job).exists()]
+
+    def fly(self, engine: Engine) -> Iterator[int]:
+        """Fly what is missing; how many flights each chunk that is done had."""
+        for job, tally in engine(_Work(self._text), self.missing()):
+            _write(self._path(job), tally)
+            yield Tally.model_validate_json(tally).flights
+
+    def tally(self, case: int) -> Tally:
+        """What is known of a case, added up in the order of the chunks, whatever order they were flown in."""
+        total = Tally()
+        for job in self.definition.jobs():
+            if job[0] == case and (path := self._path(job)).exists():
+                total += Tally.model_validate_json(path.read_text(encoding="utf-8"))
+        return total
+
+    def _path(self, job: Job) -> Path:
+        case, chunk = job
+        return self.folder / CHUNKS / f"{case}-{chunk:06d}.json"
+
+
+class _Work:
+    """`fly_chunk` of one campaign, as it goes to other processes."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __call__(self, job: Job) -> str:
+        return fly_chunk(self._text, job)
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file that is there as a whole or not at all."""
+    part = path.with_suffix(".part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)  # noqa: PTH105 - atomic, over what may be there
+    except OSError as error:
+        raise ParameterError(f"{path} cannot be written ({error.strerror}), expected a folder and a disk that can") from None

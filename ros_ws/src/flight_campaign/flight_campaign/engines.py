@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Where the chunks of a campaign are flown: threads of this process, or the workers of dask. The chunks are the same."""
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from itertools import islice
+from typing import Any, Protocol
+
+from flight_core.parameters import ParameterError
+
+AHEAD = 2  # chunks a worker has waiting: enough to keep it busy, few enough that nothing grows with their number
+
+Job = tuple[int, ...]
+Work = Callable[[Job], Any]
+
+
+class Engine(Protocol):
+    """Flies jobs in any order."""
+
+    def __call__(self, work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
+        """Each job with its result, as they are done."""
+
+
+def threads(workers: int | None = None) -> Engine:
+    """Threads of this process: compiled once, side by side, for the compiled loop leaves Python alone."""
+    count = workers or os.cpu_count() or 1
+
+    def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
+        waiting = iter(jobs)
+        pool = ThreadPoolExecutor(count, thread_name_prefix="campaign")
+        try:
+            underway: dict[Future[Any], Job] = {pool.submit(work, job): job for job in islice(waiting, AHEAD * count)}
+            while underway:
+                done, _ = wait(underway, return_when=FIRST_COMPLETED)
+                for future in done:
+                    job = underway.pop(future)
+                    underway.update((pool.submit(work, other), other) for other in islice(waiting, 1))
+                    yield job, future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+    return fly
+
+
+def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
+    """Processes of this machine, or the workers of a scheduler. A worker that dies costs its chunks again, no more."""
+
+    def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
+        from distributed import Client, LocalCluster, as_completed  # noqa: PLC0415 - half a second, for this engine alone
+
+        waiting, count = iter(jobs), workers or os.cpu_count() or 1
+        with ExitStack() as stack:
+            try:
+                if scheduler is None:
+                    cluster = stack.enter_context(LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None))
+                client = stack.enter_context(Client(scheduler or cluster, timeout="10s"))
+            except OSError as error:
+                raise ParameterError(f"--scheduler: found {scheduler}, expected one of dask's that answers ({error})") from None
+            ahead = AHEAD * max(count, len(client.scheduler_info()["workers"]))
+            underway = {submit(client, work, job): job for job in islice(waiting, ahead)}
+            done = as_completed(list(underway))
+            for future in done:
+                job, result = underway.pop(future), future.result()
+                for other in islice(waiting, 1):
+                    more = submit(client, work, other)
+                    underway[more] = other
+                    done.add(more)
+                yield job, result
+
+    def submit(client: Any, work: Work, job: Job) -> Any:
+        return client.submit(work, job, pure=False)  # never a result of before
+
+    return fly

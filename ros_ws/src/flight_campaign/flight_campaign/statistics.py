@@ -1,0 +1,156 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Statistics that do not grow with the number of flights: moments, histograms and the worst few, added up chunk by chunk."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+from pydantic import Field
+
+from flight_core.parameters import Parameters
+from flight_core.vectors import FloatArray
+
+PER_DECADE, DECADES = 100, (-8, 6)
+"""Bins of the histograms: 2.3 % wide, from 1e-8 to 1e6 in SI, which all errors of a flight lie in."""
+
+EDGES = 10.0 ** (np.arange(DECADES[0] * PER_DECADE, DECADES[1] * PER_DECADE + 1) / PER_DECADE)
+
+SCORE_UNIT = {"rad/s": 0.010, "m/s": 0.1}
+"""What an rms error is counted in, by unit of the channel; p alone counts half, for its commands are larger."""
+
+SCORE_UNIT_OF = {"p": 0.020}  # rad/s
+LOST = 10.0  # a score above it: the aircraft no longer tracks; 1 to 4 is usual
+QUANTILES = (0.5, 0.95, 0.99)
+KEPT = 10  # of the worst flights
+
+
+class Figure(Parameters):
+    """One figure over many flights. Sums are exact in their order: the same chunks give the same bits."""
+
+    count: int = 0
+    mean: float = 0.0
+    squares: float = 0.0  # sum of (value - mean)^2
+    largest: float = -1.0  # none yet
+    bins: dict[int, int] = Field(
+        default_factory=dict
+    )  # counts by place in EDGES, -1 below and len(EDGES) - 1 above; empty ones left out
+
+    @classmethod
+    def of(cls, values: FloatArray) -> Self:
+        """Of values >= 0, shape (N,)."""
+        if not len(values):
+            return cls()
+        places, counts = np.unique(np.searchsorted(EDGES, values, side="right") - 1, return_counts=True)
+        mean = float(np.mean(values))
+        bins = dict(zip(places.tolist(), counts.tolist(), strict=True))
+        return cls(
+            count=len(values),
+            mean=mean,
+            squares=float(np.sum((values - mean) ** 2)),
+            largest=float(np.max(values)),
+            bins=bins,
+        )
+
+    def __add__(self, other: Self) -> Self:
+        """Both together. Source: Chan, Golub, LeVeque, Updating formulae and a pairwise algorithm, 1979."""
+        count = self.count + other.count
+        if not count:
+            return self
+        gap = other.mean - self.mean
+        bins = dict(self.bins)
+        for place, found in other.bins.items():
+            bins[place] = bins.get(place, 0) + found
+        return type(self)(
+            count=count,
+            mean=self.mean + gap * other.count / count,
+            squares=self.squares + other.squares + gap**2 * self.count * other.count / count,
+            largest=max(self.largest, other.largest),
+            bins=dict(sorted(bins.items())),
+        )
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the sample, 0 of fewer than two."""
+        return math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
+
+    def quantile(self, share: float) -> float:
+        """The value that a share of the flights stays below, to the width of a bin (2.3 %)."""
+        wanted, below = share * self.count, 0
+        for place, found in self.bins.items():
+            if below + found >= wanted:
+                low, high = EDGES[max(place, 0)], EDGES[min(place + 1, len(EDGES) - 1)]
+                return min(float(low * (high / low) ** ((wanted - below) / found)), self.largest)
+            below += found
+        return self.largest
+
+
+class Worst(Parameters):
+    """A flight to look at: the number of its aircraft, and its score, none where it diverged."""
+
+    number: int
+    score: float | None
+
+
+class Tally(Parameters):
+    """What is known of many flights."""
+
+    flights: int = 0
+    diverged: int = 0
+    lost: int = 0  # did not diverge, score above LOST
+    figures: dict[str, Figure] = Field(
+        default_factory=dict
+    )  # by name: "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
+    worst: tuple[Worst, ...] = ()  # the worst first
+
+    @classmethod
+    def of(cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]) -> Self:
+        """Of the aircraft first, first + 1, ...; every figure of shape (N,), one of them the "score"."""
+        flew, score = ~np.asarray(diverged, dtype=bool), np.asarray(figures["score"])
+        rank = np.where(flew, score, np.inf)
+        order = np.argsort(-rank, kind="stable")[:KEPT]
+        return cls(
+            flights=len(flew),
+            diverged=int((~flew).sum()),
+            lost=int((score[flew] > LOST).sum()),
+            figures={name: Figure.of(np.asarray(values)[flew]) for name, values in figures.items()},
+            worst=tuple(Worst(number=first + int(k), score=float(score[k]) if flew[k] else None) for k in order),
+        )
+
+    def __add__(self, other: Self) -> Self:
+        names = list(self.figures) or list(other.figures)
+        worst = sorted((*self.worst, *other.worst), key=lambda one: -math.inf if one.score is None else -one.score)
+        return type(self)(
+            flights=self.flights + other.flights,
+            diverged=self.diverged + other.diverged,
+            lost=self.lost + other.lost,
+            figures={name: self.figures.get(name, Figure()) + other.figures.get(name, Figure()) for name in names},
+            worst=tuple(worst[:KEPT]),
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """As figures for a file, SI."""
+        shares = {}
+        for word, count in (("diverged", self.diverged), ("lost", self.lost)):
+            share, low, high = self.share(count)
+            shares[word] = {"count": count, "share": share, "low": low, "high": high}
+        named = {
+            name: {"mean": of.mean, "deviation": of.deviation, "worst": of.largest}
+            | {f"q{100 * part:g}": of.quantile(part) for part in QUANTILES}
+            for name, of in self.figures.items()
+        }
+        return {"flights": self.flights, **shares, "figures": named, "worst": [one.model_dump() for one in self.worst]}
+
+    def share(self, of: int) -> tuple[float, float, float]:
+        """So many of the flights as a share, and its 95 % confidence interval (Clopper-Pearson), each 0 to 1."""
+        from scipy.stats import binomtest  # noqa: PLC0415 - half a second, for this alone
+
+        interval = binomtest(of, self.flights).proportion_ci(0.95, method="exact")
+        return of / self.flights, float(interval.low), float(interval.high)
+
+
+def score(rms: FloatArray, outputs: Sequence[str], units: Mapping[str, str]) -> FloatArray:
+    """Sum over the channels of rms / SCORE_UNIT, (N,) from (m, N): 1 a channel is 10 mrad/s or 0.1 m/s, 20 mrad/s in p."""
+    unit = np.array([SCORE_UNIT_OF.get(name, SCORE_UNIT[units[name]]) for name in outputs])
+    return np.asarray(np.sum(rms / unit[:, None], axis=0))

@@ -1,0 +1,16 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+setup(
+    name="flight_campaign",
+    version="0.1.0",
+    description="Thousands of uncertain aircraft at once, and other control laws beside RISE-DI.",
+    license="Apache-2.0",
+    packages=["flight_campaign", "flight_campaign.laws"],
+    package_data={"flight_campaign": ["tuned/*.yaml"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/flight_campaign"]),
+        ("share/flight_campaign", ["package.xml"]),
+    ],
+)

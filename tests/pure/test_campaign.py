@@ -1,0 +1,230 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Campaigns: statistics that do not grow, chunks that are the same wherever and in whatever order they fly, kill and resume."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from flight_analysis.metrics import true_error
+from flight_analysis.scenario import load_scenario, scenario_yaml
+from flight_analysis.simulate import simulate
+from flight_bringup.scenarios import find_scenario
+from flight_campaign import engines
+from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define
+from flight_campaign.statistics import KEPT, Figure, Tally, score
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+
+SHORT = find_scenario("osprey_servo").vary(flight={"duration": 5.0})
+VALUES = arrays(np.float64, st.integers(1, 60), elements=st.floats(1e-6, 1e4))
+
+
+def definition(aircraft: int = 60, chunk: int = 20, sweep: Sweep | None = None) -> Definition:
+    return define(SHORT, aircraft, 0.3, 7, chunk, sweep)
+
+
+def flown(folder: Path, of: Definition) -> Campaign:
+    folder.mkdir()
+    campaign = Campaign.begin(folder, of)
+    assert sum(campaign.fly(engines.threads(2))) == of.aircraft * of.cases
+    return campaign
+
+
+# Statistics
+
+
+@given(VALUES, st.data())
+def test_a_figure_added_up_from_parts_is_that_of_the_whole(values: FloatArray, data: st.DataObject) -> None:
+    cut = data.draw(st.integers(0, len(values)))
+    whole, parts = Figure.of(values), Figure.of(values[:cut]) + Figure.of(values[cut:])
+    assert parts.count == len(values)
+    assert parts.bins == whole.bins
+    assert parts.largest == values.max()
+    # Sums in another order: rounding alone.
+    assert parts.mean == pytest.approx(float(np.mean(values)), rel=1e-12)
+    assert parts.deviation == pytest.approx(float(np.std(values, ddof=1)) if len(values) > 1 else 0.0, rel=1e-9, abs=1e-9)
+
+
+@given(VALUES, st.floats(0.01, 1.0))
+def test_a_quantile_is_right_to_the_width_of_a_bin(values: FloatArray, share: float) -> None:
+    # inverted_cdf: the smallest value that so many reach. A bin is 10^(1/100) wide.
+    exact = float(np.quantile(values, share, method="inverted_cdf"))
+    assert Figure.of(values).quantile(share) == pytest.approx(exact, rel=10 ** (1 / 100) - 1.0)
+
+
+def test_a_figure_does_not_grow_with_the_flights() -> None:
+    rng = np.random.default_rng(1)
+    sizes = [len(Figure.of(np.exp(rng.normal(size=count))).model_dump_json()) for count in (10_000, 1_000_000)]
+    assert sizes[1] < 2 * sizes[0]  # more bins at the tails, a digit or two more a bin
+
+
+def test_the_worst_are_kept_and_those_that_diverged_lead_them() -> None:
+    scores = np.arange(30.0)
+    diverged = scores == 4.0
+    halves = [Tally.of(first, diverged[first : first + 15], {"score": scores[first : first + 15]}) for first in (0, 15)]
+    total = halves[0] + halves[1]
+    assert [one.number for one in total.worst] == [4, *range(29, 29 - KEPT + 1, -1)]
+    assert total.worst[0].score is None
+    assert (total.flights, total.diverged, total.lost) == (30, 1, 19)  # 11 to 29 are above 10
+    assert total.figures["score"].count == 29
+
+
+def test_the_share_of_the_diverged_has_its_interval() -> None:
+    # Clopper-Pearson: of 0 in n, the upper end is 1 - 0.025^(1/n).
+    share, low, high = Tally(flights=100).share(0)
+    assert (share, low) == (0.0, 0.0)
+    assert high == pytest.approx(1.0 - 0.025 ** (1 / 100), rel=1e-9)
+
+
+def test_a_score_counts_errors_in_their_units() -> None:
+    rms = np.array([[0.010], [0.020], [0.010], [0.1]])
+    assert score(rms, ("q", "p", "r", "V"), {"q": "rad/s", "p": "rad/s", "r": "rad/s", "V": "m/s"}) == pytest.approx([4.0])
+
+
+# Campaigns
+
+
+def test_an_aircraft_of_a_campaign_flies_again_alone_with_the_same_score(tmp_path: Path) -> None:
+    campaign = flown(tmp_path / "one", definition())
+    worst = campaign.tally(0).worst[0]
+    path = tmp_path / "again.yaml"
+    path.write_text(scenario_yaml(campaign.definition.aircraft_scenario(worst.number)), encoding="utf-8")
+    again = load_scenario(path)
+    error = true_error(simulate(again))
+    assert error is not None
+    outputs = again.controller.outputs
+    at_ticks = error.stamp_ns % 10_000_000 == 0
+    rms = np.array([[np.sqrt(np.mean(error[name][at_ticks] ** 2))] for name in outputs])
+    units = again.aircraft.channels().outputs
+    assert worst.score == pytest.approx(score(rms, outputs, units)[0], rel=1e-3)  # as of single flights: tests of fleets
+
+
+def test_the_same_seed_gives_the_same_figures_whatever_the_order_and_the_engine(tmp_path: Path) -> None:
+    first, second = (flown(tmp_path / name, definition()) for name in ("first", "second"))
+    assert first.tally(0).model_dump_json() == second.tally(0).model_dump_json()
+
+    def backwards(work: engines.Work, jobs: Iterable[engines.Job]) -> Iterator[tuple[engines.Job, Any]]:
+        return ((job, work(job)) for job in reversed(list(jobs)))
+
+    (tmp_path / "third").mkdir()
+    third = Campaign.begin(tmp_path / "third", definition())
+    list(third.fly(backwards))
+    assert third.tally(0).model_dump_json() == first.tally(0).model_dump_json()
+    other = flown(tmp_path / "other", define(SHORT, 60, 0.3, 8, 20))
+    assert other.tally(0).figures["score"].mean != first.tally(0).figures["score"].mean
+
+
+def test_a_campaign_that_was_stopped_goes_on_where_it_was(tmp_path: Path) -> None:
+    whole = flown(tmp_path / "whole", definition())
+    (tmp_path / "part").mkdir()
+    part = Campaign.begin(tmp_path / "part", definition())
+    next(part.fly(engines.threads(1)))
+    resumed = Campaign.resume(tmp_path / "part")
+    there = len(resumed.missing())
+    assert 0 < there < 3
+    list(resumed.fly(engines.threads(1)))
+    assert resumed.missing() == []
+    assert resumed.tally(0) == whole.tally(0)
+
+
+def test_a_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
+    campaign = flown(tmp_path / "sweep", definition(20, 20, Sweep(parameter="beta", factors=(0.25, 1.0))))
+    weak, strong = (campaign.tally(case).figures["score"].mean for case in (0, 1))
+    assert weak > 1.05 * strong  # beta far below the slew of the ideal control follows worse
+    plain = flown(tmp_path / "plain", definition(20, 20))
+    assert plain.tally(0) == campaign.tally(1)
+
+
+@pytest.mark.parametrize(
+    ("sweep", "sentence"),
+    [
+        (Sweep(parameter="gain", factors=(1.0,)), "--sweep: found gain, expected a parameter of the controller: k_g"),
+        (Sweep(parameter="beta", factors=(0.0,)), r"--sweep: found \(0.0,\), expected factors above 0"),
+    ],
+)
+def test_a_sweep_that_makes_no_sense_is_refused(sweep: Sweep, sentence: str) -> None:
+    with pytest.raises(ParameterError, match=f"^{sentence}"):
+        definition(20, 20, sweep)
+
+
+def test_a_folder_without_a_campaign_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match=r"found no campaign .*, expected the folder of one"):
+        Campaign.resume(tmp_path)
+
+
+# The command, as a process: killed, resumed, over dask
+
+
+def command(*arguments: str, cwd: Path) -> "subprocess.Popen[str]":
+    program = [sys.executable, "-m", "flight_bringup.cli", "campaign", *arguments, "--json"]
+    return subprocess.Popen(program, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def new(aircraft: int, *more: str) -> tuple[str, ...]:
+    return ("osprey_servo", "--duration", "5", "--aircraft", str(aircraft), "--chunk", "20", "--seed", "7", *more)
+
+
+def figures(process: "subprocess.Popen[str]") -> list[object]:
+    output, said = process.communicate(timeout=120)
+    assert process.returncode == 0, said
+    cases = json.loads(output)["cases"]
+    for case in cases:
+        case.pop("fly_again")  # names the folder
+    return list(cases)
+
+
+def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") -> Path:
+    """Until so many chunks of the one campaign in `runs` are done; its folder."""
+    until = time.monotonic() + 120.0
+    while time.monotonic() < until:
+        found = list(runs.glob(f"*/{CHUNKS}/*.json"))
+        if len(found) >= count:
+            return found[0].parents[1]
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    pytest.fail(f"no {count} chunks within two minutes")
+
+
+def test_a_killed_campaign_resumes_to_the_figures_of_one_that_was_not(tmp_path: Path) -> None:
+    whole = figures(command(*new(400, "--runs", "whole"), cwd=tmp_path))
+    stopped = command(*new(400, "--runs", "part", "--workers", "1"), cwd=tmp_path)
+    folder = wait_for_chunks(tmp_path / "part", 2, stopped)
+    stopped.send_signal(signal.SIGKILL)
+    stopped.communicate()
+    there = len(list((folder / CHUNKS).glob("*.json")))
+    assert 2 <= there < 20, "killed too late to show anything"
+    assert figures(command("--resume", str(folder), cwd=tmp_path)) == whole
+
+
+def test_ctrl_c_says_how_to_go_on(tmp_path: Path) -> None:
+    stopped = command(*new(4000, "--runs", "part", "--workers", "1"), cwd=tmp_path)
+    folder = wait_for_chunks(tmp_path / "part", 1, stopped)
+    stopped.send_signal(signal.SIGINT)
+    output, said = stopped.communicate(timeout=60)
+    assert stopped.returncode == 130, said
+    assert "Traceback" not in said
+    assert f"go on with: rise-di campaign --resume {folder.relative_to(tmp_path)}" in output + said
+
+
+def test_two_processes_of_dask_give_the_same_figures_and_a_killed_one_costs_its_chunk_alone(tmp_path: Path) -> None:
+    local = figures(command(*new(400, "--runs", "local"), cwd=tmp_path))
+    spread = command(*new(400, "--runs", "spread", "--engine", "dask", "--workers", "2"), cwd=tmp_path)
+    wait_for_chunks(tmp_path / "spread", 2, spread)
+    workers = [one for one in psutil.Process(spread.pid).children(recursive=True) if one.cpu_times().user > 0.5]
+    assert workers, "no worker of dask found"
+    workers[0].kill()
+    assert figures(spread) == local
+    assert len(list(tmp_path.glob(f"spread/*/{CHUNKS}/*.json"))) == 20
