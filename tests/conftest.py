@@ -5,9 +5,14 @@
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from flight_analysis.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
+
+# How long an example takes says something of the machine, not of what is tested.
+settings.register_profile("flight", deadline=None)
+settings.load_profile("flight")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

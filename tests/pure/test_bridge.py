@@ -139,6 +139,16 @@ def test_the_pilot_disengages_at_once_and_no_one_engages_over_him() -> None:
     assert bridge.engage(at(0.05)) == ""
 
 
+def test_of_a_set_of_bits_those_count_that_are_the_pilots() -> None:
+    """ROSflight's rc_override: 0x01 to 0x20 are switches and sticks, 0x40 to 0x200 say that no command comes yet."""
+    bridge = made(load_map("rosflight"))
+    bridge.take_override("transmitter", float(0x40 | 0x80 | 0x100 | 0x200), at(0.0))
+    assert not bridge.refusal(at(0.0)).startswith("the pilot")
+    for bit in (0x01, 0x02, 0x04, 0x08, 0x10, 0x20):
+        bridge.take_override("transmitter", float(0x40 | bit), at(0.0))
+        assert bridge.refusal(at(0.0)) == "the pilot has the aircraft by transmitter"
+
+
 def test_zero_times_stop_at_once() -> None:
     bridge = engaged(with_silence(neutral=0.0, release=0.0))
     hear(bridge, 0.3)

@@ -3,7 +3,8 @@
 """Channel maps: each row of each map by values worked out by hand, the conversion, and what a map may not say.
 
 Messages of packages that are not installed (px4_msgs, mavros_msgs, rosflight_msgs, rosplane_msgs) are stood in for by plain
-objects with the published field names; those of common_interfaces are too here, and real ones in tests/ros/test_bridge.py.
+objects with the published fields (tests/published_messages.py); those of common_interfaces are too here. Real ones of either
+kind are in tests/ros/test_bridge.py and test_published_messages.py.
 """
 
 import math
@@ -16,8 +17,9 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.published_messages import FOREIGN_MAPS, PUBLISHED, blank, kind
 
-from autopilot_bridge.channel_map import Line, get_field, message_type, read_raw, set_field, to_channel, to_raw
+from autopilot_bridge.channel_map import STEP, Line, get_field, message_type, read_raw, set_field, to_channel, to_raw
 from autopilot_bridge.params import LIBRARY, BridgeParameters, ChannelMap, load_map
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
@@ -69,6 +71,38 @@ def test_each_input_is_sent_in_the_autopilots_unit_and_sign(name: str) -> None:
     for (path, expected), row in zip(SENT[name].items(), chart.inputs.values(), strict=True):
         assert path in (row.field, f"{row.message}.{row.field}")
         assert to_raw(row.trim + 0.1, row.line) == pytest.approx(expected, abs=1e-3)  # us are whole ones anyway
+
+
+@pytest.mark.parametrize("name", FOREIGN_MAPS)
+def test_each_field_of_a_map_is_published_and_takes_what_the_map_puts_into_it(name: str) -> None:
+    """float32 has 24 bits: what is put in comes back to 1e-7 of itself; what is a whole number comes back to half a unit."""
+    chart = load_map(name)
+    foreign = {key: kind_ for key, _, kind_ in chart.used_topics() if kind_ in PUBLISHED}
+    messages = {key: blank(kind_) for key, kind_ in foreign.items()}
+    assert {kind_.split("/")[0] for kind_ in foreign.values()} <= {"px4_msgs", "mavros_msgs", "rosflight_msgs", "rosplane_msgs"}
+    for key, row in chart.messages.items():
+        message = messages[f"messages.{key}"]
+        for path, value in row.values.items():
+            set_field(message, path, list(value) if isinstance(value, tuple) else value)
+            assert path in PUBLISHED[row.type]
+        assert not row.stamped or "header" in PUBLISHED[row.type]
+    for channel, input_row in chart.inputs.items():
+        message, kind_ = messages[f"messages.{input_row.message}"], chart.messages[input_row.message].type
+        ((field, place), *_) = STEP.findall(input_row.field)
+        element, length, is_array = kind(PUBLISHED[kind_][field])
+        assert is_array, channel
+        assert int(place) < (length or 0), channel
+        for raw in (*input_row.range, input_row.neutral, input_row.release, to_raw(input_row.trim + 0.123, input_row.line)):
+            set_field(message, input_row.field, raw)
+            error = 1e-7 * abs(raw) if element == "float32" else 0.5
+            assert get_field(message, input_row.field) == pytest.approx(raw, rel=0.0, abs=error, nan_ok=True)
+    for key, reader in [("outputs." + one, row) for one, row in chart.outputs.items()] + [
+        ("overrides." + one, row) for one, row in chart.overrides.items()
+    ]:
+        if key in messages:
+            assert read_raw(messages[key], reader.field, "value") == 0.0
+            needs_header = getattr(reader, "stamp", "arrival") == "header"
+            assert not needs_header or "header" in PUBLISHED[reader.type], key
 
 
 @pytest.mark.parametrize("name", MAPS)

@@ -103,6 +103,23 @@ def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> No
     )
 
 
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (("--bridge", "ardupilot", "--lockstep"), "--bridge: found a flight in lockstep or in one process"),
+        (("--bridge", "ardupilot", "--in-process"), "--bridge: found a flight in lockstep or in one process"),
+        (("--send",), "--send: found no --bridge"),
+        (("--bridge", "nowhere"), "map: found 'nowhere', expected one of ardupilot"),
+    ],
+    ids=lambda one: " ".join(one) if isinstance(one, tuple) else "",
+)
+def test_an_autopilot_is_flown_in_real_time_and_by_a_map_alone(options: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
+    shown = CliRunner().invoke(app, ["fly", "osprey_gust", *options, "--runs", str(tmp_path)])
+    assert isinstance(shown.exception, ParameterError)
+    assert str(shown.exception).startswith(sentence)
+    assert not list(tmp_path.iterdir())  # refused before anything is made
+
+
 def test_a_map_of_other_channels_or_motions_is_one_sentence() -> None:
     with pytest.raises(ParameterError, match=r"outputs\.q\.positive: found 'roll right', expected a motion that q shows"):
         through(changed("ardupilot", "outputs", "q", positive="roll right"), omega_of_the_osprey())

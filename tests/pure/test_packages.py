@@ -26,7 +26,19 @@ EXECUTABLES = {
 # The keys of rosdep (rosdep/python.yaml of ros/rosdistro); a ROS package is its own key.
 KEYS = {name: f"python3-{name}" for name in ("matplotlib", "numpy", "psutil", "pydantic", "rich", "scipy", "typer", "yaml")}
 # Those that have none, or (rosbags) one that calls pip alone, which Ubuntu 24.04 refuses for its own Python.
-WITHOUT_KEY = {"array_api_compat", "jsbsim", "mcap", "plotly", "polars", "rosbags", "zstandard"}
+WITHOUT_KEY = {
+    "array_api_compat",
+    "cma",
+    "distributed",
+    "jax",
+    "jsbsim",
+    "lz4",
+    "mcap",
+    "plotly",
+    "polars",
+    "rosbags",
+    "zstandard",
+}
 
 
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda path: path.name)

@@ -9,6 +9,7 @@ fit what the map says of ArduPilot, not that ArduPilot does what the map says.
 import math
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ from typer.testing import CliRunner
 
 from autopilot_bridge.channel_map import message_type, read_raw, set_field, to_channel, to_raw
 from autopilot_bridge.params import LIBRARY, load_map
+from flight_analysis.bag_reader import read_run
+from flight_analysis.stored_messages import stored_messages
 from flight_bringup.cli import app
 from flight_core.rates import NANOSECONDS
 from flight_ros.messages import to_message
@@ -37,6 +40,9 @@ from flight_ros.messages import to_message
 SCENARIO = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
 BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELEASE_AFTER = 1.0  # s, in place of the 3 s of RC_OVERRIDE_TIME
+NEUTRAL = 0.4  # s, where a test has neutral values sent
+FULL = math.radians(30.0)  # of a surface, as the map has it
+EARLY = 0.05  # s: the last u may be some periods older than what was taken for it
 MAX_AGE, RELEASE = 0.5, 0.5  # s; the first one in place of the map's 0.2 s, for machines on which other tests run too
 LATE = 0.2  # s that a busy machine may be late; without load it is a tick of 5 ms and one of the message's 20 ms
 INPUTS = ("elevator", "thrust", "aileron", "rudder")
@@ -48,13 +54,22 @@ class Sky:
     def __init__(self, start: Start, someone: Peer, folder: Path) -> None:
         self._start = start
         self.map = str(folder / "ardupilot.yaml")
-        content = yaml.safe_load((LIBRARY / "ardupilot.yaml").read_text(encoding="utf-8"))
-        for row in (content["silence"], *content["outputs"].values()):
-            row["max_age"] = MAX_AGE
-        Path(self.map).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+        Path(self.map).write_bytes((LIBRARY / "ardupilot.yaml").read_bytes())
+        for place in (("silence",), *(("outputs", name) for name in ("q", "V", "p", "r"))):
+            self.change_map(*place, max_age=MAX_AGE)
         self.peer = someone
         self.joys: list[Joy] = []
         someone.node.create_subscription(Joy, "/ap/joy", self.joys.append, BEST_EFFORT)
+
+    def change_map(self, *place: str, **values: object) -> None:
+        """Change some keys of one row of the map."""
+        content = yaml.safe_load(Path(self.map).read_text(encoding="utf-8"))
+        row = content
+        for key in place:
+            row[key] = dict(row[key])  # merged keys share what they hold
+            row = row[key]
+        row.update(values)
+        Path(self.map).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
     def autopilot(self) -> Process:
         """The stand-in, started."""
@@ -87,6 +102,14 @@ class Sky:
         self.peer.until(lambda: self.peer.heard["u"] and not any(self.peer.heard["u"][-1].position))
         self.peer.until(lambda: self.engage() == "")
         self.law(Transition.TRANSITION_ACTIVATE)
+        self.joys.clear()
+        self.peer.until(lambda: len(self.joys) > 5)
+
+    def take_over_by_command(self) -> None:
+        """The same by `rise-di engage`."""
+        command = self._start("flight_bringup.cli", "engage")
+        self.peer.until(lambda: command.popen.poll() is not None, timeout=60.0)
+        assert command.end() == 0, command.output
         self.joys.clear()
         self.peer.until(lambda: len(self.joys) > 5)
 
@@ -193,7 +216,7 @@ def test_pilot_silent_autopilot_and_end_of_the_bridge_each_give_the_channels_bac
     sky.spin(0.5)
     assert not sky.joys  # y is there again; the bridge does not engage by itself
 
-    sky.take_over()
+    sky.take_over_by_command()
     bridge.interrupt()
     assert bridge.end() == 0
     sky.spin(0.1)
@@ -212,6 +235,115 @@ def test_pilot_silent_autopilot_and_end_of_the_bridge_each_give_the_channels_bac
     assert not released
 
 
+def test_a_stale_u_brings_neutral_then_releasing_values_then_nothing_each_for_its_time(sky: Sky) -> None:
+    """The controller lives and u comes again: what counts is the age of u, not who is there."""
+    sky.autopilot()
+    sky.change_map("silence", neutral=NEUTRAL)
+    bridge = sky.bridge("-p", "dry_run:=false")
+    commanded = 0.02  # rad of elevator, within a tenth of its limit, so that it engages
+    last = 0.0
+
+    def command() -> None:
+        nonlocal last
+        last = time.time()
+        sky.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([commanded, 0.0, 0.0, 0.0]), "test"))
+
+    heard = sky.peer.heard
+    sky.peer.until(lambda: heard["y"] and heard["bridge/would_send"], timeout=60.0, each=command)
+    client = sky.peer.node.create_client(SetBool, "bridge/engage")
+    sky.peer.until(client.service_is_ready, each=command)
+    future = client.call_async(SetBool.Request(data=True))
+    sky.peer.until(future.done, each=command)
+    assert future.result().message == ""
+    sky.peer.until(lambda: len(sky.joys) > 10, each=command)
+    stale = last
+
+    sky.peer.until(lambda: any("RELEASE -> DISENGAGED: u is" in line for line in bridge.lines))
+    sky.spin(0.3)
+    sent = [(stamp(joy) - stale, [float(axis) for axis in joy.axes]) for joy in sky.joys]
+    flown = [at for at, axes in sent if axes[1] == pytest.approx(commanded / FULL, abs=1e-6)]
+    neutral = [at for at, axes in sent if axes == [0.0, 0.0, 0.0, 0.0]]
+    released = [at for at, axes in sent if all(map(math.isnan, axes))]
+    assert len(flown) + len(neutral) + len(released) == len(sent)  # nothing else is sent
+    assert flown[0] < neutral[0] < released[0]
+    assert MAX_AGE - EARLY < max(flown) < MAX_AGE + LATE
+    assert MAX_AGE - EARLY < min(neutral) < MAX_AGE + LATE
+    assert MAX_AGE + NEUTRAL - EARLY < min(released) < MAX_AGE + NEUTRAL + 2 * LATE
+    assert MAX_AGE + NEUTRAL + RELEASE - LATE < max(released) < MAX_AGE + NEUTRAL + RELEASE + 2 * LATE
+
+    sky.joys.clear()
+    begin = time.monotonic()
+    sky.peer.until(lambda: time.monotonic() > begin + 0.5, each=command)
+    assert not sky.joys  # u is there again; the bridge does not engage by itself
+    assert sum("-> ENGAGED" in line for line in bridge.lines) == 1
+
+
+def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_be_sent(
+    sky: Sky, start: Start, tmp_path: Path
+) -> None:
+    autopilot = sky.autopilot()
+    bag = tmp_path / "bag"
+    topics = ("/ap/twist/filtered", "/ap/airspeed")
+    recorder = start(
+        "flight_recorder.node",
+        *("--ros-args", "-p", f"directory:={bag}", "-p", f"topics:=[{', '.join(topics)}]", "-p", "rate:=50.0"),
+    )
+    recorder.wait_for("ready")
+    said = len(autopilot.lines)
+    sky.peer.until(lambda: len(autopilot.lines) > said + 150)  # 3 s
+    recorder.interrupt()
+    assert recorder.end() == 0, recorder.output
+    autopilot.popen.kill()
+    recorded = [deserialize_message(one.data, TwistStamped) for one in stored_messages(bag) if one.topic == topics[0]]
+    rates = {(-one.twist.angular.y, one.twist.angular.x, -one.twist.angular.z) for one in recorded}
+    assert len(recorded) > 100  # of 150
+
+    sky.bridge()
+    player = start("flight_bringup.cli", "play", str(bag), "--topics", ",".join(topics))
+
+    def command() -> None:
+        sky.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.1, 0.0, 0.0, 0.0]), "test"))
+
+    sky.peer.until(lambda: player.popen.poll() is not None, timeout=60.0, each=command)
+    assert player.end() == 0, player.output
+    heard = sky.peer.heard["y"]
+    assert len(heard) > 50  # as many as had both topics fresh when the bridge looked
+    assert all(list(y.name) == ["q", "V", "p", "r"] for y in heard)
+    assert {(y.position[0], y.position[2], y.position[3]) for y in heard} <= rates  # to the last bit
+    assert max(abs(y.position[1]) for y in heard) < 0.2  # m/s from trim: noise of 0.03 m/s
+    assert sky.peer.heard["bridge/would_send"][-1].position[0] == pytest.approx(0.1 / FULL)
+    assert not sky.joys
+
+
+def test_rise_di_fly_has_the_bridge_in_the_aircrafts_place_and_logs_what_the_autopilot_says(
+    sky: Sky, start: Start, tmp_path: Path
+) -> None:
+    sky.autopilot()
+    flight = start("flight_bringup.cli", "fly", str(SCENARIO), "--bridge", sky.map, "--duration", "12", "--json")
+    sky.peer.until(lambda: sky.peer.heard["bridge/would_send"], timeout=60.0)
+    refused = start("flight_bringup.cli", "engage")
+    sky.peer.until(lambda: flight.popen.poll() is not None, timeout=90.0)
+    assert refused.end() == 1
+    assert "error: not engaged: dry_run is true: nothing is sent" in refused.output
+    assert flight.end() == 0, flight.output
+    run = tmp_path / "runs" / "latest"
+    log = read_run(run)
+    assert {"y", "y_m", "u", "internals", "bridge/would_send"} <= log.tape.signals.keys()
+    assert "truth" not in log.tape
+    assert Path(sky.map).read_bytes() in [file.content for file in log.attachments]
+    counts = Counter(one.topic for one in stored_messages(run))
+    assert counts["/ap/twist/filtered"] > 100  # of 600
+    assert counts["/ap/joy"] == 0  # a dry run
+    assert not sky.joys
+
+
+def test_a_map_with_a_flipped_sign_is_not_flown(sky: Sky, start: Start) -> None:
+    sky.change_map("inputs", "elevator", sign=-1)
+    flight = start("flight_bringup.cli", "fly", str(SCENARIO), "--bridge", sky.map, "--send")
+    assert flight.end() == 2
+    assert "with the map ardupilot D of q and elevator is -1, the controller has +1" in flight.output
+
+
 def test_a_dry_run_says_what_it_would_send_and_sends_nothing(sky: Sky) -> None:
     sky.autopilot()
     sky.bridge()
@@ -222,8 +354,7 @@ def test_a_dry_run_says_what_it_would_send_and_sends_nothing(sky: Sky) -> None:
     heard = sky.peer.heard["bridge/would_send"]
     sky.peer.until(lambda: len(heard) > 20 and sky.peer.heard["y"], each=command)
     assert list(heard[-1].name) == ["joy.axes[1]", "joy.axes[2]", "joy.axes[0]", "joy.axes[3]"]
-    full = 0.523599
-    assert list(heard[-1].position) == pytest.approx([0.1 / full, 0.2, 0.261799 / full, -0.1 / full])  # aileron at its limit
+    assert list(heard[-1].position) == pytest.approx([0.1 / FULL, 0.2, 0.5, -0.1 / FULL], rel=1e-5)  # aileron at its limit
     assert list(sky.peer.heard["y"][-1].name) == ["q", "V", "p", "r"]
     assert np.abs(sky.peer.heard["y"][-1].position).max() < 0.2  # in trim: noise of 0.03 m/s in V, little else
     assert sky.engage() == "dry_run is true: nothing is sent"
@@ -302,5 +433,6 @@ def test_inputs_are_put_into_a_real_joy() -> None:
         set_field(message, path, value)
     for row, u in zip(chart.inputs.values(), (0.1, 0.1, -0.1, 0.2), strict=True):
         set_field(message, row.field, to_raw(row.trim + u, row.line))
-    full = 0.523599
-    assert list(through_the_wire(message).axes) == pytest.approx([-0.1 / full, 0.1 / full, 0.2, 0.2 / full])  # RC1 to RC4
+    assert list(through_the_wire(message).axes) == pytest.approx(
+        [-0.1 / FULL, 0.1 / FULL, 0.2, 0.2 / FULL], rel=1e-5
+    )  # RC1 to 4

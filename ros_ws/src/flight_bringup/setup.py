@@ -9,13 +9,14 @@ setup(
     version="0.1.0",
     description="Scenarios, launch files and the rise-di command of the RISE-DI flight stack.",
     license="Apache-2.0",
-    packages=["flight_bringup"],
+    packages=["flight_bringup", "flight_bringup.launch"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_bringup"]),
         ("share/flight_bringup", ["package.xml"]),
         ("share/flight_bringup/launch", sorted(glob("launch/*.launch.py"))),
         ("share/flight_bringup/config", sorted(glob("config/*.yaml"))),
         ("share/flight_bringup/layouts", sorted(glob("layouts/*"))),
+        ("share/flight_bringup/security", sorted(glob("security/*"))),
     ],
     entry_points={"console_scripts": ["rise-di = flight_bringup.cli:main"]},
 )

@@ -19,7 +19,6 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError
 from flight_ros.inbox import Inbox
-from flight_ros.messages import Decoder, Encoder
 from flight_ros.runtime import FlightNode, run
 from flight_ros.ticker import Tick
 from flight_ros.topics import Topic, U, Y
@@ -48,11 +47,11 @@ class BridgeNode(FlightNode[BridgeParameters]):
                 _require_field(kind(), name, row)
             self._readers.append((self.inbox(Topic(topic, kind, foreign=True), _qos(self._map.topics[topic])), rows))
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
-        self._u_inbox, self._decoder = self.inbox(U), Decoder(self._bridge.inputs)
+        self._u_inbox, self._decoder = self.inbox(U), self.decoder(U, self._bridge.inputs)
         self._publish_y, self._publish_would_send = self.outlet(Y), self.outlet(WOULD_SEND)
-        self._y_encoder = Encoder(self._bridge.outputs, self.instance)
+        self._y_encoder = self.encoder(Y, self._bridge.outputs)
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
-        self._would_send_encoder = Encoder(names, self.instance)
+        self._would_send_encoder = self.encoder(WOULD_SEND, names)
         self.create_service(SetBool, "~/engage", self._engage)
         self.get_logger().info(
             f"map {self._map.name}: "

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from autopilot_bridge.channel_map import Line, is_path, to_raw
 from flight_core.files import is_file, read_yaml
-from flight_core.parameters import NodeParameters, NonNegative, Parameters, Positive, as_tuple, require
+from flight_core.parameters import KeyedParameters, NonNegative, Parameters, Positive, as_tuple, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 
@@ -121,10 +121,15 @@ class OverrideRow(Parameters):
     field: str = Field(description="the path of the field")
     above: float | None = Field(default=None, description="the pilot has it where the field is above this")
     below: float | None = Field(default=None, description="the pilot has it where the field is below this")
+    bits: Annotated[int, Field(gt=0)] | None = Field(
+        default=None, description="of a whole number that is a set of bits: those that count"
+    )
     source: str = Field(min_length=1, description="where the row is from")
 
     def takes_over(self, raw: float) -> bool:
         """Whether the pilot takes over."""
+        if self.bits is not None:
+            raw = float(int(raw) & self.bits)
         return (self.above is not None and raw > self.above) or (self.below is not None and raw < self.below)
 
 
@@ -223,17 +228,27 @@ ROUNDING = 1e-6
 """Limits may be written with six digits where they are the ends of a range."""
 
 
+def maps() -> list[str]:
+    """Names of the channel maps of the library."""
+    return sorted(file.stem for file in LIBRARY.glob("*.yaml"))
+
+
+def find_map(name: str) -> Path:
+    """The file of a channel map, by its name in the library or by its path, which ends in .yaml. Raises ParameterError."""
+    path = Path(name) if name.endswith(".yaml") else LIBRARY / f"{name}.yaml"
+    require(is_file(path), "map", f"{name!r}", f"one of {', '.join(maps())}, or the path of a channel map ending in .yaml")
+    return path.absolute()
+
+
 def load_map(name: str) -> ChannelMap:
     """A channel map by its name in the library, or by the path of a file. Raises ParameterError."""
-    path = Path(name) if name.endswith(".yaml") else LIBRARY / f"{name}.yaml"
-    known = ", ".join(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
-    require(is_file(path), "map", f"{name!r}", f"one of {known}, or the path of a channel map ending in .yaml")
+    path = find_map(name)
     content = read_yaml(path, f"map {path}", "a channel map")
     require(isinstance(content, dict), f"map {path}", type(content).__name__, "a mapping")
     return ChannelMap.validate_mapping(content, f"map {path.stem}")
 
 
-class BridgeParameters(NodeParameters):
+class BridgeParameters(KeyedParameters):
     """All parameters of the bridge's node."""
 
     map: str = Field(description="the name of a channel map of the library, or the path of a file ending in .yaml")

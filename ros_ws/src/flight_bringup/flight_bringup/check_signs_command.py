@@ -13,12 +13,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframe import Airframe, load_airframe
 from autopilot_bridge.params import ChannelMap, InputRow, OutputRow, load_map
 from autopilot_bridge.signs import SURE, Estimate, estimate, output_signs, through
 from flight_analysis.bag_reader import read_run
+from flight_analysis.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import signs
 
@@ -59,7 +60,26 @@ def check_signs(
     chart = load_map(map_name)
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe or chosen.aircraft.airframe)
-    outputs, inputs = chosen.controller.outputs, chosen.controller.inputs
+    checked = _check_for(chart, chosen, frame, bag)
+    if as_json:
+        print(json.dumps(_plain(chart, checked)))
+    else:
+        _show(Console(), chart, checked, frame.name)
+    for sentence in checked.contradictions:
+        print(f"error: {sentence}", file=sys.stderr)
+    if checked.contradictions:
+        raise typer.Exit(CONTRADICTS)
+
+
+def require_signs(chart: ChannelMap, scenario: Scenario) -> None:
+    """Raise ParameterError where a map contradicts the D of a scenario's controller, by the scenario's airframe."""
+    checked = _check_for(chart, scenario, load_airframe(scenario.aircraft.airframe), None)
+    if checked.contradictions:
+        raise ParameterError("; ".join(checked.contradictions))
+
+
+def _check_for(chart: ChannelMap, scenario: Scenario, frame: Airframe, bag: Path | None) -> Checked:
+    outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     for key, found, expected in (
         (f"map {chart.name}: outputs", tuple(chart.outputs), outputs),
         (f"map {chart.name}: inputs", tuple(chart.inputs), inputs),
@@ -77,15 +97,7 @@ def check_signs(
         for topic in ("y", "u"):
             require(topic in tape, str(bag), f"no {topic}", "a log with y and u")
         measured = estimate(tape["y"], tape["u"], outputs, inputs)
-    checked = check(chart, in_map, outputs, inputs, chosen.controller.D, measured)
-    if as_json:
-        print(json.dumps(_plain(chart, checked)))
-    else:
-        _show(Console(), chart, checked, frame.name)
-    for sentence in checked.contradictions:
-        print(f"error: {sentence}", file=sys.stderr)
-    if checked.contradictions:
-        raise typer.Exit(CONTRADICTS)
+    return check(chart, in_map, outputs, inputs, scenario.controller.D, measured)
 
 
 def check(

@@ -16,10 +16,15 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from flight_analysis.scenario import Scenario
 from flight_bringup import fly as flying
 from flight_bringup.airframes_command import airframes
-from flight_bringup.check_signs_command import check_signs
+from flight_bringup.campaign_command import campaign
+from flight_bringup.check_signs_command import check_signs, require_signs
+from flight_bringup.compare_command import compare
+from flight_bringup.engage_command import engage
 from flight_bringup.gains_command import gains
+from flight_bringup.graph import Autopilot, find_autopilot
 from flight_bringup.identify_command import identify_aircraft
 from flight_bringup.layouts_command import layouts
 from flight_bringup.play_command import play
@@ -28,7 +33,7 @@ from flight_bringup.replay_command import replay_run
 from flight_bringup.report_command import report, short, show
 from flight_bringup.scenarios import find_scenario
 from flight_core import outcome as ends
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 
 BAD_INPUT, ENDED_EARLY, INTERRUPTED = 2, 3, 130
 STATUS = {ends.COMPLETED: 0, ends.INTERRUPTED: INTERRUPTED}
@@ -54,6 +59,13 @@ def fly(
     one_process: Annotated[
         bool, typer.Option("--one-process", help="In lockstep, with all nodes as objects in one process.")
     ] = False,
+    bridge: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MAP", help="Fly an autopilot in the aircraft's place, by a channel map; a dry run without --send."
+        ),
+    ] = None,
+    send: Annotated[bool, typer.Option("--send", help="Send to the autopilot, once the bridge is told to engage.")] = False,
     runs: Annotated[Path, typer.Option(help="Folder that the run's folder is made in.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")] = False,
 ) -> None:
@@ -64,6 +76,11 @@ def fly(
     chosen = find_scenario(scenario)
     if duration is not None:
         chosen = chosen.vary(flight={"duration": duration})
+    stepping = lockstep or one_process or chosen.flight.lockstep
+    autopilot = None if bridge is None else _autopilot(chosen, bridge, send=send)
+    require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
+    real_time = "a flight in real time over topics: an autopilot does not wait"
+    require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     run = flying.new_run(chosen, runs)
     console = Console(stderr=True, quiet=as_json)
     columns = (TextColumn("{task.fields[clock]}"), BarColumn(), TextColumn("{task.fields[shown]}"))
@@ -76,8 +93,9 @@ def fly(
         if in_process:
             outcome = flying.fly_in_process(chosen, run, progress)
         else:
-            stepping = lockstep or one_process or chosen.flight.lockstep
-            outcome = flying.fly_over_topics(chosen, run, progress, lockstep=stepping, one_process=one_process)
+            outcome = flying.fly_over_topics(
+                chosen, run, progress, lockstep=stepping, one_process=one_process, autopilot=autopilot
+            )
         if outcome == "completed":
             progress(chosen.flight.duration, outcome)
     status = STATUS.get(outcome, ENDED_EARLY)
@@ -99,11 +117,20 @@ def fly(
     raise typer.Exit(status)
 
 
+def _autopilot(scenario: Scenario, map_name: str, *, send: bool) -> Autopilot:
+    found = find_autopilot(map_name, dry_run=not send)
+    require_signs(found.chart, scenario)
+    return found
+
+
 app.command()(report)
 app.command()(gains)
+app.command()(campaign)
+app.command()(compare)
 app.command()(airframes)
 app.command("identify")(identify_aircraft)
 app.command()(check_signs)
+app.command()(engage)
 app.command("replay")(replay_run)
 app.command()(play)
 app.command()(layouts)

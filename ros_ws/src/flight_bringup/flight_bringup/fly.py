@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, NamedTuple
 
-from flight_analysis.bag_reader import read_run
+from flight_analysis.bag_reader import StoredFile, read_run
 from flight_analysis.bag_writer import write_run
 from flight_analysis.latency import latency
 from flight_analysis.recorded import Recorded
@@ -22,7 +22,7 @@ from flight_analysis.report import write_page
 from flight_analysis.scenario import Scenario, load_scenario
 from flight_analysis.simulate import simulate
 from flight_analysis.summary import shown_units, summarise, summarise_unflown
-from flight_bringup.graph import enclosed
+from flight_bringup.graph import Autopilot, enclosed
 from flight_bringup.processes import Flight
 from flight_core.outcome import COMPLETED, INTERRUPTED
 from flight_core.parameters import ParameterError
@@ -49,9 +49,9 @@ class Concluded(NamedTuple):
     report: Path
 
 
-def new_run(scenario: Scenario, runs: Path) -> Path:
-    """Make the folder of a new run, runs/<UTC stamp>-<scenario>. Raises ParameterError where that cannot be."""
-    stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{scenario.name}"
+def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
+    """Make the folder of a new run, runs/<UTC stamp>-<kind><scenario>. Raises ParameterError where that cannot be."""
+    stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}{scenario.name}"
     for name in (stem, *(f"{stem}-{k}" for k in range(2, 100))):
         run = (runs / name).absolute()
         try:
@@ -79,13 +79,19 @@ def _signals_as_interrupt() -> Iterator[None]:
 
 
 def fly_over_topics(
-    scenario: Scenario, run: Path, progress: Progress, *, lockstep: bool = False, one_process: bool = False
+    scenario: Scenario,
+    run: Path,
+    progress: Progress,
+    *,
+    lockstep: bool = False,
+    one_process: bool = False,
+    autopilot: Autopilot | None = None,
 ) -> str:
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
     In real time, or in `lockstep` as fast as the machine allows; `one_process` holds all nodes in one process, for lockstep
-    alone. "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence naming the process that
-    ended early.
+    alone; `autopilot` flies in the aircraft's place, in real time alone. "completed", "interrupted" (Ctrl-C or SIGTERM), or a
+    sentence naming the process that ended early.
     """
     from flight_bringup.node import Monitor  # noqa: PLC0415 - loads rclpy, which no other command needs
 
@@ -94,7 +100,12 @@ def fly_over_topics(
             _signals_as_interrupt(),
             Monitor(scenario.controller.outputs, lockstep=lockstep) as monitor,
             Flight(
-                scenario, run, before_start=monitor.require_nobody_flies, lockstep=lockstep, one_process=one_process
+                scenario,
+                run,
+                before_start=monitor.require_nobody_flies,
+                lockstep=lockstep,
+                one_process=one_process,
+                autopilot=autopilot,
             ) as flight,
         ):
             follow = _follow_lockstep if lockstep else _follow_real_time
@@ -158,10 +169,7 @@ def read_flight(run: Path, outcome: str | None = None) -> Recorded:
     if recorded.scenario is None:
         raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
     folder = _folder(run)
-    stored = folder / recorded.scenario.name
-    with _writing(folder):
-        stored.write_bytes(recorded.scenario.content)
-    scenario = load_scenario(stored)
+    scenario = _written(recorded.scenario, folder)
     waited = latency(run)
     signals = recorded.tape.signals if waited is None else {**recorded.tape.signals, "latency": waited}
     tape = _until_last_input(replace(recorded.tape, signals=signals))
@@ -169,6 +177,21 @@ def read_flight(run: Path, outcome: str | None = None) -> Recorded:
         outcome = "the controller never engaged"
     name = folder.name if run.is_dir() else run.stem
     return Recorded(name, scenario, tape, summarise(scenario, tape, outcome or _outcome_before(folder / SUMMARY)))
+
+
+def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
+    """The scenario inside a log, which is written beside it. Raises ParameterError where the log holds none."""
+    stored = read_run(run, namespace).scenario
+    if stored is None:
+        raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
+    return _written(stored, _folder(run))
+
+
+def _written(stored: StoredFile, folder: Path) -> Scenario:
+    path = folder / stored.name
+    with _writing(folder):
+        path.write_bytes(stored.content)
+    return load_scenario(path)
 
 
 def conclude(run: Path, outcome: str | None = None) -> Concluded:

@@ -38,7 +38,7 @@ def gains(
     inputs: Annotated[str | None, typer.Option(help="What drives each output, in the airframe's order: rudder,aileron")] = None,
     gamma_2: Annotated[float, typer.Option(help="gamma_2 of Lemma 1 in 1/s: stated, for nothing bounds it.")] = 0.0,
     samples: Annotated[
-        int, typer.Option(min=0, help="How many uncertain airframes to bound the theorem's figures with.")
+        int, typer.Option(min=0, max=10_000, help="How many uncertain airframes to bound the theorem's figures with.")
     ] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain airframes.")] = 1,
     write: Annotated[Path | None, typer.Option(help="File to write the engineering gains to, as a scenario has them.")] = None,

@@ -2,16 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The graph of a flight: which nodes there are and what each is told. The launch file and the runner both read it here."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import NamedTuple
 
 import yaml
 
 from aircraft_sim.uncertainty import as_yaml
-from flight_analysis.scenario import SCHEMAS, Scenario
+from autopilot_bridge.params import ChannelMap, find_map, load_map
+from flight_analysis.scenario import Scenario, scenario_yaml
 from flight_bringup.provenance import provenance
-from flight_core.parameters import ParameterError, Parameters
+from flight_core.parameters import ParameterError
 from flight_recorder.bag import Enclosed
 
 
@@ -31,6 +33,7 @@ RECORDER = NodeSpec("flight_recorder", "recorder")
 AIRCRAFT = NodeSpec("aircraft_sim", "aircraft")
 REFERENCE_MODEL = NodeSpec("reference_model", "reference_model")
 CONTROLLER = NodeSpec("rise_di_controller", "controller")
+BRIDGE = NodeSpec("autopilot_bridge", "bridge")
 
 # All four as objects in one process, for lockstep; each reads its own section of the scenario.
 ONE_PROCESS = NodeSpec("flight_bringup", "one_process")
@@ -39,9 +42,41 @@ ONE_PROCESS = NodeSpec("flight_bringup", "one_process")
 # aircraft is never without its controller. The recorder ends last.
 FIRST = (RECORDER, CONTROLLER)
 THEN = (AIRCRAFT, REFERENCE_MODEL)
+BRIDGED = (BRIDGE, REFERENCE_MODEL)  # with an autopilot in the aircraft's place
+
+WOULD_SEND = "bridge/would_send"
+
+# What each node says of a flight; the bridge also what its map sends to the autopilot.
+SAID: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
+    {
+        AIRCRAFT: ("y", "truth"),
+        REFERENCE_MODEL: ("y_m",),
+        CONTROLLER: ("u", "internals"),
+        BRIDGE: ("y", WOULD_SEND),
+        RECORDER: ("recorded",),
+    }
+)
 
 READY = "]: ready"  # what a node says in its log when its loop begins
 FLOWN = "]: flown to its end"  # what the aircraft says at the end of a lockstep flight
+
+
+class Autopilot(NamedTuple):
+    """What flies in the aircraft's place."""
+
+    chart: ChannelMap
+    path: Path  # of the map
+    dry_run: bool  # say what would be sent, and send nothing
+
+    @property
+    def topics(self) -> list[str]:
+        """What is recorded of it: the autopilot's own topics, and what the bridge makes of u for them."""
+        return [*self.chart.topics, WOULD_SEND]
+
+
+def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
+    """An autopilot by the name of its channel map, or the path of one. Raises ParameterError."""
+    return Autopilot(load_map(map_name), find_map(map_name), dry_run)
 
 
 def start_lead(startup: float) -> float:
@@ -60,20 +95,44 @@ PROVENANCE = "provenance.yaml"
 Told = dict[str, str | float | bool | list[str]]
 
 
-def parameters(node: NodeSpec, scenario: Scenario, run: Path, start_time: float, *, lockstep: bool) -> Told:
+def parameters(
+    node: NodeSpec, scenario: Scenario, run: Path, start_time: float, *, lockstep: bool, autopilot: Autopilot | None = None
+) -> Told:
     """What a process is told beside its section of the scenario file, by name; "node:name" where it holds several nodes.
 
     In real time those that start last are told the instant of t = 0. In lockstep the aircraft is told at which instants it
     waits for u and where the flight ends, and the controller how often y comes. The recorder is told what to store inside the
-    log, which is made in the folder of the run.
+    log, which is made in the folder of the run. With an autopilot in the aircraft's place the bridge is told its map, and the
+    recorder the topics of the autopilot.
     """
+    if node is BRIDGE:
+        return {} if autopilot is None else {"map": str(autopilot.path), "dry_run": autopilot.dry_run}
     together = node is ONE_PROCESS
     told_by = {one: _told(one, scenario, run, lockstep=lockstep, together=together) for one in (*FIRST, *THEN)}
     if node in (RECORDER, ONE_PROCESS):
-        told_by[RECORDER] |= _stored(enclosed(scenario, run, {one.executable: told for one, told in told_by.items()}))
+        further = () if autopilot is None else (autopilot.path,)
+        if autopilot is not None:
+            told_by[RECORDER]["topics"] = [*scenario.recorder.topics, *autopilot.topics]
+        told_by[RECORDER] |= _stored(enclosed(scenario, run, {one.executable: told for one, told in told_by.items()}, further))
     if together:
         return {f"{one.executable}:{name}": value for one, told in told_by.items() for name, value in told.items()}
     return told_by[node] | ({"start_time": start_time} if node in THEN and not lockstep else {})
+
+
+def to_play(
+    known: Collection[str], nodes: Collection[NodeSpec], namespace: str = "", autopilot: Autopilot | None = None
+) -> list[str]:
+    """Which of the topics of a log are played to nodes: those that none of the nodes says itself; full names, in order.
+
+    `known` are the topics of the log by their full names, `namespace` is that of the nodes. With a bridge among the nodes what
+    its map sends is left out too.
+    """
+    within = f"/{namespace.strip('/')}/".replace("//", "/")
+    said = {within + name for node in nodes for name in SAID[node]}
+    if BRIDGE in nodes and autopilot is not None:
+        sent = (message.topic for message in autopilot.chart.messages.values())
+        said |= {topic if topic.startswith("/") else within + topic for topic in sent}
+    return sorted(set(known) - said)
 
 
 def _told(node: NodeSpec, scenario: Scenario, run: Path, *, lockstep: bool, together: bool) -> Told:
@@ -96,13 +155,14 @@ def _stored(files: Enclosed) -> Told:
     }
 
 
-def enclosed(scenario: Scenario, run: Path, told: Mapping[str, Told] | None = None) -> Enclosed:
+def enclosed(scenario: Scenario, run: Path, told: Mapping[str, Told] | None = None, further: Sequence[Path] = ()) -> Enclosed:
     """What the log of a flight holds beside its messages; what is no file yet is made in the folder of the run.
 
     The scenario, the airframe that flies, every parameter as the nodes validate it (`told`, by the node's name, over the
-    scenario; nothing where the flight has no nodes), and `provenance`. Raises ParameterError where it cannot be written.
+    scenario; nothing where the flight has no nodes), `further` files, and `provenance`. Raises ParameterError where it cannot
+    be written.
     """
-    attached = [_write(run / PARAMETERS, _as_flown(scenario, told or {}))]
+    attached = [_write(run / PARAMETERS, scenario_yaml(scenario, told)), *further]
     if not scenario.aircraft.is_jsbsim:
         attached.append(_write(run / AIRFRAME, as_yaml(scenario.aircraft.drawn())))
     notes = _write(run / PROVENANCE, yaml.safe_dump(provenance(), sort_keys=False))
@@ -115,22 +175,3 @@ def _write(path: Path, text: str) -> Path:
     except OSError as error:
         raise ParameterError(f"{path} cannot be written ({error.strerror}), expected a folder and a disk that can") from None
     return path
-
-
-def _as_flown(scenario: Scenario, told: Mapping[str, Told]) -> str:
-    """A scenario file with every parameter in it, also those by default; what is left out or none is so by default."""
-    sections = {}
-    for name, schema in SCHEMAS.items():
-        given: Parameters = getattr(scenario, name)
-        flown = schema.validate_mapping(given.model_dump() | told.get(name, {}), name)
-        # The instant of t = 0 is not known before all nodes run; `truth` says it.
-        sections[f"/**/{name}"] = {"ros__parameters": _plain(flown.model_dump(exclude={"start_time"}))}
-    return yaml.safe_dump(sections, sort_keys=False, default_flow_style=None, width=128)
-
-
-def _plain(values: Any) -> Any:
-    """Values as YAML knows them, without those that stand for nothing: None, and empty texts, lists and mappings."""
-    if isinstance(values, Mapping):
-        plain = {key: _plain(value) for key, value in values.items()}
-        return {key: value for key, value in plain.items() if value not in (None, "", [], {})}
-    return [_plain(value) for value in values] if isinstance(values, tuple) else values

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di play`: the topics of a recorded flight again, with their timing, for any node to be tried against."""
 
+import math
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from flight_analysis.playback import SHARED, read_playback
+from flight_core.parameters import require
 
 
 class Stamps(StrEnum):
@@ -35,6 +37,8 @@ def play(
     Bytes are those of the log, but for the stamps, which are moved to now unless told otherwise. Refuses a domain in which
     somebody publishes on one of the topics already. Exit status: 0 played to its end, 2 bad input, 130 interrupted.
     """
+    for option, value in (("--rate", rate), ("--start", start)):
+        require(math.isfinite(value), option, value, "a number")  # NaN passes the ranges above
     names = [name.strip() for name in topics.split(",") if name.strip()]
     playback = read_playback(run, names, start)
     from flight_bringup.node import player  # noqa: PLC0415 - loads rclpy, which other commands do not need

@@ -19,7 +19,19 @@ from types import TracebackType
 from typing import Self
 
 from flight_analysis.scenario import Scenario
-from flight_bringup.graph import FIRST, ONE_PROCESS, READY, RECORDER, THEN, NodeSpec, Told, parameters, start_lead
+from flight_bringup.graph import (
+    BRIDGED,
+    FIRST,
+    ONE_PROCESS,
+    READY,
+    RECORDER,
+    THEN,
+    Autopilot,
+    NodeSpec,
+    Told,
+    parameters,
+    start_lead,
+)
 from flight_core.parameters import ParameterError
 
 STOP_TIMEOUT = 2.5  # s for all processes together; a node ends within 0.2 s
@@ -79,16 +91,24 @@ class NodeProcess:
 class Flight:
     """All processes of one flight. A context manager: leaving it ends them.
 
-    `before_start` is called when the first nodes are ready, before aircraft and reference model start.
+    `before_start` is called when the first nodes are ready, before aircraft and reference model start. With an autopilot its
+    bridge starts in the aircraft's place.
     """
 
     def __init__(
-        self, scenario: Scenario, run: Path, before_start: Callable[[], None], *, lockstep: bool, one_process: bool
+        self,
+        scenario: Scenario,
+        run: Path,
+        before_start: Callable[[], None],
+        *,
+        lockstep: bool,
+        one_process: bool,
+        autopilot: Autopilot | None = None,
     ) -> None:
         self._scenario, self._run, self._before_start = scenario, run, before_start
-        self._lockstep = lockstep
+        self._lockstep, self._autopilot = lockstep, autopilot
         self._first: tuple[NodeSpec, ...] = () if one_process else FIRST
-        self._then: tuple[NodeSpec, ...] = (ONE_PROCESS,) if one_process else THEN
+        self._then: tuple[NodeSpec, ...] = (ONE_PROCESS,) if one_process else THEN if autopilot is None else BRIDGED
         self.processes: list[NodeProcess] = []
         self.start_time = math.inf  # system time of t = 0, s; set once the first nodes are ready
 
@@ -115,7 +135,7 @@ class Flight:
     def _start(self, node: NodeSpec) -> NodeProcess:
         log = self._run / "log" / f"{node.executable}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
-        told = parameters(node, self._scenario, self._run, self.start_time, lockstep=self._lockstep)
+        told = parameters(node, self._scenario, self._run, self.start_time, lockstep=self._lockstep, autopilot=self._autopilot)
         process = NodeProcess(node, self._scenario.path, told, log)
         self.processes.append(process)
         return process

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-import yaml
 
 from flight_analysis.bag_reader import read_run
 from flight_bringup.graph import PARAMETERS
+from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError
 from flight_core.rates import seconds
 from flight_recorder.bag import METADATA
@@ -44,6 +44,10 @@ def _end(run: Path, last: Repaired) -> str:
     end = max(float(recorded.tape.time(name)[-1]) for name in recorded.tape.signals)
     for stored in recorded.attachments:
         if stored.name == PARAMETERS:
-            duration = yaml.safe_load(stored.content)["/**/flight"]["ros__parameters"]["duration"]
+            try:
+                parameters = parse_yaml(stored.content, PARAMETERS, "a scenario file")
+                duration = float(parameters["/**/flight"]["ros__parameters"]["duration"])
+            except (ParameterError, LookupError, OverflowError, TypeError, ValueError):
+                continue  # a file of any content may have this name
             return f"the log ends at t = {end:.3f} s of the {duration:g} s that were to be flown"
     return f"the log ends at t = {end:.3f} s; nothing says how much is missing"

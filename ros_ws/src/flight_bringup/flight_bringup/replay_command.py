@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-import yaml
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -19,7 +18,7 @@ from flight_analysis.bag_reader import read_run
 from flight_analysis.metrics import error_figures
 from flight_analysis.replay import OPEN_LOOP, Difference, Replayed, recorded_parameters, replay, vary
 from flight_analysis.stored_messages import parameter_changes
-from flight_core.files import NOT_YAML
+from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError, require
 from rise_di_controller.params import ControllerParameters
 
@@ -67,10 +66,7 @@ def _setting(text: str) -> tuple[str, Any]:
     key = name.strip().removeprefix("controller.")
     fits = bool(equals) and key != name.strip()
     require(fits, "--set", repr(text), "a parameter of the controller and its value, as in controller.k_g=2.0")
-    try:
-        return key, yaml.safe_load(value)
-    except NOT_YAML as error:
-        raise ParameterError(f"--set: {text!r} is not valid YAML ({' '.join(str(error).split())})") from None
+    return key, parse_yaml(value, f"--set {text!r}", "a value")
 
 
 def _other_parameters(result: Replayed, *, open_loop: bool) -> list[str]:

@@ -8,23 +8,29 @@ does.
 """
 
 import math
-import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, RegisterEventHandler, Shutdown, TimerAction
-from launch.event_handlers import OnProcessIO
-from launch.events.process import ProcessExited, ProcessIO
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, TimerAction
 
 from flight_bringup.fly import new_run
-from flight_bringup.graph import AIRCRAFT, FIRST, FLOWN, READY, THEN, NodeSpec, parameters, start_lead
-from flight_bringup.processes import end_with_parent
-from flight_bringup.scenarios import find_scenario, scenarios
+from flight_bringup.graph import AIRCRAFT, FIRST, FLOWN, THEN, NodeSpec, parameters, start_lead
+from flight_bringup.launch.stages import (
+    BOOLEAN,
+    end_with_launch,
+    flown,
+    in_order,
+    namespace_argument,
+    node,
+    runs_argument,
+    scenario_argument,
+    text,
+    when_said,
+)
+from flight_bringup.scenarios import find_scenario
 from launch import LaunchContext, LaunchDescription
 
 
@@ -32,84 +38,40 @@ def generate_launch_description() -> LaunchDescription:
     """The arguments, and the flight that they describe."""
     return LaunchDescription(
         [
-            DeclareLaunchArgument(
-                "scenario",
-                default_value="osprey_gust",
-                description=f"name of a scenario ({', '.join(scenarios())}), or path of a scenario file (.yaml)",
-            ),
+            scenario_argument("osprey_gust"),
             DeclareLaunchArgument("duration", default_value="", description="seconds to fly; empty flies the scenario's"),
             DeclareLaunchArgument(
                 "lockstep",
                 default_value="",
-                choices=["", "true", "false"],
+                choices=["", *BOOLEAN],
                 description="true: as fast as the machine allows, repeatable to the byte; empty: as the scenario says",
             ),
-            DeclareLaunchArgument("runs", default_value="runs", description="folder that the run's folder is made in"),
-            DeclareLaunchArgument("namespace", default_value="", description="namespace of all nodes, one an aircraft"),
+            runs_argument(),
+            namespace_argument(),
             OpaqueFunction(function=_fly),
         ]
     )
 
 
 def _fly(context: LaunchContext) -> list[Action]:
-    scenario = find_scenario(LaunchConfiguration("scenario").perform(context))
-    if duration := LaunchConfiguration("duration").perform(context):
+    scenario = find_scenario(text(context, "scenario"))
+    if duration := text(context, "duration"):
         scenario = scenario.vary(flight={"duration": yaml.safe_load(duration)})
-    asked = LaunchConfiguration("lockstep").perform(context)
+    asked = text(context, "lockstep")
     lockstep = asked == "true" if asked else scenario.flight.lockstep
-    run = new_run(scenario, Path(LaunchConfiguration("runs").perform(context)))
-    begin = time.monotonic()
-    # launch leaves its processes running when it is itself ended by anything but SIGINT.
-    context.launch_configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
+    run = new_run(scenario, Path(text(context, "runs")))
+    end_with_launch(context)
 
-    def process(node: NodeSpec, start_time: float = math.inf) -> Node:
-        return Node(
-            package=node.package,
-            executable=node.executable,
-            exec_name=node.executable,  # else the log names each process by its prefix
-            namespace=LaunchConfiguration("namespace"),
-            parameters=[str(scenario.path), parameters(node, scenario, run, start_time, lockstep=lockstep)],
-            output="screen",
-            on_exit=_require_flown,
-        )
+    def told(spec: NodeSpec, start_time: float = math.inf) -> dict[str, object]:
+        return parameters(spec, scenario, run, start_time, lockstep=lockstep)
 
-    flown = [
-        LogInfo(msg=f"flown; now: ros2 run flight_bringup rise-di report {shlex.quote(str(run))}"),
-        Shutdown(reason="flown to its end"),
-    ]
-    first = {node: process(node) for node in FIRST}
-    waiting = set(FIRST)
+    def take_off(startup: float) -> Sequence[Action]:
+        lead = start_lead(startup)
+        start_time = round(time.time() + lead, 3)
+        others = {spec: node(spec, scenario, told(spec, start_time)) for spec in THEN}
+        end: Action = TimerAction(period=lead + scenario.flight.duration, actions=flown(run))
+        if lockstep:
+            end = when_said(others[AIRCRAFT], FLOWN, lambda: flown(run))
+        return [end, *others.values()]
 
-    def when_flown(event: ProcessIO) -> list[Action] | None:
-        return flown if FLOWN in event.text.decode(errors="replace") else None
-
-    def when_ready(node: NodeSpec) -> Callable[[ProcessIO], list[Action] | None]:
-        def handle(event: ProcessIO) -> list[Action] | None:
-            if node not in waiting or READY not in event.text.decode(errors="replace"):
-                return None
-            waiting.remove(node)
-            if waiting:
-                return None
-            lead = start_lead(time.monotonic() - begin)
-            start_time = round(time.time() + lead, 3)
-            others = {other: process(other, start_time) for other in THEN}
-            if lockstep:
-                end: Action = RegisterEventHandler(
-                    OnProcessIO(target_action=others[AIRCRAFT], on_stdout=when_flown, on_stderr=when_flown)
-                )
-            else:
-                end = TimerAction(period=lead + scenario.flight.duration, actions=flown)
-            return [end, *others.values()]
-
-        return handle
-
-    handlers = [
-        RegisterEventHandler(OnProcessIO(target_action=action, on_stdout=when_ready(node), on_stderr=when_ready(node)))
-        for node, action in first.items()
-    ]
-    return [*handlers, *first.values()]
-
-
-def _require_flown(event: ProcessExited, context: LaunchContext) -> None:
-    if not context.is_shutdown:
-        raise RuntimeError(f"{event.process_name} ended before the flight did")  # launch then ends the others, with status 1
+    return in_order({spec: node(spec, scenario, told(spec)) for spec in FIRST}, take_off)

@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The maps of PX4, MAVROS and ROSflight with the real message packages, where somebody has installed them.
+
+None of them is on PyPI. On a full ROS 2: apt install ros-jazzy-mavros-msgs, and px4_msgs, rosflight_msgs and rosplane_msgs
+built in a workspace that is sourced. Without them tests/pure/test_channel_map.py tests each row on the published fields.
+"""
+
+import time
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pytest
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from std_srvs.srv import SetBool
+from tests.published_messages import FOREIGN_MAPS, PACKAGES, PUBLISHED, kind
+from tests.pure.test_channel_map import MOTION, SENT
+from tests.ros.conftest import Start
+from tests.ros.peer import Peer, peer
+
+from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field, to_channel, to_raw
+from autopilot_bridge.params import ChannelMap, load_map
+from flight_ros.messages import to_message
+
+BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+AS_PYTHON = {"float32": "float", "bool": "boolean"}  # as rclpy names the types of a definition
+INPUTS = ("elevator", "thrust", "aileron", "rudder")
+
+
+def needs(*packages: str) -> None:
+    """Skip where a message package is not there, with what it is for."""
+    for package in packages:
+        if find_spec(package) is None:
+            pytest.skip(f"{package} is not installed and not on PyPI; its fields are checked as {PACKAGES[package]} has them")
+
+
+def needs_packages_of(chart: ChannelMap) -> None:
+    needs(*sorted({kind_.split("/")[0] for _, _, kind_ in chart.used_topics()} & PACKAGES.keys()))
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_the_package_has_the_fields_that_are_said_to_be_published(name: str) -> None:
+    needs(name.partition("/")[0])
+    found: dict[str, str] = message_type(name).get_fields_and_field_types()  # type: ignore[attr-defined]
+    for field, published in PUBLISHED[name].items():
+        element, length, is_array = kind(published)
+        element = AS_PYTHON.get(element, element)
+        expected = f"{element}[{length}]" if length else f"sequence<{element}>" if is_array else element
+        assert found[field] == expected
+
+
+def frd(message: Any) -> None:
+    message.angular_velocity = np.array([0.3, 0.2, 0.1], dtype=np.float32)
+
+
+def true_airspeed(message: Any) -> None:
+    message.true_airspeed_m_s = 27.0
+
+
+def airspeed(message: Any) -> None:
+    message.airspeed = 27.0
+
+
+def state(message: Any) -> None:
+    message.p, message.q, message.r, message.va = 0.3, 0.2, 0.1, 27.0
+
+
+def flu(message: Any) -> None:
+    rates = message.angular_velocity
+    rates.x, rates.y, rates.z = 0.3, -0.2, -0.1
+
+
+ROWS: tuple[tuple[str, str, Callable[[Any], None]], ...] = (
+    ("px4", "qpr", frd),
+    ("px4", "V", true_airspeed),
+    ("mavros", "qpr", flu),
+    ("mavros", "V", airspeed),
+    ("rosflight", "qpr", state),
+    ("rosflight", "V", state),
+)
+
+
+@pytest.mark.parametrize(("name", "channels", "fill"), ROWS, ids=[f"{name}-{channels}" for name, channels, _ in ROWS])
+def test_outputs_are_read_from_real_messages(name: str, channels: str, fill: Callable[[Any], None]) -> None:
+    chart = load_map(name)
+    needs_packages_of(chart)
+    for channel in channels:
+        row = chart.outputs[channel]
+        message = message_type(row.type)()
+        fill(message)
+        message = deserialize_message(serialize_message(message), type(message))
+        value = to_channel(read_raw(message, row.field, row.function), row.line)
+        assert value == pytest.approx(2.0 if channel == "V" else MOTION[channel], abs=1e-6)  # float32
+
+
+@pytest.mark.parametrize("name", FOREIGN_MAPS)
+def test_inputs_are_put_into_real_messages(name: str) -> None:
+    chart = load_map(name)
+    needs_packages_of(chart)
+    for (path, expected), row in zip(SENT[name].items(), chart.inputs.values(), strict=True):
+        message = message_type(chart.messages[row.message].type)()
+        for field, value in chart.messages[row.message].values.items():
+            set_field(message, field, value)
+        set_field(message, row.field, to_raw(row.trim + 0.1, row.line))
+        message = deserialize_message(serialize_message(message), type(message))
+        whole = name == "mavros"  # us
+        assert get_field(message, row.field) == pytest.approx(expected, abs=0.5 if whole else 1e-3), path
+
+
+class Px4:
+    """Says y as PX4 does, hears what PX4 takes."""
+
+    def __init__(self, someone: Peer) -> None:
+        self._node, self._someone = someone.node, someone
+        self._odometry, self._airspeed = self._make("VehicleOdometry"), self._make("AirspeedValidated")
+        self._sends = [
+            (self._node.create_publisher(type(message), topic, BEST_EFFORT), message)
+            for topic, message in (
+                ("/fmu/out/vehicle_odometry", self._odometry),
+                ("/fmu/out/airspeed_validated", self._airspeed),
+            )
+        ]
+        self.heard: dict[str, list[Any]] = {"OffboardControlMode": [], "VehicleTorqueSetpoint": [], "VehicleThrustSetpoint": []}
+        for name, topic in (
+            ("OffboardControlMode", "offboard_control_mode"),
+            ("VehicleTorqueSetpoint", "vehicle_torque_setpoint"),
+            ("VehicleThrustSetpoint", "vehicle_thrust_setpoint"),
+        ):
+            self._node.create_subscription(type(self._make(name)), f"/fmu/in/{topic}", self.heard[name].append, BEST_EFFORT)
+
+    def _make(self, name: str) -> Any:
+        return getattr(import_module("px4_msgs.msg"), name)()
+
+    def say(self) -> None:
+        """One sample of y, nose up and a little fast, and of u: elevator 0.02 rad."""
+        frd(self._odometry)
+        true_airspeed(self._airspeed)
+        for publisher, message in self._sends:
+            publisher.publish(message)
+        self._someone.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.02, 0.0, 0.0, 0.0]), "test"))
+
+
+def spin(someone: Peer, duration: float) -> None:
+    end = time.monotonic() + duration
+    someone.until(lambda: time.monotonic() > end)
+
+
+def test_a_bridge_speaks_to_px4_in_its_own_messages(start: Start) -> None:
+    """Heartbeats with fresh y and u, setpoints once engaged; no u ends both."""
+    needs("px4_msgs")
+    bridge = start("autopilot_bridge.node", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false")
+    bridge.wait_for("ready")
+    with peer(listen=("y",)) as someone:
+        px4 = Px4(someone)
+        someone.until(lambda: someone.heard["y"] and len(px4.heard["OffboardControlMode"]) > 2, each=px4.say)
+        y = someone.heard["y"][-1]
+        assert dict(zip(y.name, y.position, strict=True)) == pytest.approx({**MOTION, "V": 2.0}, abs=1e-6)
+        assert not px4.heard["VehicleTorqueSetpoint"]
+        assert px4.heard["OffboardControlMode"][-1].thrust_and_torque
+        client = someone.node.create_client(SetBool, "bridge/engage")
+        someone.until(client.service_is_ready, each=px4.say)
+        future = client.call_async(SetBool.Request(data=True))
+        someone.until(future.done, each=px4.say)
+        assert future.result().success, future.result().message
+        someone.until(lambda: len(px4.heard["VehicleThrustSetpoint"]) > 5, each=px4.say)
+        assert list(px4.heard["VehicleTorqueSetpoint"][-1].xyz) == pytest.approx([0.0, 0.02 / 0.523599, 0.0], abs=1e-6)
+        assert list(px4.heard["VehicleThrustSetpoint"][-1].xyz) == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
+        someone.until(lambda: any("-> DISENGAGED: " in line for line in bridge.lines))
+        spin(someone, 0.2)  # what was still under way
+        for messages in px4.heard.values():
+            messages.clear()
+        spin(someone, 0.5)
+        assert not any(px4.heard.values())
