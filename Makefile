@@ -3,6 +3,7 @@
 #
 # make fly     set up what is needed, fly the default scenario     make fly SCENARIO=... ARGS="--duration 10"
 # make test    set up what is needed, run all checks and tests
+# make evidence   measure what has not been measured yet, write docs/evidence.md     make evidence ARGS="--again speed"
 # make setup   the set-up alone: .venv/, the workspace built, .venv/bin/rise-di
 
 PYTHON ?= python3
@@ -16,7 +17,7 @@ PACKAGES := $(notdir $(patsubst %/package.xml,%,$(wildcard ros_ws/src/*/package.
 # With symlinks in place only these need another build; Python sources are live.
 BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/config/*.yaml ros_ws/src/*/launch/*.py)
 
-.PHONY: fly test check setup lock clean
+.PHONY: fly test check evidence setup lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
@@ -28,6 +29,9 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+evidence: setup
+	@$(BIN)/python -m benchmarks.evidence $(ARGS)
 
 setup: .venv/.workspace
 

@@ -2,8 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """A fixed rate on the monotonic clock with absolute deadlines: no drift, and no stop while the system clock is set back."""
 
+import os
 import time
+from contextlib import suppress
+from pathlib import Path
 from typing import NamedTuple
+
+TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
+AHEAD = 1e-4  # s, by which a thread of real-time priority is awake before its deadline: waking takes 20 to 80 us
+
+
+def wake_on_time() -> None:
+    """Have the main thread woken at its deadlines, not up to 50 us later, which Linux does to save power. Needs no privilege.
+
+    Source: prctl(2), PR_SET_TIMERSLACK. Threads of real-time priority have no slack anyway.
+    """
+    with suppress(OSError):  # no /proc, or not to be written: ticks are that much later
+        TIMER_SLACK.write_text("1", encoding="ascii")
 
 
 class Tick(NamedTuple):
@@ -26,10 +41,19 @@ class Ticker:
         self.period_ns = period_ns
         self._start_ns = start_ns
         self._last = -1
+        self._ahead = AHEAD if os.sched_getscheduler(0) in (os.SCHED_FIFO, os.SCHED_RR) else 0.0
 
     def remaining(self) -> float:
         """Time to the next deadline in s, negative when it has passed."""
         return (self._start_ns + (self._last + 1) * self.period_ns - time.monotonic_ns()) / 1e9
+
+    def wait(self, most: float) -> None:
+        """Sleep until the next deadline, but at most so many s; with real-time priority, watch the clock for the last AHEAD."""
+        pause = self.remaining()
+        if pause > self._ahead:
+            time.sleep(min(pause - self._ahead, most))
+        while 0.0 < self.remaining() <= self._ahead:
+            pass
 
     def due(self) -> Tick | None:
         """The newest deadline that has come and was not yet returned, else None."""

@@ -1,0 +1,264 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The page of evidence is made of results alone, and says what is missing, short, failed or not to be relied on."""
+
+import json
+import re
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+from benchmarks.evidence import MEASUREMENTS, cases, read, wanted
+from benchmarks.evidence_page import BUSY, SPEED, WIDTH, Result, render
+
+MACHINE = {"processor": "a processor", "cores": 2, "memory": 8, "system": "Linux 6", "python": "3.11.7"}
+
+
+def result(name: str, measured: Any, **changes: Any) -> Result:
+    return {
+        "name": name,
+        "command": f"measure {name}",
+        "quick": False,
+        "date": "2020-01-02 03:04 UTC",
+        "revision": "abc1234",
+        "machine": MACHINE,
+        "busy": 0.0,
+        "seconds": 1.0,
+        "status": 0,
+        "result": measured,
+    } | changes
+
+
+def row(what: str, figures: dict[str, float], floor: str = "", goals: tuple[dict[str, Any], ...] = ()) -> dict[str, Any]:
+    return {"group": "node", "what": what, "figures": figures, "floor": floor, "goals": goals}
+
+
+TWICE = {"column": "p50 (us)", "at_most": 2.0, "of_floor": True}
+NODE = [
+    row("bare echo, single", {"p50 (us)": 40.0, "p99 (us)": 80.0}, "bare echo, single"),
+    row("bare echo, events", {"p50 (us)": 20.0, "p99 (us)": 60.0}, "bare echo, single"),
+    row("controller, u alone", {"p50 (us)": 50.0, "p99 (us)": 320.0}, "bare echo, single", (TWICE,)),
+]
+TIMES = {"median": 0.1234, "worst": 0.2341}
+FAULT = {
+    "case": "controller killed",
+    "u": "held",
+    "injected": 10,
+    "detected": 10,
+    "passed": 10,
+    "quiet": 10,
+    "reaction": TIMES,
+    "recovery": TIMES,
+    "ready_to_traffic": TIMES,
+    "exec_to_traffic": {"median": 0.4, "worst": 0.51},
+    "longest_pause": None,
+}
+LEVEL = {"uncertainty": 0.3, "mean": 1.75, "worst": 2.48, "diverged": 0.0, "lost": 0.0}
+LAW = {"law": "rise", "sees": "y", "tuned_on": "nominal", "score": 1.61, "levels": [LEVEL], "delay": 0.02}
+FIGURE = {"mean": 1.31, "q50": 1.21, "q95": 2.31, "q99": 2.71, "worst": 3.01, "deviation": 0.1}
+SHARE = {"count": 3, "share": 3e-4, "low": 1e-4, "high": 9e-4}
+RESULTS = {
+    "speed-node": result("speed-node", {"seconds": 10.0, "rows": NODE}),
+    "faults": result("faults", [FAULT]),
+    "security": result("security", [{"name": "test_an_outsider_hears_nothing", "outcome": "passed", "seconds": 1.0}]),
+    "fuzz-coverage": result(
+        "fuzz-coverage",
+        {"mcap": {"status": 0, "covered": 1234, "number_of_executed_units": 98765, "peak_rss_mb": 321}},
+    ),
+    "campaign": result(
+        "campaign",
+        {
+            "whole": 120_000.0,
+            "flown": 150_000.0,
+            "memory_early": 900.0,
+            "memory": 905.0,
+            "aircraft": 10_000,
+            "plain": 50.0,
+            "integration": {"q": 0.0021, "V": 0.0005},
+        },
+    ),
+    "campaign-fleet": result(
+        "campaign-fleet", {"cases": [{"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}]}
+    ),
+    "compare": result("compare", {"aircraft": 200, "seed": 1, "laws": [LAW, LAW | {"law": "pi", "score": 1.72}]}),
+    "replay": result("replay", {"osprey_gust": {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": True}}),
+}
+
+
+def page(**changes: Result) -> str:
+    """With the lines of a paragraph joined again."""
+    return re.sub(r"(?<=[^\n|])\n *(?=[^\s|#-])", " ", render(MEASUREMENTS, RESULTS | changes))
+
+
+def test_no_line_of_words_is_longer_than_the_width_and_no_command_is_broken() -> None:
+    for line in render(MEASUREMENTS, RESULTS).splitlines():
+        assert len(line) <= WIDTH or line.startswith(("|", "    ")), line
+        assert line.count("`") % 2 == 0, line
+
+
+def test_each_section_is_there() -> None:
+    titles = re.findall(r"^## (.+)$", page(), re.MULTILINE)
+    assert titles == ["Faults", "Speed", "Security", "Campaign", "Other laws", "Log"]
+
+
+def test_without_results_it_holds_no_figure_and_says_which_command_makes_each() -> None:
+    empty = render(MEASUREMENTS, {})
+    assert "Nothing has been measured yet." in empty
+    for one in MEASUREMENTS:
+        assert f'`make evidence ARGS="--again {one.name}"`' in empty
+    assert not [line for line in empty.splitlines() if line.startswith("|")]
+
+
+def test_each_table_stands_under_the_command_that_made_it() -> None:
+    for name in RESULTS:
+        assert f"\n    measure {name}    # 2020-01-02 03:04 UTC, abc1234\n" in page()
+
+
+def test_a_figure_of_the_machine_is_a_ratio_to_its_floor_with_the_figure_in_parentheses() -> None:
+    assert "| controller, u alone | 1.25 (50) | 4 (320) |" in page()  # 50 / 40 and 320 / 80
+    assert "| *bare echo, single* | 1 (40) | 1 (80) |" in page()
+
+
+def test_a_count_is_no_ratio() -> None:
+    rows = [row("timer", {"missed": 4}, "timer"), row("loop", {"missed": 2}, "timer")]
+    assert "| loop | 2 |" in page(**{"speed-node": result("speed-node", {"rows": rows})})
+
+
+@pytest.mark.parametrize(("p50", "verdict"), [(80.0, ": met."), (80.1, ": **not met**.")])
+def test_a_goal_is_met_up_to_its_limit(p50: float, verdict: str) -> None:
+    rows = [NODE[0], row("controller", {"p50 (us)": p50}, "bare echo, single", (TWICE,))]
+    text = page(**{"speed-node": result("speed-node", {"rows": rows})})
+    (line,) = [line for line in text.splitlines() if line.startswith("- Goal: controller: p50 at most 2 times")]
+    assert line.endswith(verdict)
+
+
+def test_the_controller_is_also_set_beside_the_fastest_echo() -> None:
+    assert "Beside the fastest echo (bare echo, events), times in p50: controller, u alone 2.5." in page()  # 50 / 20
+
+
+def test_the_page_changes_with_every_figure_of_every_result() -> None:
+    """But for those that it does not show."""
+    before, hidden = page(), {"seconds", "deviation", "status", "quiet"}
+    for name, whole in RESULTS.items():
+        for path in leaves(whole["result"]):
+            if path[-1] in hidden or (name == "compare" and path[-1] == "diverged"):
+                continue
+            changed = deepcopy(whole)
+            inside = changed["result"]
+            for key in path[:-1]:
+                inside = inside[key]
+            inside[path[-1]] = 3 * inside[path[-1]] + 0.5
+            assert page(**{name: changed}) != before, f"{name}: {path}"
+
+
+def leaves(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Where the numbers of a tree are."""
+    if isinstance(tree, dict | list | tuple):
+        pairs = tree.items() if isinstance(tree, dict) else enumerate(tree)
+        return [found for key, value in pairs for found in leaves(value, (*path, key))]
+    return [path] if isinstance(tree, int | float) and not isinstance(tree, bool) else []
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"quick": True}, "**A short version**, not to be quoted"),
+        ({"busy": BUSY + 0.4}, "**The machine was busy** when this began, 50 % of its processors in use"),
+        ({"result": None, "status": 2}, "**Failed**, with exit status 2"),
+        ({"status": 1}, "**Exit status 1.**"),
+    ],
+)
+def test_it_says_what_takes_from_the_worth_of_a_measurement(changes: dict[str, Any], said: str) -> None:
+    assert said not in page()
+    assert said in page(faults=RESULTS["faults"] | changes)
+
+
+def test_a_killed_node_is_timed_from_its_start_and_from_its_being_ready() -> None:
+    assert "traffic within 0.5 s of its start. Found 0.51 s at worst: **not met**." in page()
+    assert "traffic within 0.5 s of its being ready. Found 0.234 s at worst: met." in page()
+
+
+def test_only_what_is_timed_is_spoiled_by_a_busy_machine() -> None:
+    assert "machine was busy" not in page(replay=RESULTS["replay"] | {"busy": 1.0})
+
+
+def test_a_fault_that_did_not_pass_each_time_stands_out() -> None:
+    assert "1 of 1 cases passed every time; 10 of 10 faults" in page()
+    text = page(faults=result("faults", [FAULT | {"passed": 9}], status=1))
+    assert "0 of 1 cases passed every time; 9 of 10 faults" in text
+    assert "| **9** |" in text
+
+
+def test_a_test_that_failed_stands_out() -> None:
+    failed = [{"name": "test_an_outsider_hears_nothing[far]", "outcome": "failed", "seconds": 1.0}]
+    assert "| an outsider hears nothing | passed |" in page()
+    assert "| an outsider hears nothing | **failed** |" in page(security=result("security", failed, status=1))
+
+
+def test_a_scenario_that_does_not_replay_stands_out() -> None:
+    differing = {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": False, "differing": 17}
+    assert "**17 ticks differ**" in page(replay=result("replay", {"osprey_gust": differing}))
+    assert "**no flight**" in page(replay=result("replay", {"osprey_gust": {"outcome": ["error: no aircraft"]}}))
+
+
+def test_the_lowest_score_among_laws_that_see_the_same_is_bold() -> None:
+    assert "| rise | y | **1.61** |" in page()
+    assert "| pi | y | 1.72 |" in page()
+
+
+def test_a_law_that_diverges_has_no_number() -> None:
+    lost = LAW | {"law": "di", "levels": [LEVEL | {"mean": None, "worst": None}]}
+    assert "| di | y | **1.61** | diverged (diverged) |" in page(
+        compare=result("compare", {"aircraft": 200, "seed": 1, "laws": [LAW, lost]})
+    )
+
+
+def test_cells_of_each_table_are_as_many_as_its_headings() -> None:
+    for table in re.findall(r"(?:^\|.*\n)+", page(), re.MULTILINE):
+        assert len({line.replace("\\|", "").count("|") for line in table.splitlines()}) == 1, table
+
+
+def test_what_is_missing_failed_or_short_is_measured_and_nothing_else() -> None:
+    there = {one.name: result(one.name, []) for one in MEASUREMENTS}
+    assert wanted([], there, quick=False) == []
+    assert [one.name for one in wanted(["speed-"], there, quick=False)] == [f"speed-{group}" for group in SPEED]
+    del there["faults"]
+    there |= {"compare": result("compare", None, status=1), "security": result("security", [], quick=True)}
+    assert [one.name for one in wanted([], there, quick=False)] == ["faults", "security", "compare"]
+    assert [one.name for one in wanted([], there, quick=True)] == ["faults", "compare"]
+
+
+def test_every_measuring_program_is_there() -> None:
+    repository = Path(__file__).parents[2]
+    for one in MEASUREMENTS:
+        for command in (one.command, one.quick):
+            if "-m" in command and command[2].startswith("benchmarks."):
+                assert (repository / f"{command[2].replace('.', '/')}.py").exists(), command
+            for part in command:
+                assert not part.startswith("tests/") or (repository / part).exists(), part
+
+
+def test_outcomes_of_tests_are_read_from_their_file() -> None:
+    junit = """<testsuites><testsuite>
+        <testcase name="test_a" time="0.5"/>
+        <testcase name="test_b[x]" time="1"><failure>no</failure></testcase>
+        <testcase name="test_c" time="0"><skipped/></testcase>
+        <testcase name="test_d" time="0"><error/></testcase>
+    </testsuite></testsuites>"""
+    found = [(one["name"], one["outcome"], one["seconds"]) for one in cases(junit)]
+    assert found == [
+        ("test_a", "passed", 0.5),
+        ("test_b[x]", "failed", 1.0),
+        ("test_c", "skipped", 0.0),
+        ("test_d", "failed", 0.0),
+    ]
+
+
+def test_what_a_program_leaves_is_its_file_else_what_it_prints_else_nothing(tmp_path: Path) -> None:
+    left = tmp_path / "left.json"
+    assert read(left, '{"a": 1}') == {"a": 1}
+    assert read(left, "Traceback") is None
+    left.write_text(json.dumps([2]), encoding="utf-8")
+    assert read(left, '{"a": 1}') == [2]
+    assert read(tmp_path / "left.xml", "") is None
