@@ -27,6 +27,7 @@ from flight_analysis.metrics import (
     tick_figures,
     tracking_error,
 )
+from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from rise_di_controller.guard import Mode
 from rise_di_controller.internals import Limited
@@ -271,7 +272,7 @@ def test_groups_of_channels_lose_their_prefix() -> None:
     tape = signal([0], **{"e.q": [1.0], "Pi.q": [2.0], "e.V": [3.0]})
     assert tape.group("e").names == ("q", "V")
     assert tape.group("e").values.tolist() == [[1.0, 3.0]]
-    with pytest.raises(KeyError, match=r"no channel x among e\.q, Pi\.q, e\.V"):
+    with pytest.raises(ParameterError, match=r"no channel x among e\.q, Pi\.q, e\.V"):
         tape["x"]
 
 

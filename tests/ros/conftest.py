@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import psutil
@@ -22,9 +22,9 @@ Start = Callable[..., "Process"]
 class Process:
     """A process under test, its output collected line by line."""
 
-    def __init__(self, *arguments: str, cwd: Path) -> None:
+    def __init__(self, *arguments: str, cwd: Path, within: Sequence[str] = ()) -> None:
         self.popen = subprocess.Popen(
-            [sys.executable, "-m", *arguments], cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            [*within, sys.executable, "-m", *arguments], cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
         self.lines: list[str] = []
         self._changed = threading.Condition()
@@ -79,11 +79,14 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> int:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Start `python -m MODULE ...` in the test's folder; whatever still runs at the test's end is killed, with its children."""
+    """Start `python -m MODULE ...` in the test's folder, `within` another command.
+
+    Whatever still runs at the test's end is killed, with its children.
+    """
     started: list[Process] = []
 
-    def begin(*arguments: str) -> Process:
-        started.append(Process(*arguments, cwd=tmp_path))
+    def begin(*arguments: str, within: Sequence[str] = ()) -> Process:
+        started.append(Process(*arguments, cwd=tmp_path, within=within))
         return started[-1]
 
     yield begin

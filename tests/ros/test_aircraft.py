@@ -63,5 +63,5 @@ def test_a_second_controller_is_refused_while_the_first_one_flies(start: Start, 
         return any(value.key == "refused u: sender" and int(value.value) > 5 for value in values)
 
     someone.until(counted, each=both)
-    process.wait_for("second commands too, beside first")
+    process.wait_for("second publishes too, beside first")
     assert min(aileron(someone)) == 0.0

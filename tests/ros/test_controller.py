@@ -85,8 +85,8 @@ def test_stale_inputs_are_held_ramped_to_trim_and_engaged_again(start: Start, os
         ("not a number", to_message(0, OUTPUTS, np.array([math.nan, 0.0, 0.0, 0.0]), "bad"), "y: finite"),
         ("wrong names", to_message(0, ("q", "V", "p", "x"), np.zeros(4), "bad"), "y: name"),
         ("wrong length", JointState(name=list(OUTPUTS), position=[1.0]), "y: length"),
-        ("an old stamp", to_message(1, OUTPUTS, np.full(4, 99.0), "bad"), "y: order"),
-        ("a stamp to come", to_message(time.time_ns() + 3600 * 10**9, OUTPUTS, np.full(4, 99.0), "bad"), "y: future"),
+        ("an old stamp", to_message(1, OUTPUTS, np.full(4, 99.0), "peer"), "y: order"),
+        ("a stamp to come", to_message(time.time_ns() + 3600 * 10**9, OUTPUTS, np.full(4, 99.0), "peer"), "y: future"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

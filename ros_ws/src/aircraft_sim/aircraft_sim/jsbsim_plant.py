@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import jsbsim
 import numpy as np
-from scipy.optimize import fsolve
 
 from aircraft_sim import actuators, guarded, turbulence
 from aircraft_sim.actuators import Actuators
@@ -468,6 +467,7 @@ def _own_trim(fdm: jsbsim.FGFDMExec) -> bool:
 
 def _solve(fdm: jsbsim.FGFDMExec) -> tuple[float, ...]:
     """The root of the accelerations of frozen flight, as far as one was found: unknowns x = START + (scaled - 1) SCALE."""
+    from scipy.optimize import fsolve  # noqa: PLC0415 - a sixth of a second, which other aircraft need not wait for
 
     def accelerations(scaled: FloatArray) -> FloatArray:
         _place(fdm, scaled)

@@ -103,7 +103,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
                 if sample is not None and not self.parameters.lockstep:
                     self._require_timely(sample, now_ns)
                 if sample is not None:
-                    self._source.require(sample.sender, now_ns, self._max_age_ns)
+                    self._source.require(sample.sender, now_ns, self._max_age_ns, self._strange_ns)
             except ChannelError as error:
                 self.reject(self._u_inbox, error.reason, str(error))
                 continue
@@ -118,7 +118,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         return came
 
     def _require_timely(self, sample: StampedVector, now_ns: int) -> None:
-        """Raise ChannelError where a u belongs to a time to come, or is older than the last one by more than a delay of y explains."""
+        """Raise ChannelError where a u belongs to a time to come, or to one before the last u, by more than the age limit."""
         ahead_ns, behind_ns = sample.stamp_ns - now_ns, self._u_stamp_ns - sample.stamp_ns
         if ahead_ns > self._max_age_ns:
             raise ChannelError("future", f"stamp {seconds(ahead_ns):g} s ahead of the clock")
@@ -133,6 +133,11 @@ class AircraftNode(FlightNode[AircraftParameters]):
     @property
     def _max_age_ns(self) -> int:
         return nanoseconds(self.parameters.max_age)
+
+    @property
+    def _strange_ns(self) -> int:
+        """After which silence another node than the one before may fly it: once u is at trim."""
+        return self._max_age_ns + nanoseconds(self.parameters.hold + self.parameters.ramp)
 
     def _silent(self, now_ns: int) -> bool:
         return self._source.silent(now_ns, self._max_age_ns)

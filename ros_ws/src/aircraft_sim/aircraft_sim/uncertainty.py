@@ -32,9 +32,7 @@ def draw(airframe: Airframe, of_A: float, of_B: float, seed: int, number: int = 
     return airframe if of_A == of_B == 0.0 else airframe.with_matrices(A[0], B[0])
 
 
-def matrices(
-    airframe: Airframe, of_A: float, of_B: float, seed: int, first: int, count: int
-) -> tuple[FloatArray, FloatArray]:
+def matrices(airframe: Airframe, of_A: float, of_B: float, seed: int, first: int, count: int) -> tuple[FloatArray, FloatArray]:
     """A and B of the aircraft first, first + 1, ... of a seed, shapes (count, n, n) and (count, n, m), SI.
 
     Every entry is multiplied by 1 + d, d uniform in +-uncertainty and independent; the rows of angles stay. An aircraft

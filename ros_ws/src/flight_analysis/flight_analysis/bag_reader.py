@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader
 
 from flight_analysis.named_vectors import Decoder, Samples, decoder, flight_start_ns
 from flight_core.files import is_file, is_folder
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import ParameterError, printable, require
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
@@ -58,11 +58,12 @@ def read_run(run: Path, namespace: str | None = None) -> Run:
     filled = {topic: signal for topic, rows in log.rows.items() if (signal := rows.signal()) is not None}
     require(bool(filled), str(run), "; ".join(["no sample on any topic", *log.notes_at(None)]), "a recorded flight")
     names = _names_of_one_aircraft(filled, namespace, str(run))
+    require(bool(names), str(run), f"topics that begin with no slash: {', '.join(filled)}", "a recorded flight")
     signals = {name: filled[topic] for topic, name in names.items()}
     start_ns = _start_ns(signals)
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
     notes = [*log.notes_at(end), *(note for topic, name in names.items() if (note := log.rows[topic].note(name)))]
-    return Run(Tape(signals, start_ns, tuple(notes)), log.scenario, log.metadata, tuple(log.attachments))
+    return Run(Tape(signals, start_ns, tuple(map(printable, notes))), log.scenario, log.metadata, tuple(log.attachments))
 
 
 def _names_of_one_aircraft(topics: Collection[str], namespace: str | None, where: str) -> dict[str, str]:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import welch
 
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
@@ -328,6 +327,8 @@ def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, Float
     Over Hann windows of a tenth of the flight, half overlapping, each without its mean; a signal that misses a sample is held
     over the gap. The square of the density, integrated over all frequencies, is the variance. Source: Welch 1967.
     """
+    from scipy.signal import welch  # noqa: PLC0415 - half a second, which commands that draw nothing need not wait for
+
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
     grid = np.arange(places[-1] + 1)
     held = signal.values[np.searchsorted(places, grid, side="right") - 1]

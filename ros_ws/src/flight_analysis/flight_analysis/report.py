@@ -165,4 +165,4 @@ def _sections_shown(sections: Sequence[Section]) -> Iterable[str]:
 def _json(value: Any) -> str:
     """JSON that cannot end the script it stands in."""
     text = value.to_json() if isinstance(value, go.Figure) else json.dumps(value)
-    return str(text).replace("</", "<\\/")
+    return str(text).replace("<", "\\u003c")  # stands in texts alone; "<!--" would hide the end too

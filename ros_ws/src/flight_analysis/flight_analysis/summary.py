@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from flight_analysis.metrics import (
     Transient,
     engagements,
@@ -85,7 +87,7 @@ def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
     came_of = settled(tape, happened)
     ticks = tick_figures(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
     latency = latency_figures(tape)
-    return {
+    summary = {
         "scenario": scenario.name,
         "outcome": outcome,
         "duration": float(tape.time("y")[-1]) if len(tape["y"].stamp_ns) else 0.0,
@@ -93,10 +95,11 @@ def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
         "errors": _errors(tape, happened),
         "inputs": _inputs(tape, happened),
         "transients": [one.transient._asdict() | {"until": one.until, "settling": one.time} for one in came_of],
-        "ticks": None if ticks is None else ticks._asdict(),
-        "latency": None if latency is None else latency._asdict(),
+        "ticks": None if ticks is None or not np.isfinite(ticks).all() else ticks._asdict(),
+        "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
         "notes": list(tape.notes),
     }
+    return {key: _known(value) for key, value in summary.items()}
 
 
 def summarise_unflown(scenario: Scenario, outcome: str) -> dict[str, Any]:
@@ -118,8 +121,8 @@ def summarise_unflown(scenario: Scenario, outcome: str) -> dict[str, Any]:
 def _errors(tape: Tape, happened: Sequence[Transient]) -> dict[str, Any]:
     bands, floors, switches = settling_bands(tape), noise_floor(tape), sign_switches(tape)
     return {
-        channel: {part: _numbers(figures._asdict()) for part, figures in parts.items()}
-        | {"bound": _number(parts["calm"].max), "band": bands[channel], "floor": floors[channel]}
+        channel: {part: figures._asdict() for part, figures in parts.items()}
+        | {"bound": parts["calm"].max, "band": bands[channel], "floor": floors[channel]}
         | {"sign_switches": switches.get(channel)}
         for channel, parts in error_table(tape, happened).items()
     }
@@ -128,18 +131,18 @@ def _errors(tape: Tape, happened: Sequence[Transient]) -> dict[str, Any]:
 def _inputs(tape: Tape, happened: Sequence[Transient]) -> dict[str, Any]:
     limited = limited_shares(tape)
     return {
-        name: {part: _numbers(figures._asdict()) for part, figures in parts.items()} | {"limited": limited.get(name)}
+        name: {part: figures._asdict() for part, figures in parts.items()} | {"limited": limited.get(name)}
         for name, parts in input_table(tape, happened).items()
     }
 
 
-def _numbers(figures: Mapping[str, float]) -> dict[str, float | None]:
-    return {key: _number(value) for key, value in figures.items()}
-
-
-def _number(value: float) -> float | None:
-    # JSON has no NaN: a part of the flight without a sample has no figure.
-    return None if math.isnan(value) else value
+def _known(value: Any) -> Any:
+    # JSON has no NaN and no infinity: a part of the flight without a sample has no figure, nor has one with values beyond all.
+    if isinstance(value, Mapping):
+        return {key: _known(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_known(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class Column(NamedTuple):

@@ -180,4 +180,8 @@ def _show(console: Console, definition: Definition, case: int, tally: Tally, fig
         console.print(f"{word}: {count} of {tally.flights}, {100 * share:.3g} % (95 %: {100 * low:.2g} to {100 * high:.2g})")
     for one in figures["fly_again"]:
         score = "diverged" if one["score"] is None else f"score {one['score']:.3g}"
-        console.print(f"worst: aircraft {one['number']}, {score}; again: {one['command']} (or --lockstep, over topics)", soft_wrap=True, highlight=False)
+        console.print(
+            f"worst: aircraft {one['number']}, {score}; again: {one['command']} (or --lockstep, over topics)",
+            soft_wrap=True,
+            highlight=False,
+        )

@@ -29,12 +29,12 @@ NOTES = """
 sees: of the flying aircraft, beside y_m. y alone is gyros and airspeed; a full state is y and the other states without error,
   vanes give alpha and beta relative to the air: no real sensor is as good, and laws that see y alone need none of them
 score: sum of rms of the true error over {unit}; mean (worst) of {aircraft} aircraft a level,
-  every entry of A and B off by up to the level, rows of angles known, seed {seed}; differences of a few % are its noise
+  every entry of A and B off by up to the level, rows of angles known, seed {seed}; a few % are the tuning's noise
 lost: aircraft with a score above 10, in % at each level; diverged ones are among them and make the mean infinite
 rms, slew: of the true error and mean abs(u_dot), nominal aircraft, in the units of the airframe and mrad/s
 delay: the most whole ticks by which u may come late with a score below three times that without
 """
-WIDTH = 150  # characters, the least that the table takes, also into a file
+WIDTH = 160  # characters, the least that the table takes, also into a file
 
 
 def compare(
@@ -80,7 +80,7 @@ def compare(
                 bar.update(task, completed=generation, description=f"{shown}: cost {least:.3f}")
 
             known.setdefault(name, {})[aim] = procedure.tune(LAWS[name], aim, here, SEEDS, progress=told)
-            procedure.save(path, known, f"rise-di compare {scenario} --tune")
+            procedure.save(path, known, f"rise-di compare {scenario} --tune --tuning {tuning}")
         tuned = {name: {aim: known[name][aim] for aim in aims if aim in known[name]} for name in names if name in known}
         require(any(tuned.values()), "--laws", "tuned gains for none of them", f"gains in {path}, or --tune, which finds them")
         task = bar.add_task("comparing", total=sum(len(by_aim) for by_aim in tuned.values()))
@@ -92,10 +92,8 @@ def compare(
     for aim in aims:
         console.print(_table(procedure.AIMS[aim], [one for one in found if one.aims == aim], chosen))
     titles = "\n".join(f"{name}: {LAWS[name].title}; knows {LAWS[name].model or 'no model'}" for name in tuned)
-    unit = ", ".join(
-        f"{procedure.UNIT[name] * units[name].factor:g} {units[name].unit} of {name}"
-        for name in chosen.aircraft.channels().outputs
-    )
+    counted = zip(chosen.controller.outputs, here.unit, strict=True)
+    unit = ", ".join(f"{one * units[name].factor:g} {units[name].unit} of {name}" for name, one in counted)
     console.print(NOTES.strip().format(titles=titles, unit=unit, aircraft=aircraft, seed=seed), style="dim", highlight=False)
     if wanted and not tune:
         missing = ", ".join(f"{name} ({aim})" for name, aim in wanted)

@@ -25,7 +25,7 @@ from flight_analysis.summary import shown_units, summarise, summarise_unflown
 from flight_bringup.graph import Autopilot, enclosed
 from flight_bringup.processes import Flight
 from flight_core.outcome import COMPLETED, INTERRUPTED
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, printable
 from flight_core.tape import Tape
 from flight_recorder.bag import bag_files
 
@@ -231,7 +231,7 @@ def _writing(folder: Path) -> Iterator[None]:
 
 def _outcome_before(summary: Path) -> str:
     try:
-        return str(json.loads(summary.read_text(encoding="utf-8"))["outcome"])
+        return printable(str(json.loads(summary.read_text(encoding="utf-8"))["outcome"]))
     except (OSError, ValueError, TypeError, KeyError):
         return "ended as its log does"
 

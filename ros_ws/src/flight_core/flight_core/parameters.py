@@ -7,14 +7,48 @@ holds, and turns whatever does not fit into a `ParameterError` of one sentence: 
 """
 
 import difflib
+import reprlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
+LONGEST_SENTENCE = 1000
+"""Characters: what is said of bad input does not grow with it."""
+
+
+def printable(text: str) -> str:
+    """A text with what does not print, such as a line's end or a terminal's commands, as escapes."""
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+
 
 class ParameterError(ValueError):
-    """A parameter, or a set of them, that cannot be flown. The message is one sentence for the user."""
+    """A parameter, or a set of them, that cannot be flown. The message is one sentence for the user, whatever it quotes.
+
+    What does not print is shown by its escape; the middle of a long one is left out.
+    """
+
+    def __init__(self, sentence: str) -> None:
+        if len(sentence) > LONGEST_SENTENCE:
+            sentence = f"{sentence[: LONGEST_SENTENCE // 2]} ... {sentence[5 - LONGEST_SENTENCE // 2 :]}"
+        super().__init__(printable(sentence))
+
+
+class _Shown(reprlib.Repr):
+    """Values as they are shown in a sentence: without end they are not."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxstring = self.maxother = self.maxlong = 120
+
+    def repr_int(self, value: int, level: int) -> str:
+        try:
+            return super().repr_int(value, level)
+        except ValueError:  # Python writes no more than 4300 digits
+            return f"a number of {value.bit_length()} bits"
+
+
+_shown = _Shown().repr
 
 
 class Parameters(BaseModel):
@@ -41,6 +75,14 @@ class NodeParameters(Parameters):
     """Base of the parameters of a node of a flight."""
 
     lockstep: bool = Field(default=False, description="move when all others have, as fast as the machine allows; no real time")
+
+
+class KeyedParameters(NodeParameters):
+    """Base of the parameters of a node whose samples can be signed."""
+
+    key_file: str = Field(
+        default="", description="file of the key that named vectors are signed and checked with (flight_core.seal); empty: none"
+    )
 
 
 def as_tuple(value: object) -> object:
@@ -96,7 +138,7 @@ def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
     location, kind, found = error["loc"], error["type"], error["input"]
     if kind == "invalid_key" or location[-1:] == ("[key]",):
         key = ".".join([where, *map(str, location[: -1 if kind == "invalid_key" else -2])])
-        return f"{key}: found the key {found!r}, expected a name"
+        return f"{key}: found the key {_shown(found)}, expected a name"
     key = where + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
     if kind == "extra_forbidden":
         known = sorted(_fields_at(cls, location[:-1]))
@@ -114,7 +156,7 @@ def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
     expected = (
         "a list of values" if kind == "tuple_type" else error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
     )
-    return f"{key}: found {found!r}, expected {expected}"
+    return f"{key}: found {_shown(found)}, expected {expected}"
 
 
 def _fields_at(cls: type[BaseModel], location: Sequence[str | int]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_core.outcome import COMPLETED
+from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 
@@ -25,9 +26,9 @@ class Signal:
     values: FloatArray
 
     def __getitem__(self, name: str) -> FloatArray:
-        """Samples of one channel, shape (N,). Raises KeyError naming the channels there are."""
+        """Samples of one channel, shape (N,). Raises ParameterError naming the channels there are."""
         if name not in self.names:
-            raise KeyError(f"no channel {name} among {', '.join(self.names)}")
+            raise ParameterError(f"the log: found no channel {name} among {', '.join(self.names)}, expected one")
         return self.values[:, self.names.index(name)]
 
     def until(self, end_ns: int) -> "Signal":
@@ -52,9 +53,9 @@ class Tape:
     outcome: str = COMPLETED
 
     def __getitem__(self, topic: str) -> Signal:
-        """The signal of a topic. Raises KeyError naming the topics there are."""
+        """The signal of a topic. Raises ParameterError naming the topics there are."""
         if topic not in self.signals:
-            raise KeyError(f"no topic {topic} on this tape, only {', '.join(self.signals) or 'none'}")
+            raise ParameterError(f"the log: found no topic {topic} among {', '.join(self.signals) or 'none'}, expected one")
         return self.signals[topic]
 
     def __contains__(self, topic: str) -> bool:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self, cast
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from flight_core.files import is_file, read_yaml
+from flight_core.files import is_file, is_folder, parse_yaml, read_yaml
 from flight_core.parameters import ParameterError, require
 from flight_recorder.definitions import Definition, definition
 from flight_recorder.disk import ReservedFile, replace_text
@@ -190,7 +190,7 @@ def bag_files(run: Path) -> list[Path]:
     """
     if is_file(run):
         return [run]
-    files = list(run.glob("*.mcap"))
+    files = [file for file in run.glob("*.mcap") if is_file(file)] if is_folder(run) else []
     stems = {re.sub(r"_\d+$", "", file.stem) for file in files}
     found = f"{len(files)} .mcap files that are no parts of one bag"
     require(len(stems) < 2, str(run), found, "one bag in the folder of a run")
@@ -206,9 +206,11 @@ def read_information(run: Path) -> tuple[dict[str, Any], int]:
     try:
         information: dict[str, Any] = dict(tree[INFORMATION])
         first, last = information["starting_time"]["nanoseconds_since_epoch"], information["duration"]["nanoseconds"]
-        return information, int(first) + int(last)
-    except (KeyError, TypeError, ValueError):
+        end_ns = int(first) + int(last)
+    except (KeyError, OverflowError, TypeError, ValueError):
         raise ParameterError(f"{METADATA}: found something else, expected that of rosbag2") from None
+    require(abs(end_ns) < 2**63, METADATA, "an end at no instant", "that of rosbag2")
+    return information, end_ns
 
 
 def information_of(files: Sequence[Contents], before: Mapping[str, Any] | None = None) -> str:
@@ -223,7 +225,7 @@ def information_of(files: Sequence[Contents], before: Mapping[str, Any] | None =
                 "name": count.topic,
                 "type": count.type_name,
                 "serialization_format": "cdr",
-                "offered_qos_profiles": yaml.safe_load(count.qos) or [],
+                "offered_qos_profiles": _profiles(count.qos),
                 "type_description_hash": count.type_hash,
             },
             "message_count": count.messages,
@@ -244,6 +246,15 @@ def information_of(files: Sequence[Contents], before: Mapping[str, Any] | None =
         "ros_distro": kept.get("ros_distro", "jazzy"),
     }
     return yaml.safe_dump({INFORMATION: information}, sort_keys=False)
+
+
+def _profiles(qos: str) -> list[Any]:
+    """The offered profiles as a channel says them; none where that is no list."""
+    try:
+        found = parse_yaml(qos, "qos", "a list")
+    except ParameterError:
+        return []
+    return found if isinstance(found, list) else []
 
 
 def _extent(files: Sequence[Contents]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO
 
+import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -28,17 +29,22 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 # What reading raises where bytes were changed: between records, inside one, inside a compressed chunk.
-DAMAGE = (McapError, CRCValidationError, MemoryError, OverflowError, UnicodeDecodeError, struct.error, zstandard.ZstdError)
+DAMAGE = (McapError, MemoryError, OverflowError, UnicodeDecodeError, struct.error, zstandard.ZstdError)
 
 RECORD = struct.Struct("<BQ")  # opcode and length, in front of each record (MCAP specification, Records)
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time and publish time, in front of each message
 TIMES = struct.Struct("<QQ")  # log times of the first and the last message, in front of each chunk
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, where the index and its offsets begin, checksum
 CRC = struct.Struct("<I")
+
+LARGEST_UNPACKED = 64 << 20
+"""Bytes of a chunk that is larger than it is packed: one of 1 kB may say that it holds any number of them, and may hold 20 MB.
+
+Recorders close a chunk at about 1 MB, or behind the message that makes it larger.
+"""
 
 READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.SCHEMA: Schema.read,
@@ -116,12 +122,12 @@ class Scan:
 
     def _frames(self, stream: IO[bytes], size: int, index: Sequence[McapRecord]) -> Iterator[tuple[int, bytes]]:
         """Opcode and content of each record up to the index; behind one that is damaged, of the next that the index knows."""
-        known = sorted(
+        starts = (
             record.chunk_start_offset if isinstance(record, ChunkIndex) else record.offset
             for record in index
             if isinstance(record, ChunkIndex | AttachmentIndex | MetadataIndex)
         )
-        known.append(size)
+        known = [*sorted(start for start in starts if start < size), size]
         stream.seek(0)
         place = len(MCAP0_MAGIC)
         if stream.read(place) != MCAP0_MAGIC:
@@ -162,8 +168,7 @@ def _split(data: bytes) -> Iterator[McapRecord]:
 def _unpack(opcode: int, content: bytes) -> Iterator[McapRecord]:
     """The record, or those in a chunk. Raises one of DAMAGE."""
     if opcode == Opcode.CHUNK:
-        stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(content))), validate_crc=True)
-        yield from _split(stream.read(size))
+        yield from _split(_unpacked(Chunk.read(ReadDataStream(BytesIO(content)))))
     elif opcode == Opcode.MESSAGE:
         channel, sequence, log_time, publish_time = MESSAGE.unpack_from(content)
         yield Message(channel, log_time, content[MESSAGE.size :], publish_time, sequence)
@@ -173,3 +178,26 @@ def _unpack(opcode: int, content: bytes) -> Iterator[McapRecord]:
             if crc not in (0, zlib.crc32(content[: -CRC.size])):
                 raise McapError("an attachment whose bytes were changed")
         yield READ[opcode](ReadDataStream(BytesIO(content)))
+
+
+def _unpacked(chunk: Chunk) -> bytes:
+    """The records of a chunk as bytes, no more of them than it says. Raises one of DAMAGE."""
+    size = chunk.uncompressed_size
+    if size > max(LARGEST_UNPACKED, len(chunk.data)):
+        raise McapError(f"a chunk that says it holds {size} bytes")
+    if chunk.compression == "zstd":
+        if zstandard.frame_content_size(chunk.data) > size:  # it would be taken at its word
+            raise McapError("a chunk that holds more than it says")
+        data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
+    elif chunk.compression == "lz4":
+        try:
+            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size)
+        except RuntimeError as error:
+            raise McapError(str(error)) from None
+    elif chunk.compression:
+        raise McapError(f"a chunk packed by {chunk.compression}")
+    else:
+        data = chunk.data
+    if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise McapError("a chunk whose bytes were changed")
+    return data

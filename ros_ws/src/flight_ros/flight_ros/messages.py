@@ -19,6 +19,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from flight_core.rates import NANOSECONDS
+from flight_core.seal import BLANK, MARK, Seal, mac_place
 from flight_core.vectors import ChannelError, FloatArray, select
 
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
@@ -50,19 +51,22 @@ def from_message(message: JointState, wanted: Sequence[str]) -> StampedVector:
     """The wanted channels of a message. Raises ChannelError where names, lengths or values do not fit."""
     stamp = message.header.stamp
     value = select(wanted, message.name, message.position)
-    return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, message.header.frame_id)
+    return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, _instance(message.header.frame_id))
 
 
 class Encoder:
     """Samples of one publisher as the bytes of a message; without names: vectors without channels.
 
     In lockstep the latter say that there is no sample at an instant. Layout by CDR (OMG Common Object Request Broker
-    Architecture, 9.3): each value stands at a multiple of its size behind the encapsulation, with zeros in between.
+    Architecture, 9.3): each value stands at a multiple of its size behind the encapsulation, with zeros in between. With a
+    `seal` each message is signed, behind `frame_id`.
     """
 
-    def __init__(self, names: Sequence[str], frame_id: str) -> None:
+    def __init__(self, names: Sequence[str], frame_id: str, seal: Seal | None = None) -> None:
+        self._seal = seal
         self._bytes = bytearray(ENCAPSULATION + bytes(STAMP.size))
-        self._add_string(frame_id)
+        self._add_string(frame_id + BLANK if seal is not None else frame_id)
+        self._mac = mac_place(self._bytes)
         self._add_count(len(names))
         for name in names:
             self._add_string(name)
@@ -89,22 +93,35 @@ class Encoder:
         """One sample, values in the order of the names."""
         STAMP.pack_into(self._bytes, STAMP_PLACE, *divmod(stamp_ns, NANOSECONDS))
         self._bytes[self._values] = values.tobytes()
-        return bytes(self._bytes)
+        message = bytes(self._bytes)
+        if self._seal is None:
+            return message
+        return message[: self._mac.start] + self._seal.mac(message) + message[self._mac.stop :]
 
 
 class Decoder:
-    """Bytes of one topic as samples: the wanted channels, by name."""
+    """Bytes of one topic as samples: the wanted channels, by name. With a `seal` those alone that are signed, and new."""
 
-    def __init__(self, wanted: Sequence[str]) -> None:
+    def __init__(self, wanted: Sequence[str], seal: Seal | None = None) -> None:
         self._wanted = list(wanted)
+        self._seal = seal
         self._fixed = b""  # what does not change between the samples of the last sender
         self._names: list[str] = []
         self._order: list[int] = []
         self._place = 0
+        self._mac = slice(0, 0)
         self._sender = ""
 
     def decode(self, raw: bytes) -> StampedVector | None:
         """The sample, None for a vector without channels. Raises ChannelError where it cannot be used."""
+        if self._seal is None:
+            return self._decode(raw)
+        self._seal.check(raw)
+        if (sample := self._decode(raw)) is not None:
+            self._seal.let_in(sample.stamp_ns)
+        return sample
+
+    def _decode(self, raw: bytes) -> StampedVector | None:
         if not self._fixed or self._fixed_part(raw) != self._fixed:
             message = _message(raw)
             if not message.name and not message.position:
@@ -119,16 +136,23 @@ class Decoder:
         return StampedVector(seconds * NANOSECONDS + nanoseconds, value, self._sender)
 
     def _fixed_part(self, raw: bytes) -> bytes:
-        return raw[:STAMP_PLACE] + raw[STAMP_PLACE + STAMP.size : self._place] + raw[self._place + 8 * len(self._names) :]
+        mac, end = self._mac, self._place + 8 * len(self._names)
+        return raw[:STAMP_PLACE] + raw[STAMP_PLACE + STAMP.size : mac.start] + raw[mac.stop : self._place] + raw[end:]
 
     def _learn(self, message: JointState, raw: bytes) -> None:
         encoder = Encoder(message.name, message.header.frame_id)
         stamp = message.header.stamp
         if encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position)) != raw:
             return  # it holds more than a named vector; it is read the long way
-        self._names, self._place, self._sender = list(message.name), encoder.place, message.header.frame_id
+        self._names, self._place, self._mac = list(message.name), encoder.place, mac_place(raw)
+        self._sender = _instance(message.header.frame_id)
         self._order = [self._names.index(name) for name in self._wanted]
         self._fixed = self._fixed_part(raw)
+
+
+def _instance(frame_id: str) -> str:
+    """The publisher's instance, without the code that it signs with."""
+    return frame_id.partition(MARK)[0]
 
 
 def stamp_of(raw: bytes) -> int:

@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 import traceback
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import Any, Generic, TypeVar
@@ -19,21 +19,25 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.signals import SignalHandlerOptions
 
 from flight_core.outcome import FlightEnded
-from flight_core.parameters import NodeParameters, ParameterError
+from flight_core.parameters import KeyedParameters, NodeParameters, ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
+from flight_core.seal import Seal, read_key
 from flight_ros import transport
 from flight_ros.company import Company
 from flight_ros.inbox import Inbox, Waiter
+from flight_ros.messages import Decoder, Encoder
 from flight_ros.parameters import changed, read_parameters
-from flight_ros.ticker import Tick, Ticker
+from flight_ros.source import SENDER
+from flight_ros.ticker import Tick, Ticker, wake_on_time
 from flight_ros.topics import DIAGNOSTICS, LISTEN, PUBLISH, STEP, Topic
 
 P = TypeVar("P", bound=NodeParameters)
@@ -53,6 +57,10 @@ ACKNOWLEDGED_WITHIN = Duration(seconds=0.5)  # at the end of a lockstep flight, 
 
 BUSY_PAUSE = 0.1  # s, between two looks at signals of life and service calls while a lockstep flight moves
 
+REPEAT_NS = 2 * NANOSECONDS  # before the same is said again
+
+CLOCK_STEP_NS = NANOSECONDS // 20  # in a second a clock is slewed by a hundredth of it
+
 NICE_PAUSE = 0.02  # s, the longest sleep, so that a signal or a service call is not left waiting
 
 
@@ -68,14 +76,25 @@ class FlightNode(Node, Generic[P]):
         # In lockstep the same flight gives the same bytes, so the process is left out.
         process = "" if self.parameters.lockstep else f"#{os.getpid()}"
         self.instance = self.get_fully_qualified_name() + process
+        key_file = self.parameters.key_file if isinstance(self.parameters, KeyedParameters) else ""
+        self._key = read_key(key_file, f"{name}.key_file") if key_file else None
+        # Samples of the time before this node are not flown. Lockstep has no such time: it begins at 0, with all that was sent.
+        self._since_ns = None if self.parameters.lockstep else time.time_ns()
+        if self._key is not None:
+            self.get_logger().info(f"samples are signed, and those that are not refused, with the key in {key_file}")
         self.rejected: Counter[str] = Counter()
+        self._rejected_said_ns: dict[str, int] = {}
+        self._intruder = ""  # who publishes beside the one that is listened to, since the last report
         self._inboxes: list[Inbox] = []
+        self._outlets: list[Publisher] = []
         self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to say it next
         self._diagnostics = self.create_publisher(DIAGNOSTICS.type, DIAGNOSTICS.name, PUBLISH)
         self._periods: list[int] = []
         self._compute: list[int] = []
         self._missed = 0
         self._last_tick_ns: int | None = None
+        self._ahead_ns = 0  # of the time of the ticks before the monotonic clock
+        self._clock_ns = 0  # how far the system clock was set since the start
 
     # What a subclass says
 
@@ -113,8 +132,9 @@ class FlightNode(Node, Generic[P]):
 
     def outlet(self, topic: Topic) -> Callable[[bytes], None]:
         """A publisher of serialised messages on a topic of the flight, as the function that publishes one."""
-        handle = self.create_publisher(topic.type, topic.name, STEP if self.parameters.lockstep else PUBLISH).handle
-        publish: Callable[[bytes], None] = handle.publish_raw
+        publisher = self.create_publisher(topic.type, topic.name, STEP if self.parameters.lockstep else PUBLISH)
+        self._outlets.append(publisher)
+        publish: Callable[[bytes], None] = publisher.handle.publish_raw
         return publish
 
     def inbox(self, topic: Topic, qos: QoSProfile | None = None) -> Inbox:
@@ -123,10 +143,37 @@ class FlightNode(Node, Generic[P]):
         self._inboxes.append(inbox)
         return inbox
 
+    def encoder(self, topic: Topic, names: Sequence[str]) -> Encoder:
+        """Samples of a topic as messages of this node, signed where it has a key."""
+        return Encoder(names, self.instance, self._seal(topic))
+
+    def decoder(self, topic: Topic, wanted: Sequence[str]) -> Decoder:
+        """Messages of a topic as samples; where the node has a key, those alone that are signed with it, each once."""
+        return Decoder(wanted, self._seal(topic))
+
+    def _seal(self, topic: Topic) -> Seal | None:
+        return None if self._key is None else Seal(self._key, self.resolve_topic_name(topic.name), self._since_ns)
+
     def reject(self, inbox: Inbox, reason: str, sentence: str) -> None:
-        """Count a sample that cannot be used, and say so at most once in 2 s."""
-        self.rejected[f"{inbox.topic.name}: {reason}"] += 1
-        self.get_logger().warning(f"{inbox.name}: sample refused: {sentence}", throttle_duration_sec=2.0)
+        """Count a sample that cannot be used, and say so, of each topic and reason at most once in 2 s.
+
+        A second publisher is an alarm: an ERROR here and in the diagnostics.
+        """
+        what, now_ns = f"{inbox.topic.name}: {reason}", time.monotonic_ns()
+        self.rejected[what] += 1
+        if reason == SENDER:
+            self._intruder = f"{inbox.name}: {sentence}"
+        if now_ns - self._rejected_said_ns.get(what, -REPEAT_NS) < REPEAT_NS:
+            return
+        self._rejected_said_ns[what] = now_ns
+        if reason == SENDER:
+            self.get_logger().error(f"{inbox.name}: sample refused: {sentence}")
+        else:
+            self.get_logger().warning(f"{inbox.name}: sample refused: {sentence}")
+
+    def now_ns(self) -> int:
+        """The time of the ticks, ns: the system clock as it was at the start, gone on with the monotonic clock."""
+        return time.monotonic_ns() + self._ahead_ns
 
     def waiting_for(self, inbox: Inbox) -> None:
         """Called at each tick while nothing comes on a topic: says so after 3 s, then every 2 s, and who is there."""
@@ -167,8 +214,25 @@ class FlightNode(Node, Generic[P]):
         self.tick(tick, now_ns)
         self._compute.append(time.monotonic_ns() - begin_ns)
 
+    def keep_time(self, start_ns: int, monotonic_ns: int) -> None:
+        """Ticks count from here: one instant on both clocks."""
+        self._ahead_ns = start_ns - monotonic_ns
+
+    def check_clock(self) -> None:
+        """Say where the system clock was set: the node goes on with the time it began with, one started now does not."""
+        set_ns = time.time_ns() - self.now_ns()
+        if abs(set_ns - self._clock_ns) > CLOCK_STEP_NS:
+            by = f"the system clock was set by {seconds(set_ns - self._clock_ns):+.3f} s"
+            rest = (
+                "it is right again" if abs(set_ns) <= CLOCK_STEP_NS else "this node goes on with its own; restart all or none"
+            )
+            self.get_logger().error(f"{by}: {rest}")
+            self._clock_ns = set_ns
+
     def check_graph(self) -> None:
         """Say what keeps a topic silent for ever: another type, or an incompatible quality of service."""
+        for publisher in self._outlets:
+            self._check_listeners(publisher)
         for inbox in self._inboxes:
             wanted = f"{inbox.topic.type.__module__.split('.')[0]}/msg/{inbox.topic.type.__name__}"
             for peer in self.get_publishers_info_by_topic(inbox.name):
@@ -183,6 +247,20 @@ class FlightNode(Node, Generic[P]):
                     self.get_logger().error(
                         f"{inbox.name}: quality of service of {node} does not fit: {reason}", throttle_duration_sec=5.0
                     )
+
+    def _check_listeners(self, publisher: Publisher) -> None:
+        known = self.get_publishers_info_by_topic(publisher.topic_name)
+        offered = next((one.qos_profile for one in known if one.node_name == self.get_name()), None)
+        if offered is None:  # the graph does not know of it yet; it tells of both sides in the same terms
+            return
+        for peer in self.get_subscriptions_info_by_topic(publisher.topic_name):
+            compatibility, reason = qos_check_compatible(offered, peer.qos_profile)
+            if compatibility == QoSCompatibility.ERROR:
+                node = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
+                self.get_logger().error(
+                    f"{publisher.topic_name}: quality of service of {node}, which listens, does not fit: {reason}",
+                    throttle_duration_sec=5.0,
+                )
 
     def steps(self) -> bool:
         """Whether it moves by `advance` in lockstep; else by `tick` in real time."""
@@ -207,6 +285,8 @@ class FlightNode(Node, Generic[P]):
     def publish_diagnostics(self) -> None:
         """The 1 Hz report: loop period, compute time, missed ticks, refused samples, and what the node adds."""
         level, sentence, figures = self.status()
+        if self._intruder:
+            level, sentence, self._intruder = DiagnosticStatus.ERROR, self._intruder, ""
         shown: dict[str, object] = {"missed ticks": self._missed}
         for key, sample in (("period", self._periods), ("compute time", self._compute)):
             if sample:
@@ -295,11 +375,20 @@ def _refuse(sentence: str) -> int:
     return 2
 
 
-def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any]) -> None:
-    try:
-        executor.spin_once(timeout_sec=0)
-    except Exception as error:  # a service request that rclpy cannot serve, such as an invalid lifecycle transition
-        node.get_logger().error(f"request refused: {' '.join(str(error).split())}")
+def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: int = 0) -> None:
+    """Serve one request, where there is one, and further ones until an instant of the monotonic clock."""
+    while True:
+        try:
+            handler, _, _ = executor.wait_for_ready_callbacks(0, None, lambda: False)
+        except TimeoutException:
+            return
+        try:
+            handler()
+            handler.result()  # raises what it has raised
+        except Exception as error:  # a service request that rclpy cannot serve, such as an invalid lifecycle transition
+            node.get_logger().error(f"request refused: {' '.join(str(error).split())}")
+        if time.monotonic_ns() >= until_ns:
+            return
 
 
 def _begin(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
@@ -346,22 +435,26 @@ def _loop(node: FlightNode[Any], stop: _Stop) -> None:
         raise ParameterError(
             f"{node.get_name()}.start_time: found an instant {seconds(past):.0f} s ago, expected one to come, or 0"
         )
-    ticker = Ticker(node.period_ns(), time.monotonic_ns() + start_ns - time.time_ns())
+    begin_ns = time.monotonic_ns() + start_ns - time.time_ns()
+    node.keep_time(start_ns, begin_ns)
+    ticker = Ticker(node.period_ns(), begin_ns)
     if (lead := start_ns - time.time_ns()) > nanoseconds(60):
         node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
     serve_ns = report_ns = time.monotonic_ns()
+    chores: deque[Callable[[], None]] = deque()
+    wake_on_time()
     while not stop.requested:
-        pause = ticker.remaining()
-        if pause > 0:
-            time.sleep(min(pause, NICE_PAUSE))
+        ticker.wait(NICE_PAUSE)
         if (tick := ticker.due()) is not None:
             node.run_tick(tick, start_ns + tick.number * ticker.period_ns)
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
             serve_ns = now_ns + nanoseconds(NICE_PAUSE)
-            _serve(executor, node)
+            # half of what is left to the next tick, which no request may hold up
+            _serve(executor, node, now_ns + nanoseconds(max(ticker.remaining(), 0.0) / 2.0))
             node.require_company()
         if now_ns >= report_ns:
             report_ns = now_ns + NANOSECONDS
-            node.publish_diagnostics()
-            node.check_graph()
+            chores += (node.publish_diagnostics, node.check_graph, node.check_clock)
+        if chores:  # one a tick: together they may outlast a period of 2 ms
+            chores.popleft()()

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flight_core.parameters import (
-    Names,
     KeyedParameters,
+    Names,
     Numbers,
     ParameterError,
     Parameters,

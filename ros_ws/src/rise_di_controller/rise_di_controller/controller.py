@@ -3,6 +3,8 @@
 """The controller from sample to sample: what has come, one tick, what is to be published. Flown by the node and in process."""
 
 from collections import deque
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from flight_core.rates import seconds
@@ -18,11 +20,16 @@ class Commanded(NamedTuple):
 
     stamp_ns: int  # that of the y it answers
     u: FloatArray  # (m,) in the order of the parameters' inputs
-    internals: FloatArray  # in the order of `Controller.names`
+    log: Callable[[], FloatArray]
+
+    @property
+    def internals(self) -> FloatArray:
+        """For the log, in the order of `Controller.names`; made when asked for, so that u need not wait."""
+        return self.log()
 
 
 class Controller:
-    """`guard.tick` with its memory: the state, the newest y and the last y_m."""
+    """`guard.tick` with its memory: the state, the last y and y_m."""
 
     def __init__(self, parameters: ControllerParameters) -> None:
         self._law, self._guard = parameters.law(), parameters.guard()
@@ -31,7 +38,7 @@ class Controller:
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
         self._digest = parameters.digest()
-        self._y: deque[Sample] = deque(maxlen=1)
+        self._y: deque[Sample] = deque(maxlen=guard.KEPT_REFERENCES)
         self._y_m: deque[Sample] = deque(maxlen=guard.KEPT_REFERENCES)
 
     @property
@@ -78,15 +85,22 @@ class Controller:
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> Commanded | None:
         """One tick at `now_ns`, `late_ns` after its deadline; None where nothing is to be published."""
-        y = self._y[-1] if self._y else None
+        y = self._newest_pair()
         self._state, used = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, active)
         if used is None:
             return None
         self._number += 1
         age = seconds(now_ns - used.stamp_ns)
         limits, digest = self._guard.limits, self._digest
-        values = internals.values(self._state, used, limits, seconds(late_ns), age, self._number, digest)
-        return Commanded(used.stamp_ns, self._state.u, values)
+        log = partial(internals.values, self._state, used, limits, seconds(late_ns), age, self._number, digest)
+        return Commanded(used.stamp_ns, self._state.u, log)
+
+    def _newest_pair(self) -> Sample | None:
+        """The newest y that y_m reaches; where y_m comes late, a tick takes the y before instead of letting go of u."""
+        if not self._y_m:
+            return self._y[-1] if self._y else None
+        reached_ns = self._y_m[-1].stamp_ns + self._guard.period_ns
+        return next((sample for sample in reversed(self._y) if sample.stamp_ns <= reached_ns), self._y[-1] if self._y else None)
 
     def ages(self, now_ns: int) -> dict[str, float]:
         """How old the newest y and y_m are, s; those that have come."""

@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterator
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
-from flight_core.rates import period_ns
+from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError
 from flight_ros.inbox import Inbox
-from flight_ros.messages import NO_CHANNELS, Decoder, Encoder
+from flight_ros.messages import NO_CHANNELS, Decoder
 from flight_ros.runtime import FlightNode, run
+from flight_ros.source import Source
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
@@ -54,17 +55,19 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         self._active = False
         self._controller = Controller(self.parameters)
         outputs = self.parameters.outputs
-        self._y_inbox, self._y_decoder = self.inbox(Y), Decoder(outputs)
-        self._y_m_inbox, self._y_m_decoder = self.inbox(Y_M), Decoder(outputs)
+        self._y_inbox, self._y_decoder = self.inbox(Y), self.decoder(Y, outputs)
+        self._y_m_inbox, self._y_m_decoder = self.inbox(Y_M), self.decoder(Y_M, outputs)
         self._publish_u, self._publish_internals = self.outlet(U), self.outlet(INTERNALS)
-        self._u_encoder = Encoder(self.parameters.inputs, self.instance)
-        self._internals_encoder = Encoder(self._controller.names, self.instance)
+        self._u_encoder = self.encoder(U, self.parameters.inputs)
+        self._internals_encoder = self.encoder(INTERNALS, self._controller.names)
         if self.parameters.lockstep:
-            self._nothing = Encoder((), self.instance)
+            self._nothing = self.encoder(U, ())
             self._number = 0  # of the y that comes next
             self._y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
             self._y_due: deque[Sample | None] = deque()
             self._y_m_due: deque[Sample] = deque()
+        self._y_source, self._y_m_source = Source(), Source()
+        self._last_ns = 0  # of the last tick
         if self.parameters.autostart:
             self.trigger_configure()
             self.trigger_activate()
@@ -98,16 +101,45 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         now_ns += tick.late_ns
-        for inbox, decoder, take in (
-            (self._y_inbox, self._y_decoder, self._controller.take_y),
-            (self._y_m_inbox, self._y_m_decoder, self._controller.take_y_m),
-        ):
-            for sample in self._samples(inbox, decoder):
-                if sample is not None:
-                    self._take(inbox, take, sample, now_ns)
+        if self._last_ns and now_ns - self._last_ns > self._max_age_ns:
+            self._catch_up(now_ns)
+        self._last_ns = now_ns
+        self._take_all(self._y_inbox, self._y_decoder, self._y_source, self._controller.take_y, now_ns)
+        self._take_all(self._y_m_inbox, self._y_m_decoder, self._y_m_source, self._controller.take_y_m, now_ns)
         self._fly(now_ns, tick.late_ns)
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._say_what_is_missing(now_ns)
+
+    @property
+    def _max_age_ns(self) -> int:
+        return nanoseconds(self.parameters.max_age)
+
+    def _catch_up(self, now_ns: int) -> None:
+        """After a time in which it was itself held up: the ticks in which it would have lost y and let go of u.
+
+        The aircraft has let go of u meanwhile; the law then begins from where that is, not from where u was.
+        """
+        self.get_logger().warning(f"held up for {seconds(now_ns - self._last_ns):.3f} s: engages anew")
+        self._fly(self._last_ns + self._max_age_ns + self.period_ns(), 0)
+        self._fly(now_ns, 0)
+
+    def _take_all(
+        self, inbox: Inbox, decoder: Decoder, source: Source, take: Callable[[Sample, int], None], now_ns: int
+    ) -> None:
+        """All that has come, but for samples that are bad, or of a second publisher.
+
+        Another node than the one before is listened to once u has gone to trim.
+        """
+        strange_ns = self._max_age_ns + nanoseconds(self.parameters.hold + self.parameters.ramp)
+        for received in inbox.take():
+            try:
+                decoded = decoder.decode(received.message)
+                if decoded is not None:
+                    source.require(decoded.sender, now_ns, self._max_age_ns, strange_ns)
+                    take(Sample(decoded.stamp_ns, decoded.value), now_ns)
+                    source.hear(decoded.sender, now_ns)
+            except ChannelError as error:
+                self.reject(inbox, error.reason, str(error))
 
     def _samples(self, inbox: Inbox, decoder: Decoder) -> Iterator[Sample | None]:
         for received in inbox.take():
@@ -173,7 +205,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         level = DiagnosticStatus.OK if mode is Mode.ENGAGED else DiagnosticStatus.WARN
         ages = {}
         if not self.parameters.lockstep:
-            found = self._controller.ages(self.get_clock().now().nanoseconds)
+            found = self._controller.ages(self.now_ns())
             ages = {f"age of {name} (s)": f"{age:.4f}" for name, age in found.items()}
         return level, mode.name, {"mode": mode.name, "sign": self._controller.sign.name, **ages}
 

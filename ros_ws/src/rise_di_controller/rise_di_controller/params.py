@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from flight_core.parameters import (
+    KeyedParameters,
     Names,
-    NodeParameters,
     NonNegatives,
     Numbers,
     ParameterError,
@@ -65,7 +65,7 @@ class FeedforwardParameters(Parameters):
         return Nominal(A, B, C, gravity, np.linalg.inv(C @ B), np.array(self.lead))
 
 
-class ControllerParameters(NodeParameters):
+class ControllerParameters(KeyedParameters):
     """All parameters of the controller's node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of the law, Hz")
@@ -144,7 +144,7 @@ class ControllerParameters(NodeParameters):
 
         BLAKE2b of the names and values, without what says how the node is run.
         """
-        flown = self.model_dump(exclude={"lockstep", "y_rate", "autostart"})
+        flown = self.model_dump(exclude={"lockstep", "y_rate", "autostart", "key_file"})
         return int.from_bytes(blake2b(json.dumps(sorted(flatten(flown))).encode(), digest_size=6).digest(), "big")
 
     def law(self) -> LawParams:

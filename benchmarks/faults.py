@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The fault campaign of tests/ros/faults, several times in a row, as a table.
+
+    .venv/bin/python -m benchmarks.faults [--times 10] [--json FILE] [--only "killed or stopped"]
+
+Reaction: from the fault to the first that anybody notices it. Recovery: from the fault's end, of a killed node from its being
+ready, to the law flying again. An instant is that at which the middleware had the message that tells of it. Where the machine
+held a process of the flight back for longer than QUIET, the times are the machine's too: those runs count, their times do
+not, unless there are no others; then the row is marked.
+"""
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+CAMPAIGN = REPOSITORY / "tests" / "ros" / "faults"
+QUIET = 0.02  # s
+
+Row = dict[str, Any]
+
+
+def fly(times: int, seed: int, only: str) -> list[Row]:
+    """All cases, each so many times in a row; a row a time."""
+    with tempfile.TemporaryDirectory() as folder:
+        table = Path(folder) / "rows.jsonl"
+        options = [f"--faults-table={table}", f"--faults-times={times}", f"--faults-seed={seed}", f"--timeout={120 * times}"]
+        command = [sys.executable, "-m", "pytest", "-q", str(CAMPAIGN), *options, *(["-k", only] if only else [])]
+        subprocess.run(command, cwd=REPOSITORY, check=False, stdout=sys.stderr)  # noqa: S603 - our own interpreter
+        if not table.exists():
+            sys.exit("error: no case was flown")
+        return [json.loads(line) for line in table.read_text(encoding="utf-8").splitlines()]
+
+
+def summarise(rows: Sequence[Row]) -> list[Row]:
+    """One row a case: injected, detected, passed, median and worst of each time in s."""
+    cases: dict[str, list[Row]] = {}
+    for row in rows:
+        cases.setdefault(row["case"], []).append(row)
+    return [_summary(case, those) for case, those in cases.items()]
+
+
+def _summary(case: str, rows: Sequence[Row]) -> Row:
+    passed = [row for row in rows if row["passed"]]
+    quiet = [row for row in passed if row["held_back"] <= QUIET]
+    judged = quiet or passed
+    summary: Row = {"case": case, "u": rows[0]["does"], "injected": len(rows), "passed": len(passed), "quiet": len(quiet)}
+    summary["detected"] = sum(row["reaction"] is not None for row in passed) if rows[0]["expected"] else None
+    summary["held_back"] = max((row["held_back"] for row in judged), default=None)
+    for key in ("reaction", "recovery", "ready_to_traffic", "exec_to_traffic", "longest_pause"):
+        values = [row[key] for row in judged if row.get(key) is not None]
+        summary[key] = {"median": statistics.median(values), "worst": max(values)} if values else None
+    return summary
+
+
+def shown(summaries: Sequence[Row]) -> Table:
+    """For a terminal; ms."""
+    table = Table(title="Faults, times in ms, median / worst")
+    for name, justify in (("fault", "left"), ("injected", "right"), ("detected", "right")):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for name in ("passed", "reaction", "recovery", "traffic", "pause"):
+        table.add_column(name, justify="right")
+    for one in summaries:
+        times = [_milliseconds(one[key]) for key in ("reaction", "recovery", "ready_to_traffic", "longest_pause")]
+        busy = "" if one["quiet"] else " *"
+        detected = "-" if one["detected"] is None else str(one["detected"])
+        table.add_row(one["case"] + busy, str(one["injected"]), detected, str(one["passed"]), *times)
+    table.caption = "traffic: from ready to the first of all that a killed node says; "
+    table.caption += "pause: the longest of a topic that is to go on; "
+    table.caption += f"*: in no run was the machine free enough (a process held back by {1e3 * QUIET:g} ms at most)"
+    return table
+
+
+def _milliseconds(times: Row | None) -> str:
+    return "-" if times is None else f"{1e3 * times['median']:.0f} / {1e3 * times['worst']:.0f}"
+
+
+def main(
+    times: Annotated[int, typer.Option(min=1, help="How often each fault is done in a row.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first time; they count up.")] = 1,
+    only: Annotated[str, typer.Option(help="Cases by parts of their names, as pytest's -k takes them.")] = "",
+    file: Annotated[Path | None, typer.Option("--json", help="Where to write the table for machines.")] = None,
+) -> None:
+    """Fly the fault campaign and print its table; exit status 1 where a case did not pass each time."""
+    summaries = summarise(fly(times, seed, only))
+    if file is not None:
+        file.write_text(json.dumps(summaries, indent=2) + "\n", encoding="utf-8")
+    Console().print(shown(summaries))
+    if any(one["passed"] < times for one in summaries):
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    typer.run(main)

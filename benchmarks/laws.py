@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What tuned laws are worth where they were not tuned: other gusts, sines, turbulence, and an observer wrong about the wind.
+
+python -m benchmarks.laws    # the gains of osprey_servo that ship, some minutes
+"""
+
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from benchmarks.sampling import SINES, new_table
+from rich.console import Console
+from rich.progress import track
+
+from flight_analysis.scenario import Scenario
+from flight_bringup.scenarios import find_scenario
+from flight_campaign.compare import Compared, compare
+from flight_campaign.tuning import Arena, Tuned, arena, file_of, load
+
+LAWS = ("rise", "rise_ff", "rise_observer", "lqg", "pi", "pi_ff", "l1", "indi", "lqi_vanes")
+OBSERVER = "rise_observer"
+LEVELS = (0.3, 0.5)
+GUSTS = {
+    "vertical": {"start": 41.3, "speed": -8.0, "length": 30.0},
+    "lateral": {"start": 47.0, "speed": -6.0, "length": 25.0},
+}  # s, m/s, m: longer, upwards, from the left
+TURBULENCE = {"altitude": 100.0, "wind": 15.4, "seed": 3}  # m; m/s at 20 ft, moderate by MIL-F-8785C
+NOISE_SEED = 7
+WIDTH = 110  # characters, the least that the table takes, also into a file
+WRONG = (0.3, 0.5, 0.5, 1.0)
+"""By how much each entry of the observer's wind columns is off, drawn anew for each; 1 stands for none of them at all."""
+
+
+def courses(scenario: Scenario) -> dict[str, Scenario]:
+    """The scenario as it was tuned on, and others."""
+    sensors: dict[str, Any] = scenario.aircraft.sensors.model_dump() | {"seed": NOISE_SEED}
+    return {
+        "as tuned": scenario,
+        "other gusts and noise": scenario.vary(aircraft={"gusts": GUSTS, "sensors": sensors}),
+        "sines": scenario.vary(reference_model={"pulses": {}, "sines": SINES}),
+        "turbulence": scenario.vary(aircraft={"gusts": {}, "turbulence": TURBULENCE}),
+    }
+
+
+def wrong_wind(here: Arena) -> Iterator[tuple[str, Arena]]:
+    """The arena with an observer that knows the wind's columns wrongly; the aircraft stay."""
+    generator = np.random.default_rng(5)
+    for part in WRONG:
+        factor = 1.0 + part * generator.uniform(-1.0, 1.0, here.known.wind.shape) if part < 1.0 else 0.0
+        name = f"wind wrong by up to {100.0 * part:g} %" if part < 1.0 else "no wind known"
+        yield name, here._replace(known=here.known._replace(wind=here.known.wind * factor))
+
+
+def main(
+    aircraft: Annotated[int, typer.Option(min=1, help="Uncertain aircraft at each level.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain aircraft.")] = 1,
+) -> None:
+    """Print scores of laws tuned on osprey_servo's manoeuvre and gusts, on courses that they were not tuned on."""
+    scenario = find_scenario("osprey_servo")
+    tuned = load(file_of(scenario))
+    chosen: dict[str, dict[str, Tuned]] = {name: {"uncertain": tuned[name]["uncertain"]} for name in LAWS}
+    chosen[OBSERVER] |= {"late": tuned[OBSERVER]["late"]}
+    flown: list[tuple[str, Arena, dict[str, dict[str, Tuned]]]] = [
+        (name, arena(one), chosen) for name, one in courses(scenario).items()
+    ]
+    flown += [(name, one, {OBSERVER: chosen[OBSERVER]}) for name, one in wrong_wind(arena(scenario))]
+    rows: list[tuple[str, Compared]] = []
+    for name, here, laws in track(flown, "courses", console=Console(stderr=True)):
+        rows += [(name, one) for one in compare(here, laws, aircraft, LEVELS, seed)]
+    levels = tuple(f"+-{100.0 * level:g} %" for level in LEVELS)
+    title = f"Scores, mean (worst) of {aircraft} aircraft a level, seed {seed}"
+    table = new_table(title, ("course", "law", "tuned on", "nominal", *levels), texts=3)
+    for name, one in rows:
+        cells = (f"{level.mean:.2f} ({level.worst:.2f})" for level in one.levels)
+        table.add_row(name, one.law, one.aims, f"{one.score:.2f}", *cells)
+    console = Console()
+    console.width = max(console.width, WIDTH)
+    console.print(table)
+
+
+if __name__ == "__main__":
+    typer.run(main)

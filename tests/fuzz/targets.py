@@ -1,0 +1,258 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What is fuzzed: every reader of something that comes from outside, as a function of bytes.
+
+A target returns, or raises what is no refusal: any exception but the stack's own, a refusal that is no sentence. `SEEDS` gives
+each the inputs to begin with, made by the stack's own writers; what fuzzers have found lies in tests/corpus/<target>/.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import CompressionType, IndexType, Writer
+from tests.joint_states import JOINT_STATE, STORE, vector
+
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.simulator import Simulator
+from autopilot_bridge.bridge import Bridge
+from autopilot_bridge.params import LIBRARY as MAPS
+from autopilot_bridge.params import load_map
+from flight_analysis.bag_reader import read_run
+from flight_analysis.latency import latency
+from flight_analysis.named_vectors import decoder
+from flight_analysis.playback import read_playback
+from flight_analysis.replay import recorded_parameters, replay
+from flight_analysis.scenario import load_scenario
+from flight_analysis.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
+from flight_bringup.scenarios import share
+from flight_core.parameters import ParameterError
+from flight_recorder.bag import SCENARIO, Contents, Count, information_of, read_information, read_metadata
+from flight_recorder.repair import repair
+from rise_di_controller.controller import Controller
+from rise_di_controller.params import ControllerParameters
+
+LONGEST_SENTENCE = 2000
+"""Characters: what is said of an input does not grow with it."""
+
+Target = Callable[[bytes, Path], None]
+"""Reads the input, with a folder of its own to lay it in."""
+
+
+def refused(call: Callable[[], object]) -> bool:
+    """Whether the call was refused, by the stack's own error, with one sentence."""
+    try:
+        call()
+    except ParameterError as error:
+        said = str(error)
+        if not said.strip() or len(said.splitlines()) != 1 or len(said) > LONGEST_SENTENCE:
+            raise AssertionError(f"no sentence: {said[:LONGEST_SENTENCE]!r} of {len(said)} characters") from error
+        return True
+    return False
+
+
+def mcap(data: bytes, folder: Path) -> None:
+    """A log: read as a flight, as messages, as a replay; then repaired, which leaves what reads without a fault."""
+    run = _run(folder, data)
+    file = run / "run_0.mcap"
+    refused(lambda: read_run(file))
+    refused(lambda: latency(file))
+    refused(lambda: read_playback(file))
+    refused(lambda: _replay(file))
+    if not refused(lambda: repair(run)):
+        again = repair(run)
+        if any(one.damaged for one in again.files):
+            raise AssertionError("what was repaired is damaged")
+
+
+def metadata(data: bytes, folder: Path) -> None:
+    """metadata.yaml of a bag, and the file of metadata that goes into one."""
+    run = _run(folder, _PLAIN)
+    (run / "metadata.yaml").write_bytes(data)
+    refused(lambda: read_information(run))
+    refused(lambda: read_metadata(run / "metadata.yaml"))
+    refused(lambda: read_run(run))
+    refused(lambda: repair(run))
+
+
+def scenario(data: bytes, folder: Path) -> None:
+    """A scenario file, up to what is about to fly."""
+    path = folder / "scenario.yaml"
+    path.write_bytes(data)
+
+    def fly() -> None:
+        chosen = load_scenario(path)
+        with np.errstate(all="ignore"):  # an aircraft that diverges is flown, and ended, elsewhere
+            Controller(chosen.controller)
+            if not chosen.aircraft.is_jsbsim:  # which loads a model, in a process of its own
+                Simulator(chosen.aircraft).sample(0, np.zeros(len(chosen.controller.inputs)))
+
+    refused(fly)
+
+
+def airframe(data: bytes, folder: Path) -> None:
+    """An airframe file, up to its matrices."""
+    path = folder / "airframe.yaml"
+    path.write_bytes(data)
+
+    def matrices() -> None:
+        frame = load_airframe(str(path))
+        with np.errstate(all="ignore"):
+            frame.matrix_c() @ frame.matrix_b()
+        frame.matrix_a(), frame.matrix_gravity(), frame.products()
+
+    refused(matrices)
+
+
+def channel_map(data: bytes, folder: Path) -> None:
+    """A channel map, up to a bridge by it."""
+    path = folder / "map.yaml"
+    path.write_bytes(data)
+
+    def bridge() -> None:
+        made = Bridge(load_map(str(path)), dry_run=False)
+        made.engage(0), made.raw(), made.flown()
+
+    refused(bridge)
+
+
+def message(data: bytes, folder: Path) -> None:
+    """The payload of a message, as the log's readers take it: alone, and behind a sound one."""
+    for messages in ([data], [_SAMPLE, data, _SAMPLE]):
+        decode = decoder("/y", JOINT_STATE)
+        assert decode is not None
+        decode(messages)
+    run = _run(folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)]))
+    refused(lambda: read_run(run))
+    refused(lambda: latency(run))
+    refused(lambda: read_playback(run))
+    refused(lambda: parameter_changes(run, "controller", ControllerParameters.model_fields))
+
+
+TARGETS: Mapping[str, Target] = {
+    "mcap": mcap,
+    "metadata": metadata,
+    "scenario": scenario,
+    "airframe": airframe,
+    "map": channel_map,
+    "message": message,
+}
+
+
+def _run(folder: Path, content: bytes) -> Path:
+    run = folder / "run"
+    run.mkdir(exist_ok=True)
+    for file in run.iterdir():
+        file.unlink()
+    (run / "run_0.mcap").write_bytes(content)
+    return run
+
+
+def _replay(file: Path) -> None:
+    recorded = read_run(file)
+    if recorded.scenario is not None:
+        parameters = recorded_parameters(recorded.scenario)
+        with np.errstate(all="ignore"):
+            replay(recorded.tape, parameters, None, parameter_changes(file, "controller", ControllerParameters.model_fields))
+
+
+# What fuzzing begins with
+
+
+def log(
+    messages: Sequence[tuple[str, str, bytes]],
+    packed: CompressionType = CompressionType.NONE,
+    attached: Mapping[str, bytes] = {},
+    *,
+    checked: bool = False,
+    chunked: bool = True,
+    indexed: bool = True,
+) -> bytes:
+    """An MCAP file of (topic, type, payload), 1 ms apart; without checksums, which a changed byte would not pass."""
+    stream = BytesIO()
+    writer = Writer(
+        stream,
+        chunk_size=1024,
+        compression=packed,
+        index_types=IndexType.ALL if indexed else IndexType.NONE,
+        use_chunking=chunked,
+        enable_crcs=checked,
+        enable_data_crcs=checked,
+    )
+    writer.start(profile="ros2", library="fuzz")
+    channels: dict[str, int] = {}
+    for name, content in attached.items():
+        writer.add_attachment(0, 0, name, SCENARIO, content)
+    for k, (topic, kind, data) in enumerate(messages):
+        if topic not in channels:
+            schema = writer.register_schema(kind, "ros2msg", b"std_msgs/Header header\n")
+            channels[topic] = writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": "- depth: 1\n"})
+        writer.add_message(channels[topic], 1_000_000 * k, data, 1_000_000 * k, k)
+    writer.add_metadata("rise_di_lost", {"/y": "1"})
+    writer.finish()  # type: ignore[no-untyped-call]
+    return stream.getvalue()
+
+
+def _event() -> bytes:
+    types: dict[str, Any] = STORE.types
+    none = np.zeros(0)
+    value = types["rcl_interfaces/msg/ParameterValue"](
+        3, False, 0, 2.5, "", none.astype(np.uint8), none.astype(bool), none.astype(np.int64), none, []
+    )
+    changed = types["rcl_interfaces/msg/Parameter"]("k_g", value)
+    stamp = types["builtin_interfaces/msg/Time"](0, 5)
+    return bytes(STORE.serialize_cdr(types[PARAMETER_EVENT](stamp, "/controller", [], [changed], []), PARAMETER_EVENT))
+
+
+_SAMPLE = vector(1_000_000, ("q", "V"), (0.5, -1.0), "/aircraft#1")
+_PLAIN = log([("/y", JOINT_STATE, vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k), "a")) for k in range(8)])
+
+
+FLIGHT = {"/y": ("q", "V"), "/y_m": ("q", "V"), "/u": ("elevator", "thrust"), "/truth": ("t", "x.q")}
+
+
+def _flight() -> list[tuple[str, str, bytes]]:
+    messages = []
+    for k in range(6):
+        at = 10_000_000 * k
+        for topic, names in FLIGHT.items():
+            messages.append((topic, JOINT_STATE, vector(at, names, (0.01 * k, 0.1 * k), "/n")))
+    return [*messages, (PARAMETER_EVENTS, PARAMETER_EVENT, _event())]
+
+
+def _mcaps() -> list[bytes]:
+    flight, file = _flight(), {"osprey.yaml": b"/**/flight:\n  ros__parameters: {duration: 1.0}\n"}
+    whole = log(flight, attached=file)
+    return [
+        whole,
+        whole[: len(whole) // 2],
+        log(flight, CompressionType.ZSTD, checked=True),
+        log(flight, CompressionType.LZ4),
+        log(flight, chunked=False),
+        log(flight, indexed=False),
+        _PLAIN,
+    ]
+
+
+def _metadata() -> list[bytes]:
+    count = Count("/y", JOINT_STATE, "RIHS01_0", "- depth: 1\n", 8)
+    return [
+        information_of([Contents("run_0.mcap", 0, 7_000_000, (count,))]).encode(),
+        b"rise_di_flight: {start: a, command: b}\n",
+    ]
+
+
+def _files(folder: Path) -> list[bytes]:
+    return [path.read_bytes() for path in sorted(folder.glob("*.yaml"))]
+
+
+SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
+    "mcap": _mcaps,
+    "metadata": _metadata,
+    "scenario": lambda: _files(share() / "config"),
+    "airframe": lambda: _files(Path(__file__).parents[2] / "ros_ws/src/aircraft_sim/aircraft_sim/airframes"),
+    "map": lambda: _files(MAPS),
+    "message": lambda: [_SAMPLE, _event(), vector(1, (), ())],
+}

@@ -1,0 +1,180 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What fuzzing found, each finding by its name: what is now done instead of a traceback, a wait or a full memory."""
+
+import json
+import shutil
+import tracemalloc
+from pathlib import Path
+
+import pytest
+import yaml
+from mcap.records import Message
+from mcap.writer import CompressionType
+from tests.conftest import REPOSITORY
+from tests.fuzz.targets import log
+from tests.joint_states import JOINT_STATE, vector
+
+from flight_analysis.bag_reader import read_run
+from flight_analysis.latency import latency
+from flight_analysis.playback import read_playback
+from flight_analysis.report import _json
+from flight_analysis.scenario import Scenario
+from flight_bringup.fly import read_flight
+from flight_bringup.repair_command import repair_run
+from flight_core.files import parse_yaml
+from flight_core.parameters import LONGEST_SENTENCE, ParameterError
+from flight_recorder.bag import METADATA, read_information
+from flight_recorder.repair import repair
+from flight_recorder.scan import Scan
+
+CORPUS = REPOSITORY / "tests" / "corpus"
+Y = [("/y", JOINT_STATE, vector(10_000_000 * k, ("q", "V"), (0.1 * k, k))) for k in range(20)]
+
+
+BOMBS = [*sorted(path.name for path in (CORPUS / "mcap").glob("*bomb*")), "zstd_header_says_a_terabyte"]
+
+
+def lay(folder: Path, content: bytes) -> Path:
+    """The folder of a run with this log."""
+    run = folder / "run"
+    run.mkdir()
+    (run / "run_0.mcap").write_bytes(content)
+    return run
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_a_chunk_is_unpacked_to_no_more_than_it_says_and_to_64_mb(name: str) -> None:
+    scan = Scan(CORPUS / "mcap" / name)
+    tracemalloc.start()
+    try:
+        list(scan.records())
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert scan.damaged == 1
+    assert peak < 10e6  # of half a gigabyte, or a terabyte; the file itself is 33 kB
+
+
+def test_a_chunk_of_lz4_with_changed_bytes_is_left_out(tmp_path: Path) -> None:
+    changed = bytearray(log(Y, CompressionType.LZ4))
+    frame = changed.index(b"\x04\x22\x4d\x18")  # the magic number of LZ4 frames
+    changed[frame + 4] ^= 0xFF  # the flags of the first of several chunks
+    path = tmp_path / "changed.mcap"
+    path.write_bytes(changed)
+    scan = Scan(path)
+    assert any(isinstance(record, Message) for record in scan.records())
+    assert scan.damaged == 1
+
+
+def test_an_index_that_knows_places_beyond_the_file_reads_no_more_than_there_is() -> None:
+    assert list(Scan(CORPUS / "mcap" / "index_beyond_the_file").records()) is not None
+
+
+def test_a_channel_whose_quality_of_service_is_no_yaml_is_repaired(tmp_path: Path) -> None:
+    run = lay(tmp_path, log(Y).replace(b"- depth: 1\n", b"[: \x01 depth:"))
+    assert repair(run).wrote_metadata
+    information = yaml.safe_load((run / METADATA).read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+    assert information["topics_with_message_count"][0]["topic_metadata"]["offered_qos_profiles"] == []
+
+
+@pytest.mark.parametrize("name", ["run_0.mcap", "metadata.yaml", "", "..", "../../x.yaml", "a\x00.yaml", "x" * 300 + ".yaml"])
+def test_a_scenario_inside_a_log_is_laid_beside_it_under_no_name_of_the_logs_own_files(
+    name: str, tmp_path: Path, osprey_gust: Scenario
+) -> None:
+    content = osprey_gust.path.read_bytes()
+    outputs, inputs = osprey_gust.controller.outputs, osprey_gust.controller.inputs
+    topics = {"/y": outputs, "/y_m": outputs, "/u": inputs}
+    flown = [
+        (topic, JOINT_STATE, vector(k * 10_000_000, names, (0.0,) * 4)) for k in range(3) for topic, names in topics.items()
+    ]
+    log_before = log(flown, attached={name: content})
+    run = lay(tmp_path, log_before)
+    read_flight(run)
+    assert (run / "run_0.mcap").read_bytes() == log_before
+    kept = "x.yaml" if name == "../../x.yaml" else "scenario.yaml"
+    assert {path.name for path in run.iterdir()} == {"run_0.mcap", kept}
+    assert (run / kept).read_bytes() == content
+
+
+@pytest.mark.parametrize("t", [float("nan"), float("inf"), -1e300])
+def test_a_flight_time_that_is_none_leaves_the_first_sample_at_0(t: float, tmp_path: Path) -> None:
+    run = lay(tmp_path, log([*Y[3:], ("/truth", JOINT_STATE, vector(50_000_000, ("t",), (t,)))]))
+    assert read_run(run).tape.start_ns == 30_000_000
+    assert read_playback(run).start_ns == read_playback(run).messages[0].due_ns
+
+
+def test_a_u_too_short_for_a_stamp_or_of_another_type_has_no_latency(tmp_path: Path) -> None:
+    assert latency(lay(tmp_path, log([*Y, ("/u", JOINT_STATE, b"\x00\x01")]))) is None
+    shutil.rmtree(tmp_path / "run")
+    assert latency(lay(tmp_path, log([*Y, ("/u", "std_msgs/msg/String", b"\x00\x01\x00\x00")]))) is None
+
+
+def test_topics_that_no_node_can_have_are_refused_by_their_names(tmp_path: Path) -> None:
+    run = lay(tmp_path, log([("y", kind, data) for _, kind, data in Y]))
+    with pytest.raises(ParameterError, match="found topics that begin with no slash: y, expected a recorded flight"):
+        read_run(run)
+
+
+@pytest.mark.parametrize("last", [".inf", "0x" + "f" * 40, "[1]"])
+def test_metadata_that_ends_at_no_instant_are_refused(last: str, tmp_path: Path) -> None:
+    text = f"rosbag2_bagfile_information: {{starting_time: {{nanoseconds_since_epoch: 0}}, duration: {{nanoseconds: {last}}}}}"
+    (tmp_path / METADATA).write_text(text, encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"metadata\.yaml: found .*, expected that of rosbag2"):
+        read_information(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"[: x", b"5", b"/**/flight: {ros__parameters: {duration: [1]}}"])
+def test_a_log_with_parameters_of_any_content_is_repaired(
+    content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = log(Y).replace(b"rise_di_lost", b"rise_di_more")
+    run = lay(tmp_path, whole[: len(whole) // 2])
+    stored = log(Y[:1], attached={"parameters.yaml": content})
+    (run / "run_1.mcap").write_bytes(stored.replace(b"application/yaml", b"text/yaml_______"))
+    repair_run(run)
+    assert "metadata.yaml written" in capsys.readouterr().out
+
+
+def test_aliases_that_stand_for_billions_and_one_inside_itself_are_refused() -> None:
+    for name in ("aliases_of_a_billion", "itself_inside"):
+        with pytest.raises(ParameterError, match=r"not valid YAML \(found more than 100000 values"):
+            parse_yaml((CORPUS / "scenario" / name).read_bytes(), "x", "y")
+    assert parse_yaml("{a: &b [1, 2], c: *b}", "x", "y") == {"a": [1, 2], "c": [1, 2]}
+
+
+def test_a_log_does_not_command_the_terminal_that_its_notes_are_shown_on(tmp_path: Path) -> None:
+    run = lay(
+        tmp_path,
+        log([*Y, ("/\x1b[2Jz", JOINT_STATE, vector(1, ("a",), (1.0,))), ("/\x1b[2Jz", JOINT_STATE, vector(2, ("b",), (1.0,)))]),
+    )
+    notes = read_run(run).tape.notes
+    assert r"\x1b[2Jz: 1 samples with other names refused" in notes
+    assert all(note.isprintable() for note in notes)
+
+
+def test_a_sentence_stays_one_whatever_it_quotes() -> None:
+    said = str(ParameterError("found \x1b[2J\r\na" + "x" * 5000))
+    assert said.startswith(r"found \x1b[2J\r\na")
+    assert said.isprintable()
+    assert len(said) <= LONGEST_SENTENCE + 10
+
+
+def test_no_text_of_a_log_ends_or_hides_the_script_it_stands_in() -> None:
+    hostile = "</script><!--<script>"
+    assert "<" not in _json({"name": hostile})
+    assert json.loads(_json({"name": hostile})) == {"name": hostile}
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, on values that no flight has
+@pytest.mark.parametrize("value", [1e300, float("nan"), float("-inf")])
+def test_a_figure_that_is_not_finite_is_none(value: float, tmp_path: Path, osprey_gust: Scenario) -> None:
+    topics = {"/y": osprey_gust.controller.outputs, "/y_m": osprey_gust.controller.outputs, "/u": osprey_gust.controller.inputs}
+    flown = [
+        (topic, JOINT_STATE, vector(k * 10_000_000, names, (value,) * 4)) for k in range(3) for topic, names in topics.items()
+    ]
+    run = lay(tmp_path, log(flown, attached={"osprey_gust.yaml": osprey_gust.path.read_bytes()}))
+    summary = read_flight(run).summary
+    json.dumps(summary, allow_nan=False)
+    assert summary["errors"]["q"]["whole"]["rms"] in (None, 0.0)
+    assert summary["inputs"]["elevator"]["whole"]["rms"] is None

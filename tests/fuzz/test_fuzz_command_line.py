@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The command line on what is no input: an exit status that says so, one sentence, no traceback, nothing waited for."""
+
+import contextlib
+import io
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from tests.fuzz.targets import SEEDS
+
+from flight_bringup import cli
+
+few = settings(
+    max_examples=30,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    phases=(Phase.generate,),
+    suppress_health_check=list(HealthCheck),
+)
+
+
+class Said(NamedTuple):
+    """How a command ended."""
+
+    status: int
+    output: str
+    errors: str
+
+
+@contextlib.contextmanager
+def as_command(*arguments: str) -> Iterator[None]:
+    """sys.argv and what Ctrl-C does, as before afterwards."""
+    argv, handler = sys.argv, signal.getsignal(signal.SIGINT)
+    sys.argv = ["rise-di", *arguments]
+    try:
+        yield
+    finally:
+        sys.argv = argv
+        signal.signal(signal.SIGINT, handler)
+
+
+def rise_di(*arguments: str) -> Said:
+    """The command, in this process: what it raises beside SystemExit would be its traceback."""
+    output, errors = io.StringIO(), io.StringIO()
+    with as_command(*arguments), contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else 1
+    return Said(status, output.getvalue(), errors.getvalue())
+
+
+def require_refusal(said: Said) -> None:
+    """Exit status 2, and one sentence; of a wrong option the usage, as Typer writes it."""
+    assert said.status == 2, said
+    assert "Traceback" not in said.errors
+    sentences = [line for line in said.errors.splitlines() if line.startswith("error: ")]
+    if sentences:
+        assert len(sentences) == 1
+        assert said.errors.splitlines()[-1] == sentences[0]
+        assert len(sentences[0]) < 1100
+    else:
+        assert said.errors.startswith("Usage: "), said.errors
+
+
+@pytest.fixture
+def garbage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of files that are none, which is also the working folder."""
+    monkeypatch.chdir(tmp_path)
+    for name, content in {
+        "empty": b"",
+        "zeros": bytes(4096),
+        "text": b"not a log",
+        "magic": b"\x89MCAP0\r\n",
+        "cut": SEEDS["mcap"]()[0][:700],
+    }.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / f"{name}_0.mcap").write_bytes(content)
+        (tmp_path / f"{name}.yaml").write_bytes(content)
+    (tmp_path / "folder.yaml").mkdir()
+    (tmp_path / "nothing").mkdir()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "metadata.yaml").write_text("rosbag2_bagfile_information: 5\n", encoding="utf-8")
+    (tmp_path / "other" / "other.db3").write_bytes(b"SQLite format 3\x00" + bytes(200))
+    return tmp_path
+
+
+RUNS = [
+    "absent",
+    "empty",
+    "zeros",
+    "text",
+    "magic",
+    "nothing",
+    "other",
+    "other/other.db3",
+    "text/text_0.mcap",
+    "folder.yaml",
+    "/dev/null",
+    "x" * 5000,
+    "",
+    "a\x1b[2Jb",
+]
+
+
+@pytest.mark.parametrize("run", RUNS, ids=range(len(RUNS)))
+@pytest.mark.parametrize(
+    "command", [["report"], ["replay"], ["repair"], ["play"], ["check-signs", "px4", "--bag"]], ids=lambda c: c[0]
+)
+def test_a_run_that_is_none_is_refused(command: list[str], run: str, garbage: Path) -> None:
+    require_refusal(rise_di(*command, run))
+
+
+FILES = [
+    "absent",
+    "absent.yaml",
+    "empty.yaml",
+    "zeros.yaml",
+    "text.yaml",
+    "magic.yaml",
+    "folder.yaml",
+    "../../x",
+    "x" * 5000,
+    "x" * 5000 + ".yaml",
+    "",
+    "\x1b[2J",
+]
+
+
+@pytest.mark.parametrize("name", FILES, ids=range(len(FILES)))
+@pytest.mark.parametrize(
+    "command", [["fly", "--in-process"], ["fly"], ["gains"], ["check-signs"], ["gains", "osprey", "--scenario"]], ids=str
+)
+def test_a_file_that_is_none_is_refused(command: list[str], name: str, garbage: Path) -> None:
+    require_refusal(rise_di(*command, name))
+
+
+OPTIONS = {
+    "fly osprey_gust --in-process --duration": ["nan", "inf", "-1", "0", "x", "1e999", "", "1e7"],
+    "gains osprey --samples 0 --rate": ["nan", "inf", "0", "-5", "1e9", "x", "333.3"],
+    "gains osprey --uncertainty": ["nan", "inf", "-1", "2", "x"],
+    "gains osprey --delay": ["nan", "inf", "-1", "1e9"],
+    "gains osprey --gamma-2": ["nan", "inf", "-1"],
+    "gains osprey --lag": ["nan", "x", "-1", "1,2", ",", "inf"],
+    "gains osprey --samples 0 --inputs": ["rudder,x"],
+    "gains osprey --samples": ["-1", "1000000000", "x", "1.5", "nan"],
+    "gains osprey --seed": ["-1", "x"],
+    "play cut --rate": ["nan", "inf", "0", "-1", "1e9"],
+    "play cut --start": ["nan", "inf", "-1", "1e300"],
+    "play cut --topics": ["nothing", "\x1b", ",", "/"],
+    "play cut --stamps": ["tomorrow"],
+    "replay cut --namespace": ["/three", "\x1b[2J", "a b"],
+    "replay cut --set": ["x", "=", "controller.=1", "controller.k_g", "controller.k_g=[", "controller.k_g=&a [*a]"],
+    "report cut --png": ["/dev/null/x.png", "nowhere/x.png"],
+    "report cut --csv": ["/dev/null/x.csv", "nowhere/x.csv"],
+    "report cut --html": ["/dev/null/x.html", "nowhere/x.html"],
+    "check-signs px4 --airframe": ["absent", "text.yaml"],
+    "check-signs px4 --scenario": ["absent", "text.yaml"],
+}
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_a_value_that_is_none_is_refused(command: str, garbage: Path) -> None:
+    for value in OPTIONS[command]:
+        if command.startswith("play") and value == ",":
+            continue  # which is none, and stands for all topics
+        require_refusal(rise_di(*command.split(), value))
+
+
+COMMANDS = ["fly", "report", "replay", "repair", "play", "gains", "check-signs", "airframes", "layouts", "identify"]
+OTHERS = ["--json", "--set", "--in-process", "--duration", "--bag", "--", "-", "--help", "--topics", "--rate", "--check"]
+VALUES = ["osprey", "px4", "cut", "text", "absent", "nan", "0", "y"]
+WORDS = st.sampled_from(COMMANDS + OTHERS + VALUES) | st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=5)
+
+
+@few
+@given(st.lists(WORDS, max_size=5))
+def test_no_words_end_in_a_traceback(garbage: Path, words: list[str]) -> None:
+    if words[:1] == ["fly"]:
+        words = ["fly", "absent", *words[1:]]  # what may fly, flies
+    said = rise_di(*words)
+    assert said.status in (0, 1, 2)
+    assert "Traceback" not in said.errors

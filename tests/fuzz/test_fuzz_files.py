@@ -1,0 +1,251 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Files and messages of any content are read, or refused with one sentence: no other exception, no hang, bounded memory."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from tests.conftest import REPOSITORY
+from tests.fuzz.targets import SEEDS, TARGETS, log, refused
+from tests.joint_states import JOINT_STATE, vector
+
+from flight_analysis.bag_reader import read_run
+from flight_analysis.scenario import Scenario
+from flight_bringup.fly import conclude, read_flight
+from flight_bringup.scenarios import find_scenario
+
+CORPUS = REPOSITORY / "tests" / "corpus"
+
+# The same examples each time: a test that fails fails for everybody. Long searches are benchmarks/fuzz.py's.
+few = settings(
+    max_examples=30,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    phases=(Phase.generate,),
+    suppress_health_check=list(HealthCheck),
+)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_what_fuzzers_found_is_read_or_refused_in_time_and_memory(target: str) -> None:
+    files = sorted(str(path) for path in (CORPUS / target).iterdir())
+    assert files
+    command = [sys.executable, "-m", "benchmarks.fuzz", target, "--replay", *files]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert f"{len(files)} inputs read or refused" in done.stdout
+
+
+def test_the_corpus_is_small() -> None:
+    assert sum(path.stat().st_size for path in CORPUS.rglob("*") if path.is_file()) < 300_000
+
+
+# Bytes: cut, changed, put elsewhere
+
+BINARY = {name: SEEDS[name]() for name in ("mcap", "message")}
+
+
+@st.composite
+def damaged(draw: st.DrawFn, name: str) -> bytes:
+    """A sound input that was cut, in which bytes were changed, taken out or come twice."""
+    data = bytearray(draw(st.sampled_from(BINARY[name])))
+    for _ in range(draw(st.integers(1, 4))):
+        place, other = sorted((draw(st.integers(0, len(data))), draw(st.integers(0, len(data)))))
+        match draw(st.sampled_from(("cut", "change", "number", "take", "twice"))):
+            case "cut":
+                del data[place:]
+            case "change":
+                data[place : place + 1] = draw(st.binary(min_size=1, max_size=2))
+            case "number":
+                data[place : place + 8] = draw(st.sampled_from(NUMBERS)).to_bytes(8, "little")
+            case "take":
+                del data[place:other]
+            case "twice":
+                data[other:other] = data[place : place + 200]
+    return bytes(data)
+
+
+NUMBERS = [0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1, 2**63, 2**64 - 1]
+
+
+@few
+@given(damaged("mcap"))
+def test_a_damaged_log_is_read_repaired_or_refused(tmp_path: Path, data: bytes) -> None:
+    TARGETS["mcap"](data, tmp_path)
+
+
+@few
+@given(damaged("message") | st.binary(max_size=200))
+def test_a_damaged_message_in_a_log_is_read_or_left_out(tmp_path: Path, data: bytes) -> None:
+    TARGETS["message"](data, tmp_path)
+
+
+# Text: values that are not what is asked for, wherever one stands
+
+SCALARS = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.sampled_from([2**63, -(2**80), 10**4000, 1e308, -1e-320, float("nan"), float("inf"), -0.0, 1e-9, 3.0, 1000.0])
+    | st.text(max_size=8)
+    | st.sampled_from(["osprey", "jsbsim:c172p", "/dev/zero", "../x.yaml", "a\x1b[2Jb", "\x85", "x" * 5000, "2001-01-01", "q"])
+)
+VALUES = st.recursive(
+    SCALARS, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=3), max_leaves=6
+)
+
+
+@st.composite
+def edited(draw: st.DrawFn, seeds: list[Any]) -> bytes:
+    """A sound file in which some values are others, or under other keys."""
+    tree = yaml.safe_load(draw(st.sampled_from(seeds)))
+    for _ in range(draw(st.integers(1, 3))):
+        node = tree
+        for _ in range(draw(st.integers(0, 6))):
+            if not isinstance(node, dict | list) or not node:
+                break
+            key = draw(st.sampled_from(sorted(node, key=str) if isinstance(node, dict) else range(len(node))))
+            deeper = node[key]
+            if not isinstance(deeper, dict | list) or not deeper or draw(st.integers(0, 3)) == 0:
+                match draw(st.sampled_from(("value", "key", "none"))):
+                    case "value":
+                        node[key] = draw(VALUES)
+                    case "key" if isinstance(node, dict):
+                        node[draw(SCALARS)] = node.pop(key)
+                    case _:
+                        node.pop(key)
+                break
+            node = deeper
+    return yaml.safe_dump(tree, allow_unicode=True).encode("utf-8", "surrogatepass")
+
+
+@few
+@given(edited(SEEDS["scenario"]()))
+def test_a_scenario_with_other_values_flies_or_is_refused(tmp_path: Path, data: bytes) -> None:
+    TARGETS["scenario"](data, tmp_path)
+
+
+@few
+@given(edited(SEEDS["airframe"]()))
+def test_an_airframe_with_other_values_is_one_or_is_refused(tmp_path: Path, data: bytes) -> None:
+    TARGETS["airframe"](data, tmp_path)
+
+
+@few
+@given(edited(SEEDS["map"]()))
+def test_a_channel_map_with_other_values_is_one_or_is_refused(tmp_path: Path, data: bytes) -> None:
+    TARGETS["map"](data, tmp_path)
+
+
+@few
+@given(edited(SEEDS["metadata"]()) | st.binary(max_size=100))
+def test_metadata_with_other_values_leave_the_log_readable(tmp_path: Path, data: bytes) -> None:
+    TARGETS["metadata"](data, tmp_path)
+
+
+@pytest.mark.parametrize("target", ["scenario", "airframe", "map", "metadata"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "&a [*a]",
+        "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
+        + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)),
+        "x: " + "[" * 1000,
+        "x: " + "9" * 6000,
+        "x: 0x" + "f" * 6000,
+        "? [1, 2]\n: 3",
+        "? {a: 1}\n: 3",
+        "!!python/object/apply:os.system [id]",
+        "!!timestamp 5",
+        "<<: 5",
+        "a: *b",
+        "\ufeff---\n...\n---\n",
+        "a: !!binary '%'",
+        "\x00",
+        "- " * 2000,
+    ],
+    ids=range(15),
+)
+def test_yaml_that_is_made_to_hurt_is_refused(target: str, text: str, tmp_path: Path) -> None:
+    TARGETS[target](text.encode(), tmp_path)
+
+
+def test_a_file_too_large_for_one_and_a_pipe_are_refused(tmp_path: Path) -> None:
+    TARGETS["scenario"](b"# " + b"x" * (2 << 20), tmp_path)
+    (tmp_path / "run").mkdir()
+    for name in ("run_0.mcap", "metadata.yaml"):
+        os.mkfifo(tmp_path / "run" / name)
+    assert refused(lambda: read_run(tmp_path / "run"))  # and nobody is waited for
+
+
+# Flights of any content: what can be read has a report
+
+Report = Callable[[Callable[[Path], object], list[tuple[str, str, bytes]]], None]
+TOPICS = st.sampled_from(["/y", "/y_m", "/u", "/u_m", "/internals", "/truth", "/two/y", "y", "/", ""])
+CHANNELS = st.lists(
+    st.sampled_from(
+        ["q", "V", "p", "r", "elevator", "thrust", "t", "x.q", "mode", "dt", "age", "late", "number", "e.q", "u.elevator"]
+    )
+    | st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=6),
+    max_size=5,
+)
+NUMBER = st.floats() | st.sampled_from([0.0, 1.0, 1e300, -1e300, 5e-324])
+
+
+@st.composite
+def flights(draw: st.DrawFn, complete: dict[str, tuple[str, ...]]) -> list[tuple[str, str, bytes]]:
+    """Messages of a flight, of which some topics, channels, stamps and values are as they should be."""
+    messages = []
+    for topic, names in [*complete.items(), *draw(st.dictionaries(TOPICS, CHANNELS.map(tuple), max_size=2)).items()]:
+        for k in range(draw(st.integers(0, 4))):
+            given_names = draw(st.just(names) | st.permutations(names) | CHANNELS)
+            values = draw(st.lists(NUMBER, min_size=len(given_names), max_size=len(given_names)))
+            stamp = draw(st.just(10_000_000 * k) | st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
+            messages.append((topic, JOINT_STATE, vector(stamp, given_names, values, draw(st.text("a/#;=", max_size=3)))))
+    return messages
+
+
+def channels(scenario: Scenario) -> dict[str, tuple[str, ...]]:
+    outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
+    return {"/y": outputs, "/y_m": outputs, "/u": inputs, "/truth": ("t", *(f"x.{name}" for name in outputs))}
+
+
+@pytest.fixture
+def reported(tmp_path: Path, osprey_gust: Scenario) -> Report:
+    """What reads these messages as a flight of the default scenario."""
+
+    def report(read: Callable[[Path], object], messages: list[tuple[str, str, bytes]]) -> None:
+        run = tmp_path / "run"
+        run.mkdir(exist_ok=True)
+        (run / "run_0.mcap").write_bytes(log(messages, attached={"osprey_gust.yaml": osprey_gust.path.read_bytes()}))
+        with np.errstate(all="ignore"):
+            refused(lambda: read(run))
+
+    return report
+
+
+FLIGHTS = flights(channels(find_scenario("osprey_gust")))
+
+
+@few
+@given(FLIGHTS)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, on values that no flight has
+def test_a_flight_of_any_values_has_figures_or_is_refused(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
+    reported(read_flight, messages)
+
+
+@settings(few, max_examples=5)  # each page takes half a second
+@given(FLIGHTS)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_flight_of_any_values_has_a_page_or_is_refused(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
+    reported(conclude, messages)

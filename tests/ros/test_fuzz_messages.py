@@ -1,0 +1,102 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Payloads of any content, as a node takes them: a sample, or refused with a reason, and the next sound one is read."""
+
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.serialization import deserialize_message
+from tests.conftest import REPOSITORY
+from tests.joint_states import vector
+
+from autopilot_bridge.channel_map import message_type, read_raw
+from autopilot_bridge.params import load_map
+from flight_core.seal import Seal
+from flight_core.vectors import ChannelError
+from flight_ros.messages import Decoder, Encoder
+
+NAMES = ("q", "V", "p", "r")
+REASONS = {"finite", "length", "mac", "malformed", "name", "order"}
+
+many = settings(
+    max_examples=300,
+    derandomize=True,
+    deadline=None,
+    database=None,
+    phases=(Phase.generate,),
+    suppress_health_check=list(HealthCheck),
+)
+
+
+@st.composite
+def payloads(draw: st.DrawFn) -> bytes:
+    """A sound payload in which some bytes are others, or which is cut or longer; or any bytes."""
+    names = draw(st.sampled_from([NAMES, NAMES[::-1], ("q",), ("q", "q", "V", "p", "r"), ()]))
+    values = draw(st.lists(st.floats(), min_size=len(names), max_size=len(names)))
+    stamp = draw(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
+    data = bytearray(
+        vector(stamp, names, values, draw(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=4)))
+    )
+    for _ in range(draw(st.integers(0, 3))):
+        place = draw(st.integers(0, len(data)))
+        match draw(st.sampled_from(("cut", "change", "length", "more"))):
+            case "cut":
+                del data[place:]
+            case "change":
+                data[place : place + 1] = draw(st.binary(min_size=1, max_size=1))
+            case "length":
+                data[place : place + 4] = draw(st.sampled_from([0, 1, 255, 2**31, 2**32 - 1])).to_bytes(4, "little")
+            case "more":
+                data += draw(st.binary(max_size=9))
+    return bytes(data)
+
+
+CORPUS = [path.read_bytes() for path in sorted((REPOSITORY / "tests" / "corpus" / "message").iterdir())]
+
+
+def taken(decoder: Decoder, raw: bytes) -> None:
+    """Read it, or see that it is refused with a reason of those that are counted."""
+    reason = ""
+    try:
+        sample = decoder.decode(raw)
+    except ChannelError as error:
+        reason = error.reason
+    else:
+        assert sample is None or np.isfinite(sample.value).all()
+    assert reason in {"", *REASONS}
+
+
+@many
+@given(payloads() | st.binary(max_size=120) | st.sampled_from(CORPUS))
+def test_any_payload_is_a_sample_or_refused_and_spoils_no_other(raw: bytes) -> None:
+    for seal in (None, Seal(bytes(32), "/y", None)):
+        decoder = Decoder(NAMES, seal)
+        taken(decoder, raw)
+        good = Encoder(NAMES, "/aircraft#1", seal).encode(7, np.array([1.0, 2.0, 3.0, 4.0]))
+        for _ in range(2):  # the long way, then the short one
+            sample = decoder.decode(good)
+            assert sample is not None
+            assert sample.value.tolist() == [1.0, 2.0, 3.0, 4.0]
+            taken(decoder, raw)
+
+
+@many
+@given(st.data())
+def test_any_payload_of_an_autopilots_topic_is_a_value_or_refused(data: st.DataObject) -> None:
+    chart = load_map("ardupilot")  # its message types are installed with the others
+    row = data.draw(st.sampled_from([*chart.outputs.values()]))
+    kind: Any = message_type(row.type)
+    raw = data.draw(payloads() | st.binary(max_size=200))
+    try:
+        message = deserialize_message(raw, kind)
+    except _rclpy.RMWError:
+        return
+    reason = ""
+    try:
+        assert np.isfinite(read_raw(message, row.field, row.function))
+    except ChannelError as error:
+        reason = error.reason
+    assert reason in {"", "field", "finite"}
