@@ -418,6 +418,11 @@ class Flight:
             and (np.abs(flown.u[-10:] - inputs[-1]).max(axis=1) == 0.0).any()
         )
 
+    def is_at_rest(self) -> bool:
+        """Whether u has hardly moved in the last second."""
+        u = self.flown(time.time() - 1.0).u
+        return bool(len(u) and np.ptp(u, axis=0).max() <= 0.03)
+
     def is_near_trim(self) -> bool:
         """Whether no input has been far from trim in the last half second."""
         inputs = self.moved(time.time() - 0.5)[1]

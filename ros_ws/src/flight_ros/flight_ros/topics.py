@@ -15,8 +15,9 @@ from sensor_msgs.msg import JointState
 # nothing; the depth covers two seconds at 1 kHz, as that of the recorder does.
 PUBLISH = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Control loops want the newest samples and never a retransmission. The depth covers the samples between two ticks
-# that are needed to bring y_m to the stamp of y.
-LISTEN = QoSProfile(depth=16, reliability=ReliabilityPolicy.BEST_EFFORT)
+# that are needed to bring y_m to the stamp of y, and those of a stranger at 10 kHz beside them: a u that these had displaced
+# would be lost.
+LISTEN = QoSProfile(depth=128, reliability=ReliabilityPolicy.BEST_EFFORT)
 # In lockstep every sample counts, from the first one on, whoever is matched late. The depth is for speed: with a history that
 # is full, Fast DDS asks for an acknowledgement of each sample.
 STEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
