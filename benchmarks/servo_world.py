@@ -26,7 +26,6 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
-from benchmarks.feedforward import UNIT
 from benchmarks.sampling import MOVING, NO_SIGN, REST, cells, new_table, sampling_scenario, scaled_beta
 from rich.console import Console
 from rich.progress import track
@@ -36,6 +35,7 @@ from flight_analysis.scenario import Scenario
 from flight_analysis.simulate import simulate
 from flight_analysis.summary import shown_units
 from flight_bringup.scenarios import find_scenario
+from flight_campaign.statistics import score_units
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
@@ -192,9 +192,10 @@ def _integrated(*, nominal: bool) -> Iterator[None]:
 
 
 def score(scenario: Scenario) -> float:
-    """Sum over the channels of rms of the true error / UNIT, of a flight."""
+    """Sum over the channels of rms of the true error in its unit, of a flight."""
     error = true_error_of(simulate(scenario))
-    return sum(error_figures(error[name]).rms / UNIT[name] for name in error.names)
+    unit = score_units(error.names, scenario.aircraft.channels().outputs)
+    return float(sum(error_figures(error[name]).rms / one for name, one in zip(error.names, unit.tolist(), strict=True)))
 
 
 def delayed(scenario: Scenario, delay: float, rate: float = 1.0 / DELAY_STEP) -> Scenario:

@@ -24,7 +24,7 @@ from flight_analysis.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define
-from flight_campaign.statistics import KEPT, Figure, Tally, score
+from flight_campaign.statistics import KEPT, Figure, Tally, score, score_units
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
@@ -91,7 +91,10 @@ def test_the_share_of_the_diverged_has_its_interval() -> None:
 
 def test_a_score_counts_errors_in_their_units() -> None:
     rms = np.array([[0.010], [0.020], [0.010], [0.1]])
-    assert score(rms, ("q", "p", "r", "V"), {"q": "rad/s", "p": "rad/s", "r": "rad/s", "V": "m/s"}) == pytest.approx([4.0])
+    units = {"q": "rad/s", "p": "rad/s", "r": "rad/s", "V": "m/s", "theta": "rad"}
+    assert score(rms, score_units(("q", "p", "r", "V"), units)) == pytest.approx([4.0])
+    with pytest.raises(ParameterError, match=r"^outputs: found theta in rad, expected units a score counts: rad/s, m/s"):
+        score_units(("q", "theta"), units)
 
 
 # Campaigns
@@ -109,7 +112,9 @@ def test_an_aircraft_of_a_campaign_flies_again_alone_with_the_same_score(tmp_pat
     at_ticks = error.stamp_ns % 10_000_000 == 0
     rms = np.array([[np.sqrt(np.mean(error[name][at_ticks] ** 2))] for name in outputs])
     units = again.aircraft.channels().outputs
-    assert worst.score == pytest.approx(score(rms, outputs, units)[0], rel=1e-3)  # as of single flights: tests of fleets
+    assert worst.score == pytest.approx(
+        score(rms, score_units(outputs, units))[0], rel=1e-3
+    )  # as of single flights: tests of fleets
 
 
 def test_the_same_seed_gives_the_same_figures_whatever_the_order_and_the_engine(tmp_path: Path) -> None:

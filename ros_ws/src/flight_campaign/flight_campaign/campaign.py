@@ -21,8 +21,9 @@ from flight_campaign.course import Course, chart
 from flight_campaign.engines import Engine, Job
 from flight_campaign.laws import rise
 from flight_campaign.laws.rise import RiseParams
-from flight_campaign.statistics import Tally, score
+from flight_campaign.statistics import Tally, score, score_units
 from flight_core.parameters import ParameterError, Parameters, require
+from flight_core.vectors import FloatArray
 
 if TYPE_CHECKING:
     from flight_campaign.fleet import Vehicle
@@ -115,8 +116,21 @@ class _Prepared(NamedTuple):
     params: RiseParams
 
 
+class Chunk(NamedTuple):
+    """How the aircraft of a chunk flew: what `Tally.of` takes."""
+
+    first: int  # number of the first
+    diverged: FloatArray  # (N,)
+    figures: dict[str, FloatArray]  # (N,) each, by name
+
+
 def fly_chunk(text: str, job: Job) -> str:
     """Fly a chunk of a campaign: its definition as JSON, the job -> its Tally as JSON. It depends on nothing else."""
+    return Tally.of(*chunk_flown(text, job)).model_dump_json()
+
+
+def chunk_flown(text: str, job: Job) -> Chunk:
+    """Fly a chunk of a campaign, aircraft by aircraft."""
     from flight_campaign import fleet  # noqa: PLC0415 - JAX, which the command needs only once it flies
 
     definition = Definition.model_validate_json(text)
@@ -131,10 +145,10 @@ def fly_chunk(text: str, job: Job) -> str:
     flown = fleet.fly(flying, vehicle, course, rise.pilot(scenario.controller.law().sign), params)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (flown.rms, flown.max, flown.slew))
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
-    figures = {"score": score(rms, outputs, scenario.aircraft.channels().outputs)}
+    figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs))}
     for kind, names, values in (("rms", outputs, rms), ("max", outputs, largest), ("slew", inputs, slew)):
         figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
-    return Tally.of(first, np.asarray(flown.diverged)[:count], figures).model_dump_json()
+    return Chunk(first, np.asarray(flown.diverged)[:count], figures)
 
 
 @lru_cache(maxsize=8)

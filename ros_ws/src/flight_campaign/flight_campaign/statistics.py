@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field
 
-from flight_core.parameters import Parameters
+from flight_core.parameters import Parameters, require
 from flight_core.vectors import FloatArray
 
 PER_DECADE, DECADES = 100, (-8, 6)
@@ -18,9 +18,10 @@ PER_DECADE, DECADES = 100, (-8, 6)
 EDGES = 10.0 ** (np.arange(DECADES[0] * PER_DECADE, DECADES[1] * PER_DECADE + 1) / PER_DECADE)
 
 SCORE_UNIT = {"rad/s": 0.010, "m/s": 0.1}
-"""What an rms error is counted in, by unit of the channel; p alone counts half, for its commands are larger."""
+"""What an rms error is counted in, by unit of the channel; p counts half, for its commands are larger."""
 
-SCORE_UNIT_OF = {"p": 0.020}  # rad/s
+SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel, in place of its unit's
+
 LOST = 10.0  # a score above it: the aircraft no longer tracks; 1 to 4 is usual
 QUANTILES = (0.5, 0.95, 0.99)
 KEPT = 10  # of the worst flights
@@ -150,7 +151,15 @@ class Tally(Parameters):
         return of / self.flights, float(interval.low), float(interval.high)
 
 
-def score(rms: FloatArray, outputs: Sequence[str], units: Mapping[str, str]) -> FloatArray:
-    """Sum over the channels of rms / SCORE_UNIT, (N,) from (m, N): 1 a channel is 10 mrad/s or 0.1 m/s, 20 mrad/s in p."""
-    unit = np.array([SCORE_UNIT_OF.get(name, SCORE_UNIT[units[name]]) for name in outputs])
+def score_units(outputs: Sequence[str], units: Mapping[str, str]) -> FloatArray:
+    """What the rms error of each channel is counted in, SI, shape (m,). Raises ParameterError for a unit without one."""
+    for name in outputs:
+        require(
+            units[name] in SCORE_UNIT, "outputs", f"{name} in {units[name]}", f"units a score counts: {', '.join(SCORE_UNIT)}"
+        )
+    return np.array([SCORE_UNIT_OF.get(name, SCORE_UNIT[units[name]]) for name in outputs])
+
+
+def score(rms: FloatArray, unit: FloatArray) -> FloatArray:
+    """Sum over the channels of rms / unit, shape (N,), from (m, N) and (m,): one a channel is 10 mrad/s or 0.1 m/s, 20 in p."""
     return np.asarray(np.sum(rms / unit[:, None], axis=0))

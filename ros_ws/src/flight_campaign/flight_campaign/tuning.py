@@ -14,12 +14,12 @@ from aircraft_sim.plant import Plant
 from aircraft_sim.uncertainty import KINEMATIC, uncertain
 from flight_analysis.gain_selection import with_feedforward
 from flight_analysis.scenario import Scenario
-from flight_campaign import fleet
+from flight_campaign import fleet, statistics
 from flight_campaign.course import Course, chart
 from flight_campaign.fleet import Fleet, Flown, Vehicle
 from flight_campaign.laws.catalogue import LAWS, Gains, Law, start
 from flight_campaign.laws.known import Known
-from flight_campaign.statistics import SCORE_UNIT, SCORE_UNIT_OF
+from flight_campaign.statistics import score_units
 from flight_core.files import read_yaml
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
@@ -85,16 +85,13 @@ def arena(scenario: Scenario) -> Arena:
     ahead = scenario.vary(controller=with_feedforward(controller, airframe).model_dump())
     columns = [list(airframe.inputs).index(name) for name in controller.inputs]
     rows = [list(airframe.outputs).index(name) for name in controller.outputs]
-    for name in controller.outputs:
-        counted = airframe.states[name] in SCORE_UNIT
-        require(counted, "outputs", f"{name} in {airframe.states[name]}", f"units a score counts: {', '.join(SCORE_UNIT)}")
     states, limits, m = list(airframe.states), scenario.aircraft.actuators, len(controller.inputs)
 
     def of(values: Iterable[float], otherwise: float) -> FloatArray:
         given = list(values) or [otherwise] * m
         return np.array([given[column] for column in columns])
 
-    unit = np.array([SCORE_UNIT_OF.get(name, SCORE_UNIT[airframe.states[name]]) for name in controller.outputs])
+    unit = score_units(controller.outputs, airframe.states)
     noise = scenario.aircraft.sensor_arrays().noise[rows]
     known = Known(
         airframe.matrix_a(),
@@ -128,7 +125,7 @@ def arena(scenario: Scenario) -> Arena:
 
 def score(flown: Flown, unit: FloatArray) -> FloatArray:
     """Sum over the channels of rms of the true error / unit, shape (N,); infinite where a flight diverged."""
-    total = np.sum(np.asarray(flown.rms) / unit[:, None], axis=0)
+    total = statistics.score(np.asarray(flown.rms), unit)
     return np.where(np.asarray(flown.diverged) | ~np.isfinite(total), np.inf, total)
 
 
