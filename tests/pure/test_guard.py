@@ -50,6 +50,16 @@ def test_a_single_sample_is_held_for_one_period() -> None:
     assert align([sample(0, 7.0)], 11 * MS, 10 * MS) is None
 
 
+def test_a_reference_whose_samples_bunch_up_is_not_thrown_far_by_their_noise() -> None:
+    # Two samples 1 us apart that differ by 1: a straight line through them is 8000 off 8 ms later. The slope is taken from
+    # samples at least a twentieth of the reach apart, here of the first and the last; without such it is held.
+    bunch = [Sample(2 * MS, np.array([1.0])), Sample(2 * MS + 1000, np.array([2.0]))]
+    value = align([sample(0, 0.0), *bunch], 10 * MS, 10 * MS)
+    assert value is not None
+    assert value[0] == pytest.approx(2.0 * 10.0 / 2.001, rel=1e-12)
+    assert align(bunch, 10 * MS, 10 * MS) == pytest.approx([2.0], rel=0.0)
+
+
 @given(ms=st.floats(0, 20))
 def test_a_straight_line_is_reproduced_at_any_instant(ms: float) -> None:
     value = align([sample(t, t) for t in (0, 5, 10)], round(ms * MS), 10 * MS)

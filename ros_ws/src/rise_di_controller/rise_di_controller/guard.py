@@ -43,6 +43,9 @@ class Limits(NamedTuple):
     rate: Array  # (m,) per s
 
 
+# Part of the reach: a slope from samples closer to each other would be more noise than slope, 20 times as much further on.
+APART = 0.05
+
 # Reference samples to keep, so that one of the stamp of y is among them: 0.1 s at 1 kHz, more where y_m is slower.
 KEPT_REFERENCES = 100
 
@@ -100,8 +103,8 @@ def start(m: int) -> ControllerState:
 def align(samples: Sequence[Sample], stamp_ns: int, reach_ns: int) -> FloatArray | None:
     """The signal at an instant, shape (m,), None where no sample reaches it.
 
-    The sample of that stamp, else linear between its neighbours, else linear beyond the newest two by at most `reach_ns`;
-    a single sample is held as far.
+    The sample of that stamp, else linear between its neighbours, else linear beyond the newest by at most `reach_ns`, by the
+    slope from the newest that is APART of it older; where there is none, the newest is held as far.
 
     Arguments: samples with increasing stamps.
     """
@@ -114,10 +117,12 @@ def align(samples: Sequence[Sample], stamp_ns: int, reach_ns: int) -> FloatArray
         before, after = older[-1], newer[0]
     elif not older or stamp_ns - older[-1].stamp_ns > reach_ns:
         return None
-    elif len(older) == 1:
-        return older[0].value
     else:
-        before, after = older[-2:]
+        after = older[-1]
+        apart = [sample for sample in older if after.stamp_ns - sample.stamp_ns >= APART * reach_ns]
+        if not apart:
+            return after.value
+        before = apart[-1]
     fraction = (stamp_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
     return before.value + fraction * (after.value - before.value)
 
