@@ -279,6 +279,14 @@ def hosts() -> Iterator[Hosts]:
                 ["link", "set", "lo", "up"],
             ):
                 subprocess.run([*place, ip, *command], check=True)
+        for place in places:  # Linux says so up to a second later, and Fast DDS passes over a device that is not up
+            deadline = time.monotonic() + 5.0
+            while (
+                "state UP"
+                not in subprocess.run([*place, ip, "link", "show", name], capture_output=True, text=True, check=False).stdout
+            ):
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
         yield Hosts(places[0], places[1], "10.77.0.1")
     finally:
         for holder in holders:
