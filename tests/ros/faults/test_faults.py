@@ -141,7 +141,10 @@ def flies(case: Case, flight: Flight, window: Window) -> None:
         low, high = before.u.min(axis=0), before.u.max(axis=0)
         assert (moved >= low - MOVES / 10).all()
         assert (moved <= high + MOVES / 10).all()
-    found = survive(flight, ("y", "y_m", "u", "truth", "internals"), window.begin, until, window)
+    # The probe listens with best effort: of a topic in a storm its socket drops what the flight's own readers get again.
+    stormed = case.name.removeprefix("storm on ")
+    topics = tuple(topic for topic in ("y", "y_m", "u", "truth", "internals") if topic != stormed)
+    found = survive(flight, topics, window.begin, until, window)
     if not held_back:
         assert flown.modes == [Mode.ENGAGED], found
         # not the thrust, which may still be on its way back from an earlier fault
