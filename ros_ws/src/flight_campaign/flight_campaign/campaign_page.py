@@ -19,8 +19,8 @@ from flight_campaign.campaign import Definition
 from flight_campaign.statistics import EDGES, LOST, PER_DECADE, Figure, Tally
 from flight_core.vectors import FloatArray
 
-COARSE = PER_DECADE // 20
-"""Bins of the statistics in one of the picture, 12 % wide."""
+COARSE = PER_DECADE // 50
+"""Bins of the statistics in one of the picture, 5 % wide."""
 
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 
