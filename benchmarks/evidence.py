@@ -56,7 +56,7 @@ def _own(task: str, *options: str) -> tuple[str, ...]:
 FAULTS = (SHORT, "-m", "benchmarks.faults", "--json", FILE, "--times")
 CAMPAIGN = (SHORT, "-m", "benchmarks.campaign", "--json", FILE)
 FLEET = ("rise-di", "campaign", "osprey_servo", "--uncertainty", "0.3", "--seed", "7", "--json", "--aircraft")
-COMPARE = ("rise-di", "compare", "osprey_servo", "--json", FILE, "--aircraft")
+COMPARE = ("rise-di", "compare", "osprey_servo", "--tuning", "nominal,uncertain,late", "--json", FILE, "--aircraft")
 
 MEASUREMENTS = (
     *(_speed(group) for group in SPEED),

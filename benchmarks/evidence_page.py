@@ -396,8 +396,9 @@ def _compare(results: Results) -> Iterator[str]:
     yield (
         "Same aircraft, reference, gusts, noise, limits and tuning procedure for each law. *Score*: sum of the rms true "
         "errors over 10 mrad/s, 0.1 m/s, 20 mrad/s (p); smaller is better, mean (worst) over the uncertain aircraft. "
-        "*Lost*: score above 10. *Delay*: by how much u may be late before the score triples. Bold is the lowest among laws "
-        "that see the same. Differences of a few percent are the tuning's noise."
+        "*Lost*: score above 10. *Slew*: mean abs(u_dot) of each input on the nominal aircraft, SI. *Delay*: by how much u "
+        "may be late before the score triples. Bold is the lowest among laws that see the same. Differences of a few percent "
+        "are the tuning's noise. What the laws are, and what else they were flown in: [experiments.md](experiments.md#other-laws)."
     )
     lines: list[str] = []
     found = _result(results, "compare", lines)
@@ -415,10 +416,12 @@ def _compare(results: Results) -> Iterator[str]:
             for k, level in enumerate(law["levels"]):
                 scores.append(f"{_mark(level['mean'], least[2 * k + 1])} ({_mark(level['worst'], least[2 * k + 2])})")
             lost = " / ".join(f"{100 * level['lost']:.3g}" for level in law["levels"])
-            rows.append((law["law"], law["sees"], *scores, lost, f"{1e3 * law['delay']:.0f}"))
-        yield f"Gains tuned on: {aims}. {found['aircraft']} aircraft a level, seed {found['seed']}."
+            slew = " / ".join(f"{of:.2g}" for of in law["slew"].values())
+            rows.append((law["law"], law["sees"], *scores, lost, slew, f"{1e3 * law['delay']:.0f}"))
+        inputs = ", ".join(laws[0]["slew"])
+        yield f"Gains tuned on: {aims}. Inputs: {inputs}. {found['aircraft']} aircraft a level, seed {found['seed']}."
         heads = (f"+-{100 * level:g} %" for level in levels)
-        yield from _table(("law", "sees", "nominal", *heads, "lost (%)", "delay (ms)"), rows, texts=2)
+        yield from _table(("law", "sees", "nominal", *heads, "lost (%)", "slew", "delay (ms)"), rows, texts=2)
 
 
 def _scores(law: Mapping[str, Any]) -> list[float]:

@@ -55,7 +55,15 @@ FAULT = {
     "longest_pause": None,
 }
 LEVEL = {"uncertainty": 0.3, "mean": 1.75, "worst": 2.48, "diverged": 0.0, "lost": 0.0}
-LAW = {"law": "rise", "sees": "y", "tuned_on": "nominal", "score": 1.61, "levels": [LEVEL], "delay": 0.02}
+LAW = {
+    "law": "rise",
+    "sees": "y",
+    "tuned_on": "nominal",
+    "score": 1.61,
+    "levels": [LEVEL],
+    "slew": {"elevator": 0.077},
+    "delay": 0.02,
+}
 FIGURE = {"mean": 1.31, "q50": 1.21, "q95": 2.31, "q99": 2.71, "worst": 3.01, "deviation": 0.1}
 SHARE = {"count": 3, "share": 3e-4, "low": 1e-4, "high": 9e-4}
 RESULTS = {
