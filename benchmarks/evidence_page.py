@@ -398,7 +398,7 @@ def _compare(results: Results) -> Iterator[str]:
         "errors over 10 mrad/s, 0.1 m/s, 20 mrad/s (p); smaller is better, mean (worst) over the uncertain aircraft. "
         "*Lost*: score above 10. *Slew*: mean abs(u_dot) of each input on the nominal aircraft, SI. *Delay*: by how much u "
         "may be late before the score triples. Bold is the lowest among laws that see the same. Differences of a few percent "
-        "are the tuning's noise. What the laws are, and what else they were flown in: [experiments.md](experiments.md#other-laws)."
+        "are the tuning's noise. What the laws are, and what else they flew in: [experiments.md](experiments.md#other-laws)."
     )
     lines: list[str] = []
     found = _result(results, "compare", lines)
