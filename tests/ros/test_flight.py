@@ -76,7 +76,7 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
     bound = 1.5 * rms(tracking_error(simulate(scenario)).values)
     # The bound speaks of the loop, not of the machine: a flight in which the machine held the controller back by more than a
     # quarter of its period, or the aircraft by more than a sample, says nothing against it, and is flown again.
-    held_back, flown = True, np.full(4, np.inf)
+    all_late = True
     for _ in range(4):
         flight = fly(start, short_scenario)
         assert flight.end(60.0) == 0, flight.output
@@ -84,12 +84,13 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
         tape = read_run(run).tape
         ticks = json.loads((run / "summary.json").read_text(encoding="utf-8"))["ticks"]
         late = ticks["late_max"] >= 0.0025 or ticks["without_new_y"] > 1
-        held_back = late or np.diff(tape["y"].stamp_ns).max() > 4_000_000
+        held_back = bool(late or np.diff(tape["y"].stamp_ns).max() > 4_000_000)
+        all_late = all_late and late
         flown = rms(tracking_error(tape).values)
-        if not held_back:
+        if not held_back or (flown <= bound).all():
             break
-    if held_back and not (flown <= bound).all():
-        pytest.skip(f"the machine held nodes back in four flights of four; {flown} over topics, at most {bound}")
+    if all_late and not (flown <= bound).all():
+        pytest.skip("the machine held the controller's ticks back in four flights of four")
     assert (flown <= bound).all(), f"{flown} over topics, at most {bound}"
 
     with AnyReader([run]) as reader:
