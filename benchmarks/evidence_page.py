@@ -99,7 +99,8 @@ def _about(found: Mapping[str, Result]) -> Iterator[str]:
     yield ""
     yield (
         "What all of it leaves open: one host, the loopback interface, simulated aircraft; nothing is said of a network or a "
-        "real-time kernel. A virtual machine also waits for its host, which no figure tells from the stack's own time."
+        "real-time kernel. A virtual machine also waits for its host, which no time here tells from the stack's own; "
+        "missed ticks alone are told apart."
     )
 
 
@@ -206,11 +207,12 @@ MEANING = {
     "middleware, services and diagnostics too, for each u; the controller also takes a y_m and publishes `internals` each "
     "time. The stack's own data goes through none of these executors: a tick reads what has come; an executor serves "
     "parameters and services between ticks.",
-    "ticks": "How long after its deadline a tick begins. One that is later than a period is *missed*. The stack's loop "
-    "sleeps until an absolute deadline on the monotonic clock, with no executor on the way; it is an empty node, with its "
-    "services and its 1 Hz reports. *FIFO*: started by `chrt -f 50`, as in `chrt -f 50 rise-di fly osprey_gust`, which "
-    "gives all its processes that priority; such a process wakes 0.1 ms early and watches the clock for the rest. *Full "
-    "load*: every core busy with something else.",
+    "ticks": "How long after its deadline a tick begins. One that is later than a period is *missed*. *By itself*: missed, "
+    "less the time in which the machine ran nothing of ours, a virtual one while its host ran something else; a process on "
+    "each core that goes before all others notices. The stack's loop sleeps until 0.1 ms before an absolute deadline on the "
+    "monotonic clock and watches the clock for the rest, with no executor on the way; it is an empty node, with its services "
+    "and its 1 Hz reports. *FIFO*: started by `chrt -f 50`, as in `chrt -f 50 rise-di fly osprey_gust`, which gives all its "
+    "processes that priority. *Full load*: every core busy with something else.",
     "flight": "Real time, `osprey_gust`: aircraft and reference model at 500 Hz, controller at 100 Hz, recorder of all topics. "
     "Memory by itself is what the process does not share with others.",
     "start": "Wall time. A flight waits on purpose until its recorder and controller are ready, and then as long again for the "
@@ -258,7 +260,7 @@ def _speed_group(results: Results, group: str) -> Iterator[str]:
     yield ""
 
 
-PLAIN = ("missed", "lost", "ticks", "max (us)")  # counts, and single outliers, of which a ratio says nothing
+PLAIN = ("missed", "by itself", "lost", "ticks", "max (us)")  # counts, and single outliers, of which a ratio says nothing
 
 
 def _beside(value: float | None, floor: float | None, column: str) -> str:

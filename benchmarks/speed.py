@@ -28,6 +28,7 @@ import numpy as np
 import psutil
 import rclpy
 from benchmarks import campaign, law, lockstep, recorder
+from benchmarks.held import Intervals, missed_by_itself
 from benchmarks.sampling import new_table
 from rclpy.context import Context
 from rclpy.node import Node
@@ -55,6 +56,7 @@ NODE_RATE = 500.0  # Hz, at which the callback of a node is timed
 WARM_UP = 1.0  # s, left out of what is measured of a process
 MATCHED_WITHIN = 20.0  # s
 ENDS_WITHIN = 10.0  # s
+BY_ITSELF = "by itself"  # column: ticks missed while the machine ran
 
 
 @dataclass(frozen=True)
@@ -111,16 +113,16 @@ class Child:
         """Time that its threads have run, those that have ended left out, ns."""
         return threads_ns(self.popen.pid)
 
-    def figures(self, timeout: float = 20.0) -> dict[str, float]:
+    def figures(self, timeout: float = 20.0) -> dict[str, Any]:
         """Wait for its end, and what it says. Raises RuntimeError where that is nothing."""
         said, _ = self.popen.communicate(timeout=timeout)
         lines = [line for line in said.splitlines() if line.startswith("{")]
         if not lines:
             raise RuntimeError(f"{' '.join(self.popen.args)} ended with status {self.popen.returncode} and said nothing")
-        found: dict[str, float] = json.loads(lines[-1])
+        found: dict[str, Any] = json.loads(lines[-1])
         return found
 
-    def stop(self) -> dict[str, float]:
+    def stop(self) -> dict[str, Any]:
         """Tell it to end, and what it says then."""
         self.popen.terminate()
         return self.figures()
@@ -294,6 +296,9 @@ def _latency(driven: Driven, values: Sequence[float]) -> dict[str, float]:
 def tick_rows(seconds: float) -> Iterator[Row]:
     """How late ticks begin, of a node of the stack that does nothing in them, beside rclpy's own timers."""
     short = min(seconds, FLOOR_SECONDS)
+    chrt = shutil.which("chrt")
+    if chrt is not None and subprocess.run([chrt, "-f", str(PRIORITY), "true"], check=False).returncode:  # noqa: S603
+        chrt = None  # no right to real-time priority here
     for hz in RATES:
         told = ("--hz", str(hz), "--seconds")
         floor = f"empty timer, single, {hz} Hz"
@@ -302,12 +307,12 @@ def tick_rows(seconds: float) -> Iterator[Row]:
                 yield Row("ticks", f"empty timer, {executor}, {hz} Hz", *_ticks(child, short), floor)
         with Child("bare_loop", *told, str(short)) as child:
             yield Row("ticks", f"loop that only sleeps, {hz} Hz", *_ticks(child, short), floor)
-        goals = {500: [Goal("missed", 0)], 1000: [Goal("p99 (us)", 100.0)]}.get(hz, [])
-        with Child("ticker", *told, str(seconds)) as child:
-            yield Row("ticks", f"the stack's loop, {hz} Hz", *_ticks(child, seconds), floor, goals)
-    chrt = shutil.which("chrt")
-    if chrt is None or subprocess.run([chrt, "-f", str(PRIORITY), "true"], check=False).returncode:  # noqa: S603
-        return  # no right to real-time priority here
+        goals = {500: [Goal(BY_ITSELF if chrt else "missed", 0)], 1000: [Goal("p99 (us)", 100.0)]}.get(hz, [])
+        with sentinels(chrt is not None) as held, Child("ticker", *told, str(seconds)) as child:
+            figures = _ticks(child, seconds, held)
+        yield Row("ticks", f"the stack's loop, {hz} Hz", *figures, floor, goals)
+    if chrt is None:
+        return
     within = (chrt, "-f", str(PRIORITY))
     with full_load():
         for name, role in (("empty timer, single", "timer"), ("the stack's loop", "ticker")):
@@ -318,14 +323,28 @@ def tick_rows(seconds: float) -> Iterator[Row]:
                 yield Row("ticks", what, *_ticks(child, length), floor, goals)
 
 
-def _ticks(child: Child, seconds: float) -> tuple[dict[str, float]]:
+@contextlib.contextmanager
+def sentinels(allowed: bool) -> Iterator[Callable[[], Intervals] | None]:
+    """When the machine was held back, by a process on each core that goes before all others; None if not allowed."""
+    if not allowed:
+        yield None
+        return
+    with contextlib.ExitStack() as stack:
+        watching = [stack.enter_context(Child("sentinel", "--core", str(core))) for core in sorted(os.sched_getaffinity(0))]
+        yield lambda: [tuple(one) for child in watching for one in child.stop()["held"]]
+
+
+def _ticks(child: Child, seconds: float, held: Callable[[], Intervals] | None = None) -> tuple[dict[str, float]]:
     time.sleep(seconds / 2.0)
     cpu_ns, at = child.cpu_ns(), time.monotonic()
     time.sleep(seconds / 2.0)  # and then, having started later, it still runs
     share = (child.cpu_ns() - cpu_ns) / 1e9 / (time.monotonic() - at)
     found = child.figures(timeout=seconds + 20.0)
     shown = {f"{name} (us)": found[name] for name in ("p50", "p99", "max")}
-    return (shown | {"missed": found["missed"], "ticks": found["ticks"], "CPU (%)": 100.0 * share},)
+    shown |= {"missed": found["missed"]}
+    if held is not None:
+        shown[BY_ITSELF] = missed_by_itself(found["skipped"], held(), found["period_ns"])
+    return (shown | {"ticks": found["ticks"], "CPU (%)": 100.0 * share},)
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ Executors are never spun without a timeout: without one the events executor of t
 
 import argparse
 import json
+import os
 import signal
 import threading
 import time
@@ -36,7 +37,9 @@ EXECUTORS: dict[str, Callable[[], Any]] = {
     "multi": lambda: MultiThreadedExecutor(num_threads=2),
     "events": EventsExecutor,
 }
+ROLES = ("echo", "timed_echo", "idle", "timer", "bare_loop", "ticker", "sentinel", "controller")
 PAUSE = 0.1  # s, the longest that an executor waits
+SENTINEL_PERIOD = 0.0005  # s
 
 
 def lateness(late_ns: list[int], missed: int) -> dict[str, float]:
@@ -157,26 +160,48 @@ def bare_loop(hz: float, seconds: float) -> dict[str, float]:
     return lateness(late, missed)
 
 
-def ticker_node(hz: float, seconds: float) -> dict[str, float]:
+def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
     """An empty node of the stack, with all that its loop does beside the ticks: services, diagnostics, a look at the graph."""
     late: list[int] = []
-    missed = [0]
+    skipped: list[tuple[int, int]] = []  # from the first deadline that was missed until the tick that came, monotonic ns
+    period = round(NANOSECONDS / hz)
 
     class Empty(FlightNode[NodeParameters]):
         def __init__(self) -> None:
             super().__init__("ticker", NodeParameters)
 
         def period_ns(self) -> int:
-            return round(NANOSECONDS / hz)
+            return period
 
         def tick(self, tick: Tick, now_ns: int) -> None:
             late.append(tick.late_ns)
-            missed[0] += tick.missed
+            if tick.missed:
+                begin_ns = time.monotonic_ns()
+                skipped.append((begin_ns - tick.late_ns - tick.missed * period, begin_ns))
 
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGTERM))
     signal.setitimer(signal.ITIMER_REAL, seconds + 1.0)
     run(Empty)
-    return lateness(late, missed[0])
+    missed = sum((until - since) // period for since, until in skipped)
+    return lateness(late, missed) | {"skipped": skipped, "period_ns": period}
+
+
+def sentinel(core: int) -> dict[str, Any]:
+    """On one core, before everything else: intervals in which it did not run, monotonic ns; nothing ran then on that core.
+
+    What holds it back is the kernel or, in a virtual machine, the host that runs something else.
+    """
+    os.sched_setaffinity(0, {core})
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_max(os.SCHED_FIFO)))
+    ended, held = until_told(), []
+    last_ns = time.monotonic_ns()
+    while not ended.is_set():
+        time.sleep(SENTINEL_PERIOD)
+        now_ns = time.monotonic_ns()
+        if now_ns - last_ns > 2e9 * SENTINEL_PERIOD:
+            held.append((last_ns, now_ns))
+        last_ns = now_ns
+    return {"held": held}
 
 
 def controller() -> dict[str, float]:
@@ -211,18 +236,20 @@ def controller() -> dict[str, float]:
 def main() -> None:
     """Do as one of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("role", choices=("echo", "timed_echo", "idle", "timer", "bare_loop", "ticker", "controller"))
+    parser.add_argument("role", choices=ROLES)
     parser.add_argument("--executor", choices=EXECUTORS, default="single")
     parser.add_argument("--hz", type=float, default=500.0)
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--core", type=int, default=0)
     asked, _ = parser.parse_known_args()  # the rest is for ROS
-    roles: dict[str, Callable[[], dict[str, float]]] = {
+    roles: dict[str, Callable[[], dict[str, Any]]] = {
         "echo": lambda: echo(asked.executor, asked.hz, timed=False),
         "timed_echo": lambda: echo(asked.executor, asked.hz, timed=True),
         "idle": idle,
         "timer": lambda: timer(asked.executor, asked.hz, asked.seconds),
         "bare_loop": lambda: bare_loop(asked.hz, asked.seconds),
         "ticker": lambda: ticker_node(asked.hz, asked.seconds),
+        "sentinel": lambda: sentinel(asked.core),
         "controller": controller,
     }
     print(json.dumps(roles[asked.role]()), flush=True)
