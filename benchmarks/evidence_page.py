@@ -175,13 +175,16 @@ def _faults(results: Results) -> Iterator[str]:
     times = ("reaction (ms)", "recovery (ms)", "traffic, of start (ms)", "of ready (ms)", "longest pause (ms)")
     yield from _table(("fault", "u meanwhile", "injected", "detected", "passed", *times), rows, texts=2)
     yield (
-        "Times are median / worst. *Longest pause*: of a topic that is to go on. \\*: other work held the machine back in "
-        "every run, and the times are its too."
+        "Times are median / worst. *Longest pause*: of a topic that is to go on. \\*: other work, or the fault itself, held "
+        "processes back in every run, and the times are the machine's too."
     )
     for key, since in (("exec_to_traffic", "its start"), ("ready_to_traffic", "its being ready")):
         if back := [one[key]["worst"] for one in found if one.get(key)]:
             yield ""
             yield _goal(f"a killed node is back to full traffic within 0.5 s of {since}", max(back), 0.5, "s at worst")
+    if caught_up := [one["ready_to_caught_up"] for one in found if one.get("ready_to_caught_up")]:
+        took = " or ".join(_pair(one) for one in caught_up)
+        yield f"- A recorder also has the last 2000 samples of each topic, which publishers keep, {took} ms after being ready."
 
 
 def _pair(times: Mapping[str, float] | None) -> str:

@@ -57,7 +57,7 @@ def _summary(case: str, rows: Sequence[Row]) -> Row:
     summary: Row = {"case": case, "u": rows[0]["does"], "injected": len(rows), "passed": len(passed), "quiet": len(quiet)}
     summary["detected"] = sum(row["reaction"] is not None for row in passed) if rows[0]["expected"] else None
     summary["held_back"] = max((row["held_back"] for row in judged), default=None)
-    for key in ("reaction", "recovery", "ready_to_traffic", "exec_to_traffic", "longest_pause"):
+    for key in ("reaction", "recovery", "ready_to_traffic", "exec_to_traffic", "ready_to_caught_up", "longest_pause"):
         values = [row[key] for row in judged if row.get(key) is not None]
         summary[key] = {"median": statistics.median(values), "worst": max(values)} if values else None
     return summary
@@ -95,7 +95,8 @@ def main(
     summaries = summarise(fly(times, seed, only))
     if file is not None:
         file.write_text(json.dumps(summaries, indent=2) + "\n", encoding="utf-8")
-    Console().print(shown(summaries))
+    console = Console()
+    Console(width=None if console.is_terminal else 160).print(shown(summaries))
     if any(one["passed"] < times for one in summaries):
         raise typer.Exit(1)
 

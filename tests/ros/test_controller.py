@@ -3,6 +3,7 @@
 """The controller's node among peers that fail: engagement, stale and bad samples, parameters and transitions in flight."""
 
 import math
+import signal
 import time
 from collections.abc import Iterator
 
@@ -77,6 +78,23 @@ def test_stale_inputs_are_held_ramped_to_trim_and_engaged_again(start: Start, os
     someone.until(lambda: someone.modes()[-1] == Mode.ENGAGED, each=lambda: someone.send(0.05))
     engaged = next(m for m in reversed(someone.heard["internals"]) if m.position[m.name.index("dt")] == 0.0)
     assert engaged.position[engaged.name.index("u.elevator")] == 0.0
+
+
+def test_one_that_was_stopped_says_nothing_of_before_and_engages_from_where_u_was_let_go(
+    start: Start, osprey_gust: Scenario, someone: Peer
+) -> None:
+    process = controller(start, osprey_gust, "-p", "hold:=0.1", "-p", "ramp:=0.2")
+    engage(someone)
+    someone.until(lambda: np.abs(someone.u()[-1]).max() > 1e-3, each=lambda: someone.send(0.05))
+    process.popen.send_signal(signal.SIGSTOP)
+    try:
+        again = time.monotonic() + 0.6  # s: beyond its age limit, hold and ramp
+        someone.until(lambda: time.monotonic() > again, each=lambda: someone.send(0.05))
+        before = len(someone.heard["u"])  # what it said last has arrived long since
+    finally:
+        process.popen.send_signal(signal.SIGCONT)
+    someone.until(lambda: len(someone.heard["u"]) > before + 2, each=lambda: someone.send(0.05))
+    assert (someone.u()[before] == 0.0).all()
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ import psutil
 import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
+from mcap.records import Channel, Message
 from rcl_interfaces.msg import Log
 from rclpy.context import Context
 from rclpy.node import Node
@@ -30,6 +31,7 @@ from tests.ros.conftest import Process
 from flight_bringup.processes import end_with_parent
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.vectors import FloatArray
+from flight_recorder.scan import Scan
 from flight_ros import transport
 from flight_ros.inbox import Inbox, Waiter
 from flight_ros.messages import Decoder
@@ -53,6 +55,7 @@ SAYS = {"aircraft": ("truth", "y"), "reference_model": ("y_m",), "controller": (
 
 SPEAKERS = tuple(role for role in PACKAGES if role != "recorder")  # it cannot record that it no longer records
 
+TICK = 0.01  # s, the controller's, as in the default scenario
 MAX_AGE = 0.1  # s, of y and y_m, as in the default scenario
 SILENCE = 0.2  # s, of u, the aircraft's default
 HOLD, RAMP = 0.2, 0.3  # s, of both: shorter than flown, so that a case sees all of it
@@ -169,6 +172,31 @@ class Flown(NamedTuple):
     def modes(self) -> list[Mode]:
         """The modes in their order, repeats left out."""
         return [Mode(int(mode)) for k, mode in enumerate(self.mode) if k == 0 or self.mode[k - 1] != mode]
+
+
+def _flown(t: FloatArray, values: FloatArray) -> Flown:
+    mode, late, number, e, u, y, y_m = np.split(values, [1, 2, 3, 7, 11, 15], axis=1)
+    return Flown(t, mode[:, 0], late[:, 0], number[:, 0], e, u, y, y_m)
+
+
+class Logged(NamedTuple):
+    """A message in a log, when it was sent and written, s of the system clock."""
+
+    topic: str
+    sent: float
+    written: float
+    data: bytes
+
+
+def logged(run: Path) -> Iterator[Logged]:
+    """All messages of a log, which may still grow."""
+    for path in run.glob("*.mcap"):
+        topics: dict[int, str] = {}
+        for record in Scan(path).records():
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                yield Logged(topics[record.channel_id], seconds(record.publish_time), seconds(record.log_time), record.data)
 
 
 WANTED = ("mode", "late", "number", *(f"e.{name}" for name in OUTPUTS), *(f"u.{name}" for name in INPUTS))
@@ -323,9 +351,19 @@ class Flight:
 
     def flown(self, begin: float, end: float = float("inf")) -> Flown:
         """The controller's ticks."""
-        t, values = self._values("internals", WANTED, begin, end)
-        mode, late, number, e, u, y, y_m = np.split(values, [1, 2, 3, 7, 11, 15], axis=1)
-        return Flown(t, mode[:, 0], late[:, 0], number[:, 0], e, u, y, y_m)
+        return _flown(*self._values("internals", WANTED, begin, end))
+
+    def engaged_ticks(self, begin: float, until: float) -> Flown | None:
+        """The ticks with the law from samples since, from the log, which has them all; None while it does not reach so far."""
+        decoder, found = Decoder(WANTED), []
+        for one in logged(self.runs[-1]):
+            sample = decoder.decode(one.data) if one.topic == "/internals" else None
+            if sample is not None and sample.sender in self._ours and seconds(sample.stamp_ns) >= begin - MAX_AGE:
+                found.append(sample)
+        if not found or seconds(found[-1].stamp_ns) < until:
+            return None
+        flown = _flown(np.array([seconds(one.stamp_ns) for one in found]), np.array([one.value for one in found]))
+        return Flown(*(column[flown.mode == Mode.ENGAGED] for column in flown))
 
     def moved(self, begin: float, end: float = float("inf")) -> tuple[FloatArray, FloatArray]:
         """What the aircraft's inputs really did: when (N,), and their deviations from trim (N, m)."""

@@ -164,7 +164,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
             self.get_logger().info(f"{before.name} -> {self._controller.mode.name}")
         if commanded is None:
             return False
-        self._publish_u(self._u_encoder.encode(commanded.stamp_ns, commanded.u))
+        # One that was stopped does not send what it was about to: the aircraft has let go of u, and would jump back to it.
+        if self.parameters.lockstep or self.now_ns() - now_ns <= self._max_age_ns:
+            self._publish_u(self._u_encoder.encode(commanded.stamp_ns, commanded.u))
         self._publish_internals(self._internals_encoder.encode(commanded.stamp_ns, commanded.internals))
         return True
 
