@@ -212,7 +212,7 @@ MEANING = {
     "parameters and services between ticks.",
     "ticks": "How long after its deadline a tick begins. One that is later than a period is *missed*. *By itself*: missed, "
     "less the time in which the machine ran nothing of ours, a virtual one while its host ran something else; a process on "
-    "each core that goes before all others notices. The stack's loop sleeps until 0.1 ms before an absolute deadline on the "
+    "each core that goes before all others notices. The stack's loop sleeps until shortly before an absolute deadline on the "
     "monotonic clock and watches the clock for the rest, with no executor on the way; it is an empty node, with its services "
     "and its 1 Hz reports. *FIFO*: started by `chrt -f 50`, as in `chrt -f 50 rise-di fly osprey_gust`, which gives all its "
     "processes that priority. *Full load*: every core busy with something else.",

@@ -3,6 +3,7 @@
 """A small disk to fill, where mounting one is allowed."""
 
 import errno
+import os
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -10,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+
+from flight_recorder.disk import free_bytes
 
 
 @contextmanager
@@ -27,12 +30,13 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
 
 
 def fill(path: Path) -> None:
-    """Write a file until there is no space left."""
+    """Take all the space that is left, in one piece: what somebody else gives up afterwards stays free."""
     with path.open("ab", buffering=0) as stream:
-        while True:
+        taken = 0
+        while free := free_bytes(path.parent):
             try:
-                stream.write(bytes(512))
-            except OSError as error:
+                os.posix_fallocate(stream.fileno(), taken, free)
+                taken += free
+            except OSError as error:  # somebody else has taken some of it meanwhile
                 if error.errno != errno.ENOSPC:
                     raise
-                return

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from flight_ros.ticker import AHEAD, TIMER_SLACK, Ticker
+from flight_ros.ticker import AHEAD, SHARE, TIMER_SLACK, Ticker
 
 PERIOD_NS = 10_000_000
 
@@ -49,13 +49,17 @@ def test_it_waits_for_the_deadline_and_no_longer_than_it_may() -> None:
     assert time.thread_time() < begin + 0.5  # s: a deadline that has passed is not waited for
 
 
-def test_it_is_awake_before_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("period_ns", "ahead"), [(PERIOD_NS, AHEAD), (1_000_000, SHARE * 1e-3)])
+def test_it_is_awake_before_the_deadline_by_no_more_than_a_share_of_the_period(
+    period_ns: int, ahead: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     slept: list[float] = []
     monkeypatch.setattr(time, "sleep", slept.append)  # which wakes at once
-    ticker = Ticker(PERIOD_NS, time.monotonic_ns())
+    monkeypatch.setattr(time, "monotonic_ns", iter(range(0, 10 * period_ns, period_ns // 20)).__next__)
+    ticker = Ticker(period_ns, 0)
     ticker.due()
     ticker.wait(1.0)
-    assert slept[0] <= PERIOD_NS / 1e9 - AHEAD
+    assert slept == [pytest.approx(0.95 * period_ns / 1e9 - ahead)]  # it is looked at a second time
 
 
 @pytest.mark.skipif(not TIMER_SLACK.exists(), reason="no Linux, or no /proc")

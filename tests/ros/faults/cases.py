@@ -424,11 +424,14 @@ STORM_OF_PARAMETERS, UNDER_WAY = 2000, 8  # a service keeps ten requests
 
 
 def parameters(flight: Flight, random: Generator) -> None:
-    """Two thousand changes of the controller's gains, half of them bad, eight always under way."""
+    """Two thousand changes of the controller's gains, half of them bad, the first one too; eight always under way."""
     valid = random.random(STORM_OF_PARAMETERS) < 0.5
+    valid[0] = False
     with peer(listen=()) as someone:
         client = someone.node.create_client(SetParameters, "controller/set_parameters")
         someone.until(client.service_is_ready)
+        first = client.call_async(SetParameters.Request(parameters=[number("k_g", 1.0)]))
+        someone.until(first.done)  # from then on each knows of the other
         flight.fault()
         futures: list[Any] = []
         done = 0

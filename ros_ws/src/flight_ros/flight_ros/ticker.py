@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
-AHEAD = 1e-4  # s, by which a thread is awake before its deadline to watch the clock for the rest: waking takes 20 to 100 us
-# and differs from time to time. It costs 1 % of a core at 100 Hz.
+AHEAD = 2.5e-4  # s, by which a thread is awake before its deadline to watch the clock for the rest: waking takes 20 to 250 us
+SHARE = 0.1  # of a period, and so of a core, that the watch takes at most
 
 
 def wake_on_time() -> None:
@@ -39,6 +39,7 @@ class Ticker:
 
     def __init__(self, period_ns: int, start_ns: int) -> None:
         self.period_ns = period_ns
+        self._ahead = min(AHEAD, SHARE * period_ns / 1e9)  # s
         self._start_ns = start_ns
         self._last = -1
 
@@ -47,11 +48,11 @@ class Ticker:
         return (self._start_ns + (self._last + 1) * self.period_ns - time.monotonic_ns()) / 1e9
 
     def wait(self, most: float) -> None:
-        """Sleep until the next deadline, but at most so many s; watch the clock for the last AHEAD of it."""
+        """Sleep until the next deadline, but at most so many s; watch the clock for the last of it."""
         pause = self.remaining()
-        if pause > AHEAD:
-            time.sleep(min(pause - AHEAD, most))
-        while 0.0 < self.remaining() <= AHEAD:
+        if pause > self._ahead:
+            time.sleep(min(pause - self._ahead, most))
+        while 0.0 < self.remaining() <= self._ahead:
             pass
 
     def due(self) -> Tick | None:
