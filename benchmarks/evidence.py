@@ -114,7 +114,7 @@ def measure(one: Measurement, *, quick: bool) -> Result:
         "command": " ".join(shown),
         "quick": quick,
         "date": date,
-        "revision": _said("git", "describe", "--always", "--dirty"),
+        "revision": revision(),
         "machine": machine(),
         "busy": busy,
         "seconds": time.monotonic() - begin,
@@ -155,6 +155,12 @@ def machine() -> dict[str, Any]:
         "system": f"{platform.system()} {platform.release()}",
         "python": platform.python_version(),
     }
+
+
+def revision() -> str:
+    """The commit, and whether anything but the page differs from it."""
+    changed = _said("git", "status", "--porcelain", "--", ".", f":(exclude){PAGE.relative_to(REPOSITORY)}")
+    return _said("git", "describe", "--always") + ("-dirty" if changed else "")
 
 
 def _said(*command: str) -> str:
