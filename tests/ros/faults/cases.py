@@ -305,7 +305,16 @@ def malformed(topic: str, kind: str) -> Callable[[Flight, Generator], None]:
 def publishing(someone: Peer, topic: str) -> Iterator[Callable[[JointState], None]]:
     """A further publisher of a topic, found by all who listen."""
     publisher = someone.node.create_publisher(JointState, topic, PUBLISH)
-    someone.until(lambda: publisher.get_subscription_count() >= 3)  # the node that flies with it, the recorder, the probe
+    wanted = {TAKERS[topic], "recorder", "probe"}
+
+    def met() -> bool:
+        return bool(publisher.get_subscription_count() >= len(wanted))
+
+    try:
+        someone.until(met)
+    except AssertionError as error:
+        known = {one.node_name for one in someone.node.get_subscriptions_info_by_topic(topic)}
+        raise AssertionError(f"{error}: a newcomer on {topic} knows of {sorted(known & wanted)}, of {sorted(wanted)}") from None
     yield publisher.publish
     someone.node.destroy_publisher(publisher)
 
