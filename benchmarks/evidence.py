@@ -45,7 +45,7 @@ QUICK_SECONDS = 2.0
 def _speed(group: str) -> Measurement:
     what, seconds = SPEED[group]
     command = (SHORT, "-m", "benchmarks.speed", "--only", group, "--json", FILE, "--seconds")
-    takes = {"law": "10 s", "ticks": "15 min", "latency": "3 min"}.get(group, "1 min")
+    takes = {"law": "10 s", "ticks": "8 min", "latency": "3 min"}.get(group, "1 min")
     return Measurement(f"speed-{group}", (*command, f"{seconds:g}"), (*command, f"{QUICK_SECONDS:g}"), what, takes, timed=True)
 
 
@@ -60,7 +60,7 @@ COMPARE = ("rise-di", "compare", "osprey_servo", "--tuning", "nominal,uncertain,
 
 MEASUREMENTS = (
     *(_speed(group) for group in SPEED),
-    Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), "faults put into a flight over DDS", "60 min", timed=True),
+    Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), "faults put into a flight over DDS", "20 min", timed=True),
     Measurement(
         "security",
         (*PYTEST, "tests/ros/test_security.py", "tests/ros/test_policy.py"),
