@@ -78,7 +78,7 @@ def record(run: Path, rate: float, duration: float) -> tuple[dict[str, float], f
     """What was sent, and the processor time of the recorder from the first message to the last, s."""
     scenario = find_scenario("osprey_servo").path
     told = ("--ros-args", "--params-file", str(scenario), "-p", f"directory:={run}")
-    recorder = psutil.Popen([sys.executable, "-m", "flight_recorder.node", *told], stderr=subprocess.DEVNULL)
+    recorder = psutil.Popen([sys.executable, "-m", "flight_recorder.main", *told], stderr=subprocess.DEVNULL)
     command = [sys.executable, __file__, "--publish", f"--rate={rate}", f"--duration={duration}"]
     publisher = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: S603 - this file
     try:

@@ -22,9 +22,14 @@ Start = Callable[..., "Process"]
 class Process:
     """A process under test, its output collected line by line."""
 
-    def __init__(self, *arguments: str, cwd: Path, within: Sequence[str] = ()) -> None:
+    def __init__(self, *arguments: str, cwd: Path, within: Sequence[str] = (), stdin: int | None = None) -> None:
         self.popen = subprocess.Popen(
-            [*within, sys.executable, "-m", *arguments], cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            [*within, sys.executable, "-m", *arguments],
+            cwd=cwd,
+            stdin=stdin,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
         )
         self.lines: list[str] = []
         self._changed = threading.Condition()

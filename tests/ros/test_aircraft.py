@@ -23,7 +23,7 @@ def someone() -> Iterator[Peer]:
 
 
 def aircraft(start: Start, scenario: Scenario, *arguments: str) -> Process:
-    return start("aircraft_sim.node", "--ros-args", "--params-file", str(scenario.path), *arguments)
+    return start("aircraft_sim.main", "--ros-args", "--params-file", str(scenario.path), *arguments)
 
 
 def command(someone: Peer, sender: str, aileron: float) -> None:

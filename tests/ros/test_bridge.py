@@ -77,7 +77,7 @@ class Sky:
 
     def bridge(self, *arguments: str) -> Process:
         """The bridge by the shipped map but for its age limits, ready."""
-        process = self._start("autopilot_bridge.node", "--ros-args", "-p", f"map:={self.map}", *arguments)
+        process = self._start("autopilot_bridge.main", "--ros-args", "-p", f"map:={self.map}", *arguments)
         process.wait_for("ready")
         return process
 
@@ -152,9 +152,9 @@ def test_the_unchanged_controller_tracks_through_the_map_and_its_death_gives_the
     assert CliRunner().invoke(app, ["check-signs", sky.map, "--scenario", str(SCENARIO)]).exit_code == 0
     autopilot = sky.autopilot()
     bridge = sky.bridge("-p", "dry_run:=false")
-    controller = sky.node("rise_di_controller.node")
+    controller = sky.node("rise_di_controller.main")
     controller.wait_for("ready")
-    sky.node("reference_model.node")
+    sky.node("reference_model.main")
     sky.peer.until(lambda: sky.peer.heard["u"])
     assert not sky.joys  # nothing is sent before it is engaged
     sky.take_over()
@@ -183,8 +183,8 @@ def test_the_unchanged_controller_tracks_through_the_map_and_its_death_gives_the
 def test_pilot_silent_autopilot_and_end_of_the_bridge_each_give_the_channels_back(sky: Sky) -> None:
     autopilot = sky.autopilot()
     bridge = sky.bridge("-p", "dry_run:=false")
-    sky.node("rise_di_controller.node").wait_for("ready")
-    sky.node("reference_model.node")
+    sky.node("rise_di_controller.main").wait_for("ready")
+    sky.node("reference_model.main")
     sky.peer.until(lambda: sky.peer.heard["u"])
 
     gamepad = sky.peer.node.create_publisher(Joy, "/joy", 10)
@@ -285,7 +285,7 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
     bag = tmp_path / "bag"
     topics = ("/ap/twist/filtered", "/ap/airspeed")
     recorder = start(
-        "flight_recorder.node",
+        "flight_recorder.main",
         *("--ros-args", "-p", f"directory:={bag}", "-p", f"topics:=[{', '.join(topics)}]", "-p", "rate:=50.0"),
     )
     recorder.wait_for("ready")
@@ -363,7 +363,7 @@ def test_a_dry_run_says_what_it_would_send_and_sends_nothing(sky: Sky) -> None:
 
 
 def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Start) -> None:
-    bridge = start("autopilot_bridge.node", "--ros-args", "-p", "map:=ardupilot")
+    bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot")
     with peer(listen=()) as other:
         other.node.create_publisher(TwistStamped, "/ap/airspeed", 10)  # as an AP_DDS would whose type has changed
         other.node.create_subscription(Imu, "/ap/joy", lambda _: None, 10)
@@ -374,7 +374,7 @@ def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Sta
 
 
 def test_a_message_package_that_is_missing_ends_the_bridge_with_what_to_install(start: Start) -> None:
-    bridge = start("autopilot_bridge.node", "--ros-args", "-p", "map:=px4")
+    bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4")
     assert bridge.end() == 2
     assert "error: px4_msgs/msg/VehicleOdometry: found no Python package px4_msgs" in bridge.output
     assert "install ros-jazzy-px4-msgs" in bridge.output

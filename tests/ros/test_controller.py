@@ -31,7 +31,7 @@ def someone() -> Iterator[Peer]:
 
 
 def controller(start: Start, scenario: Scenario, *arguments: str) -> Process:
-    return start("rise_di_controller.node", "--ros-args", "--params-file", str(scenario.path), *arguments)
+    return start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario.path), *arguments)
 
 
 def engage(someone: Peer, y: float = 0.01) -> None:
@@ -218,10 +218,10 @@ def test_a_peer_of_another_type_or_quality_of_service_is_named(start: Start, osp
 
 
 def _check_that_unfitting_peers_are_named(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
-    process = start("aircraft_sim.node", "--ros-args", "--params-file", str(osprey_gust.path))
+    process = start("aircraft_sim.main", "--ros-args", "--params-file", str(osprey_gust.path))
     someone.node.create_publisher(Float64MultiArray, "u", QoSProfile(depth=1))
     process.wait_for("/u: /peer publishes std_msgs/msg/Float64MultiArray, expected sensor_msgs/msg/JointState")
-    recorder = start("flight_recorder.node", "--ros-args", "--params-file", str(osprey_gust.path))
+    recorder = start("flight_recorder.main", "--ros-args", "--params-file", str(osprey_gust.path))
     someone.node.create_publisher(JointState, "truth", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
     recorder.wait_for("/truth: quality of service of /peer does not fit")
 

@@ -181,7 +181,7 @@ def test_a_flight_with_a_wrong_sign_ends_when_it_diverges(start: Start, short_sc
 def test_a_killed_node_ends_the_flight_by_name(start: Start, short_scenario: Path, tmp_path: Path) -> None:
     flight = fly(start, short_scenario)
     nodes = wait_for_nodes(flight, tmp_path / "runs")
-    next(node for node in nodes if "rise_di_controller.node" in node.cmdline()).kill()
+    next(node for node in nodes if "rise_di_controller.main" in node.cmdline()).kill()
     assert flight.end() == 3
     assert "controller was killed by SIGKILL" in flight.output
     assert not psutil.wait_procs(nodes, timeout=3.0)[1]

@@ -20,7 +20,7 @@ def check(*names: str) -> tuple[int, str]:
 
 
 def test_a_node_that_works_is_healthy_and_one_that_hangs_is_not(start: Start, osprey_gust: Scenario) -> None:
-    recorder = start("flight_recorder.node", "--ros-args", "--params-file", str(osprey_gust.path))
+    recorder = start("flight_recorder.main", "--ros-args", "--params-file", str(osprey_gust.path))
     recorder.wait_for("ready")
     assert check()[0] == 0
     status, said = check("recorder")

@@ -118,7 +118,7 @@ def nodes(start: Start, scenario: Path) -> dict[str, Process]:
     }
     return {
         role: start(
-            f"{package}.node",
+            f"{package}.main",
             *("--ros-args", "--params-file", str(scenario), "-p", "lockstep:=true"),
             *(word for item in items for word in ("-p", item)),
         )
@@ -153,7 +153,7 @@ def test_the_others_end_within_two_seconds_of_a_kill_and_name_who_is_gone(victim
 def test_a_killed_node_ends_the_flight_with_its_name_in_the_summary(start: Start, tmp_path: Path) -> None:
     command = start("flight_bringup.cli", "fly", str(scenario_file(tmp_path, 1e5)), "--lockstep", "--runs", "runs")
     wait_until_recorded(tmp_path / "runs", command)
-    node = next(child for child in command.children() if "reference_model.node" in child.cmdline())
+    node = next(child for child in command.children() if "reference_model.main" in child.cmdline())
     node.send_signal(signal.SIGKILL)
     assert command.end() == 3
     outcome = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))["outcome"]

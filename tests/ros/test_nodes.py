@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from tests.ros.conftest import Start
+from tests.ros.peer import peer
 
 from flight_analysis.scenario import Scenario
 
@@ -21,7 +22,7 @@ NODES = {
 
 @pytest.mark.parametrize("package", NODES)
 def test_a_node_without_parameters_says_what_is_missing_and_ends_with_status_2(package: str, start: Start) -> None:
-    node = start(f"{package}.node")
+    node = start(f"{package}.main")
     assert node.end() == 2
     assert len(node.lines) == 1
     assert node.lines[0].startswith("error: ")
@@ -39,7 +40,7 @@ def test_a_node_without_parameters_says_what_is_missing_and_ends_with_status_2(p
     ],
 )
 def test_a_bad_parameter_is_one_sentence(arguments: list[str], sentence: str, start: Start, osprey_gust: Scenario) -> None:
-    node = start("rise_di_controller.node", "--ros-args", "--params-file", str(osprey_gust.path), *arguments)
+    node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path), *arguments)
     assert node.end() == 2
     assert any(line.startswith(sentence) for line in node.lines), node.output
     assert "Traceback" not in node.output
@@ -50,7 +51,7 @@ def test_a_bad_parameter_is_one_sentence(arguments: list[str], sentence: str, st
 def test_a_node_without_its_peer_says_so_keeps_waiting_and_ends_cleanly(
     package: str, waits_for: str, number: signal.Signals, start: Start, osprey_gust: Scenario
 ) -> None:
-    node = start(f"{package}.node", "--ros-args", "--params-file", str(osprey_gust.path))
+    node = start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path))
     node.wait_for(f"waiting for {waits_for}: no publisher there")
     assert node.popen.poll() is None
     node.popen.send_signal(number)
@@ -58,9 +59,29 @@ def test_a_node_without_its_peer_says_so_keeps_waiting_and_ends_cleanly(
     assert "Traceback" not in node.output
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_node_that_is_stopped_while_it_loads_ends_cleanly(
+    number: signal.Signals, start: Start, osprey_gust: Scenario
+) -> None:
+    with peer(listen=()) as someone:
+        node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
+        herald = f"_start_{node.popen.pid}"
+        someone.until(lambda: herald in someone.node.get_node_names() or "ready" in node.output)  # at times it is that quick
+        node.popen.send_signal(number)
+        assert node.end(5.0) == 0
+        assert "Traceback" not in node.output
+
+
+def test_what_holds_a_nodes_place_while_it_loads_goes(start: Start, osprey_gust: Scenario) -> None:
+    with peer(listen=()) as someone:
+        node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
+        node.wait_for("ready")
+        someone.until(lambda: set(someone.node.get_node_names()) == {"peer", "controller"})
+
+
 def test_a_storm_of_signals_ends_a_node_as_one_does(start: Start, osprey_gust: Scenario) -> None:
     # A lock taken in the handler would hang here: the second signal comes while the first is handled.
-    node = start("aircraft_sim.node", "--ros-args", "--params-file", str(osprey_gust.path))
+    node = start("aircraft_sim.main", "--ros-args", "--params-file", str(osprey_gust.path))
     node.wait_for("waiting for /u")
     for _ in range(50):
         node.popen.send_signal(signal.SIGTERM)
@@ -70,21 +91,21 @@ def test_a_storm_of_signals_ends_a_node_as_one_does(start: Start, osprey_gust: S
 
 def test_a_missing_transport_profile_is_refused_before_anything_starts(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/nowhere/profile.xml")
-    node = start("aircraft_sim.node")
+    node = start("aircraft_sim.main")
     assert node.end() == 2
     assert node.lines[0].startswith("error: FASTRTPS_DEFAULT_PROFILES_FILE: /nowhere/profile.xml cannot be read")
 
 
 @pytest.mark.parametrize("package", ["aircraft_sim", "reference_model"])
 def test_a_start_in_the_past_is_refused_not_caught_up_with(package: str, start: Start, osprey_gust: Scenario) -> None:
-    node = start(f"{package}.node", "--ros-args", "--params-file", str(osprey_gust.path), "-p", "start_time:=1000000.0")
+    node = start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path), "-p", "start_time:=1000000.0")
     assert node.end() == 2
     assert any("start_time: found an instant" in line for line in node.lines)
 
 
 def test_a_recorder_that_cannot_write_says_where(start: Start, osprey_gust: Scenario) -> None:
     arguments = ("--params-file", str(osprey_gust.path), "-p", "directory:=/proc/nowhere")
-    node = start("flight_recorder.node", "--ros-args", *arguments)
+    node = start("flight_recorder.main", "--ros-args", *arguments)
     assert node.end() == 2
     assert "recorder.directory: /proc/nowhere cannot be written" in node.output
 

@@ -146,7 +146,7 @@ def test_a_controller_alone_answers_a_lockstep_flight_with_the_same_bytes(
     u, said = of(recorded, "u"), of(recorded, "internals")
     controller = ("--params-file", str(osprey_gust.path), "-p", "lockstep:=true", "-p", "y_rate:=500.0")
     with listener(U, INTERNALS) as ears:
-        node = start("rise_di_controller.node", "--ros-args", *controller)
+        node = start("rise_di_controller.main", "--ros-args", *controller)
         node.wait_for("ready")
         process = start("flight_bringup.cli", "play", str(recorded), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "3")
         ears.until(U, len(u))
@@ -158,7 +158,7 @@ def test_a_controller_alone_answers_a_lockstep_flight_with_the_same_bytes(
 
 def test_a_controller_in_real_time_flies_along_a_recorded_flight(run: Path, osprey_gust: Scenario, start: Start) -> None:
     with peer() as someone:
-        node = start("rise_di_controller.node", "--ros-args", "--params-file", str(osprey_gust.path))
+        node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
         node.wait_for("ready")
         process = start("flight_bringup.cli", "play", str(run), "--topics", "y,y_m")
         node.wait_for("WAITING -> ENGAGED")

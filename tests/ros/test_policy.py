@@ -92,8 +92,8 @@ def test_the_policy_names_every_topic_and_service_of_a_flight_and_no_other(
     policy, file = allowed(), str(osprey_gust.path)
     modules = {"rise_di_controller": "controller", "reference_model": "reference_model", "aircraft_sim": "aircraft"}
     with peer(listen=()) as someone:
-        processes = [start(f"{module}.node", "--ros-args", "--params-file", file) for module in modules]
-        processes.append(start("flight_recorder.node", "--ros-args", "--params-file", file))
+        processes = [start(f"{module}.main", "--ros-args", "--params-file", file) for module in modules]
+        processes.append(start("flight_recorder.main", "--ros-args", "--params-file", file))
         for process in processes:
             process.wait_for("ready", timeout=60.0)
         real_time = seen(someone, ROLES, policy)
@@ -102,7 +102,7 @@ def test_the_policy_names_every_topic_and_service_of_a_flight_and_no_other(
             process.end()
         told = [f"{role}:lockstep:=true" for role in ROLES] + ["aircraft:control_rate:=100.0", "controller:y_rate:=500.0"]
         told.append(f"recorder:directory:={tmp_path / 'run'}")
-        start("flight_bringup.node", "--ros-args", "--params-file", file, *(word for one in told for word in ("-p", one)))
+        start("flight_bringup.main", "--ros-args", "--params-file", file, *(word for one in told for word in ("-p", one)))
         lockstep = seen(someone, ROLES, policy)
     for role in ROLES:
         assert real_time[role].merged(lockstep[role]) == policy[role], role
@@ -120,7 +120,7 @@ def test_the_policy_names_what_the_bridge_has_with_every_map(start: Start) -> No
     heard = {topic for key, topic, _ in used if not key.startswith("messages.")}
     policy = allowed()["bridge"]
     with peer(listen=()) as someone:
-        start("autopilot_bridge.node", "--ros-args", "-p", "map:=ardupilot").wait_for("dry run")  # its message types are here
+        start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot").wait_for("dry run")  # its message types are here
         own = seen(someone, ("bridge",), allowed())["bridge"]
     assert own.publish | sent == policy.publish
     assert own.subscribe | heard == policy.subscribe

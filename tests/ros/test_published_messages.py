@@ -152,7 +152,7 @@ def spin(someone: Peer, duration: float) -> None:
 def test_a_bridge_speaks_to_px4_in_its_own_messages(start: Start) -> None:
     """Heartbeats with fresh y and u, setpoints once engaged; no u ends both."""
     needs("px4_msgs")
-    bridge = start("autopilot_bridge.node", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false")
+    bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false")
     bridge.wait_for("ready")
     with peer(listen=("y",)) as someone:
         px4 = Px4(someone)

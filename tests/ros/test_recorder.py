@@ -46,7 +46,7 @@ def someone() -> Iterator[Peer]:
 
 def recorder(start: Start, scenario: Scenario, folder: Path | str, *parameters: str) -> Process:
     arguments = [word for one in (f"directory:={folder}", *parameters) for word in ("-p", one)]
-    return start("flight_recorder.node", "--ros-args", "--params-file", str(scenario.path), *arguments)
+    return start("flight_recorder.main", "--ros-args", "--params-file", str(scenario.path), *arguments)
 
 
 def stop(process: Process) -> None:
@@ -343,7 +343,7 @@ def test_a_flight_whose_recorder_is_killed_has_a_report_and_a_log_that_can_be_re
 ) -> None:
     flight = start("flight_bringup.cli", "fly", str(osprey_gust.path), "--duration", "30")
     wait_for_size(tmp_path / "runs", 150_000, flight)
-    node = next(child for child in flight.children() if "flight_recorder.node" in child.cmdline())
+    node = next(child for child in flight.children() if "flight_recorder.main" in child.cmdline())
     killed_ns = time.time_ns()
     node.kill()
     assert flight.end(60.0) == 3, flight.output

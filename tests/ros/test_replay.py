@@ -116,7 +116,7 @@ def test_what_a_killed_recorder_left_comes_again(start: Start, tmp_path: Path) -
 
     with peer(()) as someone:
         someone.until(written, timeout=60.0)
-    next(one for one in flight.children() if "flight_recorder.node" in one.cmdline()).kill()
+    next(one for one in flight.children() if "flight_recorder.main" in one.cmdline()).kill()
     assert flight.end(timeout=60) == 3, flight.output
     found = replayed(start, log[0].parent)
     assert found["ticks"] == found["checked"] > 100
@@ -128,11 +128,11 @@ def test_a_recorder_that_comes_late_leaves_its_first_tick_unchecked_and_says_wha
 ) -> None:
     scenario = scenario_file(tmp_path, 1e3, "osprey_gust")
     for module in ("rise_di_controller", "aircraft_sim", "reference_model"):
-        start(f"{module}.node", "--ros-args", "--params-file", str(scenario))
+        start(f"{module}.main", "--ros-args", "--params-file", str(scenario))
     more_than_kept = PUBLISH.depth + 200
     someone.until(lambda: len(someone.heard["internals"]) > more_than_kept, timeout=90.0)
     recorder = start(
-        *("flight_recorder.node", "--ros-args", "--params-file", str(scenario)),
+        *("flight_recorder.main", "--ros-args", "--params-file", str(scenario)),
         *("-p", f"scenario_file:={scenario}", "-p", "directory:=run"),
     )
     recorder.wait_for("recording to")

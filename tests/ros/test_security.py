@@ -115,7 +115,7 @@ def keys(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def aircraft(start: Start, scenario: Scenario, *told: str, within: tuple[str, ...] = ()) -> Process:
-    process = start("aircraft_sim.node", "--ros-args", "--params-file", str(scenario.path), *told, within=within)
+    process = start("aircraft_sim.main", "--ros-args", "--params-file", str(scenario.path), *told, within=within)
     process.wait_for("ready", BUSY)
     return process
 
@@ -232,7 +232,7 @@ def test_a_key_file_that_is_none_stops_the_node(
     if content is not None:
         path.write_bytes(content)
         path.chmod(mode)
-    node = start("aircraft_sim.node", "--ros-args", "--params-file", str(osprey_gust.path), "-p", f"key_file:={path}")
+    node = start("aircraft_sim.main", "--ros-args", "--params-file", str(osprey_gust.path), "-p", f"key_file:={path}")
     assert node.end(BUSY) == 2
     assert f"error: aircraft.key_file: found {path} {sentence}" in node.output or sentence in node.output
 

@@ -13,5 +13,5 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/aircraft_sim"]),
         ("share/aircraft_sim", ["package.xml"]),
     ],
-    entry_points={"console_scripts": ["aircraft = aircraft_sim.node:main"]},
+    entry_points={"console_scripts": ["aircraft = aircraft_sim.main:main"]},
 )

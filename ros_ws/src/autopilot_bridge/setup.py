@@ -13,5 +13,5 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/autopilot_bridge"]),
         ("share/autopilot_bridge", ["package.xml"]),
     ],
-    entry_points={"console_scripts": ["bridge = autopilot_bridge.node:main"]},
+    entry_points={"console_scripts": ["bridge = autopilot_bridge.main:main"]},
 )

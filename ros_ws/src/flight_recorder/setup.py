@@ -12,5 +12,5 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/flight_recorder"]),
         ("share/flight_recorder", ["package.xml"]),
     ],
-    entry_points={"console_scripts": ["recorder = flight_recorder.node:main"]},
+    entry_points={"console_scripts": ["recorder = flight_recorder.main:main"]},
 )

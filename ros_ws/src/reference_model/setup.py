@@ -12,5 +12,5 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/reference_model"]),
         ("share/reference_model", ["package.xml"]),
     ],
-    entry_points={"console_scripts": ["reference_model = reference_model.node:main"]},
+    entry_points={"console_scripts": ["reference_model = reference_model.main:main"]},
 )

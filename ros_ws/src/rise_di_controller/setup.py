@@ -12,5 +12,5 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/rise_di_controller"]),
         ("share/rise_di_controller", ["package.xml"]),
     ],
-    entry_points={"console_scripts": ["controller = rise_di_controller.node:main"]},
+    entry_points={"console_scripts": ["controller = rise_di_controller.main:main"]},
 )

@@ -270,12 +270,12 @@ class Flight:
     # Processes
 
     def node(self, role: str, *parameters: str) -> Process:
-        """Start a node as `python -m PACKAGE.node`."""
+        """Start a node as `python -m PACKAGE.main`."""
         words = [word for one in parameters for word in ("-p", one)]
         preload = {} if self._clock is None else {"LD_PRELOAD": str(self._clock), "FAULTS_CLOCK": str(self._step)}
         with environment(preload):
             process = Process(
-                f"{PACKAGES[role]}.node",
+                f"{PACKAGES[role]}.main",
                 *("--ros-args", "--params-file", str(self.scenario), *words),
                 cwd=self.folder,
                 within=APART,

@@ -10,7 +10,7 @@ from aircraft_sim.simulator import Simulator
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, FloatArray
 from flight_ros.messages import NO_CHANNELS, StampedVector, instant, stamp_of
-from flight_ros.runtime import FlightNode, run
+from flight_ros.runtime import FlightNode
 from flight_ros.source import Source
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, RECORDED, TRUTH, U, Y
@@ -152,12 +152,3 @@ class AircraftNode(FlightNode[AircraftParameters]):
         if not self.parameters.lockstep and self._silent(self.now_ns()):
             return DiagnosticStatus.ERROR, self._silence, {}
         return DiagnosticStatus.OK, f"flown by {self._source.name}", {}
-
-
-def main() -> None:
-    """Entry point of the executable `aircraft`."""
-    run(AircraftNode)
-
-
-if __name__ == "__main__":
-    main()

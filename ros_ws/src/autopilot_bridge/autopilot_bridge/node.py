@@ -19,7 +19,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError
 from flight_ros.inbox import Inbox
-from flight_ros.runtime import FlightNode, run
+from flight_ros.runtime import FlightNode
 from flight_ros.ticker import Tick
 from flight_ros.topics import Topic, U, Y
 
@@ -242,12 +242,3 @@ def _require_field(empty: Any, name: str, row: OutputRow | OverrideRow) -> None:
             get_field(empty, "header.stamp")
     except ChannelError as error:
         raise ParameterError(f"{name}.field: {error}, expected a field of {row.type}") from None
-
-
-def main() -> None:
-    """Entry point of the executable `bridge`."""
-    run(BridgeNode)
-
-
-if __name__ == "__main__":
-    main()

@@ -26,7 +26,7 @@ class NodeSpec(NamedTuple):
     @property
     def module(self) -> str:
         """The Python module behind the executable."""
-        return f"{self.package}.node"
+        return f"{self.package}.main"
 
 
 RECORDER = NodeSpec("flight_recorder", "recorder")

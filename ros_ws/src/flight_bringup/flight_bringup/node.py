@@ -163,19 +163,3 @@ class Engager:
 def player(types: Mapping[str, str], shared: Collection[str]) -> Player:
     """A player of topics, by their names with their types; see flight_ros.player. Raises ParameterError."""
     return Player(types, shared)
-
-
-def main() -> None:
-    """The four nodes as objects in one process, in lockstep over the same topics."""
-    # Loaded here: the monitor of every flight is in this module too, and need not wait for them.
-    from aircraft_sim.node import AircraftNode  # noqa: PLC0415
-    from flight_recorder.node import RecorderNode  # noqa: PLC0415
-    from flight_ros.runtime import run  # noqa: PLC0415
-    from reference_model.node import ReferenceModelNode  # noqa: PLC0415
-    from rise_di_controller.node import ControllerNode  # noqa: PLC0415
-
-    run(AircraftNode, ReferenceModelNode, ControllerNode, RecorderNode)
-
-
-if __name__ == "__main__":
-    main()

@@ -6,9 +6,14 @@ from collections.abc import Sequence
 from typing import Any
 
 import array_api_compat
-import array_api_compat.numpy  # else its first use imports it, 0.15 s in the middle of a tick
 import numpy as np
 from numpy.typing import NDArray
+
+NUMPY: Any = np  # NumPy 2 has the array API itself
+if not hasattr(np, "concat"):
+    import array_api_compat.numpy  # loads all of NumPy, 0.1 s
+
+    NUMPY = array_api_compat.numpy
 
 FloatArray = NDArray[np.float64]
 Array = Any  # an array of whichever array namespace the caller flies with: NumPy, JAX
@@ -19,7 +24,7 @@ def array_namespace(array: Array) -> Any:
 
     NumPy's at once, for most of the time of a step of a few small arrays would go into looking what else it could be.
     """
-    return array_api_compat.numpy if type(array) is np.ndarray else array_api_compat.array_namespace(array)
+    return NUMPY if isinstance(array, (np.ndarray, np.generic)) else array_api_compat.array_namespace(array)
 
 
 class ChannelError(ValueError):

@@ -28,7 +28,7 @@ from flight_recorder.disk import free_bytes
 from flight_recorder.params import RecorderParameters
 from flight_ros.inbox import Inbox, Received
 from flight_ros.messages import instant, stamp_of
-from flight_ros.runtime import WAIT_BEFORE_SAYING_NS, FlightNode, run
+from flight_ros.runtime import WAIT_BEFORE_SAYING_NS, FlightNode
 from flight_ros.ticker import Tick
 from flight_ros.topics import FLIGHT, PUBLISH, RECORD, RECORD_FOREIGN, RECORDED, TRUTH, Topic
 
@@ -320,12 +320,3 @@ def _qos(qos: QoSProfile) -> dict[str, object]:
 def _duration(duration: Duration) -> dict[str, int]:
     sec, nsec = divmod(duration.nanoseconds or FOREVER_NS, NANOSECONDS)  # 0 stands for none
     return {"sec": sec, "nsec": nsec}
-
-
-def main() -> None:
-    """Entry point of the executable `recorder`."""
-    run(RecorderNode)
-
-
-if __name__ == "__main__":
-    main()

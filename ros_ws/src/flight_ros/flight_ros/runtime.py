@@ -322,10 +322,11 @@ class _Stop:
         self.requested = True
 
 
-def run(*make_nodes: Callable[[], FlightNode[Any]]) -> None:
+def run(*make_nodes: Callable[[], FlightNode[Any]], herald: _rclpy.Node | None = None) -> None:
     """Run a node, or several in lockstep, until SIGINT or SIGTERM, then leave with exit status 0.
 
-    Otherwise 2 for bad parameters, 3 for a flight that cannot go on, 1 for a fault.
+    Otherwise 2 for bad parameters, 3 for a flight that cannot go on, 1 for a fault. `herald` has come before them and goes when
+    they are there (flight_ros.start).
 
     Ticks run on the monotonic clock in the main thread; what comes over topics is taken at the tick. In lockstep there are no
     ticks: a node moves when what it needs has come. The executor serves parameters and services, after ticks and without ever
@@ -335,9 +336,7 @@ def run(*make_nodes: Callable[[], FlightNode[Any]]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop.request)
     try:
-        transport.prepare()
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        nodes = [make_node() for make_node in make_nodes]
+        nodes = _made(make_nodes, herald)
     except ParameterError as error:
         sys.exit(_refuse(str(error)))
     except FlightEnded as error:
@@ -369,6 +368,16 @@ def run(*make_nodes: Callable[[], FlightNode[Any]]) -> None:
         rclpy.try_shutdown()
 
 
+def _made(make_nodes: Sequence[Callable[[], FlightNode[Any]]], herald: _rclpy.Node | None) -> list[FlightNode[Any]]:
+    transport.prepare()
+    if not rclpy.ok():
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    nodes = [make_node() for make_node in make_nodes]
+    if herald is not None:
+        herald.destroy_when_not_in_use()
+    return nodes
+
+
 def _refuse(sentence: str) -> int:
     print(f"error: {sentence}", file=sys.stderr)
     rclpy.try_shutdown()
@@ -395,8 +404,8 @@ def _begin(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
     executor = SingleThreadedExecutor()
     for node in nodes:
         executor.add_node(node)
-    gc.collect()
-    gc.freeze()  # a collection then takes microseconds, not tens of milliseconds
+    gc.freeze()  # a collection then takes microseconds, not tens of milliseconds, as the one of now would
+    gc.enable()
     for node in nodes:
         node.get_logger().info("ready")
     return executor

@@ -11,10 +11,6 @@ from importlib.resources import files
 from pathlib import Path
 from xml.etree import ElementTree
 
-import psutil
-
-from flight_core.parameters import ParameterError
-
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 DISCOVERY_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 LOOPBACK_PROFILE = Path(str(files("flight_ros"))) / "loopback.xml"
@@ -35,6 +31,8 @@ def prepare() -> None:
     try:
         ElementTree.parse(profile)  # noqa: S314 - the user's own configuration file, not foreign input
     except (OSError, ElementTree.ParseError) as error:
+        from flight_core.parameters import ParameterError  # noqa: PLC0415 - loads pydantic, see flight_ros.start
+
         raise ParameterError(f"{PROFILE_VARIABLE}: {profile} cannot be read ({error}), expected a Fast DDS profile") from None
 
 
@@ -42,5 +40,7 @@ def open_to_network() -> list[str]:
     """UDP sockets of this process that listen on all interfaces although the loopback profile is in force; should be none."""
     if os.environ.get(PROFILE_VARIABLE) != str(LOOPBACK_PROFILE):
         return []
+    import psutil  # noqa: PLC0415 - see flight_ros.start
+
     sockets = psutil.Process().net_connections(kind="udp")
     return [f"{s.laddr.ip}:{s.laddr.port}" for s in sockets if s.laddr and s.laddr.ip in ("0.0.0.0", "::")]  # noqa: S104 - compared, not bound

@@ -5,7 +5,7 @@
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError
 from flight_ros.messages import stamp_of
-from flight_ros.runtime import FlightNode, run
+from flight_ros.runtime import FlightNode
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, U_M, Y_M
 from reference_model.params import ReferenceModelParameters
@@ -65,12 +65,3 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         level, _, figures = super().status()
         return level, "profile" if self._reference.live is None else "live commands", figures
-
-
-def main() -> None:
-    """Entry point of the executable `reference_model`."""
-    run(ReferenceModelNode)
-
-
-if __name__ == "__main__":
-    main()

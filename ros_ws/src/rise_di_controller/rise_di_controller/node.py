@@ -12,7 +12,7 @@ from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError
 from flight_ros.inbox import Inbox
 from flight_ros.messages import NO_CHANNELS, Decoder
-from flight_ros.runtime import FlightNode, run
+from flight_ros.runtime import FlightNode
 from flight_ros.source import Source
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
@@ -210,12 +210,3 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
             found = self._controller.ages(self.now_ns())
             ages = {f"age of {name} (s)": f"{age:.4f}" for name, age in found.items()}
         return level, mode.name, {"mode": mode.name, "sign": self._controller.sign.name, **ages}
-
-
-def main() -> None:
-    """Entry point of the executable `controller`."""
-    run(ControllerNode)
-
-
-if __name__ == "__main__":
-    main()

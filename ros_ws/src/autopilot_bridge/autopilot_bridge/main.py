@@ -1,0 +1,14 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable `bridge`."""
+
+from flight_ros.start import start
+
+
+def main() -> None:
+    """Its entry point."""
+    start("autopilot_bridge.node:BridgeNode")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,19 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The four nodes of a flight as objects in one process, in lockstep over the same topics."""
+
+from flight_ros.start import start
+
+
+def main() -> None:
+    """Its entry point."""
+    start(
+        "aircraft_sim.node:AircraftNode",
+        "reference_model.node:ReferenceModelNode",
+        "rise_di_controller.node:ControllerNode",
+        "flight_recorder.node:RecorderNode",
+    )
+
+
+if __name__ == "__main__":
+    main()
