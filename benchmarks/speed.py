@@ -37,6 +37,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from flight_analysis.scenario import scenario_yaml
+from flight_bringup.graph import CONTROLLER
 from flight_bringup.processes import Flight
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import NANOSECONDS, period_ns
@@ -86,12 +87,13 @@ def us(values: Sequence[float] | FloatArray) -> dict[str, float]:
 
 
 class Child:
-    """One of benchmarks/speed_nodes.py as a process. A context manager that ends it."""
+    """One of benchmarks/speed_nodes.py, or a module with a point in its name, as a process. A context manager that ends it."""
 
     def __init__(self, role: str, *arguments: str, within: Sequence[str] = ()) -> None:
         self.begin = time.monotonic()
+        words = (role,) if "." in role else ("benchmarks.speed_nodes", role)
         self.popen = psutil.Popen(
-            [*within, sys.executable, "-m", "benchmarks.speed_nodes", role, *arguments],
+            [*within, sys.executable, "-m", *words, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
@@ -230,13 +232,13 @@ class Driven:
 
 
 @contextlib.contextmanager
-def flown(hz: float, folder: Path) -> Iterator[Child]:
+def flown(hz: float, folder: Path, role: str = "controller") -> Iterator[Child]:
     """The controller's node at a rate."""
     file = folder / f"at_{hz:g}_hz.yaml"
     others = {"rate": max(hz, 500.0)}  # at least as fast as the controller, as a scenario demands; they do not fly here
     rates = {"aircraft": others | {"step": 0.001}, "reference_model": others, "controller": {"rate": hz}}
     file.write_text(scenario_yaml(find_scenario(SCENARIO).vary(**rates)), encoding="utf-8")
-    with Child("controller", "--ros-args", "--params-file", str(file)) as child:
+    with Child(role, "--ros-args", "--params-file", str(file)) as child:
         yield child
 
 
@@ -401,7 +403,7 @@ def start_rows(folder: Path) -> Iterator[Row]:
         waits = []
         for _ in range(5):
             begin = time.time()
-            with flown(100.0, folder) as child:
+            with flown(100.0, folder, CONTROLLER.module) as child:
                 waits.append(peer.drive(100.0, 0.1, child).start - begin)
         yield Row("start", "controller, to its first u", {"seconds": float(np.median(waits))}, floor)
     yield Row("start", "rise-di fly, to its first u", {"seconds": whole_flight()}, floor)
