@@ -184,7 +184,7 @@ def _faults(results: Results) -> Iterator[str]:
             yield _goal(f"a killed node is back to full traffic within 0.5 s of {since}", max(back), 0.5, "s at worst")
     if caught_up := [one["ready_to_caught_up"] for one in found if one.get("ready_to_caught_up")]:
         took = " or ".join(_pair(one) for one in caught_up)
-        yield f"- A recorder also has the last 2000 samples of each topic, which publishers keep, {took} ms after being ready."
+        yield f"- A recorder also has the samples of the last two seconds, which publishers keep, {took} ms after being ready."
 
 
 def _pair(times: Mapping[str, float] | None) -> str:

@@ -28,11 +28,11 @@ from tests.small_disk import small_disk
 
 from flight_analysis.bag_reader import read_run
 from flight_analysis.scenario import Scenario
-from flight_core.rates import NANOSECONDS
+from flight_core.rates import NANOSECONDS, period_ns
 from flight_recorder.scan import Scan
 from flight_ros.inbox import Inbox
 from flight_ros.messages import stamp_of, to_message
-from flight_ros.topics import LISTEN, PUBLISH, Y
+from flight_ros.topics import LISTEN, PUBLISH, Y, published
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -371,3 +371,8 @@ def test_a_flight_whose_recorder_is_killed_has_a_report_and_a_log_that_can_be_re
     assert after.tape.notes == ()
     assert after.tape["y"].values.tobytes() == before.tape["y"].values.tobytes()
     assert json.loads((run / "summary.json").read_text(encoding="utf-8"))["outcome"] == "recorder was killed by SIGKILL"
+
+
+@pytest.mark.parametrize(("rate", "depth"), [(0.1, 1), (100.0, 200), (500.0, 1000), (1000.0, 2000), (5000.0, 2000)])
+def test_a_publisher_keeps_what_two_seconds_hold_for_a_recorder(rate: float, depth: int) -> None:
+    assert published(period_ns(rate, "rate")).depth == depth

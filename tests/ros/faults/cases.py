@@ -45,8 +45,7 @@ REPORT = 1.0  # s, the period of the diagnostics
 
 FOUND = 0.5  # s, in which a newcomer has announced itself to all
 
-BACK = 0.5  # s, from being ready to full traffic
-CAUGHT_UP = 1.5  # s, from being ready until the recorder has the last 2000 samples of each topic too, that publishers have kept
+BACK = 0.5  # s, from being ready to full traffic, and until a recorder also has what publishers have kept
 
 STOPPED = 1.2  # s: beyond the age limits, hold and ramp
 

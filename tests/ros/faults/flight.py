@@ -28,6 +28,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tests.ros.conftest import Process
 
+from flight_bringup.graph import READY
 from flight_bringup.processes import end_with_parent
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.vectors import FloatArray
@@ -93,7 +94,7 @@ class Probe:
             for topic in TOPICS
         }
         self.heard: dict[str, deque[Heard]] = {topic.name: deque(maxlen=KEPT) for topic in TOPICS}
-        self.watched: set[int] = {os.getpid()}  # processes whose waiting for a processor is of interest
+        self.watched: list[Process] = []  # whose waiting for a processor is of interest, once they are ready
         self.waited: deque[tuple[float, float]] = deque(maxlen=KEPT)  # when, and the longest of them since the sample before, s
         self._waited_ns: dict[int, int] = {}
         self._changed = threading.Condition()
@@ -116,7 +117,8 @@ class Probe:
 
     def _look_who_waits(self) -> None:
         before = self._waited_ns
-        self._waited_ns = {process: _waited_ns(process) for process in list(self.watched)}
+        ready = [one.popen.pid for one in list(self.watched) if READY in one.output]
+        self._waited_ns = {process: _waited_ns(process) for process in (os.getpid(), *ready)}
         longest = max(waited - before.get(process, waited) for process, waited in self._waited_ns.items())
         self.waited.append((time.time(), longest / NANOSECONDS))
 
@@ -281,7 +283,7 @@ class Flight:
                 within=APART,
             )
         self._all.append(process)
-        self.probe.watched.add(process.popen.pid)
+        self.probe.watched.append(process)
         return process
 
     def set_clock(self, by: float) -> None:

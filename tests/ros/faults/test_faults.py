@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rcl_interfaces.msg import Log
 from rclpy.serialization import deserialize_message
-from tests.ros.faults.cases import BACK, CASES, CAUGHT_UP, SLACK, Case, Does
+from tests.ros.faults.cases import BACK, CASES, SLACK, Case, Does
 from tests.ros.faults.conftest import Hangar, Row
 from tests.ros.faults.flight import HOLD, INPUTS, MAX_AGE, RAMP, SILENCE, TICK, Flight, logged
 
@@ -96,7 +96,7 @@ def judge(case: Case, flight: Flight) -> tuple[float | None, float, float]:
     if (back := flight.measured.get("ready_to_traffic")) is not None:
         assert back <= BACK + slack, f"full traffic {back:.3f} s after it was ready"
     if (caught_up := flight.measured.get("ready_to_caught_up")) is not None:
-        assert caught_up <= CAUGHT_UP + slack, f"what publishers had kept taken {caught_up:.3f} s after it was ready"
+        assert caught_up <= BACK + slack, f"what publishers had kept taken {caught_up:.3f} s after it was ready"
     CHECKS[case.does](case, flight, window)
     for role, process in flight.processes.items():
         assert process.popen.poll() is None, f"{role} has ended: {process.output}"

@@ -38,7 +38,7 @@ from flight_ros.messages import Decoder, Encoder
 from flight_ros.parameters import changed, read_parameters
 from flight_ros.source import SENDER
 from flight_ros.ticker import Tick, Ticker, wake_on_time
-from flight_ros.topics import DIAGNOSTICS, LISTEN, PUBLISH, STEP, Topic
+from flight_ros.topics import DIAGNOSTICS, LISTEN, PUBLISH, STEP, Topic, published
 
 P = TypeVar("P", bound=NodeParameters)
 
@@ -132,7 +132,8 @@ class FlightNode(Node, Generic[P]):
 
     def outlet(self, topic: Topic) -> Callable[[bytes], None]:
         """A publisher of serialised messages on a topic of the flight, as the function that publishes one."""
-        publisher = self.create_publisher(topic.type, topic.name, STEP if self.parameters.lockstep else PUBLISH)
+        qos = STEP if self.parameters.lockstep else published(self.period_ns())
+        publisher = self.create_publisher(topic.type, topic.name, qos)
         self._outlets.append(publisher)
         publish: Callable[[bytes], None] = publisher.handle.publish_raw
         return publish

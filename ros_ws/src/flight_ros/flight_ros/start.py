@@ -21,22 +21,30 @@ from rclpy.utilities import get_default_context
 from flight_ros import transport
 
 
-def start(*nodes: str) -> None:
-    """Run nodes, each "module:class", as `flight_ros.runtime.run` does; stopped before that, it leaves with status 0 too."""
+def start(*nodes: str, early: bool = True) -> None:
+    """Run nodes, each "module:class", as `flight_ros.runtime.run` does; stopped before that, it leaves with status 0 too.
+
+    `early`: join the others before the nodes are loaded.
+    """
     gc.disable()  # `run` enables it: a tenth of the way there is collections that find nothing
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _leave)
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # else each start looks for some in all that is installed
-    herald = None
+    herald = _join() if early else None
+    run = resolve_name("flight_ros.runtime:run")
+    make_nodes = [resolve_name(node) for node in nodes]
+    run(*make_nodes, herald=herald)
+
+
+def _join() -> _rclpy.Node | None:
+    """A node without topics, hidden as its name begins with _ (ROS 2 design, topic and service names)."""
     with suppress(Exception):  # `run` meets it again, and has the sentence for it
         transport.prepare()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         context = get_default_context().handle
-        with context:  # hidden, as its name begins with _ (ROS 2 design, topic and service names), and without topics
-            herald = _rclpy.Node(f"_start_{os.getpid()}", "", context, None, False, False)
-    run = resolve_name("flight_ros.runtime:run")
-    make_nodes = [resolve_name(node) for node in nodes]
-    run(*make_nodes, herald=herald)
+        with context:
+            return _rclpy.Node(f"_start_{os.getpid()}", "", context, None, False, False)
+    return None
 
 
 def _leave(number: int, frame: FrameType | None) -> None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
 AHEAD = 2.5e-4  # s, by which a thread is awake before its deadline to watch the clock for the rest: waking takes 20 to 250 us
-SHARE = 0.1  # of a period, and so of a core, that the watch takes at most
+SHARE = 0.2  # of a period, and so of a core, that the watch takes at most
 
 
 def wake_on_time() -> None:

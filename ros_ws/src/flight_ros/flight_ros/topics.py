@@ -11,8 +11,10 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
+from flight_core.rates import NANOSECONDS
+
 # Publishers are reliable and keep their last samples, so that a recorder that is matched a moment late, or held up, loses
-# nothing; the depth covers two seconds at 1 kHz, as that of the recorder does.
+# nothing. The depth covers two seconds at 1 kHz, as that of the recorder does; see `published`.
 PUBLISH = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Control loops want the newest samples and never a retransmission. The depth covers the samples between two ticks
 # that are needed to bring y_m to the stamp of y, and those of a stranger at 10 kHz beside them: a u that these had displaced
@@ -28,6 +30,18 @@ RECORD = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durabili
 # For topics that others publish, whose kept samples cannot be counted on; where one of them offers less, the recorder asks for
 # less.
 RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+
+KEPT_NS = 2 * NANOSECONDS
+
+
+def published(period_ns: int) -> QoSProfile:
+    """PUBLISH at a rate: it keeps what it published in the last two seconds.
+
+    More would hold a flight back when a recorder comes: it is sent at once, by the threads that send what is new.
+    """
+    return QoSProfile(
+        depth=min(max(KEPT_NS // period_ns, 1), PUBLISH.depth), reliability=PUBLISH.reliability, durability=PUBLISH.durability
+    )
 
 
 class Topic(NamedTuple):
