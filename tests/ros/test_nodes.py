@@ -79,6 +79,21 @@ def test_what_holds_a_nodes_place_while_it_loads_goes(start: Start, osprey_gust:
         someone.until(lambda: set(someone.node.get_node_names()) == {"peer", "controller"})
 
 
+def test_nothing_is_loaded_once_a_node_is_ready(start: Start, osprey_gust: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    # What a function of a library loads at its first call, it would load in the middle of a tick.
+    monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
+    with peer(listen=("/diagnostics",)) as someone:
+        nodes = [start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path)) for package in NODES]
+
+        def reports(name: str) -> int:
+            return sum(one.status[0].name == f"/{name}" for one in someone.heard["/diagnostics"])
+
+        someone.until(lambda: all(reports(name) >= 3 for name in NODES.values()))
+    assert any("ENGAGED" in node.output for node in nodes)
+    for node in nodes:
+        assert [line for line in node.output.partition("]: ready")[2].splitlines() if "import time:" in line] == []
+
+
 def test_a_storm_of_signals_ends_a_node_as_one_does(start: Start, osprey_gust: Scenario) -> None:
     # A lock taken in the handler would hang here: the second signal comes while the first is handled.
     node = start("aircraft_sim.main", "--ros-args", "--params-file", str(osprey_gust.path))

@@ -18,7 +18,7 @@ def wake_on_time() -> None:
     Source: prctl(2), PR_SET_TIMERSLACK. Threads of real-time priority have no slack anyway.
     """
     with suppress(OSError):  # no /proc, or not to be written: ticks are that much later
-        TIMER_SLACK.write_text("1", encoding="ascii")
+        TIMER_SLACK.write_text("1", encoding="utf-8")
 
 
 class Tick(NamedTuple):
