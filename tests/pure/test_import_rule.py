@@ -11,6 +11,7 @@ import pytest
 
 SOURCES = Path(__file__).resolve().parents[2] / "ros_ws" / "src"
 ROS = {"rclpy", "ament_index_python", "launch", "launch_ros", "flight_ros"}
+OF_ROS = {"node.py", "main.py"}  # a package's node, and its executable
 ROS_SUFFIXES = ("_msgs", "_interfaces", "_srvs")
 MAY = {  # which packages of the stack a package's maths may import
     "flight_core": set(),
@@ -35,7 +36,7 @@ def imported(path: Path) -> set[str]:
 
 
 def may_import_ros(path: Path) -> bool:
-    return path.name == "node.py" or {"flight_ros", "launch"} & set(path.relative_to(SOURCES).parts[:-1])  # type: ignore[return-value]
+    return path.name in OF_ROS or {"flight_ros", "launch"} & set(path.relative_to(SOURCES).parts[:-1])  # type: ignore[return-value]
 
 
 FILES = sorted(path for path in SOURCES.glob("*/**/*.py") if path.name != "setup.py")
@@ -57,7 +58,7 @@ def test_only_nodes_flight_ros_and_launch_files_import_ros(path: Path) -> None:
 def test_a_package_imports_only_the_packages_before_it(package: str) -> None:
     ours = {path.name for path in SOURCES.iterdir()}
     for path in (SOURCES / package / package).glob("**/*.py"):
-        if path.name != "node.py":
+        if path.name not in OF_ROS:
             assert (imported(path) & ours) - {package} <= MAY[package], path.name
 
 
