@@ -48,7 +48,7 @@ setup: .venv/.workspace
 	cd ros_ws && PATH="$(BIN):$$PATH" colcon build --symlink-install --event-handlers console_cohesion- status-
 	@printf '%s\n' $(PACKAGES:%=$(CURDIR)/ros_ws/build/%) \
 	  > "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/rise_di_workspace.pth"
-	@ln -sf ../../ros_ws/install/flight_bringup/lib/flight_bringup/rise-di .venv/bin/rise-di
+	@ln -sf ../../ros_ws/install/flight_cli/lib/flight_cli/rise-di .venv/bin/rise-di
 	@touch $@
 
 lock: .venv/.installed

@@ -19,14 +19,14 @@ from rich.console import Console
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import matrices
+from control_laws import rise_di
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import true_error
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines, fleet
+from flight_campaign.benchmark_course import build_course
 from flight_campaign.campaign import Campaign, define
-from flight_campaign.course import chart
-from flight_campaign.laws import rise
 from flight_core.vectors import FloatArray
 
 FINE = 1e-4  # s: a twentieth of the scenario's step, at which an integration counts as exact
@@ -75,14 +75,14 @@ def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray
 
     Also the speed of the loop in one process at the scenario's own step, aircraft-seconds per second.
     """
-    course = chart(scenario)
+    course = build_course(scenario)
     A, B = matrices(load_airframe(scenario.aircraft.airframe), PART, PART, SEED, 0, count)
     flown = fleet.fly(
         fleet.assemble(A, B, scenario.aircraft.plant(), course),
         fleet.vehicle(scenario),
         course,
-        rise.pilot(scenario.controller.law().sign),
-        rise.params(scenario.controller),
+        rise_di.control_law(scenario.controller.law().sign),
+        rise_di.params(scenario.controller),
     )
     worst, plain = np.zeros(len(scenario.controller.outputs)), 0.0
     for number in range(count):

@@ -12,9 +12,9 @@ import typer
 from benchmarks.sampling import cells, new_table
 from rich.console import Console
 
-from flight_analysis.gain_selection import with_feedforward
-from flight_analysis.scenario import Scenario
-from flight_analysis.summary import shown_units
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.design.gain_selection import with_feedforward
+from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_campaign.campaign import define, fly_chunk
 from flight_campaign.statistics import Tally
@@ -41,7 +41,7 @@ def main(
 ) -> None:
     """Print scores and activity of u with and without feedforward, the same gains, on the same aircraft."""
     scenario = find_scenario("osprey_servo")
-    channels, units = scenario.aircraft.channels(), shown_units(scenario)
+    channels, units = scenario.aircraft.channels(), display_units(scenario)
     sets = {"nominal, calm air": (scenario.vary(aircraft={"gusts": {}}), 0.0, 1), "nominal": (scenario, 0.0, 1)}
     sets |= {f"+-{100 * level:g} %": (scenario, level, aircraft) for level in LEVELS}
     table = new_table(

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, aircraft_names
-from flight_analysis.identification import Flown, Identified, fly_all, identify, without_beta
+from flight_analysis.design.identification import Identified, ManoeuvreResult, fly_all, identify, without_beta
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import ParameterError
 
@@ -118,7 +118,7 @@ def _row(name: str, where: Condition, found: Identified) -> str:
     )
 
 
-def _errors(flight: Flown) -> str:
+def _errors(flight: ManoeuvreResult) -> str:
     if flight.outcome != COMPLETED:
         return flight.outcome
     return " / ".join(f"{flight.rms[one] * (1.0 if one == 'V' else 1e3):.2g}" for one in OUTPUTS)

@@ -14,7 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from flight_analysis.scenario import load_scenario
+from flight_analysis.closed_loop.scenario import load_scenario
 from rise_di_controller import guard
 from rise_di_controller.guard import Sample
 from rise_di_controller.law import engage, step
@@ -48,7 +48,7 @@ def measure() -> dict[str, tuple[float, float, float]]:
     y, y_m = rng.normal(size=(REPEATS, 4)) * 0.01, np.zeros(4)
     dt, zero = 0.01, np.zeros(4)
     law_state = engage(y[0], y_m)
-    engaged, _ = guard.tick(guard.start(4), 0, Sample(0, y[0]), [Sample(0, y_m)], limits, law)
+    engaged, _ = guard.tick(guard.initial_state(4), 0, Sample(0, y[0]), [Sample(0, y_m)], limits, law)
 
     def guarded(k: int) -> object:
         return guard.guarded_step(law_state, y[k], y_m, dt, zero, zero, law, limits.limits)

@@ -14,10 +14,10 @@ from benchmarks.sampling import SINES, new_table
 from rich.console import Console
 from rich.progress import track
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
-from flight_campaign.compare import Compared, compare
-from flight_campaign.tuning import Arena, Tuned, arena, file_of, load
+from flight_campaign.law_comparison import Compared, compare
+from flight_campaign.tuning import Benchmark, TuningResult, benchmark, file_of, load
 
 LAWS = ("rise", "rise_ff", "rise_observer", "lqg", "pi", "pi_ff", "l1", "indi", "lqi_vanes")
 OBSERVER = "rise_observer"
@@ -44,8 +44,8 @@ def courses(scenario: Scenario) -> dict[str, Scenario]:
     }
 
 
-def wrong_wind(here: Arena) -> Iterator[tuple[str, Arena]]:
-    """The arena with an observer that knows the wind's columns wrongly; the aircraft stay."""
+def wrong_wind(here: Benchmark) -> Iterator[tuple[str, Benchmark]]:
+    """The benchmark with an observer that knows the wind's columns wrongly; the aircraft stay."""
     generator = np.random.default_rng(5)
     for part in WRONG:
         factor = 1.0 + part * generator.uniform(-1.0, 1.0, here.known.wind.shape) if part < 1.0 else 0.0
@@ -60,12 +60,12 @@ def main(
     """Print scores of laws tuned on osprey_servo's manoeuvre and gusts, on courses that they were not tuned on."""
     scenario = find_scenario("osprey_servo")
     tuned = load(file_of(scenario))
-    chosen: dict[str, dict[str, Tuned]] = {name: {"uncertain": tuned[name]["uncertain"]} for name in LAWS}
+    chosen: dict[str, dict[str, TuningResult]] = {name: {"uncertain": tuned[name]["uncertain"]} for name in LAWS}
     chosen[OBSERVER] |= {"late": tuned[OBSERVER]["late"]}
-    flown: list[tuple[str, Arena, dict[str, dict[str, Tuned]]]] = [
-        (name, arena(one), chosen) for name, one in courses(scenario).items()
+    flown: list[tuple[str, Benchmark, dict[str, dict[str, TuningResult]]]] = [
+        (name, benchmark(one), chosen) for name, one in courses(scenario).items()
     ]
-    flown += [(name, one, {OBSERVER: chosen[OBSERVER]}) for name, one in wrong_wind(arena(scenario))]
+    flown += [(name, one, {OBSERVER: chosen[OBSERVER]}) for name, one in wrong_wind(benchmark(scenario))]
     rows: list[tuple[str, Compared]] = []
     for name, here, laws in track(flown, "courses", console=Console(stderr=True)):
         rows += [(name, one) for one in compare(here, laws, aircraft, LEVELS, seed)]

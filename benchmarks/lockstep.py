@@ -7,7 +7,7 @@ The scenario osprey_gust with aircraft and reference model at the 100 Hz of the 
     four processes   aircraft, reference model, controller, recorder
     one process      the same four as objects in one process
     without ROS      the same parts in one loop
-    bare echo        a vector of four channels to another process and back, nothing else, by the same publisher and inbox
+    bare echo        a vector of four channels to another process and back, nothing else, by the same publisher and subscription
 
     .venv/bin/python benchmarks/lockstep.py [--duration 60] [--repeat 3]
 """
@@ -28,14 +28,15 @@ from mcap.stream_reader import StreamReader
 from rclpy.context import Context
 from rclpy.node import Node
 
-from flight_analysis.scenario import Scenario, load_scenario
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.scenarios import find_scenario
 from flight_ros import transport
-from flight_ros.inbox import Inbox, Waiter
 from flight_ros.messages import Encoder
-from flight_ros.topics import PUBLISH, STEP, U, Y
+from flight_ros.rclpy_private import WaitSet
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.topics import LOCKSTEP, PUBLISH, U, Y
 
 ECHOES = 5000
 
@@ -78,11 +79,11 @@ def echo() -> None:
     """The other end: whatever comes on y goes back on u, until the parent closes the pipe."""
     os.set_blocking(sys.stdin.fileno(), False)
     context, node = _node("echo")
-    inbox, publisher = Inbox(node, Y, STEP, raw=True), node.create_publisher(U.type, U.name, PUBLISH)
-    waiter = Waiter([inbox], context)
+    subscription, publisher = PolledSubscription(node, Y, LOCKSTEP, raw=True), node.create_publisher(U.type, U.name, PUBLISH)
+    waiter = WaitSet([subscription.entity], context)
     while sys.stdin.buffer.read(1) is None:  # b"" at its end
         waiter.wait(20_000_000)
-        for received in inbox.take():
+        for received in subscription.take():
             publisher.publish(received.message)
     node.destroy_node()
     context.try_shutdown()
@@ -91,8 +92,8 @@ def echo() -> None:
 def echoed_steps_per_second() -> float:
     """Round trips per second of four channels to another process and back."""
     context, node = _node("asker")
-    inbox, publisher = Inbox(node, U, STEP, raw=True), node.create_publisher(Y.type, Y.name, PUBLISH)
-    waiter, encoder, values = Waiter([inbox], context), Encoder(("q", "V", "p", "r"), "asker"), np.zeros(4)
+    subscription, publisher = PolledSubscription(node, U, LOCKSTEP, raw=True), node.create_publisher(Y.type, Y.name, PUBLISH)
+    waiter, encoder, values = WaitSet([subscription.entity], context), Encoder(("q", "V", "p", "r"), "asker"), np.zeros(4)
     other = subprocess.Popen([sys.executable, __file__, "--echo"], stdin=subprocess.PIPE)  # noqa: S603 - this file
     try:
         begin = 0.0
@@ -100,7 +101,7 @@ def echoed_steps_per_second() -> float:
             if k == 1:  # the first one waits for the other process
                 begin = time.perf_counter()
             publisher.publish(encoder.encode(k, values))
-            while not list(inbox.take(1)):
+            while not list(subscription.take(1)):
                 waiter.wait(20_000_000)
         return (ECHOES - 1) / (time.perf_counter() - begin)
     finally:

@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from flight_analysis.lyapunov import Evidence, evidence, example, fly, lemma_2
+from flight_analysis.design.lyapunov import Evidence, evidence, example, fly, lemma_2
 
 IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "lyapunov.svg"
 DT, DURATION = 0.01, 60.0  # s

@@ -24,7 +24,7 @@ from rclpy.node import Node
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import period_ns
 from flight_core.vectors import FloatArray

@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_figures, true_error
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
-from flight_analysis.summary import shown_units
+from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.units import SI_PER_UNIT
@@ -31,7 +31,7 @@ from flight_core.vectors import FloatArray
 WORLDS = {"paper": "no actuators", "servo": "actuators with lag, rate limits and end stops"}
 PERIODS, SMALL_PERIODS = (0.02, 0.01, 0.005), (0.002, 0.001)  # s
 WIDTH = 128  # characters, the least that the tables take, also into a file
-LONGEST_STEP = 0.0025  # s, of the integration
+MAX_STABLE_STEP = 0.0025  # s, of the integration
 NO_SIGN = 1e-9  # times beta: the law is then a PI controller
 
 # Gains that show the sign term: bandwidths K = 25, 20, 12, 3 rad/s of q, p, r, V, and beta far above what calm air asks for.
@@ -76,7 +76,7 @@ def fly(case: Case) -> Figures:
     start, stop = case.window
     t, t_u = error.stamp_ns / 1e9, tape.time("u")
     rms = np.array([error_figures(error[name][(t >= start) & (t <= stop)]).rms for name in error.names])
-    units, inside = shown_units(case.scenario), (t_u >= start) & (t_u <= stop)
+    units, inside = display_units(case.scenario), (t_u >= start) & (t_u <= stop)
     slew = [
         np.mean(np.abs(np.diff(tape["u"][name][inside]) / np.diff(t_u[inside]))) * units[name].factor
         for name in case.scenario.aircraft.load()[0].inputs
@@ -98,7 +98,7 @@ def at_period(scenario: Scenario, period: float) -> Scenario:
     """The scenario with aircraft, reference model and controller at one rate: nothing is late."""
     rate = 1.0 / period
     return scenario.vary(
-        aircraft={"rate": rate, "step": period / ceil(period / LONGEST_STEP), "sensors": {}},
+        aircraft={"rate": rate, "step": period / ceil(period / MAX_STABLE_STEP), "sensors": {}},
         reference_model={"rate": rate},
         controller={"rate": rate, "delay": 0.0},
     )

@@ -9,7 +9,7 @@ from timeit import repeat
 
 import numpy as np
 
-from flight_core.seal import Seal
+from flight_core.authentication import MessageAuthenticator
 from flight_ros.messages import Decoder, Encoder
 
 INPUTS = ("elevator", "aileron", "rudder", "thrust")
@@ -20,7 +20,10 @@ CALLS, TIMES = 5000, 15
 def main() -> None:
     """Print us a message."""
     print(f"{'':10}{'bytes':>8}{'encode us':>12}{'decode us':>12}")
-    for name, seals in (("no key", (None, None)), ("key", tuple(Seal(bytes(32), "/u", None) for _ in range(2)))):
+    for name, seals in (
+        ("no key", (None, None)),
+        ("key", tuple(MessageAuthenticator(bytes(32), "/u", None) for _ in range(2))),
+    ):
         encoder, decoder = Encoder(INPUTS, "/controller#4711", seals[0]), Decoder(INPUTS, seals[1])
         message = encoder.encode(1, VALUES)
         decoder.decode(message)  # learns the layout

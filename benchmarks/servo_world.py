@@ -30,17 +30,17 @@ from benchmarks.sampling import MOVING, NO_SIGN, REST, cells, new_table, samplin
 from rich.console import Console
 from rich.progress import track
 
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.gain_conditions import LinearPlant, Loop, delay_margin
 from flight_analysis.metrics import ErrorFigures, error_figures, true_error
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
-from flight_analysis.summary import shown_units
+from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_campaign.statistics import score_units
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller import guard
-from rise_di_controller.gains import LinearPlant, Loop, delay_margin
 from rise_di_controller.law import LawParams
 
 NOISE = [0.0017, 0.03, 0.0017, 0.0017]  # q, V, p, r in rad/s and m/s, rms per sample of 10 ms
@@ -156,12 +156,12 @@ def true_error_of(tape: Tape) -> Signal:
 
 
 def _errors(flown: Flown, read: Callable[[ErrorFigures], float]) -> FloatArray:
-    error, units = flown.inside(true_error_of(flown.tape)), shown_units(flown.scenario)
+    error, units = flown.inside(true_error_of(flown.tape)), display_units(flown.scenario)
     return np.array([read(error_figures(error[name])) * units[name].factor for name in error.names])
 
 
 def _inputs(flown: Flown, read: Callable[[str], float]) -> FloatArray:
-    units = shown_units(flown.scenario)
+    units = display_units(flown.scenario)
     return np.array([read(name) * units[name].factor for name in flown.scenario.aircraft.channels().inputs])
 
 

@@ -36,15 +36,15 @@ from rich.console import Console
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from flight_analysis.scenario import scenario_yaml
+from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_bringup.graph import CONTROLLER
-from flight_bringup.processes import Flight
+from flight_bringup.processes import FlightProcesses
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import NANOSECONDS, period_ns
 from flight_core.vectors import FloatArray
 from flight_ros import transport
-from flight_ros.inbox import Inbox
 from flight_ros.messages import Decoder, Encoder, stamp_of
+from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Ticker
 from flight_ros.topics import INTERNALS, PUBLISH, RECORD, Y_M, U, Y
 
@@ -150,8 +150,8 @@ class Peer:
         outputs = find_scenario(SCENARIO).controller.outputs
         self._y, self._y_m = (self._node.create_publisher(one.type, one.name, PUBLISH) for one in (Y, Y_M))
         self._y_encoder, self._y_m_encoder = (Encoder(outputs, f"/peer/{name}") for name in ("y", "y_m"))
-        self._u = Inbox(self._node, U, RECORD, raw=True)
-        self._internals = Inbox(self._node, INTERNALS, RECORD, raw=True)
+        self._u = PolledSubscription(self._node, U, RECORD, raw=True)
+        self._internals = PolledSubscription(self._node, INTERNALS, RECORD, raw=True)
         self._decoder = Decoder(("age", "late"))
         self._values = np.random.default_rng(1).normal(size=(1000, len(outputs))) * 1e-3
 
@@ -373,7 +373,7 @@ def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
         yield Row("flight", "node that only spins", _use([child.popen.pid], 3.0)[0], "node that only spins")
     path = folder / "flown.yaml"
     path.write_text(scenario_yaml(scenario), encoding="utf-8")
-    with Flight(find_scenario(str(path)), run, lambda: None, lockstep=False, one_process=False) as flight:
+    with FlightProcesses(find_scenario(str(path)), run, lambda: None, lockstep=False, one_process=False) as flight:
         time.sleep(max(flight.start_time - time.time(), 0.0) + WARM_UP)
         processes = flight.processes
         for process, figures in zip(processes, _use([one.popen.pid for one in processes], seconds), strict=True):
@@ -414,13 +414,13 @@ def whole_flight() -> float:
     context = Context()
     rclpy.init(context=context)
     node = Node("listener", context=context)
-    inbox = Inbox(node, U, RECORD, raw=True)
+    subscription = PolledSubscription(node, U, RECORD, raw=True)
     with tempfile.TemporaryDirectory() as runs:
         begin = time.time()
         command = [str(Path(sys.executable).parent / "rise-di"), "fly", SCENARIO, "--duration", "30", "--runs", runs]
         flight = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)  # noqa: S603 - this stack
         try:
-            while not (came := inbox.take()) and flight.poll() is None:
+            while not (came := subscription.take()) and flight.poll() is None:
                 time.sleep(0.005)
         finally:
             flight.send_signal(signal.SIGINT)

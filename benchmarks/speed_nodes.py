@@ -27,9 +27,10 @@ from rclpy.signals import SignalHandlerOptions
 from flight_core.parameters import NodeParameters
 from flight_core.rates import NANOSECONDS
 from flight_ros import transport
-from flight_ros.runtime import FlightNode, run
+from flight_ros.event_loop import run
+from flight_ros.flight_node import FlightNode
 from flight_ros.ticker import Tick, Ticker
-from flight_ros.topics import LISTEN, PUBLISH, U, Y
+from flight_ros.topics import NEWEST_SAMPLES, PUBLISH, U, Y
 from rise_di_controller.node import ControllerNode
 
 EXECUTORS: dict[str, Callable[[], Any]] = {
@@ -89,7 +90,7 @@ def echo(executor: str, hz: float, *, timed: bool) -> dict[str, float]:
         publisher.publish(message)
         sent_ns[0] = time.perf_counter_ns()
 
-    node.create_subscription(Y.type, Y.name, answer, LISTEN)
+    node.create_subscription(Y.type, Y.name, answer, NEWEST_SAMPLES)
     spun = EXECUTORS[executor]()
     spun.add_node(node)
     took: list[int] = []

@@ -13,7 +13,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 
 from flight_ros import transport
-from flight_ros.topics import DIAGNOSTICS, LISTEN
+from flight_ros.topics import DIAGNOSTICS, NEWEST_SAMPLES
 
 PATIENCE = 4.0  # s: some tenths to be matched, a report within the second after, and as long again for a busy machine
 
@@ -28,7 +28,7 @@ def main(names: list[str]) -> int:
     def hear(message: DiagnosticArray) -> None:
         heard.update({status.name.rpartition("/")[2]: status.message for status in message.status})
 
-    node.create_subscription(DIAGNOSTICS.type, DIAGNOSTICS.name, hear, LISTEN)
+    node.create_subscription(DIAGNOSTICS.type, DIAGNOSTICS.name, hear, NEWEST_SAMPLES)
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline and not (set(names) <= set(heard) if names else heard):
         rclpy.spin_once(node, timeout_sec=0.1)

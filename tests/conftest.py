@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
 
 # How long an example takes says something of the machine, not of what is tested.

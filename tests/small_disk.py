@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flight_recorder.disk import free_bytes
+from flight_log.disk import free_bytes
 
 
 @contextmanager

@@ -20,21 +20,21 @@ from aircraft_sim.simulator import Simulator
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.params import LIBRARY as MAPS
 from autopilot_bridge.params import load_map
-from flight_analysis.bag_reader import read_run
-from flight_analysis.latency import latency
-from flight_analysis.named_vectors import decoder
-from flight_analysis.playback import read_playback
-from flight_analysis.replay import recorded_parameters, replay
-from flight_analysis.scenario import load_scenario
-from flight_analysis.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
+from flight_analysis.closed_loop.replay import recorded_parameters, replay
+from flight_analysis.closed_loop.scenario import load_scenario
 from flight_bringup.scenarios import share
 from flight_core.parameters import ParameterError
-from flight_recorder.bag import SCENARIO, Contents, Count, information_of, read_information, read_metadata
-from flight_recorder.repair import repair
+from flight_log.bag import SCENARIO, Contents, Count, information_of, read_information, read_metadata
+from flight_log.latency import latency
+from flight_log.named_vectors import decoder
+from flight_log.playback import read_playback
+from flight_log.repair import repair
+from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
+from flight_log.tape_reader import read_run
 from rise_di_controller.controller import Controller
 from rise_di_controller.params import ControllerParameters
 
-LONGEST_SENTENCE = 2000
+MAX_SENTENCE_LENGTH = 2000
 """Characters: what is said of an input does not grow with it."""
 
 Target = Callable[[bytes, Path], None]
@@ -47,8 +47,8 @@ def refused(call: Callable[[], object]) -> bool:
         call()
     except ParameterError as error:
         said = str(error)
-        if not said.strip() or len(said.splitlines()) != 1 or len(said) > LONGEST_SENTENCE:
-            raise AssertionError(f"no sentence: {said[:LONGEST_SENTENCE]!r} of {len(said)} characters") from error
+        if not said.strip() or len(said.splitlines()) != 1 or len(said) > MAX_SENTENCE_LENGTH:
+            raise AssertionError(f"no sentence: {said[:MAX_SENTENCE_LENGTH]!r} of {len(said)} characters") from error
         return True
     return False
 

@@ -15,18 +15,17 @@ from tests.conftest import REPOSITORY
 from tests.fuzz.targets import log
 from tests.joint_states import JOINT_STATE, vector
 
-from flight_analysis.bag_reader import read_run
-from flight_analysis.latency import latency
-from flight_analysis.playback import read_playback
-from flight_analysis.report import _json
-from flight_analysis.scenario import Scenario
-from flight_bringup.fly import read_flight
-from flight_bringup.repair_command import repair_run
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.report.page import _json
+from flight_analysis.report.run_folder import read_flight
 from flight_core.files import parse_yaml
-from flight_core.parameters import LONGEST_SENTENCE, ParameterError
-from flight_recorder.bag import METADATA, read_information
-from flight_recorder.repair import repair
-from flight_recorder.scan import Scan
+from flight_core.parameters import MAX_SENTENCE_LENGTH, ParameterError
+from flight_log.bag import METADATA, read_information
+from flight_log.latency import latency
+from flight_log.playback import read_playback
+from flight_log.repair import repair
+from flight_log.scan import Scan
+from flight_log.tape_reader import read_run
 
 CORPUS = REPOSITORY / "tests" / "corpus"
 Y = [("/y", JOINT_STATE, vector(10_000_000 * k, ("q", "V"), (0.1 * k, k))) for k in range(20)]
@@ -132,7 +131,7 @@ def test_a_log_with_parameters_of_any_content_is_repaired(
     run = lay(tmp_path, whole[: len(whole) // 2])
     stored = log(Y[:1], attached={"parameters.yaml": content})
     (run / "run_1.mcap").write_bytes(stored.replace(b"application/yaml", b"text/yaml_______"))
-    repair_run(run)
+    repair(run)
     assert "metadata.yaml written" in capsys.readouterr().out
 
 
@@ -157,7 +156,7 @@ def test_a_sentence_stays_one_whatever_it_quotes() -> None:
     said = str(ParameterError("found \x1b[2J\r\na" + "x" * 5000))
     assert said.startswith(r"found \x1b[2J\r\na")
     assert said.isprintable()
-    assert len(said) <= LONGEST_SENTENCE + 10
+    assert len(said) <= MAX_SENTENCE_LENGTH + 10
 
 
 def test_no_text_of_a_log_ends_or_hides_the_script_it_stands_in() -> None:

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from tests.fuzz.targets import SEEDS
 
-from flight_bringup import cli
+from flight_cli import cli
 
 few = settings(
     max_examples=30,

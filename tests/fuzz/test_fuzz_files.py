@@ -18,10 +18,10 @@ from tests.conftest import REPOSITORY
 from tests.fuzz.targets import SEEDS, TARGETS, log, refused
 from tests.joint_states import JOINT_STATE, vector
 
-from flight_analysis.bag_reader import read_run
-from flight_analysis.scenario import Scenario
-from flight_bringup.fly import conclude, read_flight
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.report.run_folder import conclude, read_flight
 from flight_bringup.scenarios import find_scenario
+from flight_log.tape_reader import read_run
 
 CORPUS = REPOSITORY / "tests" / "corpus"
 

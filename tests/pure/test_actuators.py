@@ -14,9 +14,9 @@ from aircraft_sim.actuators import Actuators, step
 from aircraft_sim.dynamics import x_dot
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.plant import AircraftState, Plant, advance
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_figures, true_error
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError
@@ -112,7 +112,7 @@ def test_the_dead_zone_comes_before_the_lag() -> None:
 def flown_positions(times_ms: range, command: float, **actuators: list[float]) -> FloatArray:
     """Positions of the four actuators at the end of each 10 ms from the given instants on, all four commanded alike."""
     parts = osprey(10.0, **actuators)
-    state, history = plant.start(parts), []
+    state, history = plant.initial_state(parts), []
     for t in times_ms:
         state = advance(t * MS, state, np.full(4, command), 10 * MS, parts)
         history.append(state.position)
@@ -152,7 +152,7 @@ def test_a_lost_aileron_leaves_the_aircraft_as_without_it() -> None:
     parts, u = osprey(lost_at=[math.inf, math.inf, 0.0, math.inf]), np.array([0.01, 0.1, -0.02, 0.03])
     without = osprey()
     without = without._replace(aircraft=without.aircraft._replace(B=without.aircraft.B * [1.0, 1.0, 0.0, 1.0]))
-    found, expected = (advance(0, plant.start(one_of), u, 500 * MS, one_of).x for one_of in (parts, without))
+    found, expected = (advance(0, plant.initial_state(one_of), u, 500 * MS, one_of).x for one_of in (parts, without))
     assert (found == expected).all()
 
 
@@ -189,11 +189,11 @@ def test_the_plant_behind_a_lag_leads_its_continuous_model_by_half_a_step() -> N
     # The position at the end of a step acts during all of it. Of the exact answer of lag and plant together (a fine step)
     # that is an error of first order: half the step, half the error.
     u, lag = np.array([0.02, 0.0, 0.03, 0.01]), [0.02, 0.1, 0.02, 0.02]
-    runs = {ms: advance(0, plant.start(osprey()), u, 100 * MS, osprey(ms, lag=lag)) for ms in (5.0, 2.5, 0.05)}
+    runs = {ms: advance(0, plant.initial_state(osprey()), u, 100 * MS, osprey(ms, lag=lag)) for ms in (5.0, 2.5, 0.05)}
     errors = [np.abs(runs[ms].x - runs[0.05].x).max() for ms in (5.0, 2.5)]
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.05)
     # Early by dt / 2: x(t) behind 2.5 ms steps is x(t + 1.25 ms) of the fine one.
-    ahead = advance(0, plant.start(osprey()), u, 101 * MS + MS // 4, osprey(0.05, lag=lag))
+    ahead = advance(0, plant.initial_state(osprey()), u, 101 * MS + MS // 4, osprey(0.05, lag=lag))
     assert runs[2.5].x == pytest.approx(ahead.x, abs=0.05 * np.abs(ahead.x - runs[0.05].x).max())
 
 

@@ -17,7 +17,7 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.disturbance import Gusts, one_minus_cosine
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.plant import AircraftState, Plant, advance, start
+from aircraft_sim.plant import AircraftState, Plant, advance, initial_state
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
@@ -160,7 +160,7 @@ def test_steps_taken_together_are_runge_kutta_steps_of_equation_1() -> None:
     air = parts.turbulence
     assert air is not None
     u, T = np.array([0.05, 0.1, -0.04, 0.03]), 20
-    state = start(parts)._replace(x=np.linspace(-0.5, 0.5, 8))
+    state = initial_state(parts)._replace(x=np.linspace(-0.5, 0.5, 8))
     end = advance(7 * 40 * MS, state, u, 40 * MS, parts)
 
     x, position, z = state

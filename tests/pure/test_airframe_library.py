@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
-from flight_analysis.airframe_table import (
+from flight_analysis.design.airframe_properties import (
     ComplexArray,
     ZeroDynamics,
     airframe_facts,

@@ -17,17 +17,17 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from tests.joint_states import JOINT_STATE, STORE, vector
 
-from flight_analysis.bag_reader import read_run
-from flight_analysis.bag_writer import write_run
-from flight_analysis.named_vectors import decoder
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
-from flight_recorder.bag import BagWriter, Enclosed
-from flight_recorder.definitions import definition
-from flight_recorder.scan import Scan
+from flight_log.bag import BagWriter, Enclosed
+from flight_log.message_definitions import definition
+from flight_log.named_vectors import decoder
+from flight_log.scan import Scan
+from flight_log.tape_reader import read_run
+from flight_log.tape_writer import write_run
 
 
 @pytest.fixture(scope="module")

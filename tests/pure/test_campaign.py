@@ -18,9 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import true_error
-from flight_analysis.scenario import load_scenario, scenario_yaml
-from flight_analysis.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define
@@ -174,7 +174,7 @@ def test_a_folder_without_a_campaign_is_refused(tmp_path: Path) -> None:
 
 
 def command(*arguments: str, cwd: Path) -> "subprocess.Popen[str]":
-    program = [sys.executable, "-m", "flight_bringup.cli", "campaign", *arguments, "--json"]
+    program = [sys.executable, "-m", "flight_cli.cli", "campaign", *arguments, "--json"]
     return subprocess.Popen(program, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -14,14 +14,16 @@ from typer.testing import CliRunner
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.params import LIBRARY, ChannelMap, load_map
 from autopilot_bridge.signs import SURE, estimate, through
-from flight_analysis.simulate import simulate
-from flight_bringup.check_signs_command import check
-from flight_bringup.cli import app
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.sign_check import check
 from flight_bringup.scenarios import find_scenario
+from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
+
+app = application([*COMMANDS])
 
 MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")

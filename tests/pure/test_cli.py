@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 
 
 def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "flight_bringup.cli", *arguments]
+    command = [sys.executable, "-m", "flight_cli.cli", *arguments]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120, check=False)
 
 

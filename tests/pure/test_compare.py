@@ -9,32 +9,34 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from control_laws.catalogue import LAWS, start
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_figures, true_error
-from flight_analysis.simulate import simulate
-from flight_bringup.cli import app
 from flight_bringup.scenarios import find_scenario
-from flight_campaign import compare as side_by_side
 from flight_campaign import fleet, tuning
-from flight_campaign.fleet import Flown
-from flight_campaign.laws.catalogue import LAWS, start
-from flight_campaign.tuning import Arena, Tuned
+from flight_campaign import law_comparison as side_by_side
+from flight_campaign.fleet import FleetResult
+from flight_campaign.tuning import Benchmark, TuningResult
+from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
+
+app = application([*COMMANDS])
 
 SHIPPED = ("osprey_servo", "osprey_gust")
 
 
 @pytest.fixture(scope="module")
-def short() -> Arena:
+def short() -> Benchmark:
     """The first 4 s of osprey_servo, with its vertical gust brought forward into them."""
     gust = {"vertical": {"start": 2.0, "speed": 10.12, "length": 15.24}}
-    return tuning.arena(find_scenario("osprey_servo").vary(flight={"duration": 4.0}, aircraft={"gusts": gust}))
+    return tuning.benchmark(find_scenario("osprey_servo").vary(flight={"duration": 4.0}, aircraft={"gusts": gust}))
 
 
-def test_a_score_counts_each_channel_in_its_unit_and_a_cost_adds_activity(short: Arena) -> None:
+def test_a_score_counts_each_channel_in_its_unit_and_a_cost_adds_activity(short: Benchmark) -> None:
     # q, p, r, V: 10 mrad/s, 20 mrad/s, 10 mrad/s and 0.1 m/s are one each; 60 deg/s or 600 %/s of an input too
     rms = np.array([[0.01], [0.02], [0.01], [0.1]])
     slew = np.array([[np.deg2rad(60.0)], [0.0], [np.deg2rad(30.0)], [6.0]])
-    flown = Flown(rms, rms, slew, np.array([False]))
+    flown = FleetResult(rms, rms, slew, np.array([False]))
     assert tuning.score(flown, short.unit) == pytest.approx([4.0])
     assert tuning.cost(flown, short) == pytest.approx([6.5])
     lost = flown._replace(diverged=np.array([True]))
@@ -44,7 +46,9 @@ def test_a_score_counts_each_channel_in_its_unit_and_a_cost_adds_activity(short:
 
 
 @pytest.mark.parametrize(("aims", "flights"), [("nominal", 3), ("uncertain", 15), ("late", 21)])
-def test_an_evaluation_weighs_aircraft_evenly_and_calm_gusts_and_delay_once_each(aims: str, flights: int, short: Arena) -> None:
+def test_an_evaluation_weighs_aircraft_evenly_and_calm_gusts_and_delay_once_each(
+    aims: str, flights: int, short: Benchmark
+) -> None:
     costed = tuning.costed(aims, short)
     wind, late = np.asarray(costed.fleet.wind), np.asarray(costed.fleet.late)
     assert len(wind) == flights
@@ -53,7 +57,7 @@ def test_an_evaluation_weighs_aircraft_evenly_and_calm_gusts_and_delay_once_each
         assert costed.weight[part].sum() == pytest.approx(1.0)
 
 
-def test_a_search_repeats_itself_and_gets_better_than_its_start(short: Arena) -> None:
+def test_a_search_repeats_itself_and_gets_better_than_its_start(short: Benchmark) -> None:
     law, begin = LAWS["pi"], start(LAWS["pi"], short.known)
     found = [tuning.tune(law, tuning.NOMINAL, short, (3, 4), generations=6) for _ in range(2)]
     assert found[0] == found[1]
@@ -62,7 +66,8 @@ def test_a_search_repeats_itself_and_gets_better_than_its_start(short: Arena) ->
     flights, weight = tuning.costed(tuning.NOMINAL, short)
     costs = [
         float(
-            tuning.cost(fleet.fly(flights, short.vehicle, short.courses[False], law.pilot(short.known), params), short) @ weight
+            tuning.cost(fleet.fly(flights, short.vehicle, short.courses[False], law.control_law(short.known), params), short)
+            @ weight
         )
         for params in (law.params(begin, short.known), law.params(tuning.as_gains(found[0]), short.known))
     ]
@@ -70,9 +75,9 @@ def test_a_search_repeats_itself_and_gets_better_than_its_start(short: Arena) ->
     assert costs[1] < 0.95 * costs[0]
 
 
-def test_the_fleet_s_score_is_that_of_the_loop_in_one_process(short: Arena) -> None:
+def test_the_fleet_s_score_is_that_of_the_loop_in_one_process(short: Benchmark) -> None:
     controller = short.scenario.controller
-    gains = Tuned(
+    gains = TuningResult(
         {
             "K": controller.law().K.tolist(),
             "Lambda": list(controller.Lambda),
@@ -93,7 +98,7 @@ def test_the_fleet_s_score_is_that_of_the_loop_in_one_process(short: Arena) -> N
     assert found.score == pytest.approx(float(np.sum(rms / short.unit)), rel=2e-3)
 
 
-def test_more_aircraft_leave_the_first_ones_as_they_are(short: Arena) -> None:
+def test_more_aircraft_leave_the_first_ones_as_they_are(short: Benchmark) -> None:
     gains = tuning.load(tuning.TUNED / "osprey_servo.yaml")
     one = {"pi": {"nominal": gains["pi"]["nominal"]}}
     few, more = (next(iter(side_by_side.compare(short, one, count, [0.3, 0.5], 7))) for count in (2, 3))
@@ -107,7 +112,7 @@ def test_more_aircraft_leave_the_first_ones_as_they_are(short: Arena) -> None:
 def test_every_law_ships_with_gains_for_both_worlds(name: str) -> None:
     shipped = tuning.load(tuning.TUNED / f"{name}.yaml")
     assert set(shipped) == set(LAWS)
-    here = tuning.arena(find_scenario(name).vary(flight={"duration": 0.1}))
+    here = tuning.benchmark(find_scenario(name).vary(flight={"duration": 0.1}))
     for law, by_aim in shipped.items():
         assert {"nominal", "uncertain"} <= set(by_aim), law
         for found in by_aim.values():
@@ -119,7 +124,7 @@ def test_every_law_ships_with_gains_for_both_worlds(name: str) -> None:
 
 
 def test_gains_read_back_as_they_were_written(tmp_path: Path) -> None:
-    tuned = {"pi": {"nominal": Tuned({"K": [9.0, 8.0], "Lambda": [2.0, 1.0]}, 4.5, 2, [4.75, 4.5], 32)}}
+    tuned = {"pi": {"nominal": TuningResult({"K": [9.0, 8.0], "Lambda": [2.0, 1.0]}, 4.5, 2, [4.75, 4.5], 32)}}
     path = tmp_path / "made" / "gains.yaml"
     tuning.save(path, tuned, "a command")
     assert tuning.load(path) == tuned

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from flight_analysis.scenario import SCHEMAS
+from flight_analysis.closed_loop.scenario import SCHEMAS
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCKER = ROOT / "docker"

@@ -18,9 +18,9 @@ from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines, bias, design_gust
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.plant import AircraftState, advance
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import true_error
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 

@@ -16,15 +16,16 @@ import pytest
 import yaml
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.bag_reader import Run, read_run
-from flight_analysis.bag_writer import write_run
-from flight_analysis.scenario import SCHEMAS, Scenario, load_scenario
-from flight_analysis.simulate import simulate
-from flight_bringup.graph import AIRCRAFT, ONE_PROCESS, RECORDER, Told, enclosed, parameters
-from flight_bringup.provenance import provenance, revision
+from flight_analysis.closed_loop.scenario import SCHEMAS, ParameterOverrides, Scenario, load_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.run_folder import enclosed
+from flight_bringup.graph import AIRCRAFT, ONE_PROCESS, RECORDER, parameters
 from flight_bringup.scenarios import find_scenario, scenarios
 from flight_core.parameters import ParameterError
-from flight_recorder.bag import Enclosed, read_metadata
+from flight_log.bag import Enclosed, read_metadata
+from flight_log.provenance import provenance, revision
+from flight_log.tape_reader import Run, read_run
+from flight_log.tape_writer import write_run
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def stored(files: Enclosed | Run, name: str, folder: Path) -> Path:
 
 def told_to_recorder(scenario: Scenario, run: Path, *, one_process: bool) -> Enclosed:
     node, before = (ONE_PROCESS, "recorder:") if one_process else (RECORDER, "")
-    told: Told = parameters(node, scenario, run, 0.0, lockstep=True)
+    told: ParameterOverrides = parameters(node, scenario, run, 0.0, lockstep=True)
     attach, metadata = told[f"{before}attach"], told[f"{before}metadata_file"]
     assert isinstance(attach, list)
     return Enclosed(scenario.path, tuple(map(Path, attach)), Path(str(metadata)))
@@ -93,7 +94,7 @@ def test_the_airframe_in_a_log_is_the_one_that_flew(flown: Run, osprey_gust: Sce
     assert load_airframe(str(stored(flown, "airframe.yaml", tmp_path))) == load_airframe("osprey")
     drawn = osprey_gust.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.1, "seed": 7}})
     again = load_airframe(str(stored(enclosed(drawn, tmp_path), "airframe.yaml", tmp_path)))
-    assert again.A == drawn.aircraft.drawn().A
+    assert again.A == drawn.aircraft.sampled_airframe().A
     assert not np.array_equal(again.matrix_a(), load_airframe("osprey").matrix_a())
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from aircraft_sim import dynamics, plant
 from aircraft_sim.plant import AircraftState
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
@@ -75,7 +75,7 @@ def references() -> FloatArray:
 def fly(given: Callable[[int], Given]) -> list[Tick]:
     """Fly the scenario; new parameters are taken between two ticks, without a jump, as the node takes them."""
     hardware = SERVO.aircraft.plant()
-    aircraft, state, old = plant.start(hardware), guard.start(4), given(0).parameters.law()
+    aircraft, state, old = plant.initial_state(hardware), guard.initial_state(4), given(0).parameters.law()
     y: Sample | None = None
     y_m: list[Sample] = []
     flown = []
@@ -221,7 +221,7 @@ def thrown(*, latched: bool) -> tuple[FloatArray, FloatArray]:
     x = np.zeros(len(AIRFRAME.states))
     for name, value in OFF_TRIM.items():
         x[AIRFRAME.index(name)] = value
-    aircraft, state, zero = AircraftState(x, np.zeros(4)), guard.start(4), np.zeros(4)
+    aircraft, state, zero = AircraftState(x, np.zeros(4)), guard.initial_state(4), np.zeros(4)
     e, u = [], []
     for k in range(600):
         now_ns, y = k * PERIOD_NS, dynamics.y(aircraft.x, hardware.aircraft)[OUTPUTS]

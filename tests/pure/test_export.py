@@ -10,21 +10,21 @@ import polars as pl
 import pytest
 from matplotlib.image import imread
 
-from flight_analysis.export import table, write_csv, write_parquet, write_png
-from flight_analysis.recorded import Recorded
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
-from flight_analysis.summary import summarise
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.export import table, write_csv, write_parquet, write_png
+from flight_analysis.report.recorded_flight import RecordedFlight
+from flight_analysis.report.summary import summarise
 from flight_core.tape import Signal, Tape
 
 EPOCH = 1_795_000_000_000_000_000  # a stamp of today, which float64 cannot hold to the ns
 
 
 @pytest.fixture(scope="module")
-def flown(osprey_gust: Scenario) -> Recorded:
+def flown(osprey_gust: Scenario) -> RecordedFlight:
     scenario = osprey_gust.vary(flight={"duration": 3.0})
     tape = simulate(scenario)
-    return Recorded("flown", scenario, tape, summarise(scenario, tape, tape.outcome))
+    return RecordedFlight("flown", scenario, tape, summarise(scenario, tape, tape.outcome))
 
 
 def test_the_table_has_a_row_an_instant_and_nothing_where_there_is_no_sample() -> None:
@@ -39,7 +39,7 @@ def test_the_table_has_a_row_an_instant_and_nothing_where_there_is_no_sample() -
     }
 
 
-def test_csv_and_parquet_hold_every_sample_to_the_last_bit(flown: Recorded, tmp_path: Path) -> None:
+def test_csv_and_parquet_hold_every_sample_to_the_last_bit(flown: RecordedFlight, tmp_path: Path) -> None:
     write_csv(tmp_path / "flown.csv", [flown])
     write_parquet(tmp_path / "flown.parquet", [flown])
     with (tmp_path / "flown.csv").open(newline="", encoding="utf-8") as stream:
@@ -53,7 +53,7 @@ def test_csv_and_parquet_hold_every_sample_to_the_last_bit(flown: Recorded, tmp_
     assert [row["u.thrust"] != "" for row in rows[:11]] == [True, *[False] * 4, True, *[False] * 4, True]  # 100 Hz of 500
 
 
-def test_tables_of_several_flights_say_whose_each_row_is(flown: Recorded, tmp_path: Path) -> None:
+def test_tables_of_several_flights_say_whose_each_row_is(flown: RecordedFlight, tmp_path: Path) -> None:
     bare = flown._replace(name="bare", tape=Tape({"y": flown.tape["y"], "y_m": flown.tape["y_m"]}))
     write_parquet(tmp_path / "both.parquet", [flown, bare])
     both = pl.read_parquet(tmp_path / "both.parquet")
@@ -61,7 +61,7 @@ def test_tables_of_several_flights_say_whose_each_row_is(flown: Recorded, tmp_pa
     assert both.filter(pl.col("run") == "bare")["u.thrust"].null_count() == 1501
 
 
-def test_the_picture_is_one_of_all_flights(flown: Recorded, tmp_path: Path) -> None:
+def test_the_picture_is_one_of_all_flights(flown: RecordedFlight, tmp_path: Path) -> None:
     bare = flown._replace(name="bare", tape=Tape({"y": flown.tape["y"], "y_m": flown.tape["y_m"]}))
     for flights, width in (([flown], 1800), ([bare], 1800), ([flown, bare], 1800)):
         write_png(tmp_path / "flown.png", flights)

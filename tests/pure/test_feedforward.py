@@ -13,12 +13,12 @@ from benchmarks.feedforward import both
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.gain_selection import manoeuvre, study, with_feedforward
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
-from flight_bringup.cli import app
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.gain_selection import manoeuvre, study, with_feedforward
 from flight_bringup.scenarios import find_scenario
 from flight_campaign.campaign import chunk_flown, define
+from flight_cli.cli import COMMANDS, application
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
@@ -28,6 +28,8 @@ from rise_di_controller import law as rise
 from rise_di_controller.feedforward import Nominal
 from rise_di_controller.guard import ControllerState, Sample
 from rise_di_controller.params import ControllerParameters
+
+app = application([*COMMANDS])
 
 MS = 1_000_000
 SERVO = find_scenario("osprey_servo")
@@ -83,7 +85,7 @@ def reference(t: float) -> FloatArray:
 
 def largest_error(params: ControllerParameters) -> float:
     """Largest error in 6 s behind the guard, sampled at the controller's rate, integrated in steps of a tenth of it."""
-    limits, law, state, x = params.guard(), params.law(), guard.start(2), np.zeros(4)
+    limits, law, state, x = params.guard(), params.law(), guard.initial_state(2), np.zeros(4)
     samples: list[Sample] = []
     errors = []
 
@@ -107,7 +109,7 @@ def test_one_tick_gives_the_numbers_worked_by_hand() -> None:
     # From x = (0, 0) to y_m = 0.1 in 0.1 s: y_m_dot = 1, and the other state, eta_dot = 4 y_m - 3 eta with y_m = t, follows
     # exactly to 4 (3 t - 1 + exp(-3 t)) / 9 = 0.0181414, Runge-Kutta within (3 t)^5 / 5! of it.
     # In the middle x = (0.05, 0.0090707), so u = (1 - (-0.05 + 2 0.0090707)) / 2 = 0.5159293.
-    state, added = feedforward.step(feedforward.start(np.zeros(1), BY_HAND), np.array([0.1]), np.array(0.1), BY_HAND)
+    state, added = feedforward.step(feedforward.initial_state(np.zeros(1), BY_HAND), np.array([0.1]), np.array(0.1), BY_HAND)
     assert state.x == pytest.approx([0.1, 0.0181414], abs=1e-5)
     assert state.u == pytest.approx([0.5159293], abs=1e-5)
     assert added.tolist() == [0.0]
@@ -116,7 +118,7 @@ def test_one_tick_gives_the_numbers_worked_by_hand() -> None:
 def test_the_input_is_taken_ahead_along_the_straight_line_through_the_last_two() -> None:
     # Ticks of 0.1 and 0.2 s have their middles 0.15 s apart; from the last one it is 0.1 s to the tick, and 0.05 s of lead.
     led = BY_HAND._replace(lead=np.array([0.05]))
-    first, _ = feedforward.step(feedforward.start(np.zeros(1), led), np.array([0.1]), np.array(0.1), led)
+    first, _ = feedforward.step(feedforward.initial_state(np.zeros(1), led), np.array([0.1]), np.array(0.1), led)
     second, _ = feedforward.step(first, np.array([0.5]), np.array(0.2), led)
     assert second.u_0 == pytest.approx(second.u + 0.15 * (second.u - first.u) / 0.15)
 
@@ -176,7 +178,7 @@ def recomputed(params: ControllerParameters, tape: Tape) -> tuple[FloatArray, Fl
     y, y_m = log.group("y").values, log.group("y_m").values
     u = log.group("u").values[0]
     u_trim, state = u, rise.engage(y[0], y_m[0])
-    ahead = None if limits.nominal is None else feedforward.start(y_m[0], limits.nominal)
+    ahead = None if limits.nominal is None else feedforward.initial_state(y_m[0], limits.nominal)
     us, added = [u], [np.zeros_like(u)]
     for k in range(1, len(y)):
         start, u_ff, dt = u_trim, np.zeros_like(u), float(log["dt"][k])
@@ -207,7 +209,7 @@ def ticks(
     params: ControllerParameters, y: Callable[[float], FloatArray], missing: tuple[float, float] = (9.0, 9.0)
 ) -> list[ControllerState]:
     """Every 10 ms from 0.5 to 1.5 s, in the middle of the reference's motion; no samples come in `missing`."""
-    state, states = guard.start(2), []
+    state, states = guard.initial_state(2), []
     y_now, y_m_samples = Sample(0, np.zeros(2)), [Sample(0, np.zeros(2))]
     for k in range(50, 150):
         t, now_ns = k / 100, k * 10 * MS
@@ -233,7 +235,7 @@ def test_engagement_and_engagement_again_in_the_middle_of_a_manoeuvre_do_not_jum
         assert 0.005 < np.abs(np.diff(u[2:], axis=0)).max() < 0.1
         t = 0.5 + first / 100
         rate = (reference(t + 0.01) - reference(t)) / 0.01
-        whole = feedforward.ideal(feedforward.start(reference(t), nominal).x, rate, nominal)
+        whole = feedforward.ideal(feedforward.initial_state(reference(t), nominal).x, rate, nominal)
         assert np.abs(whole).max() > 0.5
 
 

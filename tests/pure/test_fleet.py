@@ -9,17 +9,17 @@ import pytest
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import matrices
-from flight_analysis.gain_selection import with_feedforward
+from control_laws import rise_di
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.gain_selection import with_feedforward
 from flight_analysis.metrics import true_error
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet
-from flight_campaign.course import chart
-from flight_campaign.laws import rise
-from flight_campaign.pilot import Pilot, Seen
+from flight_campaign.benchmark_course import build_course
 from flight_core.parameters import ParameterError
 from flight_core.vectors import Array, FloatArray
+from rise_di_controller.control_law import ControlLaw, Measurements
 
 NUMBERS = (0, 1)  # of the aircraft drawn
 SERVO = find_scenario("osprey_servo").vary(
@@ -35,20 +35,20 @@ AT_TICKS = {"aircraft": {"rate": 100.0, "step": 0.002}}
 
 
 class Flight(NamedTuple):
-    """Figures of one flight, as `fleet.Flown` has them, (m,)."""
+    """Figures of one flight, as `fleet.FleetResult` has them, (m,)."""
 
     rms: FloatArray
     max: FloatArray
     slew: FloatArray
 
 
-def flown(scenario: Scenario, part: float = 0.3, seed: int = 5) -> fleet.Flown:
+def flown(scenario: Scenario, part: float = 0.3, seed: int = 5) -> fleet.FleetResult:
     """The aircraft NUMBERS of a seed, as a fleet."""
-    course = chart(scenario)
+    course = build_course(scenario)
     A, B = matrices(load_airframe(scenario.aircraft.airframe), part, part, seed, NUMBERS[0], len(NUMBERS))
     ships = fleet.assemble(A, B, scenario.aircraft.plant(), course)
-    pilot, params = rise.pilot(scenario.controller.law().sign), rise.params(scenario.controller)
-    return fleet.fly(ships, fleet.vehicle(scenario), course, pilot, params)
+    control_law, params = rise_di.control_law(scenario.controller.law().sign), rise_di.params(scenario.controller)
+    return fleet.fly(ships, fleet.vehicle(scenario), course, control_law, params)
 
 
 def alone(scenario: Scenario, number: int, part: float = 0.3, seed: int = 5) -> Flight:
@@ -125,16 +125,16 @@ def test_each_aircraft_of_a_fleet_flies_what_it_flies_alone(scenario: Scenario) 
 
 
 def test_every_aircraft_may_have_its_own_gains_wind_and_delay() -> None:
-    course, vehicle, plant = chart(SERVO), fleet.vehicle(SERVO), SERVO.aircraft.plant()
+    course, vehicle, plant = build_course(SERVO), fleet.vehicle(SERVO), SERVO.aircraft.plant()
     A, B = matrices(load_airframe("osprey"), 0.3, 0.3, 5, 0, 1)
-    pilot, params = rise.pilot(SERVO.controller.law().sign), rise.params(SERVO.controller)
+    control_law, params = rise_di.control_law(SERVO.controller.law().sign), rise_di.params(SERVO.controller)
     wind, late = np.array([1.0, 0.0, 1.0, 1.0]), np.array([0, 0, 2, 0])
     beta = params.beta * np.array([1.0, 1.0, 1.0, 0.5])
     ships = fleet.assemble(np.repeat(A, 4, 0), np.repeat(B, 4, 0), plant, course, wind, late)
-    together = fleet.fly(ships, vehicle, course, pilot, params._replace(beta=beta))
+    together = fleet.fly(ships, vehicle, course, control_law, params._replace(beta=beta))
     for k in range(4):
         single = fleet.assemble(A, B, plant, course, wind[k], late[k])
-        apart = fleet.fly(single, vehicle, course, pilot, params._replace(beta=beta[:, k : k + 1]))
+        apart = fleet.fly(single, vehicle, course, control_law, params._replace(beta=beta[:, k : k + 1]))
         # The same operations; only their order in sums may differ with the width of the machine's vectors.
         assert np.asarray(together.rms)[:, k] == pytest.approx(np.asarray(apart.rms)[:, 0], rel=1e-9)
     rms = np.asarray(together.rms)
@@ -143,22 +143,22 @@ def test_every_aircraft_may_have_its_own_gains_wind_and_delay() -> None:
     assert not np.allclose(rms[:, 3], rms[:, 0], rtol=1e-3)
 
 
-def _pulse(delay: int) -> Pilot:
-    """A pilot that looks at nothing: one pulse of the elevator, so many ticks later."""
+def _pulse(delay: int) -> ControlLaw:
+    """A control_law that looks at nothing: one pulse of the elevator, so many ticks later."""
 
-    def start(seen: Seen, params: Any) -> Array:
+    def start(seen: Measurements, params: Any) -> Array:
         return 0.0 * seen.y[:1] + 1.0
 
-    def step(state: Array, seen: Seen, dt: Array, params: Any) -> tuple[Array, Array]:
+    def step(state: Array, seen: Measurements, dt: Array, params: Any) -> tuple[Array, Array]:
         inside = (state >= 10.0 + delay) & (state < 30.0 + delay)
         return state + 1.0, 0.0 * seen.y + 0.05 * inside * np.array([[1.0], [0.0], [0.0], [0.0]])
 
-    return Pilot(start, step)
+    return ControlLaw(start, step)
 
 
 def test_a_late_u_acts_as_many_ticks_later() -> None:
     calm = SERVO.vary(aircraft={"gusts": {}}, flight={"duration": 2.0})
-    course, vehicle, plant = chart(calm), fleet.vehicle(calm), calm.aircraft.plant()
+    course, vehicle, plant = build_course(calm), fleet.vehicle(calm), calm.aircraft.plant()
     A, B = matrices(load_airframe("osprey"), 0.0, 0.0, 1, 0, 1)
     late = fleet.fly(fleet.assemble(A, B, plant, course, late=3), vehicle, course, _pulse(0), ())
     later = fleet.fly(fleet.assemble(A, B, plant, course), vehicle, course, _pulse(3), ())
@@ -168,14 +168,14 @@ def test_a_late_u_acts_as_many_ticks_later() -> None:
 
 
 def test_an_aircraft_that_diverges_says_so_and_leaves_the_others_alone() -> None:
-    course, vehicle, plant = chart(SERVO), fleet.vehicle(SERVO), SERVO.aircraft.plant()
+    course, vehicle, plant = build_course(SERVO), fleet.vehicle(SERVO), SERVO.aircraft.plant()
     A, B = matrices(load_airframe("osprey"), 0.0, 0.0, 1, 0, 2)
     B = B * np.array([1.0, -1.0])[:, None, None]  # every sign wrong: the law drives it away
     vehicle = vehicle._replace(actuators=vehicle.actuators._replace(lower=None, upper=None, rate=None))
-    params = rise.params(SERVO.controller)
+    params = rise_di.params(SERVO.controller)
     free = params.limits._replace(lower=-np.inf + 0.0 * params.D, upper=np.inf + 0.0 * params.D)
     ships = fleet.assemble(A, B, plant, course)
-    both = fleet.fly(ships, vehicle, course, rise.pilot(SERVO.controller.law().sign), params._replace(limits=free))
+    both = fleet.fly(ships, vehicle, course, rise_di.control_law(SERVO.controller.law().sign), params._replace(limits=free))
     assert np.asarray(both.diverged).tolist() == [False, True]
     assert np.isfinite(np.asarray(both.rms)[:, 0]).all()
 
@@ -189,9 +189,9 @@ def test_an_aircraft_that_diverges_says_so_and_leaves_the_others_alone() -> None
 )
 def test_what_a_fleet_cannot_fly_is_refused(sections: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"^{sentence}"):
-        chart(SERVO.vary(**sections))
+        build_course(SERVO.vary(**sections))
 
 
 def test_an_aircraft_of_jsbsim_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"^airframe: found jsbsim:c172p, expected an airframe with matrices"):
-        chart(find_scenario("jsbsim_c172p"))
+        build_course(find_scenario("jsbsim_c172p"))

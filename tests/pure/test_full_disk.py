@@ -13,13 +13,13 @@ from rosbags.highlevel import AnyReader
 from tests.joint_states import JOINT_STATE, vector
 from tests.small_disk import fill, small_disk
 
-from flight_analysis.bag_reader import read_run
-from flight_analysis.bag_writer import write_run
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
-from flight_recorder.bag import END_BYTES, BagWriter, Channel, Enclosed
-from flight_recorder.disk import ReservedFile, free_bytes
+from flight_log.bag import END_BYTES, BagWriter, Channel, Enclosed
+from flight_log.disk import ReservedFile, free_bytes
+from flight_log.tape_reader import read_run
+from flight_log.tape_writer import write_run
 
 SIZE = 2_000_000
 

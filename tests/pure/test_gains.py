@@ -16,22 +16,22 @@ from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import uncertain
-from flight_analysis import gain_selection as selection
-from flight_analysis.gain_selection import Answer, Channels, Manoeuvre, Setting, Study
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
-from flight_bringup.airframes_command import airframes
-from flight_bringup.gains_command import gains as gains_command
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design import gain_conditions
+from flight_analysis.design import gain_selection as selection
+from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet, LinearPlant, Loop
+from flight_analysis.design.gain_selection import ChannelPairing, GainAssessment, LoopSetting, Manoeuvre, Study
 from flight_bringup.scenarios import find_scenario
+from flight_cli.airframes import airframes
+from flight_cli.gains import gains as gains_command
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
-from rise_di_controller import gains
 from rise_di_controller.decomposition import decompose, unit_diagonal
-from rise_di_controller.gains import Bounds, Condition, GainSet, LinearPlant, Loop
 from rise_di_controller.law import LawParams, Sign, engage, step
 from rise_di_controller.params import ControllerParameters
 
-SERVOS: Setting = selection.setting_of(find_scenario("osprey_servo"))._replace(delay=0.0, rate_limit={})
+SERVOS: LoopSetting = selection.setting_of(find_scenario("osprey_servo"))._replace(delay=0.0, rate_limit={})
 HAND = Bounds(
     U=np.array([[0.0, 2.0, 1.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]),
     N_d=np.array([1.0, 2.0, 3.0]),
@@ -63,11 +63,11 @@ def names(conditions: tuple[Condition, ...], channels: tuple[str, ...]) -> list[
 
 def test_beta_follows_29_and_30_from_the_last_channel_up() -> None:
     # beta_3 = 3 (1 + 0/4) = 3; beta_2 = (2 + 0.5 3) (1 + 2/2) = 7; beta_1 = (1 + 2 7 + 1 3) (1 + 1/1) = 36
-    assert gains.least_beta(np.array([1.0, 2.0, 4.0]), HAND).tolist() == [36.0, 7.0, 3.0]
+    assert gain_conditions.least_beta(np.array([1.0, 2.0, 4.0]), HAND).tolist() == [36.0, 7.0, 3.0]
 
 
 def test_k_g_and_k_d_follow_steps_2_and_3_from_the_last_channel_up() -> None:
-    found = gains.theorem_gains(HAND, np.ones(3))
+    found = gain_conditions.theorem_gains(HAND, np.ones(3))
     # k_g = 1.5 2^2 / 4; k_3 = 1 + k_g = 2.5; a row of step 3 may take 0.3 / 2
     # zeta_Phi,2 = 0.5 2.5 = 1.25, k_d,2 = 1.25^2 / (4 0.15); k_2 = 2.5 + k_d,2
     # zeta_Phi,1^2 = (2 k_2)^2 + (1 2.5)^2
@@ -78,8 +78,8 @@ def test_k_g_and_k_d_follow_steps_2_and_3_from_the_last_channel_up() -> None:
 
 
 def test_the_gains_of_theorem_1_meet_its_conditions() -> None:
-    conditions = gains.check(gains.theorem_gains(HAND, np.ones(3)), HAND)
-    assert not gains.failing(conditions)
+    conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
+    assert not gain_conditions.failing(conditions)
     assert [one.margin for one in conditions[:3]] == pytest.approx([1.0, 1.0, 1.0])  # the least beta
     assert conditions[3].margin == pytest.approx(1.5)
     assert (conditions[4].found, conditions[4].bound) == pytest.approx((0.3, 1.0 / 3.0))  # 2 rows of 0.15; 1 - 2/3
@@ -96,24 +96,24 @@ def test_the_gains_of_theorem_1_meet_its_conditions() -> None:
 )
 def test_a_condition_that_fails_is_named(change: dict[str, FloatArray | float], failing: list[str]) -> None:
     bounds = HAND._replace(gamma_2=np.array([1.0, 1.0, 0.0]))
-    good = gains.theorem_gains(bounds, np.ones(3))
+    good = gain_conditions.theorem_gains(bounds, np.ones(3))
     assert good.beta.tolist() == [36.0, 7.0, 3.0]  # with Lambda = 1 the gamma_2 of the second channel is 1
-    conditions = gains.failing(gains.check(good._replace(**change), bounds))  # type: ignore[arg-type]
+    conditions = gain_conditions.failing(gain_conditions.check(good._replace(**change), bounds))  # type: ignore[arg-type]
     assert names(conditions, ("a", "b", "c")) == failing
 
 
 def test_what_rests_on_gamma_2_is_marked_an_estimate() -> None:
-    conditions = gains.check(gains.theorem_gains(HAND, np.ones(3)), HAND)
+    conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
     assert [one.estimate for one in conditions] == [True, True, True, False, False]
 
 
 def test_a_gain_that_22_does_not_allow_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"^k_d: found \[0\.\], expected values above 0$"):
-        gains.check(GainSet(1.0, np.zeros(1), np.ones(2), np.ones(2)), HAND)
+        gain_conditions.check(GainSet(1.0, np.zeros(1), np.ones(2), np.ones(2)), HAND)
     with pytest.raises(ParameterError, match="the smallest in the last channel"):
-        gains.split(np.array([2.0, 3.0]))
+        gain_conditions.split(np.array([2.0, 3.0]))
     with pytest.raises(ParameterError, match=r"^K\[1\]: found 0\.9, expected above 1"):
-        gains.split(np.array([2.0, 0.9]))
+        gain_conditions.split(np.array([2.0, 0.9]))
 
 
 @pytest.mark.parametrize(
@@ -134,10 +134,10 @@ def test_the_literal_conditions_ask_the_osprey_for_bandwidths_no_servo_has(
     Omega = C @ np.array(airframe.B)
     response = np.abs(np.diag(Omega))
     Omega = unit_diagonal(Omega) if scaled else Omega
-    found = gains.rho(Omega, C @ A @ C.T, np.array(Lambda))
+    found = gain_conditions.rho(Omega, C @ A @ C.T, np.array(Lambda))
     assert found == pytest.approx(rho, rel=0.01)
-    bounds = Bounds(gains.bound_U(Omega[None]), np.ones(4), found, np.zeros(4))
-    answer = gains.theorem_gains(bounds, np.array(Lambda))
+    bounds = Bounds(gain_conditions.bound_U(Omega[None]), np.ones(4), found, np.zeros(4))
+    answer = gain_conditions.theorem_gains(bounds, np.array(Lambda))
     assert answer.k_g == pytest.approx(k_g, rel=0.01)
     shown = (1.0 + answer.k_g) * (np.ones(4) if scaled else response)  # before k_d
     np.testing.assert_allclose(shown, bandwidths, rtol=0.01)
@@ -146,17 +146,17 @@ def test_the_literal_conditions_ask_the_osprey_for_bandwidths_no_servo_has(
 
 def test_bounds_of_U_are_those_of_the_worst_sample() -> None:
     lower, upper = np.array([[0.9, 0.0], [0.0, 0.9]]), np.array([[1.1, 0.3], [0.2, 1.1]])
-    samples = gains.within(lower, upper, 400, seed=3)
+    samples = gain_conditions.within(lower, upper, 400, seed=3)
     assert ((samples >= lower) & (samples <= upper)).all()
     # U_12 = W_12 - L_21 with D = I: largest with W_12 = 0.3 / 0.9, L_21 = 0, which is a corner
-    assert gains.bound_U(samples)[0, 1] == pytest.approx(0.3 / 0.9)
+    assert gain_conditions.bound_U(samples)[0, 1] == pytest.approx(0.3 / 0.9)
 
 
 def test_n_d_is_minus_D_U_v_dot() -> None:
     # M Omega v_dot with M = S^-1, whatever Omega: what the ideal control has to cancel
     Omega, v_dot = np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([[0.3, -0.7], [1.0, 2.0]])
     expected = [-np.linalg.solve(decompose(Omega).S, Omega @ row) for row in v_dot]
-    np.testing.assert_allclose(gains.N_d(Omega, v_dot), expected, atol=1e-12)
+    np.testing.assert_allclose(gain_conditions.N_d(Omega, v_dot), expected, atol=1e-12)
 
 
 # The ideal control
@@ -214,24 +214,24 @@ def test_the_engineering_gains_of_the_osprey_are_about_those_that_flew_best(sele
     np.testing.assert_allclose(params.eps * params.K / params.beta, 2.75 * np.array([0.035, 0.035, 0.035, 0.115]))  # T_eps
     slew = selected.study.slew[[0, 2, 3, 1]] / params.input_scale
     np.testing.assert_allclose(params.beta, 1.25 * slew)
-    assert not gains.failing(selected.engineering.loop)
+    assert not gain_conditions.failing(selected.engineering.loop)
     # 45 ms is exact for those gains with a softening of 3; here it is 2.75, and Lambda a little smaller
     assert selected.engineering.delay_margin == pytest.approx(0.045, abs=0.003)
 
 
 def test_what_theorem_1_asks_of_the_osprey_does_not_fly_behind_servos(selected: selection.Selection) -> None:
     literal = selected.theorem
-    assert not gains.failing(literal.theorem)
+    assert not gain_conditions.failing(literal.theorem)
     assert literal.delay_margin == 0.0
-    failing = names(gains.failing(literal.loop), literal.controller.outputs)
+    failing = names(gain_conditions.failing(literal.loop), literal.controller.outputs)
     assert {"share of q", "share of p", "linear stability", "delay margin"} <= set(failing)
     assert "k_g, step 2" in names(selected.engineering.failing, literal.controller.outputs)
 
 
 def test_a_channel_too_slow_for_22_gets_inputs_of_less_response() -> None:
     loop = Loop(np.array([0.02, 1.0]), 0.0, 0.01)
-    bandwidth = gains.bandwidths(loop, np.array([0.63, 0.23]))
-    found = gains.engineering_gains(bandwidth, np.array([1.0, 1.0]), 1.25, np.array([np.inf, np.inf]))
+    bandwidth = gain_conditions.bandwidths(loop, np.array([0.63, 0.23]))
+    found = gain_conditions.engineering_gains(bandwidth, np.array([1.0, 1.0]), 1.25, np.array([np.inf, np.inf]))
     np.testing.assert_allclose(found.gains.K, [18.0, 1.5])
     np.testing.assert_allclose(found.gains.K * found.response, bandwidth)  # the same loop
     np.testing.assert_allclose(found.gains.beta * found.response, 1.25)  # and the same rate of u
@@ -241,7 +241,7 @@ def test_beta_stays_below_the_rate_of_the_actuators(osprey: Study) -> None:
     limited = selection.select_gains(osprey, SERVOS._replace(rate_limit={"thrust": 1.2})).engineering
     params = limited.controller.law()
     assert params.beta[3] * params.input_scale[3] == pytest.approx(0.7 * 1.2)  # the slew of the ideal thrust is 1.14 1/s
-    assert names(gains.failing(limited.loop), limited.controller.outputs) == ["beta above slew of V"]
+    assert names(gain_conditions.failing(limited.loop), limited.controller.outputs) == ["beta above slew of V"]
 
 
 def test_a_written_gain_set_is_read_back(selected: selection.Selection) -> None:
@@ -262,10 +262,10 @@ def test_a_written_gain_set_is_read_back(selected: selection.Selection) -> None:
 def test_a_scenarios_gain_set_is_judged_condition_by_condition(osprey: Study) -> None:
     servo = find_scenario("osprey_servo")
     weak = servo.vary(controller={"beta": [14.7, 22.5, 6.8, 3.6]})
-    failing = names(gains.failing(selection.check_gains(weak, osprey).loop), weak.controller.outputs)
+    failing = names(gain_conditions.failing(selection.check_gains(weak, osprey).loop), weak.controller.outputs)
     assert failing == ["beta above slew of q", "beta above slew of r", "beta above slew of V"]
     fast = servo.vary(controller={"k_g": 5.0, "beta": [40.0, 40.0, 40.0, 8.0]})
-    failing = names(gains.failing(selection.check_gains(fast, osprey).loop), fast.controller.outputs)
+    failing = names(gain_conditions.failing(selection.check_gains(fast, osprey).loop), fast.controller.outputs)
     assert "share of q" in failing
     assert "beta below rate of r" in failing
 
@@ -273,12 +273,12 @@ def test_a_scenarios_gain_set_is_judged_condition_by_condition(osprey: Study) ->
 # Refusals
 
 
-def osprey_channels(inputs: tuple[str, ...], flipped: tuple[str, ...] = ()) -> tuple[FloatArray, Channels]:
+def osprey_channels(inputs: tuple[str, ...], flipped: tuple[str, ...] = ()) -> tuple[FloatArray, ChannelPairing]:
     """Omega of the osprey with its inputs in some order, some of them counted the other way."""
     airframe = load_airframe("osprey")
     columns = [list(airframe.inputs).index(name) for name in inputs]
     turned = np.array([-1.0 if name in flipped else 1.0 for name in inputs])
-    return (airframe.matrix_c() @ airframe.matrix_b())[:, columns] * turned, Channels(airframe.outputs, inputs)
+    return (airframe.matrix_c() @ airframe.matrix_b())[:, columns] * turned, ChannelPairing(airframe.outputs, inputs)
 
 
 def test_a_wrong_D_is_refused_with_the_one_that_fits() -> None:
@@ -347,7 +347,9 @@ def test_delay_margins_of_the_osprey_are_those_of_an_independent_prototype(
 ) -> None:
     loop = Loop(np.array([0.02, 0.1, 0.02, 0.02]), 0.0, 0.01)
     plant, params = c_2(loop, factor * loop.total, np.array(K), np.array(Lambda))
-    assert gains.delay_margin(plant, params, loop) == pytest.approx(margin, abs=0.001)  # given as 45, 64, 61 and 30 to 31 ms
+    assert gain_conditions.delay_margin(plant, params, loop) == pytest.approx(
+        margin, abs=0.001
+    )  # given as 45, 64, 61 and 30 to 31 ms
 
 
 def scalar(omega: float, T_eps: float) -> LawParams:
@@ -388,7 +390,7 @@ def test_the_predicted_delay_margin_is_where_the_simulated_loop_begins_to_grow(l
     omega, period = 0.98, 0.01
     params = scalar(omega, factor * (lag + 1.5 * period))
     plant = LinearPlant(np.zeros((1, 1)), np.array([[omega]]), np.eye(1))
-    margin = gains.delay_margin(plant, params, Loop(np.array([lag]), 0.0, period))
+    margin = gain_conditions.delay_margin(plant, params, Loop(np.array([lag]), 0.0, period))
     # 0.75 ms: the simulated delay comes in steps of 0.25 ms, the predicted one in 0.1 ms, and growth has to show in 9 s
     assert 0.003 < margin < 0.1
     assert not grows(params, omega, lag, margin - 0.00075)
@@ -399,29 +401,29 @@ def test_a_softened_sign_narrower_than_the_lag_of_the_loop_is_unstable() -> None
     loop = Loop(np.array([0.02]), 0.0, 0.01)
     plant = LinearPlant(np.zeros((1, 1)), np.eye(1), np.eye(1))
     wide, narrow = (scalar(1.0, factor * 0.035) for factor in (1.7, 0.5))
-    assert gains.delay_margin(plant, wide, loop) > 0.0
-    assert gains.delay_margin(plant, narrow, loop) == 0.0
-    assert names(gains.failing(gains.check_loop(narrow, loop, *(np.ones(1),) * 3, np.full(1, np.inf))), ("y",)) == [
-        "softening of y"
-    ]
+    assert gain_conditions.delay_margin(plant, wide, loop) > 0.0
+    assert gain_conditions.delay_margin(plant, narrow, loop) == 0.0
+    assert names(
+        gain_conditions.failing(gain_conditions.check_loop(narrow, loop, *(np.ones(1),) * 3, np.full(1, np.inf))), ("y",)
+    ) == ["softening of y"]
 
 
 def test_delay_that_the_loop_has_already_counts_against_the_margin() -> None:
     loop = Loop(np.array([0.02, 0.1, 0.02, 0.02]), 0.0, 0.01)
     plant, params = c_2(loop, 3.0 * loop.total, np.array([18.0, 2.0, 18.0, 9.0]), np.array([5.0, 0.5, 5.0, 3.0]))
-    free = gains.delay_margin(plant, params, loop)
-    spent = gains.delay_margin(plant, params, loop._replace(delay=0.013))
+    free = gain_conditions.delay_margin(plant, params, loop)
+    spent = gain_conditions.delay_margin(plant, params, loop._replace(delay=0.013))
     assert spent == pytest.approx(free - 0.013, abs=2e-4)
-    alone = [gains.delay_margin(plant, params, loop, channel) for channel in range(4)]
+    alone = [gain_conditions.delay_margin(plant, params, loop, channel) for channel in range(4)]
     assert min(alone) < 0.05 < max(alone)  # thrust bears three times what the surfaces bear
 
 
 def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
     literal = find_scenario("osprey_servo").vary(controller={"sign": "literal"})
-    answer: Answer = selection.check_gains(literal, osprey)
+    answer: GainAssessment = selection.check_gains(literal, osprey)
     assert answer.delay_margin is None
     with pytest.raises(ParameterError, match=r"^sign: found literal, expected soft or implicit"):
-        gains.law_matrix(literal.controller.law(), 0.01)
+        gain_conditions.law_matrix(literal.controller.law(), 0.01)
 
 
 # The command line
@@ -442,7 +444,7 @@ def test_the_command_names_the_conditions_that_a_scenario_fails() -> None:
 
 
 def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
-    path = tmp_path / "gains.yaml"
+    path = tmp_path / "gain_conditions.yaml"
     arguments = [
         "gains",
         "osprey",

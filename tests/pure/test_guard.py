@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
 from flight_core.vectors import FloatArray
 from rise_di_controller import guard, internals
@@ -68,7 +68,7 @@ def test_a_straight_line_is_reproduced_at_any_instant(ms: float) -> None:
 
 
 def fly(params: ControllerParameters, *ticks: tuple[float, Sample | None, list[Sample]]) -> list[ControllerState]:
-    state, states = guard.start(4), []
+    state, states = guard.initial_state(4), []
     for now_ms, y, y_m in ticks:
         state, _ = guard.tick(state, round(now_ms * MS), y, y_m, params.guard(), params.law())
         states.append(state)
@@ -99,7 +99,7 @@ def test_each_new_sample_is_one_step_of_the_law_with_its_measured_dt(params: Con
 def test_the_measured_dt_is_held_between_a_fifth_and_three_periods(
     params: ControllerParameters, gap_ms: int, dt_ms: int
 ) -> None:
-    state, _ = guard.tick(guard.start(4), 0, sample(0, 1.0), [sample(0)], params.guard(), params.law())
+    state, _ = guard.tick(guard.initial_state(4), 0, sample(0, 1.0), [sample(0)], params.guard(), params.law())
     _, used = guard.tick(state, gap_ms * MS, sample(gap_ms, 1.0), [sample(gap_ms)], params.guard(), params.law())
     assert used is not None
     assert used.dt == pytest.approx(dt_ms / 1000)
@@ -155,7 +155,7 @@ def test_stale_samples_hold_then_ramp_to_trim_and_fresh_ones_engage_again_withou
 @pytest.mark.parametrize("policy", ["trim", "hold"])
 def test_deactivation_lets_go_of_the_input_as_the_policy_says(policy: str, osprey_gust: Scenario) -> None:
     params = osprey_gust.vary(controller={"ramp": 0.4, "on_deactivate": policy}).controller
-    state = guard.start(4)
+    state = guard.initial_state(4)
     seen = []
     for ms, active in ((0, True), (10, True), (20, False), (220, False), (620, False), (630, True)):
         now = sample(ms, 1.0 + ms / 100)
@@ -169,14 +169,14 @@ def test_deactivation_lets_go_of_the_input_as_the_policy_says(policy: str, ospre
 
 
 def test_a_controller_that_never_flew_commands_nothing_when_inactive(params: ControllerParameters) -> None:
-    state, used = guard.tick(guard.start(4), 0, sample(0, 1.0), [sample(0)], params.guard(), params.law(), active=False)
+    state, used = guard.tick(guard.initial_state(4), 0, sample(0, 1.0), [sample(0)], params.guard(), params.law(), active=False)
     assert (state.mode, used) == (Mode.INACTIVE, None)
 
 
 @given(instants=st.lists(st.tuples(st.integers(1, 400), st.booleans(), st.floats(-1, 1)), min_size=2, max_size=40))
 def test_the_input_never_jumps_but_by_a_step_of_the_law(instants: list[tuple[int, bool, float]]) -> None:
     # Whatever comes and goes: between two ticks u changes by the law's step, by the ramp, or not at all.
-    state, now_ns = guard.start(4), 0
+    state, now_ns = guard.initial_state(4), 0
     y, y_m = sample(0, 0.0), [sample(0)]
     for wait_ms, fresh, value in instants:
         now_ns += wait_ms * MS
@@ -280,10 +280,10 @@ def test_new_gains_leave_the_input_where_it_was(state: LawState, k: float, Lambd
 def test_internals_hold_the_integrals_and_what_limited_each_input(params: ControllerParameters) -> None:
     limits = Limits(np.full(4, -1.0), np.full(4, 1.0), np.full(4, np.inf))
     law_state = LawState(np.zeros(4), np.ones(4), np.full(4, 2.0), np.full(4, 3.0))
-    state = guard.start(4)._replace(
+    state = guard.initial_state(4)._replace(
         law=law_state, u_free=np.array([0.5, 5.0, -5.0, 0.9]), u=np.array([0.5, 1.0, -1.0, 0.7]), u_trim=np.full(4, 0.1)
     )
-    used = guard.Used(0, np.zeros(4), np.zeros(4), 0.0, 0.01)
+    used = guard.TickInputs(0, np.zeros(4), np.zeros(4), 0.0, 0.01)
     shown = dict(
         zip(internals.names(params.outputs, params.inputs), internals.values(state, used, limits, 0.0, 0.0, 7, 8), strict=True)
     )
@@ -294,7 +294,7 @@ def test_internals_hold_the_integrals_and_what_limited_each_input(params: Contro
 
 
 def test_internals_are_named_after_the_outputs(params: ControllerParameters) -> None:
-    state, used = guard.tick(guard.start(4), 0, sample(0, 1.5), [sample(0, 0.5)], params.guard(), params.law())
+    state, used = guard.tick(guard.initial_state(4), 0, sample(0, 1.5), [sample(0, 0.5)], params.guard(), params.law())
     assert used is not None
     shown = dict(
         zip(

@@ -13,9 +13,9 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight_analysis.identification import (
+from flight_analysis.design.identification import (
+    AUTHORITY_FRACTION,
     HEIGHTS,
-    PART,
     SIZES,
     SPAN,
     Fly,
@@ -167,8 +167,8 @@ def test_the_commanded_airspeed_asks_for_a_third_of_the_throttle(speed: float, a
     y_m, row = Reference(params), list(params.outputs).index("V")
     samples = np.array([y_m.sample(k)[row] for k in range(round(30.0 * params.rate))])
     steepest = float(np.max(np.abs(np.diff(samples)))) * params.rate
-    assert steepest <= min(PART * authority, 1.2 * HEIGHTS["V"] / math.e) * 1.001
-    assert steepest == pytest.approx(min(PART * authority, 1.2 * HEIGHTS["V"] / math.e), rel=0.02)
+    assert steepest <= min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e) * 1.001
+    assert steepest == pytest.approx(min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e), rel=0.02)
     assert max(params.pulses["q"].value) * speed <= GRAVITY * (1.0 + 1e-9)  # no more than 1 g beside its own
 
 
@@ -227,7 +227,7 @@ def test_shipped_aircraft_fly_closer_than_the_prototype_did(name: str) -> None:
 
 
 def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command_ = [sys.executable, "-m", "flight_bringup.cli", "identify", *arguments]
+    command_ = [sys.executable, "-m", "flight_cli.cli", "identify", *arguments]
     return subprocess.run(command_, cwd=cwd, capture_output=True, text=True, timeout=120, check=False)
 
 

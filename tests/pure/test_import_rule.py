@@ -1,65 +1,135 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Mathematics never imports ROS: shown by walking the imports of every source file."""
+"""Who may import whom: one table, held against the imports of every source file and against docs/architecture.md."""
 
 import ast
+import re
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
-SOURCES = Path(__file__).resolve().parents[2] / "ros_ws" / "src"
+REPOSITORY = Path(__file__).resolve().parents[2]
+SOURCES = REPOSITORY / "ros_ws" / "src"
 ROS = {"rclpy", "ament_index_python", "launch", "launch_ros", "flight_ros"}
-OF_ROS = {"node.py", "main.py"}  # a package's node, and its executable
 ROS_SUFFIXES = ("_msgs", "_interfaces", "_srvs")
-MAY = {  # which packages of the stack a package's maths may import
+ROS_FILES = {"node.py", "main.py", "clients.py"}  # a package's node, its executable, and clients of nodes
+ROS_FOLDERS = {"flight_ros", "launch"}
+
+IMPORTS: dict[str, set[str]] = {
     "flight_core": set(),
+    "flight_log": {"flight_core"},
+    "flight_ros": {"flight_core"},
     "reference_model": {"flight_core"},
-    "rise_di_controller": {"flight_core"},
     "aircraft_sim": {"flight_core"},
+    "rise_di_controller": {"flight_core"},
     "autopilot_bridge": {"flight_core"},
-    "flight_recorder": {"flight_core"},
-    "flight_analysis": {"flight_core", "reference_model", "rise_di_controller", "aircraft_sim", "flight_recorder"},
-}
+    "flight_recorder": {"flight_core", "flight_log"},
+    "control_laws": {"flight_core", "rise_di_controller"},
+    "flight_analysis.closed_loop": {
+        "aircraft_sim", "flight_core", "flight_log", "flight_recorder", "reference_model", "rise_di_controller",
+    },
+    "flight_analysis.metrics": {"flight_core", "rise_di_controller"},
+    "flight_analysis.design": {
+        "aircraft_sim", "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core",
+        "flight_log", "reference_model", "rise_di_controller",
+    },
+    "flight_analysis.report": {
+        "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core", "flight_log",
+        "rise_di_controller",
+    },
+    "flight_campaign": {
+        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.report",
+        "flight_core", "reference_model", "rise_di_controller",
+    },
+    "flight_bringup": {
+        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.report", "flight_core", "flight_log",
+    },
+    "flight_cli": {
+        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop", "flight_analysis.design",
+        "flight_analysis.metrics", "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log",
+        "rise_di_controller",
+    },
+}  # fmt: skip
+"""Which units of the stack a unit imports; nodes, executables and clients import flight_ros beside these."""
+
+CLIENTS = {"flight_bringup": {"flight_ros", "rise_di_controller"}, "flight_cli": {"flight_ros"}}
+"""What the clients of a unit import further."""
 
 
-def imported(path: Path) -> set[str]:
-    """Top-level names of all modules that a file imports, wherever in the file."""
+def imported_modules(path: Path) -> set[str]:
+    """Full names of all modules that a file imports, wherever in the file; for `from a import b` both a and a.b."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
-            names.add(node.module)
-    return {name.split(".")[0] for name in names}
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return names
+
+
+def imported(path: Path) -> set[str]:
+    """Top-level names of all modules that a file imports."""
+    return {name.split(".")[0] for name in imported_modules(path)}
+
+
+def unit_of(module: str) -> str | None:
+    """The unit of the table that a module belongs to, None for a module of others."""
+    return next((unit for unit in IMPORTS if module == unit or module.startswith(f"{unit}.")), None)
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(SOURCES).with_suffix("").parts[1:])
 
 
 def may_import_ros(path: Path) -> bool:
-    return path.name in OF_ROS or {"flight_ros", "launch"} & set(path.relative_to(SOURCES).parts[:-1])  # type: ignore[return-value]
+    return path.name in ROS_FILES or bool(ROS_FOLDERS & set(path.relative_to(SOURCES).parts[:-1]))
 
 
 FILES = sorted(path for path in SOURCES.glob("*/**/*.py") if path.name != "setup.py")
 
 
 def test_there_are_sources_to_check() -> None:
-    assert len(FILES) > 30
+    assert len(FILES) > 100
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(SOURCES)))
-def test_only_nodes_flight_ros_and_launch_files_import_ros(path: Path) -> None:
+def test_only_nodes_clients_flight_ros_and_launch_files_import_ros(path: Path) -> None:
     if may_import_ros(path):
         return
     foreign = {name for name in imported(path) if name in ROS or name.endswith(ROS_SUFFIXES)}
     assert not foreign, f"{path.relative_to(SOURCES)} imports {foreign}"
 
 
-@pytest.mark.parametrize("package", sorted(MAY))
-def test_a_package_imports_only_the_packages_before_it(package: str) -> None:
-    ours = {path.name for path in SOURCES.iterdir()}
-    for path in (SOURCES / package / package).glob("**/*.py"):
-        if path.name not in OF_ROS:
-            assert (imported(path) & ours) - {package} <= MAY[package], path.name
+@pytest.mark.parametrize("unit", IMPORTS)
+def test_a_unit_imports_what_the_table_says(unit: str) -> None:
+    found: set[str] = set()
+    for path in FILES:
+        if unit_of(module_of(path)) != unit or path.name == "__init__.py":
+            continue
+        ours = {other for name in imported_modules(path) if (other := unit_of(name)) is not None} - {unit}
+        allowed = IMPORTS[unit] | ({"flight_ros"} | CLIENTS.get(unit, set()) if may_import_ros(path) else set())
+        assert ours <= allowed, f"{path.relative_to(SOURCES)} imports {ours - allowed}"
+        found |= ours
+    assert IMPORTS[unit] <= found, f"the table allows {unit} {IMPORTS[unit] - found}, which it does not import"
+
+
+def test_every_source_file_belongs_to_a_unit_of_the_table() -> None:
+    packages = {"flight_analysis"}  # its units are its subpackages and metrics
+    strays = [path for path in FILES if "launch" not in path.parts and unit_of(module_of(path)) is None]
+    assert {module_of(path).removesuffix(".__init__") for path in strays} <= packages
+
+
+def test_no_unit_imports_itself_over_others() -> None:
+    assert len(list(TopologicalSorter(IMPORTS).static_order())) == len(IMPORTS)  # raises CycleError
+
+
+def test_the_architecture_page_draws_the_table() -> None:
+    page = (REPOSITORY / "docs" / "architecture.md").read_text(encoding="utf-8")
+    drawn = {tuple(arrow) for arrow in re.findall(r"^    ([\w.]+) --> ([\w.]+)$", page, re.MULTILINE)}
+    assert drawn == {(unit, other) for unit, others in IMPORTS.items() for other in others}
 
 
 def test_the_guard_would_notice_an_import(tmp_path: Path) -> None:
@@ -68,7 +138,26 @@ def test_the_guard_would_notice_an_import(tmp_path: Path) -> None:
     assert "rclpy" in imported(bad)
 
 
-def test_the_command_line_starts_without_loading_ros() -> None:
-    code = "import sys, flight_bringup.cli; print([m for m in sys.modules if m.split('.')[0] in ('rclpy', 'flight_ros')])"
+def modules_loaded_by(code: str) -> set[str]:
+    """Top-level names of the modules that a fresh interpreter has loaded after some code."""
+    code = f"import sys\n{code}\nprint(*{{name.split('.')[0] for name in sys.modules}})"
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert shown.stdout.strip() == "[]"
+    return set(shown.stdout.split())
+
+
+def test_the_command_line_shows_its_help_without_loading_what_commands_need() -> None:
+    heavy = {"rclpy", "flight_ros", "numpy", "scipy", "pydantic", "jax", "plotly", "polars", "jsbsim", "rosbags"}
+    assert not modules_loaded_by("from flight_cli.cli import application\napplication([])") & heavy
+
+
+@pytest.mark.parametrize(
+    ("node", "heavy"),
+    [
+        ("rise_di_controller", {"scipy", "jsbsim", "plotly", "jax", "rosbags"}),
+        ("reference_model", {"scipy", "jsbsim", "plotly", "jax", "rosbags"}),
+        ("autopilot_bridge", {"scipy", "jsbsim", "plotly", "jax", "rosbags"}),
+        ("flight_recorder", {"scipy", "jsbsim", "plotly", "jax", "rosbags"}),
+    ],
+)
+def test_a_node_loads_nothing_heavy_that_it_does_not_need(node: str, heavy: set[str]) -> None:
+    assert not modules_loaded_by(f"import {node}.node") & heavy

@@ -17,23 +17,23 @@ import pytest
 from aircraft_sim import guarded, jsbsim_plant
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, Gusts
-from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, STATES, Air, Command, JsbsimVehicle, Point, sideslip_zero
+from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, STATES, Command, FlightCondition, JsbsimVehicle, WindModel, sideslip_zero
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
 STEP_NS = 5_000_000
-CESSNA = Point("c172p", 46.3, 1219.2, STEP_NS)
+CESSNA = FlightCondition("c172p", 46.3, 1219.2, STEP_NS)
 NONE = np.zeros(len(AXES))
-STILL = Air(Gusts(NONE, NONE, NONE + 1.0), None)
+STILL = WindModel(Gusts(NONE, NONE, NONE + 1.0), None)
 SECTION: dict[str, Any] = {"airframe": "jsbsim:c172p", "speed": 46.3, "altitude": 1219.2, "rate": 200.0, "step": 0.005}
 
 
-def cessna(air: Air = STILL, point: Point = CESSNA) -> JsbsimVehicle:
+def cessna(air: WindModel = STILL, point: FlightCondition = CESSNA) -> JsbsimVehicle:
     return JsbsimVehicle(point, Actuators(), air)
 
 
@@ -50,9 +50,9 @@ def command(**values: float) -> FloatArray:
     return np.array([values.get(name, 0.0) for name in INPUTS])
 
 
-def one_gust(axis: str, speed: float, length: float) -> Air:
+def one_gust(axis: str, speed: float, length: float) -> WindModel:
     strength = np.array([speed * (name == axis) for name in AXES])
-    return Air(Gusts(NONE, strength, NONE + length), None)
+    return WindModel(Gusts(NONE, strength, NONE + length), None)
 
 
 # Trim
@@ -62,10 +62,10 @@ def one_gust(axis: str, speed: float, length: float) -> Air:
     "point",
     # JSBSim's own trim; one that it does not find, for the engine of c182 does not run in it; and DHC6, where what it finds
     # does not last, for the turboprops are not settled.
-    [CESSNA, Point("c182", 56.6, 1219.2, STEP_NS), Point("DHC6", 66.9, 1828.8, STEP_NS)],
+    [CESSNA, FlightCondition("c182", 56.6, 1219.2, STEP_NS), FlightCondition("DHC6", 66.9, 1828.8, STEP_NS)],
     ids=lambda point: point.name,
 )
-def test_trim_is_an_equilibrium_that_lasts(point: Point) -> None:
+def test_trim_is_an_equilibrium_that_lasts(point: FlightCondition) -> None:
     # JSBSim's own trim stops at 3e-4 m/s^2 and 1e-4 rad/s^2. Left alone for 5 s, residuals of that size come to 1e-3 m/s and
     # 5e-4 rad/s at most, and 4 mm to a few cm of altitude; where DHC6 is left in JSBSim's own trim it loses 1 m/s.
     vehicle = cessna(point=point)
@@ -116,7 +116,7 @@ def test_a_positive_command_does_what_the_table_says(name: str, output: str, sig
 
 def test_every_engine_gets_the_throttle() -> None:
     # On a twin one engine alone would yaw: both at once leave r where it was.
-    truth = flown(cessna(point=Point("737", 154.3, 6096.0, STEP_NS)), command(throttle=0.1), 1.0)
+    truth = flown(cessna(point=FlightCondition("737", 154.3, 6096.0, STEP_NS)), command(throttle=0.1), 1.0)
     assert truth["x.V"][-1] > 0.05
     assert np.max(np.abs(truth["x.r"])) < 1e-6
 
@@ -181,12 +181,12 @@ def test_a_flight_in_another_process_agrees_to_the_last_bit() -> None:
     # c182 needs the solver's trim: it is found in a third process, and both follow what that found.
     code = (
         "from tests.pure.test_jsbsim import *\n"
-        "truth = flown(cessna(point=Point('c182', 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)\n"
+        "truth = flown(cessna(point=FlightCondition('c182', 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)\n"
         "print(np.array(list(truth.values())).tobytes().hex())\n"
     )
     root = Path(__file__).resolve().parents[2]
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root).stdout
-    truth = flown(cessna(point=Point("c182", 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)
+    truth = flown(cessna(point=FlightCondition("c182", 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)
     assert said.strip() == np.array(list(truth.values())).tobytes().hex()
 
 
@@ -194,7 +194,7 @@ def test_nothing_is_printed_and_nothing_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    flown(cessna(point=Point("global5000", 169.8, 7620.0, STEP_NS)), command(), 0.1)  # writes a table if it is let
+    flown(cessna(point=FlightCondition("global5000", 169.8, 7620.0, STEP_NS)), command(), 0.1)  # writes a table if it is let
     assert not list(tmp_path.iterdir())
     assert capfd.readouterr() == ("", "")
 
@@ -236,20 +236,20 @@ def test_a_flight_in_one_process_survives_an_aircraft_that_crashes(monkeypatch: 
             CESSNA._replace(speed=20.0),
             r"^jsbsim:c172p does not trim at 20 m/s and 1219.2 m: accelerations of .* are left at best",
         ),
-        (Point("pa28", 51.0, 1219.2, STEP_NS), r"^jsbsim:pa28 does not trim at .*: engine 1 cannot be started$"),
+        (FlightCondition("pa28", 51.0, 1219.2, STEP_NS), r"^jsbsim:pa28 does not trim at .*: engine 1 cannot be started$"),
         (
-            Point("SGS", 25.0, 900.0, STEP_NS),
+            FlightCondition("SGS", 25.0, 900.0, STEP_NS),
             r"^jsbsim:SGS has no engine, so nothing to fly V with: no fcs/throttle-cmd-norm\[0\]$",
         ),
         (
-            Point("dr1", 41.0, 900.0, STEP_NS),
+            FlightCondition("dr1", 41.0, 900.0, STEP_NS),
             r"^jsbsim:dr1 .*: its model needs the property /sim/model/pushback/position-norm, which JSBSim alone ",
         ),
-        (Point("blank", 41.0, 900.0, STEP_NS), r"^jsbsim:blank cannot be loaded: "),
+        (FlightCondition("blank", 41.0, 900.0, STEP_NS), r"^jsbsim:blank cannot be loaded: "),
     ],
     ids=["stalled", "engine", "glider", "property", "empty"],
 )
-def test_what_does_not_trim_ends_in_one_sentence(point: Point, sentence: str) -> None:
+def test_what_does_not_trim_ends_in_one_sentence(point: FlightCondition, sentence: str) -> None:
     with pytest.raises(FlightEnded, match=sentence) as ended:
         cessna(point=point)
     assert "\n" not in str(ended.value)
@@ -314,5 +314,5 @@ def test_channels_are_those_of_the_tables() -> None:
 
 def test_sideslip_of_the_f15_grows_when_its_rates_are_held() -> None:
     # Flown with p and r held (docs/experiments.md), its sideslip goes from 0.023 to 0.063 rad in 5 s: 0.20 1/s.
-    assert sideslip_zero(Point("f15", 180.06, 4572.0, STEP_NS)) == pytest.approx(0.20, abs=0.05)
+    assert sideslip_zero(FlightCondition("f15", 180.06, 4572.0, STEP_NS)) == pytest.approx(0.20, abs=0.05)
     assert sideslip_zero(CESSNA) < 0.0

@@ -33,13 +33,15 @@ from tests.launch_stand_in import (
 )
 
 from autopilot_bridge.params import LIBRARY, BridgeParameters, load_map
-from flight_analysis.bag_writer import write_run
-from flight_analysis.scenario import SCHEMAS, Scenario
-from flight_analysis.simulate import simulate
-from flight_bringup.cli import app
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError, Parameters
 from flight_core.scenario import read_sections
-from flight_recorder.bag import Enclosed
+from flight_log.bag import Enclosed
+from flight_log.tape_writer import write_run
+
+app = application([*COMMANDS])
 
 FILES = sorted((REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "launch").glob("*.launch.py"))
 INSTALLED = REPOSITORY / "ros_ws" / "install"

@@ -15,8 +15,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from flight_analysis.layouts import channels_of, foxglove, plotjuggler
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler
 from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Tape
 

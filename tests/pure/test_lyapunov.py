@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight_analysis.lyapunov import (
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.lyapunov import (
     Evidence,
     Example,
-    Plant,
+    KnownPlant,
     decay,
     evidence,
     example,
@@ -27,8 +29,6 @@ from flight_analysis.lyapunov import (
     lemma_2,
     of_tape,
 )
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from rise_di_controller.decomposition import decompose
 from rise_di_controller.law import LawParams, Sign
@@ -44,7 +44,7 @@ def flown(dt: float, duration: float, **gains: Any) -> tuple[Example, LawParams,
     return case, params, evidence(case.plant, fly(case.plant, case.y_m, dt, params, case.x_0), params)
 
 
-def osprey(rate: float, beta_factor: float = 1.0, duration: float = 12.0) -> tuple[Scenario, Plant, Evidence]:
+def osprey(rate: float, beta_factor: float = 1.0, duration: float = 12.0) -> tuple[Scenario, KnownPlant, Evidence]:
     """The default scenario at another rate of the law, with both gusts in its first twelve seconds."""
     scenario = find_scenario("osprey_gust")
     starts = {"lateral": 4.0, "vertical": 8.0}
@@ -106,7 +106,7 @@ def test_the_constant_of_lemma_2_is_the_hand_worked_one() -> None:
     # e falls from 2 to 0 in 2 s with N_d = 0.5, Lambda = 3, beta = 2, U = 1: zeta = 0.5, gamma_2 = 3 (2 / 0.5 - 1) = 9
     # gamma_1 = max(-2, 1 - 9 1.5 - 1, 2 - 9 2) = -2, zeta_b = beta 2 + gamma_1 zeta = 4 - 1 = 3
     one = np.ones((1, 1))
-    plant = Plant(-one, one, one, lambda t, x: 0.0 * x)
+    plant = KnownPlant(-one, one, one, lambda t, x: 0.0 * x)
     column = np.array([[2.0], [1.0], [0.0]])
     zero = np.zeros(3)
     flight = Evidence(np.arange(3.0), column, -np.ones((3, 1)), column, np.full((3, 1), 0.5), zero, zero, zero, zero)

@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 from aircraft_sim import dynamics
 from aircraft_sim.params import AircraftParameters, Gust
-from flight_analysis.lyapunov import Plant, decay, evidence, example, fly
+from flight_analysis.design.lyapunov import KnownPlant, decay, evidence, example, fly
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from reference_model.command import Profile, command
@@ -331,9 +331,9 @@ def test_V1_dot_of_32_has_the_gain_22_as_three_squares(loop: Loop) -> None:
 
 
 def test_V2_dot_is_a_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> None:
-    # The sum of (32) and -L (46): what `flight_analysis.lyapunov.decay` says, on a plant that module did not choose.
+    # The sum of (32) and -L (46): what `flight_analysis.design.lyapunov.decay` says, on a plant that module did not choose.
     p = loop.p
-    Q = decay(Plant(p.A, p.B, p.C, p.f), law_of(p))
+    Q = decay(KnownPlant(p.A, p.B, p.C, p.f), law_of(p))
     for t in INSTANTS:
         N_d, _, term = loop.split(t)
         L = loop.r(t) @ (N_d + term - loop.DUD() @ (p.beta * np.sign(loop.e(t))))
@@ -349,7 +349,7 @@ def test_the_law_that_flies_tends_to_20_with_its_period(loop: Loop, sign: Sign) 
     for ticks in (60, 120, 240):
         dt = DURATION / ticks
         y_m = np.array([p.C @ loop.unpack(k * dt)[1] for k in range(ticks + 1)])
-        flight = fly(Plant(p.A, p.B, p.C, p.f), y_m, dt, params, X_0)
+        flight = fly(KnownPlant(p.A, p.B, p.C, p.f), y_m, dt, params, X_0)
         distance.append(float(np.max(np.abs(flight.x[-1] - loop.unpack(DURATION)[0]))))
     assert all(1.7 < before / after < 2.3 for before, after in pairwise(distance))
 
@@ -495,7 +495,9 @@ def test_a_matrix_without_a_leading_minor_has_no_decomposition_though_it_can_be_
 
 def hidden_state(pole: float) -> tuple[float, float]:
     """The largest x_2 and the last e of x_1_dot = x_2 + u, x_2_dot = pole x_2 + x_1, y = x_1 on sin t: its zero is `pole`."""
-    plant = Plant(np.array([[0.0, 1.0], [1.0, pole]]), np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]]), lambda *_: np.zeros(2))
+    plant = KnownPlant(
+        np.array([[0.0, 1.0], [1.0, pole]]), np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]]), lambda *_: np.zeros(2)
+    )
     one = np.ones(1)
     params = example(1.0, 1.0).params._replace(K=8.0 * one, Lambda=one, beta=5.0 * one, D=one, input_scale=one, omega=2.0 * one)
     t = 0.01 * np.arange(1501)
@@ -527,7 +529,7 @@ def test_a_servo_between_u_and_the_plant_takes_away_Omega() -> None:
 def behind_a_servo(T_eps: float) -> float:
     """The largest e over eps in the last of 10 s: y_dot = u behind a servo of 20 ms, softened sign, e(0) = eps / 2."""
     tau, one, dt = 0.02, np.ones(1), 0.0005
-    plant = Plant(
+    plant = KnownPlant(
         np.array([[0.0, 1.0], [0.0, -1.0 / tau]]), np.array([[0.0], [1.0 / tau]]), np.eye(1, 2), lambda *_: np.zeros(2)
     )
     K, beta = 10.0 * one, 3.0 * one

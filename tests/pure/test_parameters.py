@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aircraft_sim.airframe import LIBRARY, load_airframe
-from flight_analysis.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_bringup.scenarios import find_scenario
 from flight_core.files import read_yaml
 from flight_core.parameters import ParameterError, flatten, nest

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from flight_analysis.bag_writer import write_run
-from flight_analysis.named_vectors import JOINT_STATE
-from flight_analysis.playback import begins_with_stamp, read_playback
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
-from flight_recorder.bag import BagWriter, Enclosed
-from flight_recorder.definitions import definition
+from flight_log.bag import BagWriter, Enclosed
+from flight_log.message_definitions import definition
+from flight_log.named_vectors import JOINT_STATE
+from flight_log.playback import begins_with_stamp, read_playback
+from flight_log.tape_writer import write_run
 
 MS = 1_000_000
 EPOCH = 1_790_000_000_000 * MS

@@ -16,13 +16,13 @@ import yaml
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from flight_analysis.bag_reader import read_run
-from flight_analysis.bag_writer import write_run
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
-from flight_bringup.graph import enclosed
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.run_folder import enclosed
 from flight_core.parameters import ParameterError
-from flight_recorder.repair import repair
+from flight_log.repair import repair
+from flight_log.tape_reader import read_run
+from flight_log.tape_writer import write_run
 
 DURATION = 2.0
 
@@ -205,7 +205,7 @@ def test_an_earlier_damaged_file_is_kept_too(run: Path) -> None:
 def test_the_command_says_what_was_kept_and_how_much_is_missing(run: Path) -> None:
     def command() -> str:
         shown = subprocess.run(
-            [sys.executable, "-m", "flight_bringup.cli", "repair", "run"],
+            [sys.executable, "-m", "flight_cli.cli", "repair", "run"],
             cwd=run.parent,
             capture_output=True,
             text=True,

@@ -21,22 +21,24 @@ from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner, Result
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.bag_reader import read_run
-from flight_analysis.bag_writer import write_run
-from flight_analysis.gain_selection import with_feedforward
-from flight_analysis.replay import OPEN_LOOP, Replayed, replay, vary
-from flight_analysis.scenario import load_scenario
-from flight_analysis.simulate import simulate
-from flight_analysis.stored_messages import PARAMETER_EVENT, parameter_changes
-from flight_bringup.cli import app
+from flight_analysis.closed_loop.replay import OPEN_LOOP, Replayed, replay, vary
+from flight_analysis.closed_loop.scenario import load_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.gain_selection import with_feedforward
 from flight_bringup.scenarios import find_scenario
+from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray
-from flight_recorder.bag import BagWriter, Enclosed
+from flight_log.bag import BagWriter, Enclosed
+from flight_log.stored_messages import PARAMETER_EVENT, parameter_changes
+from flight_log.tape_reader import read_run
+from flight_log.tape_writer import write_run
 from rise_di_controller.controller import Controller
 from rise_di_controller.guard import Mode, Sample
 from rise_di_controller.params import ControllerParameters
+
+app = application([*COMMANDS])
 
 MS = 1_000_000
 EPOCH = 1_790_000_000_000_000_000  # stamps of a flight in real time, where float64 no longer knows the nanoseconds

@@ -12,14 +12,14 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 
-from flight_analysis import comparison, drawing, pictures, tables
-from flight_analysis.drawing import Band, Scene, drawn_points, spans
-from flight_analysis.pictures import known_limits
-from flight_analysis.recorded import Recorded
-from flight_analysis.report import write_page
-from flight_analysis.scenario import Scenario
-from flight_analysis.summary import Shown, cell, commanded, shown_units, slowest, summarise, transients
-from flight_analysis.tables import events
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.report import comparison, figures, plotting, tables
+from flight_analysis.report.figures import known_limits
+from flight_analysis.report.page import write_page
+from flight_analysis.report.plotting import Band, Scene, drawn_points, spans
+from flight_analysis.report.recorded_flight import RecordedFlight
+from flight_analysis.report.summary import DisplayUnit, cell, commanded, display_units, slowest, summarise, transients
+from flight_analysis.report.tables import events
 from flight_bringup.scenarios import find_scenario
 from flight_core.outcome import COMPLETED
 from flight_core.tape import Signal, Tape
@@ -65,8 +65,8 @@ def flight(count: int = 101, **signals: Signal) -> Tape:
     return Tape({"y": still, "y_m": still, **signals}, EPOCH)
 
 
-def scene(tape: Tape, units: dict[str, Shown] | None = None) -> Scene:
-    return pictures.flight_scene(tape, units or {}, {})
+def scene(tape: Tape, units: dict[str, DisplayUnit] | None = None) -> Scene:
+    return figures.flight_scene(tape, units or {}, {})
 
 
 def traces(figure: go.Figure | None, name: str) -> list[Any]:
@@ -86,8 +86,8 @@ def page_of(tmp_path: Path, scenario: Scenario, tape: Tape, outcome: str = COMPL
     return path.read_text(encoding="utf-8")
 
 
-def recorded(name: str, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> Recorded:
-    return Recorded(name, scenario, tape, summarise(scenario, tape, outcome))
+def recorded(name: str, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> RecordedFlight:
+    return RecordedFlight(name, scenario, tape, summarise(scenario, tape, outcome))
 
 
 def headings(page: str) -> list[str]:
@@ -161,7 +161,7 @@ def test_words_from_outside_are_shown_as_words(tmp_path: Path, servo: Scenario) 
 
 def test_every_colour_of_a_page_has_its_own_in_the_dark(tmp_path: Path, servo: Scenario) -> None:
     # Colours of modes and limits are told apart on both grounds; all others are drawn on the ground of the page.
-    both = {*pictures.MODE_COLOURS.values(), *pictures.LIMITED_COLOURS.values(), pictures.GUST}
+    both = {*figures.MODE_COLOURS.values(), *figures.LIMITED_COLOURS.values(), figures.GUST}
     whole = flight(
         u=signal([10.0 * k for k in range(101)], **{name: [0.1] * 101 for name in INPUTS}),
         internals=ticks(101, late=[1e-3] * 101),
@@ -169,7 +169,7 @@ def test_every_colour_of_a_page_has_its_own_in_the_dark(tmp_path: Path, servo: S
     )
     specifications = re.findall(r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, whole))
     used = set(re.findall(r"#[0-9a-f]{6}", " ".join(specifications)))
-    assert used - both <= set(drawing.DARK | pictures.DARK)
+    assert used - both <= set(plotting.DARK | figures.DARK)
     assert len(used) > 5
 
 
@@ -206,18 +206,18 @@ def test_spans_closer_than_can_be_seen_are_one_and_none_is_too_short_to_see() ->
 
 
 def test_every_mode_but_engaged_is_a_band_under_its_name() -> None:
-    assert set(pictures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
-    assert set(pictures.LIMITED_COLOURS) == set(Limited) - {Limited.NO}
+    assert set(figures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
+    assert set(figures.LIMITED_COLOURS) == set(Limited) - {Limited.NO}
     modes = [float(one) for one in Mode for _ in range(10)]
-    bands = pictures.mode_bands(flight(60, internals=ticks(60, mode=modes)))
+    bands = figures.mode_bands(flight(60, internals=ticks(60, mode=modes)))
     assert {band.label: (round(band.start, 3), round(band.stop, 3)) for band in bands} == {
         "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5), "inactive": (0.5, 0.59),
     }  # fmt: skip
 
 
-def test_bands_are_drawn_over_the_whole_height_of_every_picture() -> None:
+def test_bands_are_drawn_over_the_whole_height_of_every_figure() -> None:
     bands = [Band("hold", 0.2, 0.3, "#f2c230", False), Band("a gust", 0.5, 0.6, "#7f7f7f", True)]
-    drawn = pictures.tracking_picture(scene(flight())._replace(bands=bands))
+    drawn = figures.tracking_figure(scene(flight())._replace(bands=bands))
     assert [(shape.x0, shape.x1, shape.y0, shape.y1, shape.yref) for shape in drawn.layout.shapes] == [
         (0.2, 0.3, 0, 1, "paper"),
         (0.5, 0.6, 0, 1, "paper"),
@@ -236,11 +236,11 @@ def input_flight(**limited: list[float]) -> Tape:
 
 
 def test_limits_near_the_input_are_in_view_and_far_ones_are_not(servo: Scenario) -> None:
-    units = shown_units(servo)
+    units = display_units(servo)
     near = servo.vary(controller={"lower": [-3 * DEG, -1.0, -1.0, -1.0], "upper": [3 * DEG, 1.0, 1.0, 1.0]})
     for scenario, limit, inside in ((near, 3.0, True), (servo, 30.0, False)):
         tape = input_flight()
-        figure = pictures.input_picture(scene(tape, units), known_limits(scenario, tape))
+        figure = figures.input_figure(scene(tape, units), known_limits(scenario, tape))
         assert figure is not None
         lines = traces(figure, "limits of the controller")
         assert [line.y[0] for line in lines[:2]] == pytest.approx([-limit, limit])  # deg
@@ -260,7 +260,7 @@ def test_end_stops_are_those_of_actuators_that_are_simulated(servo: Scenario) ->
 
 def test_an_input_without_limits_has_no_lines(osprey_gust: Scenario) -> None:
     tape = input_flight()
-    figure = pictures.input_picture(scene(tape), known_limits(osprey_gust, tape))
+    figure = figures.input_figure(scene(tape), known_limits(osprey_gust, tape))
     assert not traces(figure, "limits of the controller")
 
 
@@ -269,7 +269,7 @@ def test_when_an_input_was_limited_is_marked_in_its_row_alone() -> None:
     limited[50:60] = [float(Limited.MAGNITUDE)] * 10
     limited[80] = float(Limited.RATE)
     tape = input_flight(**{"limited.aileron": limited})
-    figure = pictures.input_picture(scene(tape), {})
+    figure = figures.input_figure(scene(tape), {})
     (magnitude,), (rate,) = traces(figure, "limited: magnitude"), traces(figure, "limited: rate")
     assert magnitude.yaxis == rate.yaxis == "y2"  # aileron is the second row
     assert magnitude.x[:2] == pytest.approx((0.5, 0.6))
@@ -279,7 +279,7 @@ def test_when_an_input_was_limited_is_marked_in_its_row_alone() -> None:
 def test_the_actuator_is_drawn_over_the_command_by_name() -> None:
     tape = input_flight()
     behind = flight(u=tape["u"], truth=truth(101, actuator__thrust=0.3, actuator__elevator=0.01))
-    figure = pictures.input_picture(scene(behind, {"elevator": Shown("deg", 1 / DEG)}), {})
+    figure = figures.input_figure(scene(behind, {"elevator": DisplayUnit("deg", 1 / DEG)}), {})
     assert titles(figure) == ["elevator (deg)", "aileron", "rudder", "thrust"]
     by_axis = {trace.yaxis: trace.y[0] for trace in traces(figure, "actuator")}
     assert by_axis == {"y": pytest.approx(0.01 / DEG), "y4": pytest.approx(0.3)}
@@ -291,45 +291,45 @@ def test_the_actuator_is_drawn_over_the_command_by_name() -> None:
 
 def test_states_of_any_name_are_shown_those_of_known_unit_in_it() -> None:
     tape = flight(truth=truth(101, x__q=0.25, x__altitude=1200.0))
-    figure = pictures.state_picture(scene(tape, {"q": Shown("mrad/s", 1e3)}))
+    figure = figures.state_figure(scene(tape, {"q": DisplayUnit("mrad/s", 1e3)}))
     assert titles(figure) == ["q (mrad/s)", "altitude"]
     assert [trace.y[0] for trace in traces(figure, "x")] == [250.0, 1200.0]
 
 
 def test_sensors_without_error_and_air_at_rest_are_left_out() -> None:
     calm = scene(flight(truth=truth(101, noise__q=0.0, gust__vertical=0.0, x__q=0.0)))
-    assert pictures.sensor_picture(calm) is None
-    assert pictures.wind_picture(calm) is None
+    assert figures.sensor_figure(calm) is None
+    assert figures.wind_figure(calm) is None
     some = scene(flight(truth=truth(101, noise__q=0.0, noise__V=0.1, gust__vertical=0.0, gust__longitudinal=1.0)))
-    assert titles(pictures.sensor_picture(some)) == ["V"]
-    assert titles(pictures.wind_picture(some)) == ["longitudinal (m/s)"]
+    assert titles(figures.sensor_figure(some)) == ["V"]
+    assert titles(figures.wind_figure(some)) == ["longitudinal (m/s)"]
 
 
 def test_the_true_error_is_drawn_over_the_measured_one_where_they_differ() -> None:
     states = {f"x__{name}": 0.5 for name in OUTPUTS}
-    quiet = pictures.error_picture(scene(flight(truth=truth(101, **states, noise__q=0.0))))
+    quiet = figures.error_figure(scene(flight(truth=truth(101, **states, noise__q=0.0))))
     assert {trace.name for trace in quiet.data} == {"e"}
-    noisy = pictures.error_picture(scene(flight(truth=truth(101, **states, noise__q=0.1))))
+    noisy = figures.error_figure(scene(flight(truth=truth(101, **states, noise__q=0.1))))
     assert [traces(noisy, name)[0].y[0] for name in ("measured", "true")] == [0.0, 0.5]
 
 
 def test_ticks_are_shown_where_one_was_late_or_y_old_or_dt_changed() -> None:
-    assert pictures.tick_picture(scene(flight(internals=ticks(101)))) is None
+    assert figures.tick_figure(scene(flight(internals=ticks(101)))) is None
     for channel, values in (("late", [0.0] * 100 + [1e-4]), ("age", [2e-3] * 101), ("dt", [0.0] + [0.01] * 99 + [0.02])):
-        figure = pictures.tick_picture(scene(flight(internals=ticks(101, **{channel: values}))))
+        figure = figures.tick_figure(scene(flight(internals=ticks(101, **{channel: values}))))
         assert titles(figure) == ["late (ms)", "age (ms)", "dt (ms)"]
 
 
 def test_the_floor_of_the_error_is_drawn_on_both_sides_where_it_can_be_seen() -> None:
     tape = flight(y=signal([0, 1000], **{name: [1.0, 0.0] for name in OUTPUTS}))
-    figure = pictures.error_picture(scene(tape), {"q": 0.5, "V": 1e-9})
+    figure = figures.error_figure(scene(tape), {"q": 0.5, "V": 1e-9})
     (floor,) = traces(figure, "floor")
     assert (floor.yaxis, set(floor.y)) == ("y", {0.5, -0.5})  # q alone
 
 
 def test_both_integrals_of_an_output_stand_side_by_side() -> None:
     tape = flight(internals=ticks(101, **{"Pi.p": [0.0] * 100 + [3.0], "integral_e.p": [0.0] * 100 + [2.0]}))
-    figure = pictures.integral_picture(scene(tape))
+    figure = figures.integral_figure(scene(tape))
     assert figure is not None
     assert titles(figure)[4:6] == ["∫e p", "Pi p"]
     assert [trace.y[-1] for trace in figure.data[4:6]] == [2.0, 3.0]
@@ -339,17 +339,17 @@ def test_the_spectrum_of_a_commanded_sine_has_its_peak_there() -> None:
     stamps = [10.0 * k for k in range(1001)]
     sine = np.sin(2.0 * np.pi * 5.0 * np.array(stamps) / 1000.0)
     u = signal(stamps, elevator=sine.tolist(), thrust=[0.0] * 1001)
-    figure = pictures.spectrum_picture(scene(flight(u=u), {"elevator": Shown("deg", 1 / DEG)}), 10 * MS)
+    figure = figures.spectrum_figure(scene(flight(u=u), {"elevator": DisplayUnit("deg", 1 / DEG)}), 10 * MS)
     assert figure is not None
     assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
     assert figure.data[0].x[np.argmax(figure.data[0].y)] == pytest.approx(5.0, abs=0.2)
-    assert pictures.spectrum_picture(scene(flight(u=u.until(EPOCH + 100 * MS))), 10 * MS) is None  # eleven samples
+    assert figures.spectrum_figure(scene(flight(u=u.until(EPOCH + 100 * MS))), 10 * MS) is None  # eleven samples
 
 
 def test_the_controllers_time_is_spread_where_there_is_any() -> None:
-    assert pictures.timing_picture(scene(flight(internals=ticks(101))), 10 * MS) is None
+    assert figures.timing_figure(scene(flight(internals=ticks(101))), 10 * MS) is None
     waiting = flight(internals=ticks(101), latency=signal([0, 10, 20], y_to_u=[1e-3, 1e-3, 3e-3]))
-    figure = pictures.timing_picture(scene(waiting), 10 * MS)
+    figure = figures.timing_figure(scene(waiting), 10 * MS)
     assert figure is not None
     assert [axis.title.text for axis in figure.select_xaxes()] == ["y sent to u sent (ms)"]
     assert [count for count in figure.data[0].y if count] == [2.0, 1.0]
@@ -359,7 +359,7 @@ def test_the_controllers_time_is_spread_where_there_is_any() -> None:
 
 
 @pytest.fixture(scope="module")
-def pair(servo: Scenario) -> list[Recorded]:
+def pair(servo: Scenario) -> list[RecordedFlight]:
     """Two flights: the second has half the error in q, and no p."""
     y_m = signal([0, 1000], **{name: [1.0, 1.0] for name in OUTPUTS})
     first = flight(y=signal([0, 1000], q=[1.2, 1.2], V=[1.0, 1.0], p=[1.0, 1.0], r=[1.0, 1.0]), y_m=y_m)
@@ -367,7 +367,7 @@ def pair(servo: Scenario) -> list[Recorded]:
     return [recorded("a", servo, first), recorded("b", servo, second)]
 
 
-def test_figures_of_several_flights_stand_beside_each_other_by_name(pair: list[Recorded]) -> None:
+def test_figures_of_several_flights_stand_beside_each_other_by_name(pair: list[RecordedFlight]) -> None:
     blocks = {block.name: {row.what: row for row in block.rows} for block in comparison.error_blocks(pair)}
     assert list(blocks) == ["q (mrad/s)", "V (m/s)", "p (mrad/s)", "r (mrad/s)"]
     whole = blocks["q (mrad/s)"]["rms whole"]
@@ -378,29 +378,29 @@ def test_figures_of_several_flights_stand_beside_each_other_by_name(pair: list[R
     assert "rms gust" not in blocks["q (mrad/s)"]  # neither came to one
 
 
-def test_less_error_is_better_and_less_input_is_neither(pair: list[Recorded]) -> None:
+def test_less_error_is_better_and_less_input_is_neither(pair: list[RecordedFlight]) -> None:
     def cells(judged: bool) -> str:
-        rows = tuple(comparison.Row("rms", ("1", "2"), (1.0, ratio), judged) for ratio in (0.5, 1.01, 2.0, None))
-        return tables.compared_tables([comparison.Block("q", rows)], ["", ""])
+        rows = tuple(comparison.ComparisonRow("rms", ("1", "2"), (1.0, ratio), judged) for ratio in (0.5, 1.01, 2.0, None))
+        return tables.compared_tables([comparison.ComparisonBlock("q", rows)], ["", ""])
 
     assert re.findall('class="(better|same|worse)"', cells(True)) == ["better", "same", "worse", "same"]
     assert set(re.findall('class="(better|same|worse)"', cells(False))) == {"same"}
 
 
-def test_curves_of_several_flights_lie_over_each_other_and_one_reference_below(pair: list[Recorded]) -> None:
-    drawn = comparison.tracking_picture(comparison.scene(pair), pair)
+def test_curves_of_several_flights_lie_over_each_other_and_one_reference_below(pair: list[RecordedFlight]) -> None:
+    drawn = comparison.tracking_figure(comparison.scene(pair), pair)
     of_q = [trace for trace in drawn.data if trace.yaxis == "y"]
     assert [trace.name for trace in of_q] == ["y_m", "a", "b"]
     assert [trace.y[0] for trace in of_q] == pytest.approx([1000.0, 1200.0, 1100.0])
     assert [trace.name for trace in drawn.data if trace.yaxis == "y3"] == ["y_m", "a"]  # p
-    errors = comparison.error_picture(comparison.scene(pair), pair)
+    errors = comparison.error_figure(comparison.scene(pair), pair)
     assert [trace.y[0] for trace in errors.data if trace.yaxis == "y"] == pytest.approx([200.0, 100.0])
 
 
-def test_a_reference_of_its_own_is_drawn_for_each_flight(pair: list[Recorded], servo: Scenario) -> None:
+def test_a_reference_of_its_own_is_drawn_for_each_flight(pair: list[RecordedFlight], servo: Scenario) -> None:
     other = flight(y_m=signal([0, 1000], **{name: [0.0, 2.0] for name in OUTPUTS}))
     three = [*pair, recorded("c", servo, other)]
-    drawn = comparison.tracking_picture(comparison.scene(three), three)
+    drawn = comparison.tracking_figure(comparison.scene(three), three)
     assert [trace.name for trace in drawn.data if trace.yaxis == "y"] == ["y_m a", "y_m c", "a", "b", "c"]
 
 
@@ -412,19 +412,19 @@ def test_every_flight_is_in_the_legend_once_whatever_channels_it_has(servo: Scen
     two = [recorded("a", servo, only("q", "V")), recorded("b", servo, only("V", "p"))]
     shared = comparison.scene(two)
     for drawn in (
-        comparison.error_picture(shared, two),
-        comparison.spectrum_picture(shared, two),
-        comparison.timing_picture(two),
+        comparison.error_figure(shared, two),
+        comparison.spectrum_figure(shared, two),
+        comparison.timing_figure(two),
     ):
         assert drawn is not None
         assert [trace.name for trace in drawn.data if trace.showlegend] == ["a", "b"]
 
 
-def test_flights_of_one_name_are_numbered(pair: list[Recorded]) -> None:
+def test_flights_of_one_name_are_numbered(pair: list[RecordedFlight]) -> None:
     assert comparison.labels([pair[0], pair[1], pair[0]]) == ["a (1)", "b", "a (3)"]
 
 
-def test_a_comparison_is_a_page(tmp_path: Path, pair: list[Recorded]) -> None:
+def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> None:
     path = tmp_path / "comparison.html"
     write_page(path, pair)
     page = path.read_text(encoding="utf-8")
@@ -471,9 +471,9 @@ def test_a_curve_is_broken_where_samples_are_missing_and_u_is_held() -> None:
     holed = signal(stamps, **{name: [1.0] * len(stamps) for name in OUTPUTS})
     u = signal(stamps, **{name: [1.0] * len(stamps) for name in INPUTS})
     tape = Tape({"y": holed, "y_m": flight()["y"], "u": u}, EPOCH)
-    y: FloatArray = traces(pictures.tracking_picture(scene(tape)), "y")[0].y
+    y: FloatArray = traces(figures.tracking_figure(scene(tape)), "y")[0].y
     assert np.flatnonzero(np.isnan(y)).tolist() == [30]
-    assert not np.isnan(traces(pictures.input_picture(scene(tape), {}), "u")[0].y).any()
+    assert not np.isnan(traces(figures.input_figure(scene(tape), {}), "u")[0].y).any()
 
 
 def test_what_is_drawn_of_a_long_signal_keeps_its_peaks() -> None:
@@ -505,7 +505,7 @@ def test_all_samples_of_what_is_thinned_out_are_kept_once() -> None:
     stamps = EPOCH + np.arange(count, dtype=np.int64) * 2 * MS
     y = Signal(stamps, OUTPUTS, np.random.default_rng(1).standard_normal((count, 4)))
     shared = scene(Tape({"y": y, "y_m": Signal(stamps, OUTPUTS, np.zeros((count, 4)))}, EPOCH - 7))
-    drawn = [*pictures.tracking_picture(shared).data, *pictures.error_picture(shared).data]
+    drawn = [*figures.tracking_figure(shared).data, *figures.error_figure(shared).data]
     of_q = [trace for trace in drawn if trace.yaxis == "y"]
     assert [len(trace.y) < count for trace in of_q] == [True] * 3
     instants = np.cumsum(unpacked(shared.samples.packed[of_q[1].meta["t"]], "<f8"))
@@ -517,16 +517,16 @@ def test_all_samples_of_what_is_thinned_out_are_kept_once() -> None:
 
 def test_a_curve_of_few_samples_is_drawn_whole_and_kept_nowhere_else() -> None:
     shared = scene(flight())
-    assert traces(pictures.tracking_picture(shared), "y")[0].meta is None
+    assert traces(figures.tracking_figure(shared), "y")[0].meta is None
     assert shared.samples.packed == {}
 
 
 def test_names_of_bands_that_would_run_into_each_other_are_one() -> None:
     bands = [Band(name, start, start + 1.0, "#7f7f7f", True) for name, start in (("c", 50.0), ("a", 10.0), ("b", 12.0))]
-    drawn = pictures.tracking_picture(scene(flight(10_001))._replace(bands=bands))
+    drawn = figures.tracking_figure(scene(flight(10_001))._replace(bands=bands))
     assert [(note.x, note.text) for note in drawn.layout.annotations] == [(10.0, "a, b"), (50.0, "c")]
 
 
 def test_time_is_that_of_the_flight_whatever_the_stamps() -> None:
-    drawn = traces(pictures.tracking_picture(scene(flight())), "y")[0]
+    drawn = traces(figures.tracking_figure(scene(flight())), "y")[0]
     assert (drawn.x[0], drawn.x[-1]) == (0.0, 1.0)

@@ -9,13 +9,14 @@ from typing import Any
 import pytest
 from tests.joint_states import JOINT_STATE, vector
 
-from flight_analysis.latency import latency
-from flight_analysis.summary import summarise_unflown
-from flight_bringup import fly as flying
-from flight_bringup.report_command import report
+from flight_analysis.report.run_folder import conclude, new_run
+from flight_analysis.report.summary import summarise_unflown
+from flight_bringup.fly import fly_in_process
 from flight_bringup.scenarios import find_scenario
+from flight_cli.report import report
 from flight_core.parameters import ParameterError
-from flight_recorder.bag import BagWriter
+from flight_log.bag import BagWriter
+from flight_log.latency import latency
 
 MS = 1_000_000
 EPOCH = 1_795_000_000_000_000_000
@@ -27,8 +28,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     where, flown = tmp_path_factory.mktemp("runs"), []
     for name in ("osprey_gust", "osprey_servo"):
         scenario = find_scenario(name).vary(flight={"duration": 2.0})
-        run = flying.new_run(scenario, where)
-        flying.conclude(run, flying.fly_in_process(scenario, run, lambda t, shown: None))
+        run = new_run(scenario, where)
+        conclude(run, fly_in_process(scenario, run, lambda t, shown: None))
         flown.append(run)
     return flown
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from tests.browser import CHROMIUM, Browser
 
-from flight_analysis.recorded import Recorded
-from flight_analysis.report import write_page
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
-from flight_analysis.summary import summarise
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.page import write_page
+from flight_analysis.report.recorded_flight import RecordedFlight
+from flight_analysis.report.summary import summarise
 from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
 
@@ -34,21 +34,21 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="module")
-def servo() -> Recorded:
+def servo() -> RecordedFlight:
     """Seven seconds with noise: commands from 2 s on, twice as many samples as are drawn at first."""
     scenario = find_scenario("osprey_servo").vary(flight={"duration": 7.0})
     return recorded("servo", scenario, simulate(scenario))
 
 
 @pytest.fixture(scope="module")
-def page(servo: Recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page(servo: RecordedFlight, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "report.html"
     write_page(path, [servo])
     return path
 
 
-def recorded(name: str, scenario: Scenario, tape: Tape) -> Recorded:
-    return Recorded(name, scenario, tape, summarise(scenario, tape, tape.outcome))
+def recorded(name: str, scenario: Scenario, tape: Tape) -> RecordedFlight:
+    return RecordedFlight(name, scenario, tape, summarise(scenario, tape, tape.outcome))
 
 
 def open_page(browser: Browser, path: Path, scheme: str = "light") -> None:
@@ -88,7 +88,7 @@ def test_the_page_draws_all_pictures_without_a_complaint(browser: Browser, page:
     assert all(count > 0 for count in drawn)
 
 
-def test_a_zoom_shows_every_sample_in_all_pictures(browser: Browser, page: Path, servo: Recorded) -> None:
+def test_a_zoom_shows_every_sample_in_all_pictures(browser: Browser, page: Path, servo: RecordedFlight) -> None:
     open_page(browser, page)
     y = servo.tape["y"]
     whole, _ = curve(browser, 0, "y")
@@ -111,7 +111,7 @@ def test_a_zoom_shows_every_sample_in_all_pictures(browser: Browser, page: Path,
     assert browser.complaints == []
 
 
-def test_a_zoom_keeps_the_peaks_of_each_pixel(browser: Browser, tmp_path: Path, servo: Recorded) -> None:
+def test_a_zoom_keeps_the_peaks_of_each_pixel(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
     count = 40_000
     values = np.zeros((count, 4))
     values[30_001, 0], values[31_003, 0] = 5.0, -4.0  # one sample each, between 60 s and 62.1 s
@@ -150,7 +150,7 @@ def test_a_page_prints_light_on_sheets_and_comes_back(browser: Browser, page: Pa
     assert browser.complaints == []
 
 
-def test_several_flights_are_drawn_over_each_other(browser: Browser, tmp_path: Path, servo: Recorded) -> None:
+def test_several_flights_are_drawn_over_each_other(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
     path = tmp_path / "comparison.html"
     bare = replace(servo.tape, signals={name: servo.tape[name] for name in ("y", "y_m", "u")})
     write_page(path, [servo, recorded("seen from outside", servo.scenario, bare)])
@@ -166,7 +166,7 @@ def test_no_table_is_wider_than_the_page(browser: Browser, page: Path) -> None:
     assert browser.run("[...document.querySelectorAll('.tables > div')].every(table => table.scrollWidth <= table.clientWidth)")
 
 
-def test_ten_minutes_at_500_hz_are_there_soon(browser: Browser, tmp_path: Path, servo: Recorded) -> None:
+def test_ten_minutes_at_500_hz_are_there_soon(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
     # White noise in y, u and the truth: nothing can be compressed. The best of three, for others work on the machine too.
     count, random = 300_001, np.random.default_rng(1)
     stamps = np.arange(count, dtype=np.int64) * 2_000_000

@@ -11,23 +11,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
+from control_laws import adaptive, indi, inversion, lqi, mackunis, riccati, rise_di, rise_observer, super_twisting
+from control_laws.catalogue import LAWS, start
+from control_laws.nominal_model import NominalModel, inwards
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import tuning
-from flight_campaign.laws import adaptive, indi, inversion, lqi, mackunis, observed, riccati, rise, super_twisting
-from flight_campaign.laws.catalogue import LAWS, start
-from flight_campaign.laws.known import Known, inwards
-from flight_campaign.pilot import Pilot, Seen
 from flight_core.vectors import FloatArray
+from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.law import Sign
 
 DT = 0.01
 COLUMN = (1, 1)
 
 
-def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) -> Known:
+def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) -> NominalModel:
     """One output that integrates its input: y_dot = Omega u."""
     one, wide = np.ones(1), np.full(1, limit)
-    return Known(
+    return NominalModel(
         A=np.zeros(COLUMN),
         B=np.full(COLUMN, Omega),
         C=np.ones(COLUMN),
@@ -48,17 +48,17 @@ def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) ->
 
 
 @pytest.fixture(scope="module")
-def osprey() -> Known:
+def osprey() -> NominalModel:
     """The osprey without actuators or limits."""
     scenario = find_scenario("osprey_gust").vary(flight={"duration": 0.1})
-    return tuning.arena(scenario).known
+    return tuning.benchmark(scenario).known
 
 
-def at(y: Any, y_m: Any = 0.0, **others: Any) -> Seen:
+def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:
     """What a law sees of one aircraft; what is not named is 0, and x is y."""
     y = np.atleast_1d(np.asarray(y, dtype=float))[:, None]
     zero = np.zeros_like(y)
-    seen = Seen(y, zero + y_m, zero, zero, zero, zero, y, y, zero)
+    seen = Measurements(y, zero + y_m, zero, zero, zero, zero, y, y, zero)
     return seen._replace(**{key: np.asarray(value) for key, value in others.items()})
 
 
@@ -70,14 +70,16 @@ class Flight(NamedTuple):
     state: Any
 
 
-def fly(pilot: Pilot, params: Any, ticks: int, y: float, d: Any, known: Known, Omega: float | None = None) -> Flight:
+def fly(
+    control_law: ControlLaw, params: Any, ticks: int, y: float, d: Any, known: NominalModel, Omega: float | None = None
+) -> Flight:
     """The exact flight of y_dot = Omega u + d with u held over a tick and d its mean over one, y_m = 0, actuators ideal."""
     response = known.Omega[0, 0] if Omega is None else Omega
     seen, ys, us = at(y), [], []
-    state = pilot.start(seen, params)
+    state = control_law.start(seen, params)
     u = np.zeros(COLUMN)
     for k in range(ticks):
-        state, u = pilot.step(state, at(y, u_before=u, position=u), np.array(known.period), params)
+        state, u = control_law.step(state, at(y, u_before=u, position=u), np.array(known.period), params)
         ys.append(y)
         us.append(u.item())
         y += known.period * (response * u.item() + (d(k) if callable(d) else d))
@@ -94,38 +96,38 @@ def gains(**values: Any) -> dict[str, FloatArray]:
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(-0.3, 0.3), min_size=8, max_size=8), st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))
 def test_inversion_cancels_the_model_and_leaves_the_error_its_own_dynamics(
-    osprey: Known, x_of: list[float], y_m_dot_of: list[float]
+    osprey: NominalModel, x_of: list[float], y_m_dot_of: list[float]
 ) -> None:
     x, y_m_dot, K = np.array(x_of)[:, None], np.array(y_m_dot_of)[:, None], np.array([[9.0], [8.0], [4.0], [2.0]])
-    pilot = inversion.pilot(osprey, vanes=False)
+    control_law = inversion.control_law(osprey, vanes=False)
     params = inversion.inversion_params({"K": K}, osprey)
     y = osprey.C @ x
-    seen = Seen(y, y - 0.1, y_m_dot, 0.0 * y, 0.0 * y, 0.0 * y, x, x, 0.0 * y)
-    _, u = pilot.step(pilot.start(seen, params), seen, np.array(DT), params)
+    seen = Measurements(y, y - 0.1, y_m_dot, 0.0 * y, 0.0 * y, 0.0 * y, x, x, 0.0 * y)
+    _, u = control_law.step(control_law.start(seen, params), seen, np.array(DT), params)
     y_dot = osprey.C @ (osprey.A @ x + osprey.gravity @ np.sin(x) + osprey.B @ u)
     # e = 0.1, so e_dot = -0.1 K exactly; what is left is rounding of terms of size 10
     np.testing.assert_allclose(y_dot - y_m_dot, -0.1 * K, atol=1e-12)
 
 
-def test_inversion_with_vanes_looks_at_the_air_and_without_at_the_ground(osprey: Known) -> None:
+def test_inversion_with_vanes_looks_at_the_air_and_without_at_the_ground(osprey: NominalModel) -> None:
     x, air = np.zeros((8, 1)), np.zeros((8, 1))
     air[1] = 0.05
     params = inversion.inversion_params({"K": np.ones((4, 1))}, osprey)
     y = osprey.C @ x
-    seen = Seen(y, y, 0.0 * y, 0.0 * y, 0.0 * y, 0.0 * y, x, air, 0.0 * y)
+    seen = Measurements(y, y, 0.0 * y, 0.0 * y, 0.0 * y, 0.0 * y, x, air, 0.0 * y)
     u = {}
     for vanes in (False, True):
-        pilot = inversion.pilot(osprey, vanes=vanes)
-        u[vanes] = pilot.step(pilot.start(seen, params), seen, np.array(DT), params)[1]
+        control_law = inversion.control_law(osprey, vanes=vanes)
+        u[vanes] = control_law.step(control_law.start(seen, params), seen, np.array(DT), params)[1]
     assert not u[False].any()
     np.testing.assert_allclose(osprey.Omega @ u[True], -osprey.C @ osprey.A @ air, atol=1e-12)
 
 
 def test_the_integral_of_the_inversion_takes_a_constant_disturbance_away() -> None:
     known = integrator()
-    pilot = inversion.pilot(known, vanes=False)
-    kept = fly(pilot, inversion.inversion_params(gains(K=8.0), known), 2000, 0.0, 1.0, known)
-    gone = fly(pilot, inversion.inversion_params(gains(K=8.0, Lambda=2.0), known), 2000, 0.0, 1.0, known)
+    control_law = inversion.control_law(known, vanes=False)
+    kept = fly(control_law, inversion.inversion_params(gains(K=8.0), known), 2000, 0.0, 1.0, known)
+    gone = fly(control_law, inversion.inversion_params(gains(K=8.0, Lambda=2.0), known), 2000, 0.0, 1.0, known)
     # without the integral e rests where K e = d; sampled and held exactly as well, for y_dot is then 0
     assert kept.y[-1] == pytest.approx(1.0 / 8.0, rel=1e-9)
     assert abs(gone.y[-1]) < 1e-9
@@ -134,8 +136,8 @@ def test_the_integral_of_the_inversion_takes_a_constant_disturbance_away() -> No
 # LQI
 
 
-def test_doubling_solves_the_riccati_equation(osprey: Known) -> None:
-    model, generator = observed.observer(osprey), np.random.default_rng(1)
+def test_doubling_solves_the_riccati_equation(osprey: NominalModel) -> None:
+    model, generator = rise_observer.observer(osprey), np.random.default_rng(1)
     Q = np.tile(model.H.T @ model.H, (5, 1, 1))
     R = riccati.diagonals(np.exp(generator.normal(-3.0, 1.0, (4, 5))))
     found = riccati.riccati(model.F, model.G, Q, R)
@@ -154,7 +156,7 @@ def recursion(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray, steps:
     return np.asarray(np.linalg.solve(R + G.T @ P @ G, G.T @ P @ F))
 
 
-def test_lqi_is_what_a_long_finite_horizon_comes_to(osprey: Known) -> None:
+def test_lqi_is_what_a_long_finite_horizon_comes_to(osprey: NominalModel) -> None:
     size, weights = osprey.C @ osprey.size, gains(integral=np.full((4, 1), 2.0), effort=np.full((4, 1), 0.1), fade=4.0)
     F, G, E = lqi.design(osprey, 4.0)
     found = lqi.lqi_gain(osprey, weights)[..., 0]
@@ -171,7 +173,7 @@ def test_lqi_is_what_a_long_finite_horizon_comes_to(osprey: Known) -> None:
 def test_lqi_leaves_no_error_under_a_constant_disturbance() -> None:
     known = integrator()
     params = lqi.lqi_params(gains(integral=2.0, effort=0.1, fade=4.0), known)
-    assert abs(fly(lqi.pilot(vanes=False), params, 3000, 0.0, 1.0, known).y[-1]) < 1e-6
+    assert abs(fly(lqi.control_law(vanes=False), params, 3000, 0.0, 1.0, known).y[-1]) < 1e-6
 
 
 # MacKunis
@@ -179,25 +181,25 @@ def test_lqi_leaves_no_error_under_a_constant_disturbance() -> None:
 
 def test_the_acceleration_based_law_by_hand() -> None:
     known = integrator(Omega=2.0, period=0.1)
-    pilot = mackunis.pilot(known, ideal=True)
+    control_law = mackunis.control_law(known, ideal=True)
     K, Lambda, beta, eps, none = (np.full(COLUMN, value) for value in (3.0, 2.0, 5.0, 0.4, 0.0))
     params = mackunis.MacKunisParams(K, Lambda, beta, eps, none, known.limits)
-    state = pilot.start(at(0.0), params)
-    state, u = pilot.step(state, at(0.2, y_dot=np.full(COLUMN, -0.3)), np.array(0.1), params)
+    state = control_law.start(at(0.0), params)
+    state, u = control_law.step(state, at(0.2, y_dot=np.full(COLUMN, -0.3)), np.array(0.1), params)
     # r = -0.3 + 2 0.2 = 0.1, Pi = 0.1 5 0.1 / 0.4 = 0.125, integral = 0.1 0.2 / 2 = 0.01: -(3 (0.2 + 0.02) + 0.125) / 2
     assert u.item() == pytest.approx(-(0.66 + 0.125) / 2.0, rel=1e-12)
-    state, u = pilot.step(state, at(0.2, y_dot=np.full(COLUMN, 9.0)), np.array(0.1), params)
+    state, u = control_law.step(state, at(0.2, y_dot=np.full(COLUMN, 9.0)), np.array(0.1), params)
     # r far beyond eps: Pi = 0.125 + 0.5, integral = 0.03
     assert u.item() == pytest.approx(-(3.0 * (0.2 + 0.06) + 0.625) / 2.0, rel=1e-12)
 
 
 def test_the_filtered_difference_of_a_ramp_comes_to_its_slope() -> None:
     known = integrator()
-    pilot = mackunis.pilot(known, ideal=False)
+    control_law = mackunis.control_law(known, ideal=False)
     params = mackunis.mackunis_params(gains(K=1.0, Lambda=1.0, beta=1.0, softening=1.0, filter=12.6), known)
-    state = pilot.start(at(0.0), params)
+    state = control_law.start(at(0.0), params)
     for k in range(1, 301):
-        state, _ = pilot.step(state, at(0.3 * k * DT), np.array(DT), params)
+        state, _ = control_law.step(state, at(0.3 * k * DT), np.array(DT), params)
     # a filter of first order: 1 - exp(-12.6 3 s) of the slope
     assert state.e_dot.item() == pytest.approx(0.3 * (1.0 - np.exp(-12.6 * 3.0)), rel=1e-9)
 
@@ -207,16 +209,16 @@ def test_the_filtered_difference_of_a_ramp_comes_to_its_slope() -> None:
 
 def test_the_predictor_of_l1_knows_a_constant_disturbance_after_one_tick() -> None:
     known = integrator()
-    pilot, params = adaptive.l1(known, ahead=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
-    flight = fly(pilot, params, 3, 0.1, 0.7, known)
+    control_law, params = adaptive.l1(known, ahead=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
+    flight = fly(control_law, params, 3, 0.1, 0.7, known)
     x = adaptive.ADAPTATION_POLE * DT
     assert flight.state.sigma_hat.item() == pytest.approx(0.7 * x / (np.exp(x) - 1.0), rel=1e-9)
 
 
 def test_l1_rejects_what_its_filter_lets_through_with_a_wrong_input_gain() -> None:
     known = integrator()
-    pilot, params = adaptive.l1(known, ahead=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
-    flight = fly(pilot, params, 1500, 0.0, 0.7, known, Omega=1.4 * known.Omega[0, 0])
+    control_law, params = adaptive.l1(known, ahead=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
+    flight = fly(control_law, params, 1500, 0.0, 0.7, known, Omega=1.4 * known.Omega[0, 0])
     # at rest y_hat - y is constant: K e = d (1 - k) where k = 0.995 is what the pole leaves of the estimate
     assert abs(flight.y[-1]) < 0.7 * 0.006 / 3.0
     assert flight.u[-1] == pytest.approx(-0.7 / (1.4 * known.Omega[0, 0]), rel=1e-6)
@@ -224,14 +226,14 @@ def test_l1_rejects_what_its_filter_lets_through_with_a_wrong_input_gain() -> No
 
 def test_l1_with_feedforward_does_not_cancel_what_the_feedforward_cancels() -> None:
     known = integrator()
-    pilot, params = adaptive.l1(known, ahead=True), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
+    control_law, params = adaptive.l1(known, ahead=True), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
     y, state, u = 0.0, None, np.zeros(COLUMN)
     d, y_m_dot = 0.7, 0.5
     u_ff = np.full(COLUMN, (y_m_dot - d) / known.Omega[0, 0])  # a model that knows d
     for k in range(500):
         seen = at(y, y_m_dot * k * DT, y_m_dot=np.full(COLUMN, y_m_dot), u_ff=u_ff, u_before=u)
-        state = pilot.start(seen, params) if state is None else state
-        state, u = pilot.step(state, seen, np.array(DT), params)
+        state = control_law.start(seen, params) if state is None else state
+        state, u = control_law.step(state, seen, np.array(DT), params)
         y += DT * (known.Omega[0, 0] * u.item() + d)
     assert u.item() == pytest.approx(u_ff.item(), rel=1e-2)
     assert abs(y - y_m_dot * 500 * DT) < 0.01 * 0.7 / 3.0
@@ -242,23 +244,23 @@ def test_l1_with_feedforward_does_not_cancel_what_the_feedforward_cancels() -> N
 
 def test_mrac_learns_what_the_model_is_short_of() -> None:
     known = integrator()
-    pilot = adaptive.mrac(known, vanes=False)
+    control_law = adaptive.mrac(known, vanes=False)
     params = adaptive.mrac_params(gains(K=2.0, adaptation=20.0, bias=20.0, leak=0.0), known)
-    flight = fly(pilot, params, 4000, 0.3, 0.7, known)
+    flight = fly(control_law, params, 4000, 0.3, 0.7, known)
     assert abs(flight.y[-1]) < 1e-6
     assert flight.state[0, 1, 0] == pytest.approx(0.7, rel=1e-4)  # the weight of 1 is the disturbance
 
 
 def test_the_lyapunov_function_of_mrac_falls_by_what_the_theory_says() -> None:
     known = integrator(period=1e-4)
-    pilot, K, gamma, d = adaptive.mrac(known, vanes=False), 2.0, 20.0, 0.7
+    control_law, K, gamma, d = adaptive.mrac(known, vanes=False), 2.0, 20.0, 0.7
     params = adaptive.mrac_params(gains(K=K, adaptation=gamma, bias=gamma, leak=0.0), known)
-    W, y, u, values, decay = pilot.start(at(0.3), params), 0.3, np.zeros(COLUMN), [], 0.0
+    W, y, u, values, decay = control_law.start(at(0.3), params), 0.3, np.zeros(COLUMN), [], 0.0
     for _ in range(10_000):
         # what is to be learned: nothing of x, d of the constant
         values.append(y**2 / 2.0 + (W[0, 0, 0] ** 2 + (W[0, 1, 0] - d) ** 2) / (2.0 * gamma) + decay)
         decay += K * y**2 * known.period
-        W, u = pilot.step(W, at(y, u_before=u), np.array(known.period), params)
+        W, u = control_law.step(W, at(y, u_before=u), np.array(known.period), params)
         y += known.period * (2.0 * u.item() + d)
     # V + integral of K e^2 is constant in continuous time; Euler steps of 0.1 ms keep it within 1 in 1000
     np.testing.assert_allclose(values, values[0], rtol=1e-3)
@@ -269,10 +271,10 @@ def test_the_lyapunov_function_of_mrac_falls_by_what_the_theory_says() -> None:
 
 def test_indi_needs_no_model_beside_the_input_gain() -> None:
     known = integrator()
-    pilot = indi.pilot(known)
+    control_law = indi.control_law(known)
     params = indi.indi_params(gains(K=2.0, bandwidth=60.0, share=1.0), known)
     for Omega in (2.0, 1.4, 2.6):
-        flight = fly(pilot, params, 1500, 0.2, 0.7, known, Omega=Omega)
+        flight = fly(control_law, params, 1500, 0.2, 0.7, known, Omega=Omega)
         assert abs(flight.y[-1]) < 1e-6, Omega  # exp(-2 15) of the start and the disturbance, were it first order
         assert flight.u[-1] == pytest.approx(-0.7 / Omega, rel=1e-5)
 
@@ -283,8 +285,8 @@ def test_indi_needs_no_model_beside_the_input_gain() -> None:
 def reaching(e_0: float) -> float:
     """When abs(e) is first below a ten-thousandth of its start for good, s."""
     known = integrator(period=2e-4)
-    pilot, params = super_twisting.pilot(known), super_twisting.twisting_params(gains(root=3.0, beta=2.0), known)
-    flight = fly(pilot, params, 15_000, e_0, 0.0, known)
+    control_law, params = super_twisting.control_law(known), super_twisting.twisting_params(gains(root=3.0, beta=2.0), known)
+    flight = fly(control_law, params, 15_000, e_0, 0.0, known)
     return float((np.flatnonzero(np.abs(flight.y) > 1e-4 * e_0)[-1] + 1) * known.period)
 
 
@@ -296,10 +298,10 @@ def test_super_twisting_arrives_in_a_time_that_goes_with_the_root_of_the_start()
 
 def test_super_twisting_holds_against_a_disturbance_that_grows() -> None:
     known = integrator(period=2e-4)
-    pilot, params = super_twisting.pilot(known), super_twisting.twisting_params(gains(root=4.0, beta=3.0), known)
-    flight = fly(pilot, params, 20_000, 0.5, lambda k: 2.0 * k * 2e-4, known)  # d_dot = 2 < beta = 3
+    control_law, params = super_twisting.control_law(known), super_twisting.twisting_params(gains(root=4.0, beta=3.0), known)
+    flight = fly(control_law, params, 20_000, 0.5, lambda k: 2.0 * k * 2e-4, known)  # d_dot = 2 < beta = 3
     assert np.abs(flight.y[15_000:]).max() < 3e-6  # the sliding of an explicit scheme: of the order of beta dt^2 = 1.2e-7
-    linear = fly(inversion.pilot(known, vanes=False), inversion.inversion_params(gains(K=8.0, Lambda=2.0), known),
+    linear = fly(inversion.control_law(known, vanes=False), inversion.inversion_params(gains(K=8.0, Lambda=2.0), known),
                  20_000, 0.5, lambda k: 2.0 * k * 2e-4, known)  # fmt: skip
     assert np.abs(linear.y[15_000:]).min() > 0.1  # d_dot / (K Lambda) = 0.125: an integral alone follows late
 
@@ -307,15 +309,15 @@ def test_super_twisting_holds_against_a_disturbance_that_grows() -> None:
 # RISE-DI and PI
 
 
-def test_pi_is_the_law_without_its_sign(osprey: Known) -> None:
+def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
     K, Lambda = np.array([[9.0], [8.0], [4.0], [2.0]]), np.array([[3.0], [2.0], [1.0], [0.5]])
-    params = rise.of_gains({"K": K, "Lambda": Lambda}, osprey)
-    pilot, e = rise.pilot(Sign.SOFT), np.array([[0.1], [0.2], [0.0], [-0.3]])
+    params = rise_di.of_gains({"K": K, "Lambda": Lambda}, osprey)
+    control_law, e = rise_di.control_law(Sign.SOFT), np.array([[0.1], [0.2], [0.0], [-0.3]])
     zero = np.zeros((4, 1))
-    seen = Seen(zero, zero, zero, zero, zero, zero, zero, zero, zero)
-    state = pilot.start(seen, params)
+    seen = Measurements(zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    state = control_law.start(seen, params)
     for k in range(1, 6):
-        state, u = pilot.step(state, seen._replace(y=k * e), np.array(DT), params)
+        state, u = control_law.step(state, seen._replace(y=k * e), np.array(DT), params)
     # e rises by one step a tick from 0: its trapezoid up to tick 5 is 12.5 steps of dt
     np.testing.assert_allclose(u, -osprey.input_scale[:, None] * K * (5.0 + Lambda * 12.5 * DT) * e, rtol=1e-12)
 
@@ -323,9 +325,9 @@ def test_pi_is_the_law_without_its_sign(osprey: Known) -> None:
 # The observer
 
 
-def test_the_observer_finds_the_states_the_wind_and_the_disturbance_of_the_aircraft_that_it_knows(osprey: Known) -> None:
-    model = observed.observer(osprey)
-    _, corrections = observed.gains_of(model, osprey, start(LAWS["lqg"], osprey))
+def test_the_observer_finds_the_states_the_wind_and_the_disturbance_of_the_aircraft_that_it_knows(osprey: NominalModel) -> None:
+    model = rise_observer.observer(osprey)
+    _, corrections = rise_observer.gains_of(model, osprey, start(LAWS["lqg"], osprey))
     correction = corrections[..., 0]
     generator = np.random.default_rng(1)
     z, z_hat = 0.01 * generator.standard_normal(len(model.F)), np.zeros(len(model.F))
@@ -344,27 +346,29 @@ def test_what_the_observer_adds_is_bounded_whatever_it_sees() -> None:
     known = integrator(limit=0.5)
     law = LAWS["rise_observer"]
     gains_ = start(law, known) | {"K": np.full(COLUMN, 1e-6), "beta": np.full(COLUMN, 1e-6)}
-    pilot, params = law.pilot(known), law.params(gains_, known)
+    control_law, params = law.control_law(known), law.params(gains_, known)
     seen = at(0.0)
-    state = pilot.start(seen, params)
+    state = control_law.start(seen, params)
     added = []
     for k in range(200):
-        state, _ = pilot.step(state, at(100.0 * (-1.0) ** (k // 40)), np.array(DT), params)
+        state, _ = control_law.step(state, at(100.0 * (-1.0) ** (k // 40)), np.array(DT), params)
         added.append(state.u_o.item())
-    part = observed.PART * 0.5
+    part = rise_observer.PART * 0.5
     assert max(added) == part == -min(added)
     # from one bound to the other in twice WITHIN
-    assert np.abs(np.diff([0.0, *added])).max() == pytest.approx(part * DT / observed.WITHIN, rel=1e-9)
+    assert np.abs(np.diff([0.0, *added])).max() == pytest.approx(part * DT / rise_observer.WITHIN, rel=1e-9)
 
 
-def test_without_an_observer_s_gain_it_is_the_law_with_feedforward(osprey: Known) -> None:
+def test_without_an_observer_s_gain_it_is_the_law_with_feedforward(osprey: NominalModel) -> None:
     law, plain = LAWS["rise_observer"], LAWS["rise_ff"]
     gains_ = start(law, osprey)
     params = law.params(gains_, osprey)
     params = params._replace(gain=0.0 * params.gain)
-    generator, pilots = np.random.default_rng(1), (law.pilot(osprey), plain.pilot(osprey))
-    looks = [Seen(*(0.01 * generator.standard_normal((8 if k in {6, 7} else 4, 1)) for k in range(9))) for _ in range(5)]
-    states = [pilot.start(looks[0], given_) for pilot, given_ in zip(pilots, (params, params.rise), strict=True)]
+    generator, pilots = np.random.default_rng(1), (law.control_law(osprey), plain.control_law(osprey))
+    looks = [
+        Measurements(*(0.01 * generator.standard_normal((8 if k in {6, 7} else 4, 1)) for k in range(9))) for _ in range(5)
+    ]
+    states = [control_law.start(looks[0], given_) for control_law, given_ in zip(pilots, (params, params.rise), strict=True)]
     for seen in looks:
         states[0], u = pilots[0].step(states[0], seen, np.array(DT), params)
         states[1], without = pilots[1].step(states[1], seen, np.array(DT), params.rise)
@@ -384,29 +388,29 @@ def test_every_law_keeps_its_limits_and_recovers_from_them(name: str) -> None:
     known = integrator(limit=0.5)
     law = LAWS[name]
     params = law.params(start(law, known), known)
-    flight = fly(law.pilot(known), params, 3000, 0.0, lambda k: 2.0 if k < 1000 else 0.0, known)
+    flight = fly(law.control_law(known), params, 3000, 0.0, lambda k: 2.0 if k < 1000 else 0.0, known)
     assert np.abs(flight.u).max() <= 0.5  # 0.5 of 2.0 / Omega = 1.0 that the disturbance would take
     # pushed 10 away in 10 s, it comes back at Omega 0.5 = 1 /s for 10 s; a wound-up integral would not stop there
     assert np.abs(flight.y[2800:]).max() < 0.2
 
 
 @pytest.mark.parametrize("name", list(LAWS))
-def test_every_law_is_the_same_under_numpy_and_jax_and_over_a_fleet(name: str, osprey: Known) -> None:
+def test_every_law_is_the_same_under_numpy_and_jax_and_over_a_fleet(name: str, osprey: NominalModel) -> None:
     law, generator = LAWS[name], np.random.default_rng(1)
-    pilot, params = law.pilot(osprey), law.params(start(law, osprey), osprey)
+    control_law, params = law.control_law(osprey), law.params(start(law, osprey), osprey)
 
-    def look() -> Seen:
+    def look() -> Measurements:
         shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))
-        return Seen(*(0.1 * generator.standard_normal(shape) for shape in shapes))
+        return Measurements(*(0.1 * generator.standard_normal(shape) for shape in shapes))
 
     looks = [look() for _ in range(4)]
-    state, one = pilot.start(looks[0], params), [one[..., :1] for one in looks[0]]
-    compiled, alone = jax.tree.map(jax.numpy.asarray, state), pilot.start(Seen(*one), params)
-    step = jax.jit(pilot.step)
+    state, one = control_law.start(looks[0], params), [one[..., :1] for one in looks[0]]
+    compiled, alone = jax.tree.map(jax.numpy.asarray, state), control_law.start(Measurements(*one), params)
+    step = jax.jit(control_law.step)
     for seen in looks:
-        state, u = pilot.step(state, seen, np.array(DT), params)
+        state, u = control_law.step(state, seen, np.array(DT), params)
         compiled, by_jax = step(compiled, seen, DT, params)
-        alone, first = pilot.step(alone, Seen(*(one[..., :1] for one in seen)), np.array(DT), params)
+        alone, first = control_law.step(alone, Measurements(*(one[..., :1] for one in seen)), np.array(DT), params)
         # nothing but the order of additions differs
         np.testing.assert_allclose(by_jax, u, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(first, u[:, :1], rtol=1e-9, atol=1e-12)

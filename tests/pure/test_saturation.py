@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import true_error
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray

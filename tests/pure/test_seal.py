@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.joint_states import JOINT_STATE, vector
 
-from flight_analysis.named_vectors import decoder
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.authentication import BLANK, DIGITS, KEY_BYTES, MessageAuthenticator, mac_slice, read_key
 from flight_core.parameters import ParameterError
-from flight_core.seal import BLANK, DIGITS, KEY_BYTES, Seal, mac_place, read_key
 from flight_core.vectors import ChannelError
+from flight_log.named_vectors import decoder
 
 KEY = bytes(range(KEY_BYTES))
 
@@ -28,25 +28,25 @@ def hmac_sha256(key: bytes, text: bytes) -> bytes:
     return hashlib.sha256(bytes(byte ^ 0x5C for byte in padded) + inner).digest()
 
 
-def signed(stamp_ns: int, values: tuple[float, ...], seal: Seal) -> bytes:
+def signed(stamp_ns: int, values: tuple[float, ...], seal: MessageAuthenticator) -> bytes:
     """A sample of another publisher: blank, signed, put together."""
     blank = vector(stamp_ns, ("q", "V"), values, "/someone" + BLANK)
-    place = mac_place(blank)
+    place = mac_slice(blank)
     return blank[: place.start] + seal.mac(blank) + blank[place.stop :]
 
 
 @given(st.binary(min_size=KEY_BYTES, max_size=KEY_BYTES), st.text(max_size=30), st.binary(max_size=300))
 def test_the_code_is_half_of_hmac_sha256_over_topic_and_message(key: bytes, topic: str, message: bytes) -> None:
     expected = hmac_sha256(key, topic.encode() + b"\x00" + message)[:16].hex().encode()
-    assert Seal(key, topic, None).mac(message) == expected
+    assert MessageAuthenticator(key, topic, None).mac(message) == expected
     assert len(expected) == DIGITS
 
 
 def test_a_message_of_another_publisher_passes_with_its_code_and_no_other() -> None:
-    seal = Seal(KEY, "/y", None)
+    seal = MessageAuthenticator(KEY, "/y", None)
     message = signed(7, (0.5, -1.0), seal)
     seal.check(message)
-    for other in (Seal(KEY, "/u", None), Seal(bytes(KEY_BYTES), "/y", None)):
+    for other in (MessageAuthenticator(KEY, "/u", None), MessageAuthenticator(bytes(KEY_BYTES), "/y", None)):
         with pytest.raises(ChannelError) as refused:
             other.check(message)
         assert refused.value.reason == "mac"
@@ -54,12 +54,12 @@ def test_a_message_of_another_publisher_passes_with_its_code_and_no_other() -> N
 
 @given(st.binary(max_size=100))
 def test_a_place_is_found_in_bytes_of_any_kind(message: bytes) -> None:
-    place = mac_place(message)
+    place = mac_slice(message)
     assert place.stop - place.start in (0, DIGITS)
 
 
 def test_signed_samples_of_a_log_are_read_as_others_are_and_at_once() -> None:
-    seal = Seal(KEY, "/y", None)
+    seal = MessageAuthenticator(KEY, "/y", None)
     decode = decoder("/y", JOINT_STATE)
     assert decode is not None
     found = decode([signed(k, (0.1 * k, -k), seal) for k in range(5)])

@@ -9,11 +9,11 @@ import pytest
 
 from aircraft_sim import sensors as sensor_maths
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.sensors import Drift, Sample, Sensors, Underway, arrives, measure, noise, start, transmit, walk
+from aircraft_sim.sensors import Drift, Sample, Sensors, Underway, arrives, initial_drift, measure, noise, transmit, walk
 from aircraft_sim.simulator import AirframeVehicle, Simulator
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_figures, known_error, tracking_error, true_error
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
@@ -161,7 +161,7 @@ def test_the_errors_add_up_and_the_quantisation_comes_last() -> None:
     params = sensors([0.01] * 4)._replace(
         bias=np.array([0.2, -0.3, 0.0, 0.0]), drift=np.array([0.1, 0.1, 0.0, 0.1]), quantum=np.array([0.0, 0.05, 0.05, 0.5])
     )
-    drift = walk(6, start(params), params)
+    drift = walk(6, initial_drift(params), params)
     measured = measure(7, y, drift, params)
     analog = y + params.bias + walk(7, drift, params).value + noise(7, params)
     assert measured.y[0] == pytest.approx(analog[0], abs=1e-15)
@@ -173,23 +173,23 @@ def test_the_errors_add_up_and_the_quantisation_comes_last() -> None:
 def test_quantisation_rounds_to_the_nearest_step_and_halves_to_even() -> None:
     params = sensors([0.0] * 6)._replace(quantum=np.full(6, 0.25))
     y = np.array([0.1, 0.125, 0.375, -0.1, -0.2, 0.3])  # 0.125 and 0.375 are exact halves
-    assert measure(0, y, start(params), params).y.tolist() == [0.0, 0.0, 0.5, -0.0, -0.25, 0.25]
+    assert measure(0, y, initial_drift(params), params).y.tolist() == [0.0, 0.0, 0.5, -0.0, -0.25, 0.25]
 
 
 def test_a_bias_is_the_whole_error_of_a_sensor_that_has_nothing_else() -> None:
     params = sensors([0.0] * 2)._replace(bias=np.array([0.5, -0.25]))
     for k in (0, 9):
-        measured = measure(k, np.array([1.0, 2.0]), start(params), params)
+        measured = measure(k, np.array([1.0, 2.0]), initial_drift(params), params)
         assert measured.error.tolist() == [0.5, -0.25]
         assert measured.y.tolist() == [1.5, 1.75]
 
 
 def test_drift_does_not_depend_on_what_was_missed() -> None:
     params = drifting([0.1, 0.2])
-    each: list[Drift] = [start(params)]
+    each: list[Drift] = [initial_drift(params)]
     for k in range(1, 101):
         each.append(walk(k, each[-1], params))
-    seen = start(params)
+    seen = initial_drift(params)
     for k in (0, 3, 4, 50, 51, 100):
         seen = walk(k, seen, params)
         assert seen.value.tobytes() == each[k].value.tobytes()
@@ -198,12 +198,12 @@ def test_drift_does_not_depend_on_what_was_missed() -> None:
 
 
 def test_drift_does_not_depend_on_noise_and_loss_and_differs_by_seed() -> None:
-    alone = walk(20, start(drifting([0.1] * 4)), drifting([0.1] * 4)).value
+    alone = walk(20, initial_drift(drifting([0.1] * 4)), drifting([0.1] * 4)).value
     noisy = drifting([0.1] * 4)._replace(noise=np.array(NOISE), dropout=0.5)
-    assert (walk(20, start(noisy), noisy).value == alone).all()
+    assert (walk(20, initial_drift(noisy), noisy).value == alone).all()
     other = drifting([0.1] * 4, seed=2)
-    assert (walk(20, start(other), other).value != alone).all()
-    first = walk(1, start(drifting([1.0] * 4)), drifting([1.0] * 4)).value
+    assert (walk(20, initial_drift(other), other).value != alone).all()
+    first = walk(1, initial_drift(drifting([1.0] * 4)), drifting([1.0] * 4)).value
     assert (first != noise(1, sensors([1.0] * 4))).all()  # a stream of its own under the same seed
 
 
@@ -213,7 +213,7 @@ def test_the_variance_of_the_drift_grows_with_time_whatever_the_rate() -> None:
     for rate, samples in ((10.0, 20), (40.0, 80)):
         values = {"airframe": "osprey", "rate": rate, "step": 0.005, "sensors": {"drift": [0.2, 0.0, 0.4, 0.0]}}
         params = AircraftParameters.validate_mapping(values, "aircraft").sensor_arrays()
-        ends = np.array([walk(samples, start(params), params._replace(seed=seed)).value for seed in range(400)])
+        ends = np.array([walk(samples, initial_drift(params), params._replace(seed=seed)).value for seed in range(400)])
         variance = np.mean(ends**2, axis=0)
         assert variance[[0, 2]] == pytest.approx([0.04 * 2.0, 0.16 * 2.0], rel=0.28)
         assert (variance[[1, 3]] == 0.0).all()
@@ -221,7 +221,7 @@ def test_the_variance_of_the_drift_grows_with_time_whatever_the_rate() -> None:
 
 def test_ideal_sensors_give_y_to_the_last_bit() -> None:
     y = np.array([0.1, -1e-300, 3.0, 7.7])
-    measured = measure(3, y, start(sensors([0.0] * 4)), sensors([0.0] * 4))
+    measured = measure(3, y, initial_drift(sensors([0.0] * 4)), sensors([0.0] * 4))
     assert measured.y.tobytes() == y.tobytes()
     assert (measured.error == 0.0).all()
 

@@ -21,11 +21,11 @@ from benchmarks.servo_world import FIGURES, LITERAL, PI, TABLES, Row, delayed, l
 from scipy.signal import lsim
 from tests.pure.test_saturation import error, last_beyond, moved_in, pulse, state
 
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.gain_conditions import is_stable
 from flight_core.vectors import FloatArray
 from reference_model.command import Profile, command
-from rise_di_controller.gains import is_stable
 
 ROWS = {row.name: row for _, rows in TABLES.values() for row in rows()}
 

@@ -20,9 +20,9 @@ from aircraft_sim.airframe import LIBRARY
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.plant import Plant
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_figures, true_error
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
 from flight_core.tape import Tape
@@ -113,7 +113,7 @@ def fly(aircraft: Aircraft, law: LawParams, y_m: list[FloatArray], dt: float, bo
     period_ns, m = nanoseconds(dt), len(law.K)
     ideal = Actuators(np.zeros(m), np.full(m, -np.inf), np.full(m, np.inf), np.full(m, np.inf))
     hardware = Plant(aircraft, ideal, period_ns)
-    flying, u = plant.start(hardware), np.zeros(m)
+    flying, u = plant.initial_state(hardware), np.zeros(m)
     state = rise.engage(dynamics.y(flying.x, aircraft), y_m[0])
     errors = [state.e]
     for k, reference in enumerate(y_m[1:]):

@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import tracking_error
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
 from flight_core.vectors import FloatArray
 
 SHOWN = np.array([1e3, 1.0, 1e3, 1e3])  # q, V, p, r in mrad/s and m/s

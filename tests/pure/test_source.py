@@ -5,18 +5,18 @@
 import numpy as np
 import pytest
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError
-from flight_ros.source import Source
+from flight_ros.publisher_lock import PublisherLock
 from rise_di_controller.controller import Controller
 from rise_di_controller.guard import Mode, Sample
 
 AGE, STRANGE = 100, 1000
 
 
-def heard(*senders: tuple[str, int]) -> Source:
-    source = Source()
+def heard(*senders: tuple[str, int]) -> PublisherLock:
+    source = PublisherLock()
     for sender, now_ns in senders:
         source.require(sender, now_ns, AGE, STRANGE)
         source.hear(sender, now_ns)
@@ -43,7 +43,7 @@ def test_a_node_started_again_is_listened_to_after_the_age_limit_a_stranger_late
 
 
 def test_a_change_is_told_once() -> None:
-    source = Source()
+    source = PublisherLock()
     assert source.silent(0, AGE)
     assert source.hear("/aircraft#1", 0)
     assert not source.hear("/aircraft#1", 1)

@@ -15,10 +15,10 @@ import pytest
 from pydantic import BaseModel
 
 from aircraft_sim.simulator import Simulator
-from flight_analysis.lyapunov import Evidence
-from flight_analysis.scenario import SCHEMAS, Scenario
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_analysis.design.gain_conditions import Bounds, GainSet
+from flight_analysis.design.lyapunov import Evidence
 from rise_di_controller import internals
-from rise_di_controller.gains import Bounds, GainSet
 from rise_di_controller.law import LawParams, LawState
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -214,7 +214,7 @@ def test_what_does_not_exist_is_noticed(channels: Mapping[str, Sequence[str]]) -
         with pytest.raises((LookupError, ModuleNotFoundError)):
             resolve(name)
     resolve("aircraft_sim.airframe.Airframe.gravity")  # a field of a model is no attribute of its class
-    resolve("flight_analysis.scenario.Scenario.flight")
+    resolve("flight_analysis.closed_loop.scenario.Scenario.flight")
     assert not any(map(is_parameter, ("controller", "controller.K", "controler.k_g", "aircraft.gusts.*.width", "controller.*")))
     assert not any(is_field(name, channels) for name in ("internals: pi.*", "internal: Pi.*", "truth: z.*", "y: h"))
     assert not functions_of(Path(__file__)) & {"test_that_is_not_there"}

@@ -47,7 +47,7 @@ def correlation(lag: FloatArray, axis: int, of: Dryden) -> FloatArray:
 def ensemble(of: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
     """Winds of many seeds at multiples of dt, shape (3, seeds, steps)."""
     params = [filters(of, V0, dt, ALL, seed) for seed in range(seeds)]
-    z = np.array([turbulence.start(one) for one in params]).T
+    z = np.array([turbulence.initial_state(one) for one in params]).T
     numbers = np.array([turbulence.normals(0, steps, seed) for seed in range(seeds)])
     winds = np.empty((3, seeds, steps))
     for k in range(steps):
@@ -247,8 +247,8 @@ def turbulent(step_ms: float = 2.0, **values: Any) -> AircraftParameters:
 
 def test_a_flight_meets_the_same_air_however_its_time_is_cut() -> None:
     parts, u = turbulent().plant(), np.array([0.01, 0.1, 0.0, 0.0])
-    whole = plant.advance(0, plant.start(parts), u, 400 * MS, parts)
-    cut = plant.start(parts)
+    whole = plant.advance(0, plant.initial_state(parts), u, 400 * MS, parts)
+    cut = plant.initial_state(parts)
     for k in range(40):
         cut = plant.advance(10 * k * MS, cut, u, 10 * MS, parts)
     assert cut.turbulence is not None
@@ -266,7 +266,7 @@ def test_numbers_from_elsewhere_may_take_the_place_of_the_seed() -> None:
     # As a campaign on other arrays does, which NumPy cannot draw for.
     parts, u = turbulent().plant(), np.zeros(4)
     assert parts.turbulence is not None
-    state = plant.start(parts)
+    state = plant.initial_state(parts)
     own = plant.advance(0, state, u, 20 * MS, parts)
     given_numbers = plant.advance(0, state, u, 20 * MS, parts, normals=turbulence.normals(0, 10, parts.turbulence.seed))
     assert own.x.tobytes() == given_numbers.x.tobytes()
@@ -278,11 +278,11 @@ def test_truth_shows_the_wind_that_acts_from_then_on_and_f_holds_it() -> None:
     simulator, parts = Simulator(parameters), parameters.plant()
     air = parts.turbulence
     assert air is not None
-    z = turbulence.start(air)
+    z = turbulence.initial_state(air)
     for number in range(3):
         simulator.sample(number, np.zeros(4))
         shown = dict(zip(simulator.truth_names, simulator.truth(), strict=True))
-        winds = dict(zip(parameters.drawn().gusts, turbulence.wind(z, air), strict=True))
+        winds = dict(zip(parameters.sampled_airframe().gusts, turbulence.wind(z, air), strict=True))
         gust = 1.0 - math.cos(math.pi * 0.01 * number * 25.0 / 2.5)
         assert shown["gust.lateral"] == winds["lateral"] != 0.0
         assert shown["gust.vertical"] == pytest.approx(winds["vertical"] + gust, rel=1e-12)
@@ -295,7 +295,10 @@ def test_an_airframe_meets_the_axes_that_it_knows() -> None:
     # Each axis has its noise, known to the airframe or not.
     of = dryden(30.0, 7.7, 0.0)
     whole, lateral = filters(of, V0, 0.01, ALL, 1), filters(of, V0, 0.01, [AXES.index("lateral")], 1)
-    assert turbulence.wind(turbulence.start(whole), whole)[1] == turbulence.wind(turbulence.start(lateral), lateral)[0]
+    assert (
+        turbulence.wind(turbulence.initial_state(whole), whole)[1]
+        == turbulence.wind(turbulence.initial_state(lateral), lateral)[0]
+    )
 
 
 def parts_of(section: dict[str, Any], airframe: str = "osprey") -> Plant:

@@ -12,8 +12,8 @@ from scipy.stats import kstest
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.uncertainty import as_yaml, draw, uncertain
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
@@ -84,15 +84,15 @@ def test_the_aircraft_drawn_is_the_aircraft_flown(osprey_gust: Scenario, tmp_pat
     short = osprey_gust.vary(flight={"duration": 3.0})
     drawn = short.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.3, "seed": 7}})
     path = tmp_path / "drawn.yaml"
-    path.write_text(as_yaml(drawn.aircraft.drawn()), encoding="utf-8")
+    path.write_text(as_yaml(drawn.aircraft.sampled_airframe()), encoding="utf-8")
     flights = [simulate(one)["y"].values for one in (drawn, short.vary(aircraft={"airframe": str(path)}), short)]
     assert flights[0].tobytes() == flights[1].tobytes()
     assert flights[0].tobytes() != flights[2].tobytes()
 
 
 def test_without_the_section_the_published_airframe_flies() -> None:
-    assert parameters().drawn() == OSPREY
-    assert isinstance(parameters(A=0.1).drawn(), Airframe)
+    assert parameters().sampled_airframe() == OSPREY
+    assert isinstance(parameters(A=0.1).sampled_airframe(), Airframe)
 
 
 @pytest.mark.parametrize(

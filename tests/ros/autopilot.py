@@ -21,7 +21,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Joy
 
 from aircraft_sim.simulator import Simulator
-from flight_analysis.scenario import load_scenario
+from flight_analysis.closed_loop.scenario import load_scenario
 from flight_ros import transport
 
 QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -15,10 +15,10 @@ import numpy as np
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from flight_core.seal import Seal, read_key
-from flight_ros.inbox import Inbox
+from flight_core.authentication import MessageAuthenticator, read_key
 from flight_ros.messages import Encoder
-from flight_ros.topics import LISTEN, U, Y
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.topics import NEWEST_SAMPLES, U, Y
 
 INPUTS = ("elevator", "thrust", "aileron", "rudder")
 ENOUGH = 50  # samples of y, and as many u
@@ -32,14 +32,14 @@ def main() -> None:
     seconds, *keys = sys.argv[1:]
     rclpy.init()
     node = rclpy.create_node("outsider")
-    inbox = Inbox(node, Y, LISTEN, raw=True)
+    subscription = PolledSubscription(node, Y, NEWEST_SAMPLES, raw=True)
     publisher = node.create_publisher(U.type, U.name, SEND)
-    seal = Seal(read_key(keys[0], "key_file"), "/u", None) if keys else None
+    seal = MessageAuthenticator(read_key(keys[0], "key_file"), "/u", None) if keys else None
     encoder = Encoder(INPUTS, "/controller#1", seal)
     heard = sent = 0
     deadline = time.monotonic() + float(seconds)
     while time.monotonic() < deadline and not (heard >= ENOUGH and sent >= ENOUGH):
-        heard += len(inbox.take())
+        heard += len(subscription.take())
         publisher.publish(encoder.encode(time.time_ns(), np.array([0.0, 0.0, 0.02, 0.0])))
         sent += heard > 0
         time.sleep(0.02)

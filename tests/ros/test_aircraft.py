@@ -10,7 +10,7 @@ import pytest
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer, peer
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_ros.messages import to_message
 
 INPUTS = ("elevator", "thrust", "aileron", "rudder")

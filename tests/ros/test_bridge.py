@@ -31,11 +31,13 @@ from typer.testing import CliRunner
 
 from autopilot_bridge.channel_map import message_type, read_raw, set_field, to_channel, to_raw
 from autopilot_bridge.params import LIBRARY, load_map
-from flight_analysis.bag_reader import read_run
-from flight_analysis.stored_messages import stored_messages
-from flight_bringup.cli import app
+from flight_cli.cli import COMMANDS, application
 from flight_core.rates import NANOSECONDS
+from flight_log.stored_messages import stored_messages
+from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
+
+app = application([*COMMANDS])
 
 SCENARIO = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
 BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -107,7 +109,7 @@ class Sky:
 
     def take_over_by_command(self) -> None:
         """The same by `rise-di engage`."""
-        command = self._start("flight_bringup.cli", "engage")
+        command = self._start("flight_cli.cli", "engage")
         self.peer.until(lambda: command.popen.poll() is not None, timeout=60.0)
         assert command.end() == 0, command.output
         self.joys.clear()
@@ -299,7 +301,7 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
     assert len(recorded) > 100  # of 150
 
     sky.bridge()
-    player = start("flight_bringup.cli", "play", str(bag), "--topics", ",".join(topics))
+    player = start("flight_cli.cli", "play", str(bag), "--topics", ",".join(topics))
 
     def command() -> None:
         sky.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.1, 0.0, 0.0, 0.0]), "test"))
@@ -319,9 +321,9 @@ def test_rise_di_fly_has_the_bridge_in_the_aircrafts_place_and_logs_what_the_aut
     sky: Sky, start: Start, tmp_path: Path
 ) -> None:
     sky.autopilot()
-    flight = start("flight_bringup.cli", "fly", str(SCENARIO), "--bridge", sky.map, "--duration", "12", "--json")
+    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", sky.map, "--duration", "12", "--json")
     sky.peer.until(lambda: sky.peer.heard["bridge/would_send"], timeout=60.0)
-    refused = start("flight_bringup.cli", "engage")
+    refused = start("flight_cli.cli", "engage")
     sky.peer.until(lambda: flight.popen.poll() is not None, timeout=90.0)
     assert refused.end() == 1
     assert "error: not engaged: dry_run is true: nothing is sent" in refused.output
@@ -339,7 +341,7 @@ def test_rise_di_fly_has_the_bridge_in_the_aircrafts_place_and_logs_what_the_aut
 
 def test_a_map_with_a_flipped_sign_is_not_flown(sky: Sky, start: Start) -> None:
     sky.change_map("inputs", "elevator", sign=-1)
-    flight = start("flight_bringup.cli", "fly", str(SCENARIO), "--bridge", sky.map, "--send")
+    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", sky.map, "--send")
     assert flight.end() == 2
     assert "with the map ardupilot D of q and elevator is -1, the controller has +1" in flight.output
 

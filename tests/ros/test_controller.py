@@ -19,7 +19,7 @@ from std_msgs.msg import Float64MultiArray
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import OUTPUTS, Peer, peer
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_ros.messages import to_message
 from rise_di_controller.guard import Mode
 

@@ -15,11 +15,11 @@ import pytest
 from rosbags.highlevel import AnyReader
 from tests.ros.conftest import Process, Start
 
-from flight_analysis.bag_reader import read_run
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import tracking_error
-from flight_analysis.scenario import Scenario, load_scenario
-from flight_analysis.simulate import simulate
 from flight_core.vectors import FloatArray
+from flight_log.tape_reader import read_run
 
 DURATION = 12.0
 
@@ -46,7 +46,7 @@ def short_scenario(osprey_gust: Scenario, tmp_path: Path) -> Path:
 
 
 def fly(start: Start, scenario: Path, *arguments: str) -> Process:
-    return start("flight_bringup.cli", "fly", str(scenario), *arguments)
+    return start("flight_cli.cli", "fly", str(scenario), *arguments)
 
 
 def children(process: Process) -> list[psutil.Process]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.ros.conftest import Start
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 
 HEALTH = Path(__file__).resolve().parents[2] / "docker" / "health.py"
 

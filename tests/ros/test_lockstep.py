@@ -19,11 +19,11 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from tests.ros.conftest import Process, Start
 
-from flight_analysis.bag_reader import read_run
-from flight_analysis.scenario import load_scenario
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.scenario import load_scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.scenarios import find_scenario
+from flight_log.tape_reader import read_run
 
 TOPICS = ("/y", "/y_m", "/u", "/internals", "/truth")
 
@@ -50,7 +50,7 @@ def scenario_file(
 
 def fly(start: Start, scenario: Path, runs: str, *options: str) -> Path:
     """Fly to the end; the folder of the run."""
-    process = start("flight_bringup.cli", "fly", str(scenario), "--lockstep", "--runs", runs, *options)
+    process = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", runs, *options)
     assert process.end(timeout=120) == 0, process.output
     return scenario.parent / runs / "latest"
 
@@ -151,7 +151,7 @@ def test_the_others_end_within_two_seconds_of_a_kill_and_name_who_is_gone(victim
 
 
 def test_a_killed_node_ends_the_flight_with_its_name_in_the_summary(start: Start, tmp_path: Path) -> None:
-    command = start("flight_bringup.cli", "fly", str(scenario_file(tmp_path, 1e5)), "--lockstep", "--runs", "runs")
+    command = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5)), "--lockstep", "--runs", "runs")
     wait_until_recorded(tmp_path / "runs", command)
     node = next(child for child in command.children() if "reference_model.main" in child.cmdline())
     node.send_signal(signal.SIGKILL)
@@ -166,7 +166,7 @@ def test_a_diverged_aircraft_ends_the_flight_with_the_reason_and_a_log(start: St
     wrong, count = re.subn(r"D: *\n( *- 1\n){4}", lambda found: found.group().replace("- 1", "- -1", 1), text)
     assert count == 1
     scenario.write_text(wrong, encoding="utf-8")
-    command = start("flight_bringup.cli", "fly", str(scenario), "--lockstep", "--runs", "runs")
+    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", "runs")
     assert command.end(timeout=60) == 3, command.output
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
     assert re.fullmatch(r"aircraft ended with status 3: diverged at t = [\d.]+ s", summary["outcome"])

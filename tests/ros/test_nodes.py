@@ -10,7 +10,7 @@ import pytest
 from tests.ros.conftest import Start
 from tests.ros.peer import peer
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 
 NODES = {
     "aircraft_sim": "aircraft",
@@ -65,8 +65,10 @@ def test_a_node_that_is_stopped_while_it_loads_ends_cleanly(
 ) -> None:
     with peer(listen=()) as someone:
         node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
-        herald = f"_start_{node.popen.pid}"
-        someone.until(lambda: herald in someone.node.get_node_names() or "ready" in node.output)  # at times it is that quick
+        early_participant = f"_start_{node.popen.pid}"
+        someone.until(
+            lambda: early_participant in someone.node.get_node_names() or "ready" in node.output
+        )  # at times it is that quick
         node.popen.send_signal(number)
         assert node.end(5.0) == 0
         assert "Traceback" not in node.output

@@ -15,17 +15,17 @@ from rclpy.node import Node
 from tests.ros.conftest import Start
 from tests.ros.peer import peer
 
-from flight_analysis.bag_reader import read_run
-from flight_analysis.bag_writer import write_run
-from flight_analysis.playback import read_playback
-from flight_analysis.scenario import Scenario
-from flight_analysis.simulate import simulate
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_core.rates import NANOSECONDS
-from flight_recorder.bag import Enclosed
+from flight_log.bag import Enclosed
+from flight_log.playback import read_playback
+from flight_log.tape_reader import read_run
+from flight_log.tape_writer import write_run
 from flight_ros import transport
-from flight_ros.inbox import Inbox
 from flight_ros.messages import stamp_of, to_message
-from flight_ros.topics import CLOCK, INTERNALS, STEP, Y_M, Topic, U, Y
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.topics import CLOCK, INTERNALS, LOCKSTEP, Y_M, Topic, U, Y
 
 MS = 1_000_000
 
@@ -45,7 +45,7 @@ class Listener:
         self._context = Context()
         rclpy.init(context=self._context)
         self._node = Node("listener", context=self._context)
-        self._inboxes = [Inbox(self._node, topic, STEP, raw=True) for topic in topics]
+        self._polled_subscriptions = [PolledSubscription(self._node, topic, LOCKSTEP, raw=True) for topic in topics]
         self.heard: dict[str, list[bytes]] = {topic.name: [] for topic in topics}
         self.sent: dict[str, list[int]] = {topic.name: [] for topic in topics}
 
@@ -54,10 +54,10 @@ class Listener:
         deadline = time.monotonic() + timeout
         while len(self.heard[topic.name]) < count:
             assert time.monotonic() < deadline, f"{len(self.heard[topic.name])} of {count} on {topic.name} within {timeout} s"
-            for inbox in self._inboxes:
-                for received in inbox.take():
-                    self.heard[inbox.topic.name].append(bytes(received.message))
-                    self.sent[inbox.topic.name].append(received.sent_ns)
+            for subscription in self._polled_subscriptions:
+                for received in subscription.take():
+                    self.heard[subscription.topic.name].append(bytes(received.message))
+                    self.sent[subscription.topic.name].append(received.sent_ns)
             time.sleep(0.002)
 
     def close(self) -> None:
@@ -81,7 +81,7 @@ def of(run: Path, topic: str) -> list[bytes]:
 
 def test_a_flight_is_played_byte_by_byte_with_its_timing_and_the_clock_of_the_log(run: Path, start: Start) -> None:
     with listener(Y, Y_M, CLOCK) as ears:
-        process = start("flight_bringup.cli", "play", str(run), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "2")
+        process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "2")
         ears.until(Y, 1001)
         ears.until(Y_M, 1001)
         assert process.end() == 0, process.output
@@ -97,7 +97,7 @@ def test_a_flight_is_played_byte_by_byte_with_its_timing_and_the_clock_of_the_lo
 
 def test_stamps_are_moved_to_now_at_the_rate_and_all_else_stays_as_recorded(run: Path, start: Start) -> None:
     with listener(Y) as ears:
-        process = start("flight_bringup.cli", "play", str(run), "--topics", "y", "--rate", "2", "--start", "1.5")
+        process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--rate", "2", "--start", "1.5")
         ears.until(Y, 251)
         assert process.end() == 0, process.output
     stamps = np.array([stamp_of(message) for message in ears.heard["y"]])
@@ -110,7 +110,7 @@ def test_stamps_are_moved_to_now_at_the_rate_and_all_else_stays_as_recorded(run:
 def test_a_domain_in_which_somebody_publishes_the_topic_is_refused(run: Path, start: Start, domain: int) -> None:
     with peer(()) as someone:
         someone.publish("y", to_message(0, ("q",), np.zeros(1), "peer"))
-        process = start("flight_bringup.cli", "play", str(run), "--topics", "y,y_m")
+        process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
         assert process.end() == 2
     (said,) = process.lines
     assert said.startswith(
@@ -120,7 +120,7 @@ def test_a_domain_in_which_somebody_publishes_the_topic_is_refused(run: Path, st
 
 def test_a_loop_goes_on_until_it_is_interrupted(run: Path, start: Start) -> None:
     with listener(Y) as ears:
-        process = start("flight_bringup.cli", "play", str(run), "--topics", "y", "--start", "1.9", "--loop")
+        process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--start", "1.9", "--loop")
         ears.until(Y, 3 * 51 + 1)
         process.interrupt()
         begin = time.monotonic()
@@ -140,7 +140,7 @@ def lockstep_run(tmp_path_factory: pytest.TempPathFactory, osprey_gust: Scenario
 def test_a_controller_alone_answers_a_lockstep_flight_with_the_same_bytes(
     lockstep_run: Path, osprey_gust: Scenario, start: Start
 ) -> None:
-    flight = start("flight_bringup.cli", "fly", "osprey_gust", "--one-process", "--duration", "2", "--runs", str(lockstep_run))
+    flight = start("flight_cli.cli", "fly", "osprey_gust", "--one-process", "--duration", "2", "--runs", str(lockstep_run))
     assert flight.end(timeout=120) == 0, flight.output
     recorded = lockstep_run / "latest"
     u, said = of(recorded, "u"), of(recorded, "internals")
@@ -148,7 +148,7 @@ def test_a_controller_alone_answers_a_lockstep_flight_with_the_same_bytes(
     with listener(U, INTERNALS) as ears:
         node = start("rise_di_controller.main", "--ros-args", *controller)
         node.wait_for("ready")
-        process = start("flight_bringup.cli", "play", str(recorded), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "3")
+        process = start("flight_cli.cli", "play", str(recorded), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "3")
         ears.until(U, len(u))
         ears.until(INTERNALS, len(said))
         assert process.end() == 0, process.output
@@ -160,7 +160,7 @@ def test_a_controller_in_real_time_flies_along_a_recorded_flight(run: Path, ospr
     with peer() as someone:
         node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
         node.wait_for("ready")
-        process = start("flight_bringup.cli", "play", str(run), "--topics", "y,y_m")
+        process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
         node.wait_for("WAITING -> ENGAGED")
         someone.until(lambda: process.popen.poll() is not None)
         assert process.end() == 0, process.output

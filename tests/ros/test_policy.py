@@ -12,8 +12,8 @@ from tests.ros.conftest import Start
 from tests.ros.peer import Peer, peer
 
 from autopilot_bridge.params import LIBRARY, load_map
-from flight_analysis.scenario import Scenario
-from flight_bringup.node import Monitor
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_bringup.clients import FlightMonitor
 
 POLICY = REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "security" / "flight.policy.xml"
 
@@ -109,7 +109,7 @@ def test_the_policy_names_every_topic_and_service_of_a_flight_and_no_other(
 
 
 def test_the_policy_names_what_the_monitor_of_a_flight_has(osprey_gust: Scenario) -> None:
-    with peer(listen=()) as someone, Monitor(osprey_gust.controller.outputs, lockstep=False):
+    with peer(listen=()) as someone, FlightMonitor(osprey_gust.controller.outputs, lockstep=False):
         assert seen(someone, ("monitor",), allowed())["monitor"] == allowed()["monitor"]
 
 

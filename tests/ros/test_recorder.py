@@ -26,13 +26,13 @@ from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer, peer
 from tests.small_disk import small_disk
 
-from flight_analysis.bag_reader import read_run
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.rates import NANOSECONDS, period_ns
-from flight_recorder.scan import Scan
-from flight_ros.inbox import Inbox
+from flight_log.scan import Scan
+from flight_log.tape_reader import read_run
 from flight_ros.messages import stamp_of, to_message
-from flight_ros.topics import LISTEN, PUBLISH, Y, published
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.topics import NEWEST_SAMPLES, PUBLISH, Y, publisher_qos
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -143,7 +143,7 @@ def test_a_topic_that_never_appears_is_named(start: Start, osprey_gust: Scenario
     process.wait_for("nobody publishes /never; recorded as soon as somebody does")
     someone.until(lambda: said(someone)[2].get("missing /never") == "nobody publishes it")
     stop(process)
-    assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: nobody published it" in line)
+    assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: nobody publisher_qos it" in line)
 
 
 def test_a_topic_whose_type_is_not_installed_is_named(
@@ -297,7 +297,7 @@ def stamps_and_sequences(folder: Path) -> dict[str, tuple[list[int], list[int]]]
 SIGNALS = ("/y", "/y_m", "/u", "/internals", "/truth")
 
 
-def missing_seconds(folder: Path, witness: Inbox) -> float:
+def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
     """How far the file of a recorder is behind what another process has received, on the topic on which it is furthest."""
     received, found = witness.take(), stamps_and_sequences(folder)
     if not received or set(found) != set(SIGNALS):
@@ -310,7 +310,7 @@ def test_twenty_kills_cost_three_tenths_of_a_second_at_most(
     start: Start, osprey_gust: Scenario, tmp_path: Path, publisher: subprocess.Popen[str], someone: Peer
 ) -> None:
     generator = np.random.default_rng(1)
-    witness = Inbox(someone.node, Y, LISTEN, raw=True)
+    witness = PolledSubscription(someone.node, Y, NEWEST_SAMPLES, raw=True)
     missing = []
     following = recorder(start, osprey_gust, "run0")
     for k in range(20):
@@ -341,7 +341,7 @@ def test_twenty_kills_cost_three_tenths_of_a_second_at_most(
 def test_a_flight_whose_recorder_is_killed_has_a_report_and_a_log_that_can_be_repaired(
     start: Start, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    flight = start("flight_bringup.cli", "fly", str(osprey_gust.path), "--duration", "30")
+    flight = start("flight_cli.cli", "fly", str(osprey_gust.path), "--duration", "30")
     wait_for_size(tmp_path / "runs", 150_000, flight)
     node = next(child for child in flight.children() if "flight_recorder.main" in child.cmdline())
     killed_ns = time.time_ns()
@@ -358,11 +358,11 @@ def test_a_flight_whose_recorder_is_killed_has_a_report_and_a_log_that_can_be_re
         "rise_di_host",
         "rise_di_versions",
     }
-    report = start("flight_bringup.cli", "report", str(run))
+    report = start("flight_cli.cli", "report", str(run))
     assert report.end(60.0) == 0, report.output
     assert "has no end: read up to its last whole chunk, t = " in " ".join(report.output.split())
     assert (run / "report.html").stat().st_size > 10_000
-    repair = start("flight_bringup.cli", "repair", str(run))
+    repair = start("flight_cli.cli", "repair", str(run))
     assert repair.end(60.0) == 0, repair.output
     assert "of the 30 s that were to be flown" in repair.output
     counts = {topic: len(those) for topic, those in messages(run).items()}
@@ -375,4 +375,4 @@ def test_a_flight_whose_recorder_is_killed_has_a_report_and_a_log_that_can_be_re
 
 @pytest.mark.parametrize(("rate", "depth"), [(0.1, 1), (100.0, 200), (500.0, 1000), (1000.0, 2000), (5000.0, 2000)])
 def test_a_publisher_keeps_what_two_seconds_hold_for_a_recorder(rate: float, depth: int) -> None:
-    assert published(period_ns(rate, "rate")).depth == depth
+    assert publisher_qos(period_ns(rate, "rate")).depth == depth

@@ -16,10 +16,10 @@ from tests.ros.test_controller import set_parameters, transition
 from tests.ros.test_lockstep import ROUGH, both_cores_busy, scenario_file
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.bag_reader import read_run
-from flight_analysis.gain_selection import with_feedforward
-from flight_analysis.scenario import load_scenario
+from flight_analysis.closed_loop.scenario import load_scenario
+from flight_analysis.design.gain_selection import with_feedforward
 from flight_core.parameters import flatten, nest
+from flight_log.tape_reader import read_run
 from flight_ros.topics import PUBLISH
 from rise_di_controller.guard import Mode
 
@@ -32,7 +32,7 @@ def someone() -> Iterator[Peer]:
 
 def replayed(start: Start, run: Path, *settings: str, status: int = 0) -> dict[str, Any]:
     """What `rise-di replay` says of a run."""
-    process = start("flight_bringup.cli", "replay", str(run), "--json", *settings)
+    process = start("flight_cli.cli", "replay", str(run), "--json", *settings)
     assert process.end() == status, process.output
     found: dict[str, Any] = json.loads(process.output)
     assert found["equal"] is (status == 0)
@@ -40,7 +40,7 @@ def replayed(start: Start, run: Path, *settings: str, status: int = 0) -> dict[s
 
 
 def fly(start: Start, scenario: Path, *options: str) -> Process:
-    return start("flight_bringup.cli", "fly", str(scenario), *options)
+    return start("flight_cli.cli", "fly", str(scenario), *options)
 
 
 def with_limits(path: Path) -> Path:

@@ -18,8 +18,8 @@ from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer, peer
 
-from flight_analysis.scenario import Scenario
-from flight_core.seal import Seal
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.authentication import MessageAuthenticator
 from flight_core.vectors import ChannelError
 from flight_ros.messages import Decoder, Encoder
 from flight_ros.topics import U
@@ -37,11 +37,11 @@ BUSY = 120.0
 # Signed samples, as bytes
 
 
-def sealed(topic: str = "/u", key: bytes = KEY, since_ns: int | None = None) -> Seal:
-    return Seal(key, topic, since_ns)
+def sealed(topic: str = "/u", key: bytes = KEY, since_ns: int | None = None) -> MessageAuthenticator:
+    return MessageAuthenticator(key, topic, since_ns)
 
 
-def u_message(stamp_ns: int, seal: Seal | None = None) -> bytes:
+def u_message(stamp_ns: int, seal: MessageAuthenticator | None = None) -> bytes:
     return Encoder(INPUTS, "/controller#1", seal).encode(stamp_ns, np.array([0.1, 0.2, 0.3, 0.4]))
 
 
@@ -52,7 +52,7 @@ def refusal(decoder: Decoder, raw: bytes) -> str:
 
 
 @pytest.mark.parametrize("seal", [None, sealed()], ids=["no key", "key"])
-def test_a_signed_sample_is_read_with_the_key_and_by_those_who_have_none(seal: Seal | None) -> None:
+def test_a_signed_sample_is_read_with_the_key_and_by_those_who_have_none(seal: MessageAuthenticator | None) -> None:
     decoder = Decoder(INPUTS, seal)
     for stamp_ns in (5, 6, 7):  # the later ones take the short way
         sample = decoder.decode(u_message(stamp_ns, sealed()))
@@ -80,7 +80,7 @@ def test_no_bytes_of_others_pass(raw: bytes) -> None:
     [None, sealed(key=OTHER_KEY), sealed("/two/u"), sealed("/y")],
     ids=["no key", "another key", "another aircraft", "y"],
 )
-def test_a_sample_without_the_key_or_for_another_topic_is_refused(seal: Seal | None) -> None:
+def test_a_sample_without_the_key_or_for_another_topic_is_refused(seal: MessageAuthenticator | None) -> None:
     assert refusal(Decoder(INPUTS, sealed()), u_message(5, seal)) == "mac"
 
 
@@ -207,11 +207,9 @@ def test_a_flight_with_a_key_is_flown_and_signed(
         text = text.replace(f"/**/{name}:\n  ros__parameters:\n", f"/**/{name}:\n  ros__parameters:\n    key_file: {keys[0]}\n")
     scenario = tmp_path / "keyed.yaml"
     scenario.write_text(text, encoding="utf-8")
-    flight = start(
-        "flight_bringup.cli", "fly", str(scenario), "--lockstep", "--duration", "2", "--runs", str(tmp_path / "runs")
-    )
+    flight = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--duration", "2", "--runs", str(tmp_path / "runs"))
     assert flight.end(BUSY) == 0, flight.output
-    flown = start("flight_bringup.cli", "replay", str(tmp_path / "runs" / "latest"))
+    flown = start("flight_cli.cli", "replay", str(tmp_path / "runs" / "latest"))
     assert flown.end(BUSY) == 0, flown.output
     assert "every bit equal" in flown.output
 

@@ -18,5 +18,4 @@ setup(
         ("share/flight_bringup/layouts", sorted(glob("layouts/*"))),
         ("share/flight_bringup/security", sorted(glob("security/*"))),
     ],
-    entry_points={"console_scripts": ["rise-di = flight_bringup.cli:main"]},
 )

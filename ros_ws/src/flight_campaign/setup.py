@@ -7,7 +7,7 @@ setup(
     version="0.1.0",
     description="Thousands of uncertain aircraft at once, and other control laws beside RISE-DI.",
     license="Apache-2.0",
-    packages=["flight_campaign", "flight_campaign.laws"],
+    packages=["flight_campaign"],
     package_data={"flight_campaign": ["tuned/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_campaign"]),

@@ -31,7 +31,7 @@ from tests.small_disk import fill, small_disk
 
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
-from flight_recorder.scan import Scan
+from flight_log.scan import Scan
 from flight_ros.messages import to_message
 from rise_di_controller.guard import Mode
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from tests.ros.faults.flight import Flight
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario
 
 Row = dict[str, str | int | float | bool | None]
 

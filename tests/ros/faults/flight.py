@@ -32,10 +32,11 @@ from flight_bringup.graph import READY
 from flight_bringup.processes import end_with_parent
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.vectors import FloatArray
-from flight_recorder.scan import Scan
+from flight_log.scan import Scan
 from flight_ros import transport
-from flight_ros.inbox import Inbox, Waiter
 from flight_ros.messages import Decoder
+from flight_ros.rclpy_private import WaitSet
+from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import DIAGNOSTICS, INTERNALS, TRUTH, Y_M, Topic, U, Y
 from rise_di_controller.guard import Mode
 
@@ -89,8 +90,8 @@ class Probe:
         rclpy.init(context=self._context)
         self._node = Node("probe", context=self._context, start_parameter_services=False)
         qos = {DIAGNOSTICS: WATCH_LOGS, LOGS: WATCH_LOGS}
-        self._inboxes = {
-            topic.name: Inbox(self._node, topic, qos.get(topic, WATCH), raw=topic not in (DIAGNOSTICS, LOGS))
+        self._polled_subscriptions = {
+            topic.name: PolledSubscription(self._node, topic, qos.get(topic, WATCH), raw=topic not in (DIAGNOSTICS, LOGS))
             for topic in TOPICS
         }
         self.heard: dict[str, deque[Heard]] = {topic.name: deque(maxlen=KEPT) for topic in TOPICS}
@@ -103,7 +104,7 @@ class Probe:
         self._thread.start()
 
     def _listen(self) -> None:
-        waiter = Waiter(list(self._inboxes.values()), self._context)
+        waiter = WaitSet([one.entity for one in self._polled_subscriptions.values()], self._context)
         sample = 0.0
         while not self._ended:
             waiter.wait(NANOSECONDS // 20)
@@ -111,8 +112,10 @@ class Probe:
                 sample = time.monotonic() + SAMPLED
                 self._look_who_waits()
             with self._changed:
-                for name, inbox in self._inboxes.items():
-                    self.heard[name].extend(Heard(seconds(one.received_ns), one.message, one.sequence) for one in inbox.take())
+                for name, subscription in self._polled_subscriptions.items():
+                    self.heard[name].extend(
+                        Heard(seconds(one.received_ns), one.message, one.sequence) for one in subscription.take()
+                    )
                 self._changed.notify_all()
 
     def _look_who_waits(self) -> None:

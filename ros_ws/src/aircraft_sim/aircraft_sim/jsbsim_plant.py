@@ -22,7 +22,7 @@ from aircraft_sim import actuators, guarded, turbulence
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import Unit
 from aircraft_sim.disturbance import AXES, Gusts, one_minus_cosine
-from aircraft_sim.plant import LARGEST
+from aircraft_sim.plant import DIVERGENCE_LIMIT
 from aircraft_sim.turbulence import Turbulence
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
@@ -111,7 +111,7 @@ PROBE_SIZE = 0.02  # by how much it moves each command
 TIMEOUT = 30.0  # s for it all; whatever trims needs less than one
 
 
-class Point(NamedTuple):
+class FlightCondition(NamedTuple):
     """An aircraft of JSBSim in a flight condition: level, straight, gear up, engines running, heading north, no wind."""
 
     name: str  # of the aircraft, without PREFIX
@@ -142,7 +142,7 @@ class Trim(NamedTuple):
     residuals: FloatArray  # (6,) accelerations that are left, in the order of RESIDUALS, SI
 
 
-class Air(NamedTuple):
+class WindModel(NamedTuple):
     """What blows, by the AXES of the wind."""
 
     gusts: Gusts
@@ -209,7 +209,7 @@ class JsbsimVehicle:
     one step later. Raises FlightEnded where the aircraft does not trim, crashes or hangs, each tried in another process first.
     """
 
-    def __init__(self, point: Point, moves: Actuators, air: Air) -> None:
+    def __init__(self, point: FlightCondition, moves: Actuators, air: WindModel) -> None:
         self.point = point
         self._fdm, self.trim = _follow(point, recipe(point))
         paths = [_paths(one, _engines(self._fdm)) for one in INPUTS.values()]
@@ -221,9 +221,9 @@ class JsbsimVehicle:
         self._engines = [self._node(_running(i)) for i in range(_engines(self._fdm))]
         self._moves, self._air = moves, air
         self._still = air.turbulence is None and not air.gusts.speed.any()
-        self._z = None if air.turbulence is None else turbulence.start(air.turbulence)
+        self._z = None if air.turbulence is None else turbulence.initial_state(air.turbulence)
         self._position = np.zeros(len(INPUTS))
-        self._blow(self._wind(0))
+        self._apply_wind(self._wind(0))
         _settle(self._fdm, seconds(point.step_ns))  # one step, so that the aircraft feels the wind of t = 0 from t = 0 on
         self._x = self._deviations()
         self.truth_names = (
@@ -251,7 +251,7 @@ class JsbsimVehicle:
                 self._z = turbulence.step(self._z, normals[k], air)
             after_ns = t_ns + (k + 1) * step_ns
             if not self._still:
-                self._blow(self._wind(after_ns))
+                self._apply_wind(self._wind(after_ns))
             try:
                 self._fdm.run()
             except jsbsim.BaseError as error:
@@ -272,8 +272,8 @@ class JsbsimVehicle:
         return np.concatenate([self._x, self._wind(t_ns), self._position])
 
     def diverged(self) -> bool:
-        """Whether a state is not finite, or above LARGEST in any component."""
-        return not bool(np.all(np.abs(self._x) < LARGEST))
+        """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
+        return not bool(np.all(np.abs(self._x) < DIVERGENCE_LIMIT))
 
     def _deviations(self) -> FloatArray:
         return np.array([node.get_double_value() * si for node, si in self._state_nodes]) - self.trim.states
@@ -290,7 +290,7 @@ class JsbsimVehicle:
         air = self._air.turbulence
         return np.asarray(gusts if air is None else gusts + turbulence.wind(self._z, air))
 
-    def _blow(self, wind: FloatArray) -> None:
+    def _apply_wind(self, wind: FloatArray) -> None:
         along, right, down = (wind / FOOT).tolist()
         heading = self._heading.get_double_value()
         north, east = math.cos(heading), math.sin(heading)
@@ -301,7 +301,7 @@ class JsbsimVehicle:
 
 
 @cache
-def recipe(point: Point) -> Recipe:
+def recipe(point: FlightCondition) -> Recipe:
     """Find the trim and fly for 2 s in a process of its own: whatever crashes or hangs there ends in a sentence here.
 
     Raises FlightEnded.
@@ -315,7 +315,7 @@ def recipe(point: Point) -> Recipe:
 
 def try_out(name: str, speed: float, altitude: float, step_ns: int) -> Recipe:
     """Find the trim, follow it, and fly with each command moved a little; what `recipe` runs. Raises FlightEnded."""
-    point = Point(name, speed, altitude, step_ns)
+    point = FlightCondition(name, speed, altitude, step_ns)
     found = _search(point)
     fdm, _ = _follow(point, found)
     try:
@@ -329,7 +329,7 @@ def try_out(name: str, speed: float, altitude: float, step_ns: int) -> Recipe:
     return found
 
 
-def sideslip_zero(point: Point) -> float:
+def sideslip_zero(point: FlightCondition) -> float:
     """Rate at which sideslip decays (negative) or grows while p and r are held in trim, 1/s: a zero of the aircraft.
 
         beta_dot V = Y_beta beta + Y_u u,  0 = N_beta beta + N_u u  ->  beta_dot = (Y_beta - Y_u N_u^-1 N_beta) beta / V
@@ -387,7 +387,7 @@ def _reason(error: jsbsim.BaseError) -> str:
 # Trim
 
 
-def _search(point: Point) -> Recipe:
+def _search(point: FlightCondition) -> Recipe:
     """The way into trim: level, straight, sideslip 0, the wings banked as far as that takes.
 
     JSBSim's own trim comes first. It takes engines and flight control systems for settled, so they are given time in frozen
@@ -410,7 +410,7 @@ def _search(point: Point) -> Recipe:
     raise FlightEnded(f"{point.title} does not trim at {point.speed:g} m/s and {point.altitude:g} m: {problem}")
 
 
-def _follow(point: Point, way: Recipe) -> tuple[jsbsim.FGFDMExec, Trim]:
+def _follow(point: FlightCondition, way: Recipe) -> tuple[jsbsim.FGFDMExec, Trim]:
     """The aircraft where the recipe leads. Raises FlightEnded where it cannot be loaded."""
     fdm = _loaded(point)
     if way is None:
@@ -423,7 +423,7 @@ def _follow(point: Point, way: Recipe) -> tuple[jsbsim.FGFDMExec, Trim]:
     return fdm, Trim(*_commanded(fdm), states, _residuals(fdm))
 
 
-def _loaded(point: Point) -> jsbsim.FGFDMExec:
+def _loaded(point: FlightCondition) -> jsbsim.FGFDMExec:
     log = _Log()
     jsbsim.set_logger(log)  # of this thread
     fdm = jsbsim.FGFDMExec(None)

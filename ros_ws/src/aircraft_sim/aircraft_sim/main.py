@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executable `aircraft`."""
 
-from flight_ros.start import start
+from flight_ros.startup import start_nodes
 
 
 def main() -> None:
     """Its entry point."""
-    start("aircraft_sim.node:AircraftNode")
+    start_nodes("aircraft_sim.node:AircraftNode")
 
 
 if __name__ == "__main__":

@@ -9,9 +9,9 @@ from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, FloatArray
+from flight_ros.flight_node import FlightNode
 from flight_ros.messages import NO_CHANNELS, StampedVector, instant, stamp_of
-from flight_ros.runtime import FlightNode
-from flight_ros.source import Source
+from flight_ros.publisher_lock import PublisherLock
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, RECORDED, TRUTH, U, Y
 
@@ -30,11 +30,11 @@ class AircraftNode(FlightNode[AircraftParameters]):
         super().__init__("aircraft", AircraftParameters)
         self._simulator = Simulator(self.parameters)
         self._u = np.zeros(len(self._simulator.inputs))
-        self._source = Source()
+        self._source = PublisherLock()
         self._u_stamp_ns = 0  # of the last u
         self._said_silent = False
-        self._u_inbox, self._decoder = self.inbox(U), self.decoder(U, self._simulator.inputs)
-        self._publish_y, self._publish_truth = self.outlet(Y), self.outlet(TRUTH)
+        self._u_subscription, self._decoder = self.subscribe(U), self.decoder(U, self._simulator.inputs)
+        self._publish_y, self._publish_truth = self.advertise(Y), self.advertise(TRUTH)
         self._y_encoder = self.encoder(Y, self._simulator.outputs)
         self._truth_encoder = self.encoder(TRUTH, self._simulator.truth_names)
         if self.parameters.lockstep:
@@ -44,8 +44,8 @@ class AircraftNode(FlightNode[AircraftParameters]):
             self._control_ns = period_ns(self.parameters.control_rate, "control_rate")
             self._end_ns = nanoseconds(self.parameters.duration) or None
             self._nothing = self.encoder(Y, ())
-            self._recorded_inbox = self.inbox(RECORDED)
-            self._publish_clock = self.outlet(CLOCK)
+            self._recorded_subscription = self.subscribe(RECORDED)
+            self._publish_clock = self.advertise(CLOCK)
 
     def period_ns(self) -> int:
         return self._simulator.period_ns
@@ -88,16 +88,16 @@ class AircraftNode(FlightNode[AircraftParameters]):
     def _ahead_of_the_log(self) -> bool:
         if not self.parameters.recorded:
             return False
-        for received in self._recorded_inbox.take():
+        for received in self._recorded_subscription.take():
             self._recorded_ns = stamp_of(received.message)
         return self._number * self.period_ns() >= self._recorded_ns + WINDOW * self.period_ns()
 
-    def awaits(self) -> str:
-        return self._u_inbox.name if not self._answered else self._recorded_inbox.name
+    def awaited_topic(self) -> str:
+        return self._u_subscription.name if not self._answered else self._recorded_subscription.name
 
     def _take_u(self, now_ns: int) -> bool:
         came = False
-        for received in self._u_inbox.take(1 if self.parameters.lockstep else None):  # in lockstep there is one answer
+        for received in self._u_subscription.take(1 if self.parameters.lockstep else None):  # in lockstep there is one answer
             try:
                 sample = self._decoder.decode(received.message)
                 if sample is not None and not self.parameters.lockstep:
@@ -105,13 +105,13 @@ class AircraftNode(FlightNode[AircraftParameters]):
                 if sample is not None:
                     self._source.require(sample.sender, now_ns, self._max_age_ns, self._strange_ns)
             except ChannelError as error:
-                self.reject(self._u_inbox, error.reason, str(error))
+                self.reject(self._u_subscription, error.reason, str(error))
                 continue
             came = True
             if sample is not None:  # else the controller has nothing to say at this instant of a lockstep flight
                 self._accept(sample, now_ns)
         if self._silent(now_ns):
-            self.waiting_for(self._u_inbox)
+            self.warn_no_publisher(self._u_subscription)
             if self._source.name is not None and not self._said_silent:
                 self._said_silent = True
                 self.get_logger().error(self._silence)

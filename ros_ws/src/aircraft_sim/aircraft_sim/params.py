@@ -13,11 +13,11 @@ from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import Airframe, Unit, load_airframe
 from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines
 from aircraft_sim.dynamics import Aircraft, Coupling
-from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, PREFIX, Air, Point, require_aircraft
+from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, PREFIX, FlightCondition, WindModel, require_aircraft
 from aircraft_sim.plant import Plant
 from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
-from flight_core.freshness import fade
+from flight_core.failsafe import failsafe_scale
 from flight_core.parameters import (
     KeyedParameters,
     NonNegative,
@@ -32,7 +32,7 @@ from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray
 
 
-class Channels(NamedTuple):
+class AircraftChannels(NamedTuple):
     """What an aircraft shows to the outside, whatever kind it is."""
 
     outputs: dict[str, Unit]  # in the order of y
@@ -245,25 +245,25 @@ class AircraftParameters(KeyedParameters):
 
     def commanded_share(self, silence_ns: int) -> float:
         """How much of the last u is still commanded after a silence of its controller: `fade` from max_age on."""
-        return fade(silence_ns, nanoseconds(self.max_age + self.hold), nanoseconds(self.ramp))
+        return failsafe_scale(silence_ns, nanoseconds(self.max_age + self.hold), nanoseconds(self.ramp))
 
-    def channels(self) -> Channels:
+    def channels(self) -> AircraftChannels:
         """Outputs and inputs with their units, and the trim speed."""
         if self.is_jsbsim:
-            return Channels(dict(OUTPUTS), dict.fromkeys(INPUTS, "1"), self.point().speed)
+            return AircraftChannels(dict(OUTPUTS), dict.fromkeys(INPUTS, "1"), self.flight_condition().speed)
         airframe = load_airframe(self.airframe)
         inputs = {name: one.unit for name, one in airframe.inputs.items()}
-        return Channels({name: airframe.states[name] for name in airframe.outputs}, inputs, airframe.speed)
+        return AircraftChannels({name: airframe.states[name] for name in airframe.outputs}, inputs, airframe.speed)
 
-    def drawn(self) -> Airframe:
+    def sampled_airframe(self) -> Airframe:
         """The airframe that flies: the one named, or that of `uncertainty` around it."""
         around = self.uncertainty
         return uncertainty.draw(load_airframe(self.airframe), around.A, around.B, around.seed, around.number)
 
     def load(self) -> tuple[Airframe, Aircraft]:
         """The airframe that flies and the arrays of equation (1) in this disturbance, all axes of the wind that it knows."""
-        airframe = self.drawn()
-        gusts = [self.gusts.get(axis, CALM) for axis in airframe.gusts]
+        airframe = self.sampled_airframe()
+        gusts = [self.gusts.get(axis, STILL_AIR) for axis in airframe.gusts]
         direction = [airframe.gust_direction(axis) for axis in airframe.gusts]
         gain, first, second = airframe.products()
         biases = {name: one for name, one in self.bias.items() if one.value != 0.0}
@@ -284,23 +284,23 @@ class AircraftParameters(KeyedParameters):
     def plant(self) -> Plant:
         """What moves as arrays: equation (1), the actuators and the turbulence."""
         airframe, aircraft = self.load()
-        return Plant(aircraft, self.moves(), self.step_ns, self._turbulence(airframe.speed, list(airframe.gusts)))
+        return Plant(aircraft, self.actuator_model(), self.step_ns, self._turbulence(airframe.speed, list(airframe.gusts)))
 
-    def moves(self) -> Actuators:
+    def actuator_model(self) -> Actuators:
         """The actuators as arrays."""
         return Actuators(**{key: _array(values, key in {"lag", "dead_zone"}) for key, values in self.actuators})
 
-    def point(self) -> Point:
+    def flight_condition(self) -> FlightCondition:
         """The aircraft of JSBSim and the condition it flies in. Raises ParameterError where it is none of those."""
         if self.speed is None or self.altitude is None:
             raise ParameterError(f"airframe: found {self.airframe!r}, expected {PREFIX}NAME with a speed and an altitude")
-        return Point(self.airframe.removeprefix(PREFIX), self.speed, self.altitude, self.step_ns)
+        return FlightCondition(self.airframe.removeprefix(PREFIX), self.speed, self.altitude, self.step_ns)
 
-    def air(self) -> Air:
+    def wind_model(self) -> WindModel:
         """What blows around an aircraft of JSBSim, on all axes."""
-        gusts = [self.gusts.get(axis, CALM) for axis in AXES]
+        gusts = [self.gusts.get(axis, STILL_AIR) for axis in AXES]
         arrays = (np.array([getattr(gust, key) for gust in gusts]) for key in Gusts._fields)
-        return Air(Gusts(*arrays), self._turbulence(self.point().speed, AXES))
+        return WindModel(Gusts(*arrays), self._turbulence(self.flight_condition().speed, AXES))
 
     def _turbulence(self, speed: float, axes: Sequence[str]) -> Turbulence | None:
         air = self.turbulence
@@ -324,7 +324,7 @@ class AircraftParameters(KeyedParameters):
         )
 
 
-CALM = Gust(start=0.0, speed=0.0, length=1.0)
+STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)
 
 
 def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:

@@ -12,7 +12,7 @@ from flight_core.integrators import rk4
 from flight_core.rates import divide, seconds
 from flight_core.vectors import Array, array_namespace
 
-LARGEST = 1e6
+DIVERGENCE_LIMIT = 1e6
 """SI. No state of an aircraft comes near it; a diverged loop passes it on its way to infinity."""
 
 
@@ -33,10 +33,10 @@ class AircraftState(NamedTuple):
     turbulence: Array | None = None  # (5,) of its filters; None in calm air
 
 
-def start(plant: Plant) -> AircraftState:
+def initial_state(plant: Plant) -> AircraftState:
     """The state in trim: x = 0, the actuators at 0, and the turbulence, if any, drawn from its stationary distribution."""
     xp = array_namespace(plant.aircraft.A)
-    z = None if plant.turbulence is None else turbulence.start(plant.turbulence)
+    z = None if plant.turbulence is None else turbulence.initial_state(plant.turbulence)
     return AircraftState(xp.zeros_like(plant.aircraft.A[0, :]), xp.zeros_like(plant.aircraft.B[0, :]), z)
 
 
@@ -92,9 +92,9 @@ def advance(
 
 
 def diverged(state: AircraftState) -> bool:
-    """Whether a state is beyond anything that flies: not finite, or above LARGEST in any component."""
+    """Whether a state is beyond anything that flies: not finite, or above DIVERGENCE_LIMIT in any component."""
     xp = array_namespace(state.x)
-    return not bool(xp.all(xp.abs(state.x) < LARGEST))  # False for NaN too
+    return not bool(xp.all(xp.abs(state.x) < DIVERGENCE_LIMIT))  # False for NaN too
 
 
 def output(state: AircraftState, plant: Plant) -> Array:

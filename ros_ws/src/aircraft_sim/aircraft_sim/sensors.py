@@ -47,7 +47,7 @@ class Sample(NamedTuple):
 Underway = tuple[Sample, ...]
 
 
-def start(params: Sensors) -> Drift:
+def initial_drift(params: Sensors) -> Drift:
     """The random walk at sample 0, from zero."""
     return Drift(0, np.zeros_like(params.noise))
 

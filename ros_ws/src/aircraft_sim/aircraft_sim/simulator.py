@@ -26,7 +26,7 @@ class Vehicle(Protocol):
 
     @property
     def truth_names(self) -> tuple[str, ...]:
-        """Channels of `truth` that it knows: "group.name"."""
+        """AircraftChannels of `truth` that it knows: "group.name"."""
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """From t to t + duration with the command u held, deviations from trim, SI."""
@@ -50,7 +50,7 @@ class AirframeVehicle:
     def __init__(self, parameters: AircraftParameters) -> None:
         airframe, _ = parameters.load()
         self._plant = parameters.plant()
-        self._state = plant.start(self._plant)
+        self._state = plant.initial_state(self._plant)
         self._block_ns = 0
         self._block = plant.forcing(0, BLOCK, self._plant)
         self.truth_names = truth.names(airframe)
@@ -83,7 +83,7 @@ class AirframeVehicle:
 def vehicle(parameters: AircraftParameters) -> Vehicle:
     """The vehicle that the parameters name, in trim at t = 0."""
     if parameters.is_jsbsim:
-        return JsbsimVehicle(parameters.point(), parameters.moves(), parameters.air())
+        return JsbsimVehicle(parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model())
     return AirframeVehicle(parameters)
 
 
@@ -97,7 +97,7 @@ class Simulator:
         self._vehicle = vehicle(parameters)
         self._sensors = parameters.sensor_arrays()
         self.truth_names = ("t", *self._vehicle.truth_names, *(f"noise.{name}" for name in self.outputs))
-        self._drift = sensors.start(self._sensors)
+        self._drift = sensors.initial_drift(self._sensors)
         self._underway: Underway = ()
         self._error = np.zeros(len(self.outputs))
         self._number = 0

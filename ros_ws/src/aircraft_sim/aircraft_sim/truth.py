@@ -11,7 +11,7 @@ from flight_core.vectors import FloatArray
 
 
 def names(airframe: Airframe) -> tuple[str, ...]:
-    """Channels of `truth`, group by group.
+    """AircraftChannels of `truth`, group by group.
 
     "x.state", "f.state" (the part of x_dot, all disturbances in it), "gust.axis" (the wind along each axis that the airframe
     knows, 1-cosine gust and turbulence together, m/s), "actuator.input" (the position that has acted up to now).

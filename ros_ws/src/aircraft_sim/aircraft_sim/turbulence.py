@@ -102,7 +102,7 @@ def filters(spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], s
     )
 
 
-def start(params: Turbulence) -> FloatArray:
+def initial_state(params: Turbulence) -> FloatArray:
     """State at t = 0, drawn from the stationary distribution, shape (5,)."""
     normal = draws.generator(0, draws.TURBULENCE_START, params.seed).standard_normal(STATES)
     return np.asarray(params.stationary @ normal)

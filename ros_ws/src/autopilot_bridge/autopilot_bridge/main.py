@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executable `bridge`."""
 
-from flight_ros.start import start
+from flight_ros.startup import start_nodes
 
 
 def main() -> None:
     """Its entry point."""
-    start("autopilot_bridge.node:BridgeNode")
+    start_nodes("autopilot_bridge.node:BridgeNode")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
@@ -18,8 +17,9 @@ from autopilot_bridge.params import BridgeParameters, InputRow, MessageRow, Outp
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError
-from flight_ros.inbox import Inbox
-from flight_ros.runtime import FlightNode
+from flight_ros.flight_node import FlightNode
+from flight_ros.rclpy_private import DeserializationError
+from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import Topic, U, Y
 
@@ -40,15 +40,15 @@ class BridgeNode(FlightNode[BridgeParameters]):
         readers: dict[str, list[tuple[str, OutputRow | OverrideRow]]] = {}
         for name, row in named:
             readers.setdefault(row.topic, []).append((name, row))
-        self._readers: list[tuple[Inbox, list[tuple[str, OutputRow | OverrideRow]]]] = []
+        self._readers: list[tuple[PolledSubscription, list[tuple[str, OutputRow | OverrideRow]]]] = []
         for topic, rows in readers.items():
             kind = message_type(rows[0][1].type)
             for name, row in rows:
                 _require_field(kind(), name, row)
-            self._readers.append((self.inbox(Topic(topic, kind, foreign=True), _qos(self._map.topics[topic])), rows))
+            self._readers.append((self.subscribe(Topic(topic, kind, foreign=True), _qos(self._map.topics[topic])), rows))
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
-        self._u_inbox, self._decoder = self.inbox(U), self.decoder(U, self._bridge.inputs)
-        self._publish_y, self._publish_would_send = self.outlet(Y), self.outlet(WOULD_SEND)
+        self._u_subscription, self._decoder = self.subscribe(U), self.decoder(U, self._bridge.inputs)
+        self._publish_y, self._publish_would_send = self.advertise(Y), self.advertise(WOULD_SEND)
         self._y_encoder = self.encoder(Y, self._bridge.outputs)
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
         self._would_send_encoder = self.encoder(WOULD_SEND, names)
@@ -79,9 +79,9 @@ class BridgeNode(FlightNode[BridgeParameters]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         now_ns += tick.late_ns
-        for inbox, rows in self._readers:
-            for received in inbox.take():
-                self._read(inbox, rows, received.message, received.received_ns or now_ns, now_ns)
+        for subscription, rows in self._readers:
+            for received in subscription.take():
+                self._read(subscription, rows, received.message, received.received_ns or now_ns, now_ns)
         sample = self._bridge.y(now_ns)
         if sample is not None:
             self._publish_y(self._y_encoder.encode(sample.stamp_ns, sample.y))
@@ -93,12 +93,17 @@ class BridgeNode(FlightNode[BridgeParameters]):
         self._say_what_is_missing(now_ns)
 
     def _read(
-        self, inbox: Inbox, rows: list[tuple[str, OutputRow | OverrideRow]], raw: bytes, arrived_ns: int, now_ns: int
+        self,
+        subscription: PolledSubscription,
+        rows: list[tuple[str, OutputRow | OverrideRow]],
+        raw: bytes,
+        arrived_ns: int,
+        now_ns: int,
     ) -> None:
         try:
-            message = deserialize_message(raw, inbox.topic.type)
-        except _rclpy.RMWError as error:
-            self.reject(inbox, "malformed", " ".join(str(error).split()))
+            message = deserialize_message(raw, subscription.topic.type)
+        except DeserializationError as error:
+            self.reject(subscription, "malformed", " ".join(str(error).split()))
             return
         for name, row in rows:
             try:
@@ -111,18 +116,18 @@ class BridgeNode(FlightNode[BridgeParameters]):
                     stamp_ns = stamp.sec * NANOSECONDS + stamp.nanosec
                 self._bridge.take_output(name, read_raw(message, row.field, row.function), stamp_ns, now_ns)
             except ChannelError as error:
-                self.reject(inbox, error.reason, str(error))
+                self.reject(subscription, error.reason, str(error))
 
     def _take_u(self, now_ns: int) -> bool:
         came = False
-        for received in self._u_inbox.take():
+        for received in self._u_subscription.take():
             try:
                 sample = self._decoder.decode(received.message)
                 if sample is not None:
                     self._bridge.take_u(sample.value, sample.sender, now_ns)
                     came = True
             except ChannelError as error:
-                self.reject(self._u_inbox, error.reason, str(error))
+                self.reject(self._u_subscription, error.reason, str(error))
         return came
 
     def _send(self, now_ns: int, slack_ns: int) -> None:
@@ -157,11 +162,11 @@ class BridgeNode(FlightNode[BridgeParameters]):
 
     def _say_what_is_missing(self, now_ns: int) -> None:
         stale = self._bridge.stale(now_ns)
-        for inbox, rows in self._readers:
+        for subscription, rows in self._readers:
             if any(name in stale for name, row in rows if isinstance(row, OutputRow)):
-                self.waiting_for(inbox)
+                self.warn_no_publisher(subscription)
         if self._bridge.u_is_silent(now_ns):
-            self.waiting_for(self._u_inbox)
+            self.warn_no_publisher(self._u_subscription)
 
     def check_graph(self) -> None:
         """Also what keeps the autopilot from hearing: a topic that it takes in another type, or another quality of service."""

@@ -2,19 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The graph of a flight: which nodes there are and what each is told. The launch file and the runner both read it here."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
-import yaml
-
-from aircraft_sim.uncertainty import as_yaml
 from autopilot_bridge.params import ChannelMap, find_map, load_map
-from flight_analysis.scenario import Scenario, scenario_yaml
-from flight_bringup.provenance import provenance
-from flight_core.parameters import ParameterError
-from flight_recorder.bag import Enclosed
+from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
+from flight_analysis.report.run_folder import enclosed
+from flight_log.bag import Enclosed
 
 
 class NodeSpec(NamedTuple):
@@ -47,7 +43,7 @@ BRIDGED = (BRIDGE, REFERENCE_MODEL)  # with an autopilot in the aircraft's place
 WOULD_SEND = "bridge/would_send"
 
 # What each node says of a flight; the bridge also what its map sends to the autopilot.
-SAID: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
+PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
     {
         AIRCRAFT: ("y", "truth"),
         REFERENCE_MODEL: ("y_m",),
@@ -87,17 +83,9 @@ def start_lead(startup: float) -> float:
     return 0.5 + 1.5 * startup
 
 
-# Files made in the folder of a run, for its log
-AIRFRAME = "airframe.yaml"
-PARAMETERS = "parameters.yaml"
-PROVENANCE = "provenance.yaml"
-
-Told = dict[str, str | float | bool | list[str]]
-
-
 def parameters(
     node: NodeSpec, scenario: Scenario, run: Path, start_time: float, *, lockstep: bool, autopilot: Autopilot | None = None
-) -> Told:
+) -> ParameterOverrides:
     """What a process is told beside its section of the scenario file, by name; "node:name" where it holds several nodes.
 
     In real time those that start last are told the instant of t = 0. In lockstep the aircraft is told at which instants it
@@ -128,15 +116,15 @@ def to_play(
     its map sends is left out too.
     """
     within = f"/{namespace.strip('/')}/".replace("//", "/")
-    said = {within + name for node in nodes for name in SAID[node]}
+    said = {within + name for node in nodes for name in PUBLISHED_TOPICS[node]}
     if BRIDGE in nodes and autopilot is not None:
         sent = (message.topic for message in autopilot.chart.messages.values())
         said |= {topic if topic.startswith("/") else within + topic for topic in sent}
     return sorted(set(known) - said)
 
 
-def _told(node: NodeSpec, scenario: Scenario, run: Path, *, lockstep: bool, together: bool) -> Told:
-    told: Told = {"lockstep": lockstep}
+def _told(node: NodeSpec, scenario: Scenario, run: Path, *, lockstep: bool, together: bool) -> ParameterOverrides:
+    told: ParameterOverrides = {"lockstep": lockstep}
     if node is RECORDER:
         told["directory"] = str(run)
     if node is AIRCRAFT and lockstep:
@@ -147,31 +135,9 @@ def _told(node: NodeSpec, scenario: Scenario, run: Path, *, lockstep: bool, toge
     return told
 
 
-def _stored(files: Enclosed) -> Told:
+def _stored(files: Enclosed) -> ParameterOverrides:
     return {
         "scenario_file": str(files.scenario),
         "attach": [str(path) for path in files.attached],
         "metadata_file": str(files.metadata),
     }
-
-
-def enclosed(scenario: Scenario, run: Path, told: Mapping[str, Told] | None = None, further: Sequence[Path] = ()) -> Enclosed:
-    """What the log of a flight holds beside its messages; what is no file yet is made in the folder of the run.
-
-    The scenario, the airframe that flies, every parameter as the nodes validate it (`told`, by the node's name, over the
-    scenario; nothing where the flight has no nodes), `further` files, and `provenance`. Raises ParameterError where it cannot
-    be written.
-    """
-    attached = [_write(run / PARAMETERS, scenario_yaml(scenario, told)), *further]
-    if not scenario.aircraft.is_jsbsim:
-        attached.append(_write(run / AIRFRAME, as_yaml(scenario.aircraft.drawn())))
-    notes = _write(run / PROVENANCE, yaml.safe_dump(provenance(), sort_keys=False))
-    return Enclosed(scenario.path, tuple(attached), notes)
-
-
-def _write(path: Path, text: str) -> Path:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ParameterError(f"{path} cannot be written ({error.strerror}), expected a folder and a disk that can") from None
-    return path

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The four nodes of a flight as objects in one process, in lockstep over the same topics."""
 
-from flight_ros.start import start
+from flight_ros.startup import start_nodes
 
 
 def main() -> None:
     """Its entry point."""
-    start(
+    start_nodes(
         "aircraft_sim.node:AircraftNode",
         "reference_model.node:ReferenceModelNode",
         "rise_di_controller.node:ControllerNode",

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from flight_analysis.scenario import Scenario
+from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_bringup.graph import (
     BRIDGED,
     FIRST,
@@ -28,7 +28,6 @@ from flight_bringup.graph import (
     THEN,
     Autopilot,
     NodeSpec,
-    Told,
     parameters,
     start_lead,
 )
@@ -47,7 +46,7 @@ def end_with_parent() -> list[str]:
 class NodeProcess:
     """One node as a process of its own, its output kept in a file and in the last lines."""
 
-    def __init__(self, node: NodeSpec, scenario_file: Path, told: Told, log: Path) -> None:
+    def __init__(self, node: NodeSpec, scenario_file: Path, told: ParameterOverrides, log: Path) -> None:
         self.node = node
         self.lines: deque[str] = deque(maxlen=20)
         self.ready = threading.Event()
@@ -88,7 +87,7 @@ class NodeProcess:
         return status
 
 
-class Flight:
+class FlightProcesses:
     """All processes of one flight. A context manager: leaving it ends them.
 
     `before_start` is called when the first nodes are ready, before aircraft and reference model start. With an autopilot its

@@ -4,7 +4,7 @@
 
 from pathlib import Path
 
-from flight_analysis.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_core.files import is_file
 from flight_core.parameters import require
 

@@ -17,8 +17,8 @@ from launch.action import Action
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, TimerAction
 
 from autopilot_bridge.params import maps
-from flight_bringup.check_signs_command import require_signs
-from flight_bringup.fly import new_run
+from flight_analysis.design.sign_check import require_signs
+from flight_analysis.report.run_folder import new_run
 from flight_bringup.graph import BRIDGED, CONTROLLER, FIRST, NodeSpec, find_autopilot, parameters, start_lead
 from flight_bringup.launch.stages import (
     BOOLEAN,

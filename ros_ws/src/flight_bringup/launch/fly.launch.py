@@ -16,7 +16,7 @@ import yaml
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, TimerAction
 
-from flight_bringup.fly import new_run
+from flight_analysis.report.run_folder import new_run
 from flight_bringup.graph import AIRCRAFT, FIRST, FLOWN, THEN, NodeSpec, parameters, start_lead
 from flight_bringup.launch.stages import (
     BOOLEAN,

@@ -16,8 +16,7 @@ from launch.events.process import ProcessExited
 from launch_ros.substitutions import ExecutableInPackage
 
 from autopilot_bridge.params import maps
-from flight_analysis.playback import read_playback
-from flight_bringup.fly import new_run, recorded_scenario
+from flight_analysis.report.run_folder import new_run, recorded_scenario
 from flight_bringup.graph import (
     AIRCRAFT,
     BRIDGE,
@@ -43,6 +42,7 @@ from flight_bringup.launch.stages import (
 )
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import require
+from flight_log.playback import read_playback
 from launch import LaunchContext, LaunchDescription
 
 CHOSEN = (RECORDER, CONTROLLER, REFERENCE_MODEL, AIRCRAFT)

@@ -16,11 +16,11 @@ from pydantic import Field
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import matrices
-from flight_analysis.scenario import SCHEMAS, Scenario, check_together
-from flight_campaign.course import Course, chart
+from control_laws import rise_di
+from control_laws.rise_di import RiseParams
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, check_together
+from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
-from flight_campaign.laws import rise
-from flight_campaign.laws.rise import RiseParams
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.parameters import ParameterError, Parameters, require
 from flight_core.vectors import FloatArray
@@ -142,7 +142,7 @@ def chunk_flown(text: str, job: Job) -> Chunk:
     # The last chunk flies as many as the others, so that nothing is compiled again; those beyond the campaign are left out.
     A, B = matrices(load_airframe(scenario.aircraft.airframe), part, part, definition.seed, first, definition.chunk)
     flying = fleet.assemble(A, B, scenario.aircraft.plant(), course)
-    flown = fleet.fly(flying, vehicle, course, rise.pilot(scenario.controller.law().sign), params)
+    flown = fleet.fly(flying, vehicle, course, rise_di.control_law(scenario.controller.law().sign), params)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (flown.rms, flown.max, flown.slew))
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs))}
@@ -156,7 +156,7 @@ def _prepare(text: str, case: int) -> "_Prepared":
     from flight_campaign import fleet  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
-    return _Prepared(scenario, chart(scenario), fleet.vehicle(scenario), rise.params(scenario.controller))
+    return _Prepared(scenario, build_course(scenario), fleet.vehicle(scenario), rise_di.params(scenario.controller))
 
 
 class Campaign:

@@ -18,18 +18,18 @@ from scipy.sparse.csgraph import connected_components
 from aircraft_sim import actuators, dynamics, sensors
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.dynamics import Aircraft, Coupling
-from aircraft_sim.plant import LARGEST, Plant
-from flight_analysis.scenario import Scenario
-from flight_campaign.course import Course
-from flight_campaign.pilot import Pilot, Seen
+from aircraft_sim.plant import DIVERGENCE_LIMIT, Plant
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_campaign.benchmark_course import Course
 from flight_core.integrators import rk4
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
+from rise_di_controller.control_law import ControlLaw, Measurements
 
 jax.config.update("jax_enable_x64", True)  # float64 as everywhere else in the stack
 
 
-class Block(NamedTuple):
+class StateBlock(NamedTuple):
     """States that move each other and what moves them, as places in x and in [x, p_1, ..., p_K, s]. Hashable."""
 
     rows: tuple[int, ...]
@@ -44,7 +44,7 @@ class Fleet(NamedTuple):
         x+ = tick @ [x, p_1, ..., p_K, s] + wind forced @ [w_1, ..., w_K]
     """
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[StateBlock, ...]
     tick: tuple[Array, ...]  # (n, n + K m + q, N), block by block: what is 0 in all aircraft is left out
     forced: Array  # (n, K r, N)
     rate: Array  # (m, n + m, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, but for the rest
@@ -81,13 +81,13 @@ def vehicle(scenario: Scenario) -> Vehicle:
     )
 
 
-class Flown(NamedTuple):
+class FleetResult(NamedTuple):
     """How N flights went, by channel in the law's order; seen at the controller's ticks. Errors are true ones, C x - y_m."""
 
     rms: Array  # (m, N)
     max: Array  # (m, N)
     slew: Array  # (m, N) mean abs(u_dot), units of u / s
-    diverged: Array  # (N,) bool: the state went beyond LARGEST, the other figures mean nothing
+    diverged: Array  # (N,) bool: the state went beyond DIVERGENCE_LIMIT, the other figures mean nothing
 
 
 def assemble(A: FloatArray, B: FloatArray, plant: Plant, course: Course, wind: Array = 1.0, late: Array = 0) -> Fleet:
@@ -156,34 +156,34 @@ def _rest(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
     return felt, aircraft._replace(gravity=aircraft.gravity[np.ix_(rows, felt)], coupling=coupling)
 
 
-def _blocks(moves: NDArray[np.bool_]) -> tuple[Block, ...]:
+def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
     """The connected parts of the states, `moves` of shape (n, columns); longitudinal and lateral motion, as a rule."""
     number, part = connected_components(moves[:, : len(moves)], directed=False)
     rows = [np.flatnonzero(part == k) for k in range(number)]
-    return tuple(Block(tuple(row.tolist()), tuple(np.flatnonzero(moves[row].any(axis=0)).tolist())) for row in rows)
+    return tuple(StateBlock(tuple(row.tolist()), tuple(np.flatnonzero(moves[row].any(axis=0)).tolist())) for row in rows)
 
 
 def _linear(t: Any, x: Array, u: Array, L: Array) -> Array:
     return L @ x + u
 
 
-def fly(fleet: Fleet, vehicle: Vehicle, course: Course, pilot: Pilot, params: Any) -> Flown:
+def fly(fleet: Fleet, vehicle: Vehicle, course: Course, control_law: ControlLaw, params: Any) -> FleetResult:
     """Fly N aircraft through the course under one law, from trim at rest.
 
     At each tick: the sensors, the law's step (or engagement, or nothing, as the course has it), the actuators through the K
     steps to the next tick, the aircraft there. The rest s is taken at the middle of a tick, from this tick's and the last.
     Arguments: `params` of the law, (m, 1) or (m, N).
     """
-    legs = Legs(*(jnp.asarray(getattr(course, name)) for name in Legs._fields))
+    segments = Segments(*(jnp.asarray(getattr(course, name)) for name in Segments._fields))
     late = int(np.max(np.asarray(fleet.late)))
     arrays = fleet._replace(blocks=())
     return _fly(
         arrays,
         vehicle,
-        legs,
+        segments,
         params,
         course.period,
-        pilot=pilot,
+        control_law=control_law,
         blocks=fleet.blocks,
         steps=course.steps,
         y_late=course.late,
@@ -191,7 +191,7 @@ def fly(fleet: Fleet, vehicle: Vehicle, course: Course, pilot: Pilot, params: An
     )
 
 
-class Legs(NamedTuple):
+class Segments(NamedTuple):
     """The parts of a course that change from tick to tick."""
 
     t: Array
@@ -207,7 +207,7 @@ class Legs(NamedTuple):
     air: Array
 
 
-class Carried(NamedTuple):
+class LoopState(NamedTuple):
     """What is carried from tick to tick."""
 
     x: Array  # (n, N)
@@ -223,68 +223,68 @@ class Carried(NamedTuple):
     flies: Array  # (N,)
 
 
-@partial(jax.jit, static_argnames=("pilot", "blocks", "steps", "y_late", "u_late"))
+@partial(jax.jit, static_argnames=("control_law", "blocks", "steps", "y_late", "u_late"))
 def _fly(
     fleet: Fleet,
     vehicle: Vehicle,
-    legs: Legs,
+    segments: Segments,
     params: Any,
     period: Array,
     *,
-    pilot: Pilot,
-    blocks: tuple[Block, ...],
+    control_law: ControlLaw,
+    blocks: tuple[StateBlock, ...],
     steps: int,
     y_late: int,
     u_late: int,
-) -> Flown:
+) -> FleetResult:
     n, count, m = len(fleet.forced), len(fleet.wind), len(vehicle.outputs)
     places = np.argsort([row for block in blocks for row in block.rows])  # of the states among those of the blocks
 
-    def seen(now: Carried, y: Array, leg: Legs) -> Seen:
+    def seen(now: LoopState, y: Array, segment: Segments) -> Measurements:
         measured = now.x.at[vehicle.outputs].set(y)
-        forced = _product(fleet.forced_rate[..., None], leg.forcing_now)
+        forced = _product(fleet.forced_rate[..., None], segment.forcing_now)
         moving = _product(fleet.rate, [*now.x, *now.position]) + fleet.wind * forced
         position = now.position[vehicle.inputs]
-        reference = (leg.seen_y_m[:, None], leg.seen_y_m_dot[:, None], leg.u_ff[:, None])
-        return Seen(y, *reference, now.u, position, measured, measured - fleet.wind * leg.air[:, None], moving)
+        reference = (segment.seen_y_m[:, None], segment.seen_y_m_dot[:, None], segment.u_ff[:, None])
+        return Measurements(y, *reference, now.u, position, measured, measured - fleet.wind * segment.air[:, None], moving)
 
     # A branch looks for itself: what its law does not look at is then not worked out.
-    def engage(now: Carried, y: Array, leg: Legs) -> tuple[Any, Array]:
-        started = pilot.start(seen(now, y, leg), params)
+    def engage(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
+        started = control_law.start(seen(now, y, segment), params)
         return jax.tree.map(lambda one, like: jnp.broadcast_to(one, like.shape).astype(like.dtype), started, now.law), now.u
 
-    def step(now: Carried, y: Array, leg: Legs) -> tuple[Any, Array]:
-        return pilot.step(now.law, seen(now, y, leg), leg.dt, params)
+    def step(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
+        return control_law.step(now.law, seen(now, y, segment), segment.dt, params)
 
-    def hold(now: Carried, y: Array, leg: Legs) -> tuple[Any, Array]:
+    def hold(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
         return now.law, now.u
 
-    def tick(now: Carried, leg: Legs) -> tuple[Carried, None]:
+    def tick(now: LoopState, segment: Segments) -> tuple[LoopState, None]:
         true = now.x[vehicle.outputs]
-        e = true - leg.y_m[:, None]
-        y = true + leg.error[:, None]
+        e = true - segment.y_m[:, None]
+        y = true + segment.error[:, None]
         if vehicle.quantum is not None:
             y = sensors.quantised(y, vehicle.quantum)
         y, y_before = _delayed(y, now.y_before, y_late)
-        law, u = jax.lax.switch(leg.phase, (hold, engage, step), now, y, leg)
+        law, u = jax.lax.switch(segment.phase, (hold, engage, step), now, y, segment)
         history = jnp.concatenate([u[None], now.u_before])
         acting = u if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
         command, position, positions = acting[jnp.argsort(vehicle.inputs)], now.position, []
         for k in range(steps):
             moved = actuators.step(position, command, vehicle.dt, vehicle.actuators)
-            position = actuators.fail(leg.t + k * vehicle.dt, position, moved, vehicle.actuators)
+            position = actuators.fail(segment.t + k * vehicle.dt, position, moved, vehicle.actuators)
             positions.extend(position)
         rest = of_rest(now.x[vehicle.felt], vehicle.rest)
         moves = [*now.x, *positions, *(1.5 * rest - 0.5 * now.rest)]
         parts = [_product(part, [moves[j] for j in block.columns]) for part, block in zip(fleet.tick, blocks, strict=True)]
         x = jnp.concatenate(parts)[places]
         x = jax.lax.cond(
-            jnp.any(leg.forcing != 0.0),
-            lambda x: x + fleet.wind * _product(fleet.forced, leg.forcing),
+            jnp.any(segment.forcing != 0.0),
+            lambda x: x + fleet.wind * _product(fleet.forced, segment.forcing),
             lambda x: x,
             x,
         )
-        after = Carried(
+        after = LoopState(
             x,
             position,
             rest,
@@ -295,13 +295,13 @@ def _fly(
             now.squares + e * e,
             jnp.maximum(now.max, jnp.abs(e)),
             now.moved + jnp.abs(u - now.u),
-            now.flies & (jnp.max(jnp.abs(now.x), axis=0) < LARGEST),  # False for NaN too
+            now.flies & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # False for NaN too
         )
         return after, None
 
     none = jnp.zeros((m, count))
-    first = jax.tree.map(lambda leg: leg[0], legs)
-    begin = Carried(
+    first = jax.tree.map(lambda segment: segment[0], segments)
+    begin = LoopState(
         jnp.zeros((n, count)),
         none,
         jnp.zeros((len(vehicle.rest.gravity), count)),
@@ -315,11 +315,11 @@ def _fly(
         jnp.ones(count, dtype=bool),
     )
     looked = seen(begin, none, first)
-    states = jax.eval_shape(lambda: pilot.step(pilot.start(looked, params), looked, first.dt, params)[0])
+    states = jax.eval_shape(lambda: control_law.step(control_law.start(looked, params), looked, first.dt, params)[0])
     begin = begin._replace(law=jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), states))
-    end, _ = jax.lax.scan(tick, begin, legs)
-    ticks = len(legs.t)
-    return Flown(jnp.sqrt(end.squares / ticks), end.max, end.moved / ((ticks - 1) * period), ~end.flies)
+    end, _ = jax.lax.scan(tick, begin, segments)
+    ticks = len(segments.t)
+    return FleetResult(jnp.sqrt(end.squares / ticks), end.max, end.moved / ((ticks - 1) * period), ~end.flies)
 
 
 def _product(matrices: Array, vector: Any) -> Array:

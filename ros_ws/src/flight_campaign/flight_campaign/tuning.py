@@ -12,13 +12,13 @@ import yaml
 
 from aircraft_sim.plant import Plant
 from aircraft_sim.uncertainty import KINEMATIC, uncertain
-from flight_analysis.gain_selection import with_feedforward
-from flight_analysis.scenario import Scenario
+from control_laws.catalogue import LAWS, Gains, Law, start
+from control_laws.nominal_model import NominalModel
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.design.gain_selection import with_feedforward
 from flight_campaign import fleet, statistics
-from flight_campaign.course import Course, chart
-from flight_campaign.fleet import Fleet, Flown, Vehicle
-from flight_campaign.laws.catalogue import LAWS, Gains, Law, start
-from flight_campaign.laws.known import Known
+from flight_campaign.benchmark_course import Course, build_course
+from flight_campaign.fleet import Fleet, FleetResult, Vehicle
 from flight_campaign.statistics import score_units
 from flight_core.files import read_yaml
 from flight_core.parameters import ParameterError, require
@@ -33,7 +33,7 @@ BUSY = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
 NOMINAL, UNCERTAIN, LATE = "nominal", "uncertain", "late"
 """What a cost flies: the nominal aircraft; it and uncertain ones, late inputs with the nominal alone; late inputs with all."""
 
-AIMS = {
+OBJECTIVES = {
     NOMINAL: "the nominal aircraft",
     UNCERTAIN: "the nominal and 6 uncertain aircraft at +-40 %, with late inputs on the nominal one",
     LATE: "the nominal and 6 uncertain aircraft at +-40 %, with late inputs on all of them",
@@ -57,11 +57,11 @@ STEP = 0.005
 """s, of the integration, or a tick where that is shorter: as few steps as keep scores within 1 %."""
 
 
-class Arena(NamedTuple):
+class Benchmark(NamedTuple):
     """Where laws are compared: one scenario, calm and with its gusts; the law's order of channels."""
 
     scenario: Scenario
-    known: Known
+    known: NominalModel
     unit: FloatArray  # (m,) of the errors in a score
     busy: FloatArray  # (m,) of the mean abs(u_dot) in a cost
     plant: Plant
@@ -70,8 +70,8 @@ class Arena(NamedTuple):
     spare: int  # ticks by which u is late in a cost
 
 
-def arena(scenario: Scenario) -> Arena:
-    """The arena of a scenario: its manoeuvre, gusts, actuators and noise; y, y_m and law at one rate, topics take no time.
+def benchmark(scenario: Scenario) -> Benchmark:
+    """The benchmark of a scenario: its manoeuvre, gusts, actuators and noise; y, y_m and law at one rate, topics take no time.
 
     Raises ParameterError for a scenario that a fleet cannot fly, and for outputs in units that a score does not count.
     """
@@ -93,7 +93,7 @@ def arena(scenario: Scenario) -> Arena:
 
     unit = score_units(controller.outputs, airframe.states)
     noise = scenario.aircraft.sensor_arrays().noise[rows]
-    known = Known(
+    known = NominalModel(
         airframe.matrix_a(),
         airframe.matrix_b()[:, columns],
         airframe.matrix_c()[rows],
@@ -111,33 +111,33 @@ def arena(scenario: Scenario) -> Arena:
         of(limits.upper, np.inf),
         np.full(m, np.inf),
     )
-    return Arena(
+    return Benchmark(
         scenario,
         known,
         unit,
         np.array([BUSY[airframe.inputs[name].unit] for name in controller.inputs]),
         scenario.aircraft.plant(),
         fleet.vehicle(scenario),
-        {False: chart(scenario), True: chart(ahead)},
+        {False: build_course(scenario), True: build_course(ahead)},
         SPARE_TICKS if any(controller.lag) else 1,
     )
 
 
-def score(flown: Flown, unit: FloatArray) -> FloatArray:
+def score(flown: FleetResult, unit: FloatArray) -> FloatArray:
     """Sum over the channels of rms of the true error / unit, shape (N,); infinite where a flight diverged."""
     total = statistics.score(np.asarray(flown.rms), unit)
     return np.where(np.asarray(flown.diverged) | ~np.isfinite(total), np.inf, total)
 
 
-def cost(flown: Flown, here: Arena) -> FloatArray:
+def cost(flown: FleetResult, here: Benchmark) -> FloatArray:
     """Score + sum over the channels of mean abs(u_dot) / busy, shape (N,), at most MOST_COST."""
     activity = np.sum(np.asarray(flown.slew) / here.busy[:, None], axis=0)
     total = score(flown, here.unit) + activity
     return np.where(np.isfinite(total), np.minimum(total, MOST_COST), MOST_COST)
 
 
-def fleet_of(A: FloatArray, B: FloatArray, wind: FloatArray, late: FloatArray, here: Arena) -> Fleet:
-    """Aircraft in the arena, shapes as in `fleet.assemble`."""
+def fleet_of(A: FloatArray, B: FloatArray, wind: FloatArray, late: FloatArray, here: Benchmark) -> Fleet:
+    """Aircraft in the benchmark, shapes as in `fleet.assemble`."""
     return fleet.assemble(A, B, here.plant, here.courses[False], wind, late)
 
 
@@ -148,7 +148,7 @@ class Costed(NamedTuple):
     weight: FloatArray  # (F,) of their costs in the sum
 
 
-def costed(aims: str, here: Arena) -> Costed:
+def costed(aims: str, here: Benchmark) -> Costed:
     """The flights of one evaluation: every aircraft in calm air and in gusts, some in gusts with u late by `spare` ticks.
 
     The cost is the mean over the aircraft in calm air + that in the gusts + that of late flights.
@@ -188,7 +188,7 @@ def spread_over(params: Any, flights: int, candidates: int) -> Any:
     return jax.tree.map(spread, params)
 
 
-class Space(NamedTuple):
+class SearchSpace(NamedTuple):
     """Gains as one vector of logarithms."""
 
     names: tuple[str, ...]
@@ -201,12 +201,14 @@ class Space(NamedTuple):
         return dict(zip(self.names, np.split(np.exp(vectors.T), ends), strict=True))
 
 
-def space(begin: Gains) -> Space:
+def space(begin: Gains) -> SearchSpace:
     """The search space around gains of shape (m, 1) or (1, 1)."""
-    return Space(tuple(begin), tuple(len(gain) for gain in begin.values()), np.log(np.concatenate(list(begin.values()))[:, 0]))
+    return SearchSpace(
+        tuple(begin), tuple(len(gain) for gain in begin.values()), np.log(np.concatenate(list(begin.values()))[:, 0])
+    )
 
 
-class Tuned(NamedTuple):
+class TuningResult(NamedTuple):
     """What a search came to."""
 
     gains: dict[str, list[float]]
@@ -216,7 +218,7 @@ class Tuned(NamedTuple):
     evaluations: int  # of each
 
 
-def length(law: Law, here: Arena) -> int:
+def length(law: Law, here: Benchmark) -> int:
     """Generations of a search."""
     return max(GENERATIONS, A_GAIN * len(space(start(law, here.known)).origin))
 
@@ -224,12 +226,12 @@ def length(law: Law, here: Arena) -> int:
 def tune(
     law: Law,
     aims: str,
-    here: Arena,
+    here: Benchmark,
     seeds: tuple[int, ...],
     generations: int | None = None,
     begin: Gains | None = None,
     progress: Callable[[int, float], None] | None = None,
-) -> Tuned:
+) -> TuningResult:
     """The gains of least cost that CMA-ES finds from `begin`, the best of several seeds; all seeds fly together.
 
     The cost of a candidate is the weighted sum over the flights of `costed`. `progress` is told the generation and the least
@@ -240,7 +242,7 @@ def tune(
     searched = space(start(law, here.known) if begin is None else begin)
     flights, weight = costed(aims, here)
     each, candidates = len(weight), POPULATION * len(seeds)
-    flown, pilot, course = repeated(flights, candidates), law.pilot(here.known), here.courses[law.ahead]
+    flown, control_law, course = repeated(flights, candidates), law.control_law(here.known), here.courses[law.ahead]
     searches = [
         cma.CMAEvolutionStrategy(searched.origin, SPREAD, {"seed": seed, "popsize": POPULATION, "verbose": -9})
         for seed in seeds
@@ -251,7 +253,7 @@ def tune(
         asked = [np.array(search.ask()) for search in searches]
         vectors = np.concatenate(asked)
         params = spread_over(law.params(searched.gains(vectors), here.known), each, candidates)
-        costs = cost(fleet.fly(flown, here.vehicle, course, pilot, params), here)
+        costs = cost(fleet.fly(flown, here.vehicle, course, control_law, params), here)
         of_each = costs.reshape(candidates, each) @ weight
         for k, (search, found) in enumerate(zip(searches, np.split(of_each, len(seeds)), strict=True)):
             search.tell(list(asked[k]), list(found))
@@ -263,7 +265,7 @@ def tune(
     winner = int(np.argmin([value for value, _ in best]))
     gains = {name: [float(f"{v:.5g}") for v in gain[:, 0]] for name, gain in searched.gains(best[winner][1][None]).items()}
     values = [round(value, 4) for value, _ in best]
-    return Tuned(gains, values[winner], seeds[winner], values, generations * POPULATION)
+    return TuningResult(gains, values[winner], seeds[winner], values, generations * POPULATION)
 
 
 # The files of gains
@@ -274,18 +276,18 @@ def file_of(scenario: Scenario) -> Path:
     return TUNED / f"{scenario.name}.yaml"
 
 
-def load(path: Path) -> dict[str, dict[str, Tuned]]:
-    """Tuned gains by law and aim; empty where there is no file. Raises ParameterError for one that cannot be read."""
+def load(path: Path) -> dict[str, dict[str, TuningResult]]:
+    """TuningResult gains by law and aim; empty where there is no file. Raises ParameterError for one that cannot be read."""
     if not path.exists():
         return {}
     found = read_yaml(path, path.name, "a file of tuned gains")
     try:
-        return {law: {aims: Tuned(**entry) for aims, entry in by_aim.items()} for law, by_aim in found["laws"].items()}
+        return {law: {aims: TuningResult(**entry) for aims, entry in by_aim.items()} for law, by_aim in found["laws"].items()}
     except (TypeError, KeyError, AttributeError) as error:
         raise ParameterError(f"{path.name}: found {error}, expected laws, each with gains by aim") from None
 
 
-def save(path: Path, tuned: Mapping[str, Mapping[str, Tuned]], command: str) -> None:
+def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], command: str) -> None:
     """Write tuned gains, what they cost and the command that finds them."""
     path.parent.mkdir(exist_ok=True)
     laws = {law: {aims: entry._asdict() for aims, entry in by_aim.items()} for law, by_aim in tuned.items()}
@@ -298,7 +300,7 @@ def save(path: Path, tuned: Mapping[str, Mapping[str, Tuned]], command: str) -> 
     path.write_text(head + text, encoding="utf-8")
 
 
-def as_gains(tuned: Tuned) -> Gains:
+def as_gains(tuned: TuningResult) -> Gains:
     """Gains of shape (m, 1) and (1, 1)."""
     return {name: np.array(values)[:, None] for name, values in tuned.gains.items()}
 

@@ -16,10 +16,10 @@ from flight_core.parameters import ParameterError, require
 # "2001-99-99", "!!bool 2") or nests too deeply.
 NOT_YAML = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
-LARGEST_FILE = 1 << 19
+MAX_FILE_BYTES = 1 << 19
 """Bytes: a scenario has 4 kB, metadata.yaml of 500 topics less than this. PyYAML takes up to 0.7 kB and 30 us a byte."""
 
-MOST_NODES = 100_000
+MAX_YAML_NODES = 100_000
 """Values of a file with its aliases written out: a few lines of them may stand for billions."""
 
 
@@ -28,8 +28,8 @@ class _Loader(yaml.SafeLoader):
 
     def get_single_node(self) -> Any:
         node = super().get_single_node()
-        if node is not None and _size(node, {}) > MOST_NODES:
-            raise yaml.composer.ComposerError(None, None, f"found more than {MOST_NODES} values", node.start_mark)
+        if node is not None and _size(node, {}) > MAX_YAML_NODES:
+            raise yaml.composer.ComposerError(None, None, f"found more than {MAX_YAML_NODES} values", node.start_mark)
         return node
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
@@ -70,7 +70,7 @@ def is_folder(path: Path) -> bool:
         return False
 
 
-def open_at_once(path: str | Path) -> BinaryIO:
+def open_nonblocking(path: str | Path) -> BinaryIO:
     """A file for reading; a pipe to which nobody writes is an empty one, and not waited for. Raises OSError, ValueError."""
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
 
@@ -81,11 +81,11 @@ def read_yaml(path: Path, key: str, expected: str) -> Any:
     `key` names the file in the sentence, `expected` what it should be.
     """
     try:
-        with open_at_once(path) as stream:
-            content = stream.read(LARGEST_FILE + 1)
+        with open_nonblocking(path) as stream:
+            content = stream.read(MAX_FILE_BYTES + 1)
     except (OSError, ValueError) as error:
         raise ParameterError(f"{key}: cannot be read ({error}), expected {expected}") from None
-    require(len(content) <= LARGEST_FILE, key, f"more than {LARGEST_FILE} bytes", expected)
+    require(len(content) <= MAX_FILE_BYTES, key, f"more than {MAX_FILE_BYTES} bytes", expected)
     return parse_yaml(content, key, expected)
 
 

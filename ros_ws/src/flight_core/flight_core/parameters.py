@@ -13,7 +13,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-LONGEST_SENTENCE = 1000
+MAX_SENTENCE_LENGTH = 1000
 """Characters: what is said of bad input does not grow with it."""
 
 
@@ -29,8 +29,8 @@ class ParameterError(ValueError):
     """
 
     def __init__(self, sentence: str) -> None:
-        if len(sentence) > LONGEST_SENTENCE:
-            sentence = f"{sentence[: LONGEST_SENTENCE // 2]} ... {sentence[5 - LONGEST_SENTENCE // 2 :]}"
+        if len(sentence) > MAX_SENTENCE_LENGTH:
+            sentence = f"{sentence[: MAX_SENTENCE_LENGTH // 2]} ... {sentence[5 - MAX_SENTENCE_LENGTH // 2 :]}"
         super().__init__(printable(sentence))
 
 
@@ -81,7 +81,8 @@ class KeyedParameters(NodeParameters):
     """Base of the parameters of a node whose samples can be signed."""
 
     key_file: str = Field(
-        default="", description="file of the key that named vectors are signed and checked with (flight_core.seal); empty: none"
+        default="",
+        description="file of the key that named vectors are signed and checked with (flight_core.authentication); empty: none",
     )
 
 

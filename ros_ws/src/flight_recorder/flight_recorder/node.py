@@ -22,13 +22,13 @@ from rclpy.validate_topic_name import validate_topic_name
 from flight_core.files import is_file
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
-from flight_recorder.bag import LOST, BagWriter, Channel, Enclosed
-from flight_recorder.definitions import definition
-from flight_recorder.disk import free_bytes
+from flight_log.bag import LOST, BagWriter, Channel, Enclosed
+from flight_log.disk import free_bytes
+from flight_log.message_definitions import definition
 from flight_recorder.params import RecorderParameters
-from flight_ros.inbox import Inbox, Received
+from flight_ros.flight_node import NO_PUBLISHER_WARNING_NS, FlightNode
 from flight_ros.messages import instant, stamp_of
-from flight_ros.runtime import WAIT_BEFORE_SAYING_NS, FlightNode
+from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.ticker import Tick
 from flight_ros.topics import FLIGHT, PUBLISH, RECORD, RECORD_FOREIGN, RECORDED, TRUTH, Topic
 
@@ -51,7 +51,7 @@ PARAMETER_EVENTS = Topic("/parameter_events", ParameterEvent, foreign=True)
 class _Source:
     """A topic that is recorded."""
 
-    inbox: Inbox
+    subscription: PolledSubscription
     channel: Channel
     next: int = 0  # the sequence that comes next, 0 before anything has come
     publishers: int = 0  # how many there were when last looked
@@ -65,18 +65,22 @@ class RecorderNode(FlightNode[RecorderParameters]):
         wanted = [self._full_name(name) for name in self.parameters.topics]
         self._bag = self._begin()
         self._sources = [
-            *(self._record(self.inbox(topic, RECORD), [PUBLISH]) for topic in FLIGHT if not topic.foreign),
-            *(self._record(Inbox(self, topic, RECORD_FOREIGN, raw=True), [PUBLISH]) for topic in FLIGHT if topic.foreign),
-            self._record(Inbox(self, LOGS, RECORD, raw=True), [RECORD]),
-            self._record(Inbox(self, PARAMETER_EVENTS, RECORD_FOREIGN, raw=True), [RECORD_FOREIGN]),
+            *(self._record(self.subscribe(topic, RECORD), [PUBLISH]) for topic in FLIGHT if not topic.foreign),
+            *(
+                self._record(PolledSubscription(self, topic, RECORD_FOREIGN, raw=True), [PUBLISH])
+                for topic in FLIGHT
+                if topic.foreign
+            ),
+            self._record(PolledSubscription(self, LOGS, RECORD, raw=True), [RECORD]),
+            self._record(PolledSubscription(self, PARAMETER_EVENTS, RECORD_FOREIGN, raw=True), [RECORD_FOREIGN]),
         ]
-        recorded = {source.inbox.name for source in self._sources}
+        recorded = {source.subscription.name for source in self._sources}
         self._missing = [name for name in dict.fromkeys(wanted) if name not in recorded]
-        self._publish_recorded = self.outlet(RECORDED) if self.parameters.lockstep else None
+        self._publish_recorded = self.advertise(RECORDED) if self.parameters.lockstep else None
         self.lost: Counter[str] = Counter()
         self._ended = ""  # why it no longer records
         self._flushed_ns = self._emptied_ns = self._disk_ns = time.monotonic_ns()
-        self._patience_ns = time.monotonic_ns() + WAIT_BEFORE_SAYING_NS
+        self._patience_ns = time.monotonic_ns() + NO_PUBLISHER_WARNING_NS
         self.get_logger().info(f"recording to {self._bag.path}")
 
     def _full_name(self, name: str) -> str:
@@ -111,8 +115,10 @@ class RecorderNode(FlightNode[RecorderParameters]):
         free, least = free_bytes(directory) / MEGABYTE, self.parameters.min_free
         return "" if free >= least else f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB"
 
-    def _record(self, inbox: Inbox, offered: Sequence[QoSProfile]) -> _Source:
-        return _Source(inbox, self._bag.add_topic(inbox.name, _type_name(inbox.topic.type), _qos_yaml(offered)))
+    def _record(self, subscription: PolledSubscription, offered: Sequence[QoSProfile]) -> _Source:
+        return _Source(
+            subscription, self._bag.add_topic(subscription.name, _type_name(subscription.topic.type), _qos_yaml(offered))
+        )
 
     def period_ns(self) -> int:
         return period_ns(self.parameters.rate, "rate")
@@ -130,9 +136,9 @@ class RecorderNode(FlightNode[RecorderParameters]):
         self._write()
 
     def _write(self) -> None:
-        """Empty the inboxes, and now and then do what need not be done at each tick."""
+        """Empty the polled_subscriptions, and now and then do what need not be done at each tick."""
         now_ns = self._emptied_ns = time.monotonic_ns()
-        kept_up = self._empty_inboxes()
+        kept_up = self._drain_subscriptions()
         if self._publish_recorded is not None and kept_up is not None:
             self._publish_recorded(instant(kept_up))
         if now_ns - self._flushed_ns < FLUSH_PERIOD_NS or self._ended:
@@ -151,26 +157,26 @@ class RecorderNode(FlightNode[RecorderParameters]):
         if sentence := self._short_of_space(self._bag.directory):
             self._end(f"min_free: {sentence}")
 
-    def _empty_inboxes(self) -> int | None:
+    def _drain_subscriptions(self) -> int | None:
         """Write all that has come; the instant of the newest sample of `truth`, where one has, ns."""
         newest = None
         for source in self._sources:
-            received = source.inbox.take()
-            if received and source.inbox.topic is TRUTH:
+            received = source.subscription.take()
+            if received and source.subscription.topic is TRUTH:
                 newest = stamp_of(received[-1].message)
             if not self._ended:
                 self._guarded(partial(self._append, source, received))
         return newest
 
-    def _append(self, source: _Source, received: Sequence[Received]) -> None:
+    def _append(self, source: _Source, received: Sequence[ReceivedMessage]) -> None:
         write, channel = self._bag.write, source.channel
         # Several nodes may publish on a foreign topic: their sequences interleave and tell nothing.
-        counted = not source.inbox.topic.foreign
+        counted = not source.subscription.topic.foreign
         for message, sent_ns, received_ns, sequence in received:
             write(channel, received_ns, sent_ns, sequence, message)
             if counted:
                 if sequence > source.next > 0:
-                    self._say_lost(source.inbox.name, sequence - source.next)
+                    self._say_lost(source.subscription.name, sequence - source.next)
                 source.next = sequence + 1
 
     def _say_lost(self, name: str, count: int) -> None:
@@ -205,7 +211,10 @@ class RecorderNode(FlightNode[RecorderParameters]):
 
     def _look_for_weaker(self) -> None:
         for source in self._sources:
-            if source.inbox.topic.foreign and (count := self.count_publishers(source.inbox.name)) != source.publishers:
+            if (
+                source.subscription.topic.foreign
+                and (count := self.count_publishers(source.subscription.name)) != source.publishers
+            ):
                 source.publishers = count
                 self._fit(source)
 
@@ -215,7 +224,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
                 self._missing.remove(name)
                 self._subscribe(name, offered[0].topic_type)
         if self._missing and now_ns > self._patience_ns:
-            self._patience_ns = now_ns + 10 * WAIT_BEFORE_SAYING_NS
+            self._patience_ns = now_ns + 10 * NO_PUBLISHER_WARNING_NS
             self.get_logger().warning(f"nobody publishes {', '.join(self._missing)}; recorded as soon as somebody does")
 
     def _subscribe(self, name: str, type_name: str) -> None:
@@ -228,14 +237,14 @@ class RecorderNode(FlightNode[RecorderParameters]):
             return
         offered = self._offered(name, type_name)
         self._sources.append(
-            self._record(Inbox(self, Topic(name, message, foreign=True), _fitting(offered), raw=True), offered)
+            self._record(PolledSubscription(self, Topic(name, message, foreign=True), _fitting(offered), raw=True), offered)
         )
 
     def check_graph(self) -> None:
         super().check_graph()
         for source in self._sources:
-            name, type_name = source.inbox.name, source.channel.type.name
-            for peer in self.get_publishers_info_by_topic(name) if source.inbox.topic.foreign else ():
+            name, type_name = source.subscription.name, source.channel.type.name
+            for peer in self.get_publishers_info_by_topic(name) if source.subscription.topic.foreign else ():
                 if peer.topic_type != type_name:
                     node = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
                     sentence = f"{name}: {node} publishes {peer.topic_type}, expected {type_name}"
@@ -246,15 +255,15 @@ class RecorderNode(FlightNode[RecorderParameters]):
 
     def _fit(self, source: _Source) -> None:
         """Ask for less where somebody has come who offers less."""
-        inbox, name = source.inbox, source.inbox.name
+        subscription, name = source.subscription, source.subscription.name
         offered = self._offered(name, source.channel.type.name)
-        if all(qos_check_compatible(one, inbox.qos)[0] != QoSCompatibility.ERROR for one in offered):
+        if all(qos_check_compatible(one, subscription.qos)[0] != QoSCompatibility.ERROR for one in offered):
             return
         # Volatile: what was kept for those who come late has been recorded already.
-        weaker = QoSProfile(depth=inbox.qos.depth, reliability=_fitting(offered).reliability)
-        self._empty_inboxes()
-        self.destroy_subscription(next(one for one in self.subscriptions if one.handle is inbox.handle))
-        source.inbox = Inbox(self, inbox.topic, weaker, raw=True)
+        weaker = QoSProfile(depth=subscription.qos.depth, reliability=_fitting(offered).reliability)
+        self._drain_subscriptions()
+        self.destroy_subscription(subscription.entity)
+        source.subscription = PolledSubscription(self, subscription.topic, weaker, raw=True)
         self.get_logger().info(
             f"{name}: now recorded with {weaker.reliability.short_key}, as not all of its publishers offer more"
         )
@@ -269,7 +278,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
         return level, f"recording to {self._bag.path}", figures
 
     def close(self) -> None:
-        self._empty_inboxes()
+        self._drain_subscriptions()
         if not self._ended:
             self._ended = "recording ended"
             if sentence := self._close_bag():

@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
+from flight_core.authentication import BLANK, MARK, MessageAuthenticator, mac_slice
 from flight_core.rates import NANOSECONDS
-from flight_core.seal import BLANK, MARK, Seal, mac_place
 from flight_core.vectors import ChannelError, FloatArray, select
+from flight_ros.rclpy_private import DeserializationError
 
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
 STAMP = struct.Struct("<iI")  # seconds and nanoseconds, right behind the encapsulation
@@ -59,14 +59,14 @@ class Encoder:
 
     In lockstep the latter say that there is no sample at an instant. Layout by CDR (OMG Common Object Request Broker
     Architecture, 9.3): each value stands at a multiple of its size behind the encapsulation, with zeros in between. With a
-    `seal` each message is signed, behind `frame_id`.
+    `authenticator` each message is signed, behind `frame_id`.
     """
 
-    def __init__(self, names: Sequence[str], frame_id: str, seal: Seal | None = None) -> None:
-        self._seal = seal
+    def __init__(self, names: Sequence[str], frame_id: str, authenticator: MessageAuthenticator | None = None) -> None:
+        self._authenticator = authenticator
         self._bytes = bytearray(ENCAPSULATION + bytes(STAMP.size))
-        self._add_string(frame_id + BLANK if seal is not None else frame_id)
-        self._mac = mac_place(self._bytes)
+        self._add_string(frame_id + BLANK if authenticator is not None else frame_id)
+        self._mac = mac_slice(self._bytes)
         self._add_count(len(names))
         for name in names:
             self._add_string(name)
@@ -94,17 +94,17 @@ class Encoder:
         STAMP.pack_into(self._bytes, STAMP_PLACE, *divmod(stamp_ns, NANOSECONDS))
         self._bytes[self._values] = values.tobytes()
         message = bytes(self._bytes)
-        if self._seal is None:
+        if self._authenticator is None:
             return message
-        return message[: self._mac.start] + self._seal.mac(message) + message[self._mac.stop :]
+        return message[: self._mac.start] + self._authenticator.mac(message) + message[self._mac.stop :]
 
 
 class Decoder:
-    """Bytes of one topic as samples: the wanted channels, by name. With a `seal` those alone that are signed, and new."""
+    """Bytes of one topic as samples: the wanted channels, by name. With an `authenticator`: only signed, new ones."""
 
-    def __init__(self, wanted: Sequence[str], seal: Seal | None = None) -> None:
+    def __init__(self, wanted: Sequence[str], authenticator: MessageAuthenticator | None = None) -> None:
         self._wanted = list(wanted)
-        self._seal = seal
+        self._authenticator = authenticator
         self._fixed = b""  # what does not change between the samples of the last sender
         self._names: list[str] = []
         self._order: list[int] = []
@@ -114,11 +114,11 @@ class Decoder:
 
     def decode(self, raw: bytes) -> StampedVector | None:
         """The sample, None for a vector without channels. Raises ChannelError where it cannot be used."""
-        if self._seal is None:
+        if self._authenticator is None:
             return self._decode(raw)
-        self._seal.check(raw)
+        self._authenticator.check(raw)
         if (sample := self._decode(raw)) is not None:
-            self._seal.let_in(sample.stamp_ns)
+            self._authenticator.accept(sample.stamp_ns)
         return sample
 
     def _decode(self, raw: bytes) -> StampedVector | None:
@@ -144,7 +144,7 @@ class Decoder:
         stamp = message.header.stamp
         if encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position)) != raw:
             return  # it holds more than a named vector; it is read the long way
-        self._names, self._place, self._mac = list(message.name), encoder.place, mac_place(raw)
+        self._names, self._place, self._mac = list(message.name), encoder.place, mac_slice(raw)
         self._sender = _instance(message.header.frame_id)
         self._order = [self._names.index(name) for name in self._wanted]
         self._fixed = self._fixed_part(raw)
@@ -169,5 +169,5 @@ def instant(stamp_ns: int) -> bytes:
 def _message(raw: bytes) -> JointState:
     try:
         return deserialize_message(raw, JointState)
-    except _rclpy.RMWError as error:
+    except DeserializationError as error:
         raise ChannelError("malformed", " ".join(str(error).split())) from None

@@ -15,9 +15,10 @@ from rclpy.signals import SignalHandlerOptions
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_ros import transport
+from flight_ros.event_loop import IDLE_POLL_PERIOD
+from flight_ros.flight_node import ACKNOWLEDGE_TIMEOUT
 from flight_ros.messages import STAMP, STAMP_PLACE, instant
-from flight_ros.runtime import ACKNOWLEDGED_WITHIN, NICE_PAUSE
-from flight_ros.topics import CLOCK, STEP
+from flight_ros.topics import CLOCK, LOCKSTEP
 
 DISCOVERY = 1.0  # s, for somebody who is there to be found
 MATCHING = 0.5  # s, for listeners to be found by the publishers
@@ -46,8 +47,8 @@ class Player:
         self._node = rclpy.create_node("player", start_parameter_services=False, enable_rosout=False)
         try:
             self._require_alone([topic for topic in (*types, CLOCK.name) if topic not in shared])
-            self._publishers = {topic: self._node.create_publisher(kind, topic, STEP) for topic, kind in kinds.items()}
-            self._clock = self._node.create_publisher(CLOCK.type, CLOCK.name, STEP)
+            self._publishers = {topic: self._node.create_publisher(kind, topic, LOCKSTEP) for topic, kind in kinds.items()}
+            self._clock = self._node.create_publisher(CLOCK.type, CLOCK.name, LOCKSTEP)
             time.sleep(MATCHING)
         except BaseException:
             self.__exit__(None, None, None)
@@ -68,7 +69,7 @@ class Player:
                 count = self._node.count_publishers(topic)
                 expected = "nobody there: set ROS_DOMAIN_ID to a domain of its own, or choose other --topics"
                 require(count == 0, f"ROS_DOMAIN_ID {domain}", f"{count} publishers of {topic} already", expected)
-            time.sleep(NICE_PAUSE)
+            time.sleep(IDLE_POLL_PERIOD)
 
     def play(
         self, messages: Iterable[Outgoing], rate: float, *, stamps_now: bool, progress: Callable[[int], None] | None = None
@@ -95,7 +96,7 @@ class Player:
             fresh = stamps_now and stamped
             self._publishers[topic].publish(_restamped(message, begin_system_ns, first_ns, rate) if fresh else message)
         for publisher in self._publishers.values():
-            publisher.wait_for_all_acked(ACKNOWLEDGED_WITHIN)
+            publisher.wait_for_all_acked(ACKNOWLEDGE_TIMEOUT)
 
 
 def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
@@ -108,7 +109,7 @@ def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
 
 def _sleep_until(deadline_ns: int) -> None:
     while (pause_ns := deadline_ns - time.monotonic_ns()) > 0:
-        time.sleep(min(pause_ns / NANOSECONDS, NICE_PAUSE))
+        time.sleep(min(pause_ns / NANOSECONDS, IDLE_POLL_PERIOD))
 
 
 def _message_type(topic: str, name: str) -> Any:

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
-AHEAD = 2.5e-4  # s, by which a thread is awake before its deadline to watch the clock for the rest: waking takes 20 to 250 us
-SHARE = 0.2  # of a period, and so of a core, that the watch takes at most
+SPIN_TIME = (
+    2.5e-4  # s, by which a thread is awake before its deadline to watch the clock for the rest: waking takes 20 to 250 us
+)
+MAX_SPIN_FRACTION = 0.2  # of a period, and so of a core, that the watch takes at most
 
 
-def wake_on_time() -> None:
+def disable_timer_slack() -> None:
     """Have the main thread woken at its deadlines, not up to 50 us later, which Linux does to save power. Needs no privilege.
 
     Source: prctl(2), PR_SET_TIMERSLACK. Threads of real-time priority have no slack anyway.
@@ -39,7 +41,7 @@ class Ticker:
 
     def __init__(self, period_ns: int, start_ns: int) -> None:
         self.period_ns = period_ns
-        self._ahead = min(AHEAD, SHARE * period_ns / 1e9)  # s
+        self._ahead = min(SPIN_TIME, MAX_SPIN_FRACTION * period_ns / 1e9)  # s
         self._start_ns = start_ns
         self._last = -1
 

@@ -14,33 +14,35 @@ from sensor_msgs.msg import JointState
 from flight_core.rates import NANOSECONDS
 
 # Publishers are reliable and keep their last samples, so that a recorder that is matched a moment late, or held up, loses
-# nothing. The depth covers two seconds at 1 kHz, as that of the recorder does; see `published`.
+# nothing. The depth covers two seconds at 1 kHz, as that of the recorder does; see `publisher_qos`.
 PUBLISH = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Control loops want the newest samples and never a retransmission. The depth covers the samples between two ticks
 # that are needed to bring y_m to the stamp of y, and those of a stranger at 10 kHz beside them: a u that these had displaced
 # would be lost.
-LISTEN = QoSProfile(depth=128, reliability=ReliabilityPolicy.BEST_EFFORT)
+NEWEST_SAMPLES = QoSProfile(depth=128, reliability=ReliabilityPolicy.BEST_EFFORT)
 # In lockstep every sample counts, from the first one on, whoever is matched late. The depth is for speed: with a history that
 # is full, Fast DDS asks for an acknowledgement of each sample.
-STEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LOCKSTEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Nothing is ever sent with it: the middleware itself says when the process behind it no longer lives. Long enough for one
 # that a busy machine leaves waiting, short enough to end the others within two seconds.
-ALIVE = QoSProfile(depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=1.0))
+LIVELINESS = QoSProfile(depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=1.0))
 RECORD = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # For topics that others publish, whose kept samples cannot be counted on; where one of them offers less, the recorder asks for
 # less.
 RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 
-KEPT_NS = 2 * NANOSECONDS
+HISTORY_NS = 2 * NANOSECONDS
 
 
-def published(period_ns: int) -> QoSProfile:
-    """PUBLISH at a rate: it keeps what it published in the last two seconds.
+def publisher_qos(period_ns: int) -> QoSProfile:
+    """PUBLISH at a rate: it keeps what it publisher_qos in the last two seconds.
 
     More would hold a flight back when a recorder comes: it is sent at once, by the threads that send what is new.
     """
     return QoSProfile(
-        depth=min(max(KEPT_NS // period_ns, 1), PUBLISH.depth), reliability=PUBLISH.reliability, durability=PUBLISH.durability
+        depth=min(max(HISTORY_NS // period_ns, 1), PUBLISH.depth),
+        reliability=PUBLISH.reliability,
+        durability=PUBLISH.durability,
     )
 
 
@@ -49,7 +51,7 @@ class Topic(NamedTuple):
 
     name: str
     type: type
-    foreign: bool = False  # published by others than this stack's nodes
+    foreign: bool = False  # publisher_qos by others than this stack's nodes
 
 
 Y = Topic("y", JointState)

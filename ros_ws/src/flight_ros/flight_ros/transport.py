@@ -31,7 +31,7 @@ def prepare() -> None:
     try:
         ElementTree.parse(profile)  # noqa: S314 - the user's own configuration file, not foreign input
     except (OSError, ElementTree.ParseError) as error:
-        from flight_core.parameters import ParameterError  # noqa: PLC0415 - loads pydantic, see flight_ros.start
+        from flight_core.parameters import ParameterError  # noqa: PLC0415 - loads pydantic, see flight_ros.startup
 
         raise ParameterError(f"{PROFILE_VARIABLE}: {profile} cannot be read ({error}), expected a Fast DDS profile") from None
 
@@ -40,7 +40,7 @@ def open_to_network() -> list[str]:
     """UDP sockets of this process that listen on all interfaces although the loopback profile is in force; should be none."""
     if os.environ.get(PROFILE_VARIABLE) != str(LOOPBACK_PROFILE):
         return []
-    import psutil  # noqa: PLC0415 - see flight_ros.start
+    import psutil  # noqa: PLC0415 - see flight_ros.startup
 
     sockets = psutil.Process().net_connections(kind="udp")
     return [f"{s.laddr.ip}:{s.laddr.port}" for s in sockets if s.laddr and s.laddr.ip in ("0.0.0.0", "::")]  # noqa: S104 - compared, not bound

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executable `reference_model`."""
 
-from flight_ros.start import start
+from flight_ros.startup import start_nodes
 
 
 def main() -> None:
     """Its entry point."""
-    start("reference_model.node:ReferenceModelNode")
+    start_nodes("reference_model.node:ReferenceModelNode")
 
 
 if __name__ == "__main__":

@@ -4,8 +4,8 @@
 
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError
+from flight_ros.flight_node import FlightNode
 from flight_ros.messages import stamp_of
-from flight_ros.runtime import FlightNode
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, U_M, Y_M
 from reference_model.params import ReferenceModelParameters
@@ -21,13 +21,13 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
     def __init__(self) -> None:
         super().__init__("reference_model", ReferenceModelParameters)
         self._reference = Reference(self.parameters)
-        self._publish_y_m = self.outlet(Y_M)
+        self._publish_y_m = self.advertise(Y_M)
         self._encoder = self.encoder(Y_M, self.parameters.outputs)
         if self.parameters.lockstep:
             self._number, self._next = 0, self._reference.sample(0)
-            self._clock_inbox = self.inbox(CLOCK)
+            self._clock_subscription = self.subscribe(CLOCK)
         else:
-            self._u_m_inbox, self._decoder = self.inbox(U_M), self.decoder(U_M, self.parameters.outputs)
+            self._u_m_subscription, self._decoder = self.subscribe(U_M), self.decoder(U_M, self.parameters.outputs)
 
     def period_ns(self) -> int:
         return self._reference.period_ns
@@ -37,20 +37,20 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         self._publish_y_m(self._encoder.encode(now_ns, self._reference.sample(tick.number)))
-        for received in self._u_m_inbox.take():
+        for received in self._u_m_subscription.take():
             try:
                 sample = self._decoder.decode(received.message)
             except ChannelError as error:
-                self.reject(self._u_m_inbox, error.reason, str(error))
+                self.reject(self._u_m_subscription, error.reason, str(error))
                 continue
             if sample is None:
                 continue
             if self._reference.live is None:
-                self.get_logger().info(f"commands come from {self._u_m_inbox.name} now, in place of the profile")
+                self.get_logger().info(f"commands come from {self._u_m_subscription.name} now, in place of the profile")
             self._reference.live = sample.value
 
     def advance(self) -> bool:
-        now_ns = max((stamp_of(received.message) for received in self._clock_inbox.take()), default=-1)
+        now_ns = max((stamp_of(received.message) for received in self._clock_subscription.take()), default=-1)
         if now_ns < 0:
             return False
         while self._number * self.period_ns() <= now_ns:
@@ -59,8 +59,8 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
             self._next = self._reference.sample(self._number)
         return True
 
-    def awaits(self) -> str:
-        return self._clock_inbox.name
+    def awaited_topic(self) -> str:
+        return self._clock_subscription.name
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         level, _, figures = super().status()

@@ -15,7 +15,7 @@ from rise_di_controller.law import Sign, retune
 from rise_di_controller.params import ControllerParameters
 
 
-class Commanded(NamedTuple):
+class ControlOutput(NamedTuple):
     """What a tick has to say."""
 
     stamp_ns: int  # that of the y it answers
@@ -33,13 +33,13 @@ class Controller:
 
     def __init__(self, parameters: ControllerParameters) -> None:
         self._law, self._guard = parameters.law(), parameters.guard()
-        self._state = guard.start(len(parameters.inputs))
+        self._state = guard.initial_state(len(parameters.inputs))
         self.names = internals.names(parameters.outputs, parameters.inputs)
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
         self._digest = parameters.digest()
-        self._y: deque[Sample] = deque(maxlen=guard.KEPT_REFERENCES)
-        self._y_m: deque[Sample] = deque(maxlen=guard.KEPT_REFERENCES)
+        self._y: deque[Sample] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
+        self._y_m: deque[Sample] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
 
     @property
     def mode(self) -> Mode:
@@ -53,7 +53,7 @@ class Controller:
 
     def restart(self) -> None:
         """Begin anew, but with u as it is: it does not jump."""
-        self._state = guard.start(len(self._state.u))._replace(u=self._state.u)
+        self._state = guard.initial_state(len(self._state.u))._replace(u=self._state.u)
 
     def retune(self, parameters: ControllerParameters) -> None:
         """Take new parameters between two ticks, all at once and without a jump of u; the same ones change nothing."""
@@ -83,7 +83,7 @@ class Controller:
             raise ChannelError("order", f"stamp {seconds(sample.stamp_ns - samples[-1].stamp_ns):g} s after the last one")
         samples.append(sample)
 
-    def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> Commanded | None:
+    def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
         """One tick at `now_ns`, `late_ns` after its deadline; None where nothing is to be published."""
         y = self._newest_pair()
         self._state, used = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, active)
@@ -93,7 +93,7 @@ class Controller:
         age = seconds(now_ns - used.stamp_ns)
         limits, digest = self._guard.limits, self._digest
         log = partial(internals.values, self._state, used, limits, seconds(late_ns), age, self._number, digest)
-        return Commanded(used.stamp_ns, self._state.u, log)
+        return ControlOutput(used.stamp_ns, self._state.u, log)
 
     def _newest_pair(self) -> Sample | None:
         """The newest y that y_m reaches; where y_m comes late, a tick takes the y before instead of letting go of u."""

@@ -38,7 +38,7 @@ class FeedforwardState(NamedTuple):
     u_0: Array  # (m,) u_ff at engagement
 
 
-def start(y_m: Array, nominal: Nominal) -> FeedforwardState:
+def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
     """State at engagement: the outputs on y_m, shape (m,), the other states at 0, where the aircraft is trimmed."""
     xp = array_namespace(y_m)
     none, zero = xp.zeros_like(y_m), xp.zeros_like(y_m[0])

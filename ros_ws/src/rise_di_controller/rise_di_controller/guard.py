@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flight_core.freshness import fade
+from flight_core.failsafe import failsafe_scale
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller import feedforward
@@ -44,10 +44,10 @@ class Limits(NamedTuple):
 
 
 # Part of the reach: a slope from samples closer to each other would be more noise than slope, 20 times as much further on.
-APART = 0.05
+MIN_SLOPE_SPAN = 0.05
 
 # Reference samples to keep, so that one of the stamp of y is among them: 0.1 s at 1 kHz, more where y_m is slower.
-KEPT_REFERENCES = 100
+SAMPLE_BUFFER_SIZE = 100
 
 
 class GuardParams(NamedTuple):
@@ -84,7 +84,7 @@ class ControllerState(NamedTuple):
     feedforward: FeedforwardState | None = None
 
 
-class Used(NamedTuple):
+class TickInputs(NamedTuple):
     """What one tick of the controller used, for the log: recomputing the tick from it gives u to the last bit."""
 
     stamp_ns: int  # of y, and so of u; of the tick where no y is used
@@ -94,7 +94,7 @@ class Used(NamedTuple):
     dt: float  # s given to the law, 0 where it took no step
 
 
-def start(m: int) -> ControllerState:
+def initial_state(m: int) -> ControllerState:
     """The state before the first sample: u = 0."""
     zero = np.zeros(m)
     return ControllerState(Mode.WAITING, None, None, None, zero, zero, zero, 0, zero, zero)
@@ -104,7 +104,7 @@ def align(samples: Sequence[Sample], stamp_ns: int, reach_ns: int) -> FloatArray
     """The signal at an instant, shape (m,), None where no sample reaches it.
 
     The sample of that stamp, else linear between its neighbours, else linear beyond the newest by at most `reach_ns`, by the
-    slope from the newest that is APART of it older; where there is none, the newest is held as far.
+    slope from the newest that is MIN_SLOPE_SPAN of it older; where there is none, the newest is held as far.
 
     Arguments: samples with increasing stamps.
     """
@@ -119,7 +119,7 @@ def align(samples: Sequence[Sample], stamp_ns: int, reach_ns: int) -> FloatArray
         return None
     else:
         after = older[-1]
-        apart = [sample for sample in older if after.stamp_ns - sample.stamp_ns >= APART * reach_ns]
+        apart = [sample for sample in older if after.stamp_ns - sample.stamp_ns >= MIN_SLOPE_SPAN * reach_ns]
         if not apart:
             return after.value
         before = apart[-1]
@@ -179,7 +179,7 @@ def tick(
     guard: GuardParams,
     law: LawParams,
     active: bool = True,
-) -> tuple[ControllerState, Used | None]:
+) -> tuple[ControllerState, TickInputs | None]:
     """One tick of the controller: (state, now, y, y_m) -> (state, what was used), u in state.u.
 
     Fresh inputs engage it, at any time, with e_0 = e, both integrals 0 and u_trim = u as it was: u does not jump. Each
@@ -205,9 +205,9 @@ def tick(
             u_trim=state.u,
             u_free=state.u,
             u_ff=np.zeros_like(state.u),
-            feedforward=None if guard.nominal is None else feedforward.start(reference, guard.nominal),
+            feedforward=None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal),
         )
-        return engaged, Used(y.stamp_ns, y.value, reference, offset, 0.0)
+        return engaged, TickInputs(y.stamp_ns, y.value, reference, offset, 0.0)
     if y.stamp_ns <= state.y.stamp_ns:
         return state, None
     nominal = seconds(guard.period_ns)
@@ -222,12 +222,12 @@ def tick(
     if not np.array_equal(u, u_free):  # else the guarded step is the law alone, and takes three times as long
         law_state, u_free, u = guarded_step(state.law, y.value, reference, dt, u_trim, state.u, law, guard.limits)
     flown = state._replace(law=law_state, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ahead)
-    return flown, Used(y.stamp_ns, y.value, reference, offset, dt)
+    return flown, TickInputs(y.stamp_ns, y.value, reference, offset, dt)
 
 
 def _without_inputs(
     state: ControllerState, now_ns: int, guard: GuardParams, active: bool
-) -> tuple[ControllerState, Used | None]:
+) -> tuple[ControllerState, TickInputs | None]:
     y, y_m = state.y, state.y_m
     if y is None or y_m is None:
         return state._replace(mode=Mode.WAITING if active else Mode.INACTIVE), None
@@ -235,7 +235,7 @@ def _without_inputs(
     if state.mode is Mode.ENGAGED or was_active != active:
         state = state._replace(lost_ns=now_ns, u_lost=state.u)
     hold_ns = guard.hold_ns if active else 0
-    share = 1.0 if not active and guard.deactivation_holds else fade(now_ns - state.lost_ns, hold_ns, guard.ramp_ns)
+    share = 1.0 if not active and guard.deactivation_holds else failsafe_scale(now_ns - state.lost_ns, hold_ns, guard.ramp_ns)
     if not active:
         mode = Mode.INACTIVE
     elif share == 1.0:
@@ -243,4 +243,4 @@ def _without_inputs(
     else:
         mode = Mode.RAMP if share > 0.0 else Mode.TRIM
     u = state.u_lost if share == 1.0 else share * state.u_lost
-    return state._replace(mode=mode, u=u, u_free=u), Used(now_ns, y.value, y_m, 0.0, 0.0)
+    return state._replace(mode=mode, u=u, u_free=u), TickInputs(now_ns, y.value, y_m, 0.0, 0.0)

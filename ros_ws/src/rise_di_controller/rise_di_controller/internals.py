@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 
 from flight_core.vectors import FloatArray
-from rise_di_controller.guard import ControllerState, Limits, Used
+from rise_di_controller.guard import ControllerState, Limits, TickInputs
 
 SCALARS = ("mode", "dt", "y_m_offset", "late", "age", "number", "parameters")
 OUTPUT_GROUPS = ("y", "y_m", "e", "e_0", "integral_e", "Pi")
@@ -37,7 +37,7 @@ def names(outputs: Sequence[str], inputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def values(
-    state: ControllerState, used: Used, limits: Limits, late: float, age: float, number: int, parameters: int
+    state: ControllerState, used: TickInputs, limits: Limits, late: float, age: float, number: int, parameters: int
 ) -> FloatArray:
     """Values of `internals` in the order of `names`. Raises ValueError for a state that was never engaged."""
     if state.law is None:

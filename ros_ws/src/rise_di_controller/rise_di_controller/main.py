@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The executable `controller`."""
 
-from flight_ros.start import start
+from flight_ros.startup import start_nodes
 
 
 def main() -> None:
     """Its entry point."""
-    start("rise_di_controller.node:ControllerNode")
+    start_nodes("rise_di_controller.node:ControllerNode")
 
 
 if __name__ == "__main__":

@@ -10,10 +10,10 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError
-from flight_ros.inbox import Inbox
+from flight_ros.flight_node import FlightNode
 from flight_ros.messages import NO_CHANNELS, Decoder
-from flight_ros.runtime import FlightNode
-from flight_ros.source import Source
+from flight_ros.publisher_lock import PublisherLock
+from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
@@ -55,9 +55,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         self._active = False
         self._controller = Controller(self.parameters)
         outputs = self.parameters.outputs
-        self._y_inbox, self._y_decoder = self.inbox(Y), self.decoder(Y, outputs)
-        self._y_m_inbox, self._y_m_decoder = self.inbox(Y_M), self.decoder(Y_M, outputs)
-        self._publish_u, self._publish_internals = self.outlet(U), self.outlet(INTERNALS)
+        self._y_subscription, self._y_decoder = self.subscribe(Y), self.decoder(Y, outputs)
+        self._y_m_subscription, self._y_m_decoder = self.subscribe(Y_M), self.decoder(Y_M, outputs)
+        self._publish_u, self._publish_internals = self.advertise(U), self.advertise(INTERNALS)
         self._u_encoder = self.encoder(U, self.parameters.inputs)
         self._internals_encoder = self.encoder(INTERNALS, self._controller.names)
         if self.parameters.lockstep:
@@ -66,7 +66,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
             self._y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
             self._y_due: deque[Sample | None] = deque()
             self._y_m_due: deque[Sample] = deque()
-        self._y_source, self._y_m_source = Source(), Source()
+        self._y_source, self._y_m_source = PublisherLock(), PublisherLock()
         self._last_ns = 0  # of the last tick
         if self.parameters.autostart:
             self.trigger_configure()
@@ -104,8 +104,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         if self._last_ns and now_ns - self._last_ns > self._max_age_ns:
             self._catch_up(now_ns)
         self._last_ns = now_ns
-        self._take_all(self._y_inbox, self._y_decoder, self._y_source, self._controller.take_y, now_ns)
-        self._take_all(self._y_m_inbox, self._y_m_decoder, self._y_m_source, self._controller.take_y_m, now_ns)
+        self._take_all(self._y_subscription, self._y_decoder, self._y_source, self._controller.take_y, now_ns)
+        self._take_all(self._y_m_subscription, self._y_m_decoder, self._y_m_source, self._controller.take_y_m, now_ns)
         self._fly(now_ns, tick.late_ns)
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._say_what_is_missing(now_ns)
@@ -124,14 +124,19 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         self._fly(now_ns, 0)
 
     def _take_all(
-        self, inbox: Inbox, decoder: Decoder, source: Source, take: Callable[[Sample, int], None], now_ns: int
+        self,
+        subscription: PolledSubscription,
+        decoder: Decoder,
+        source: PublisherLock,
+        take: Callable[[Sample, int], None],
+        now_ns: int,
     ) -> None:
         """All that has come, but for samples that are bad, or of a second publisher.
 
         Another node than the one before is listened to once u has gone to trim.
         """
         strange_ns = self._max_age_ns + nanoseconds(self.parameters.hold + self.parameters.ramp)
-        for received in inbox.take():
+        for received in subscription.take():
             try:
                 decoded = decoder.decode(received.message)
                 if decoded is not None:
@@ -139,23 +144,23 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
                     take(Sample(decoded.stamp_ns, decoded.value), now_ns)
                     source.hear(decoded.sender, now_ns)
             except ChannelError as error:
-                self.reject(inbox, error.reason, str(error))
+                self.reject(subscription, error.reason, str(error))
 
-    def _samples(self, inbox: Inbox, decoder: Decoder) -> Iterator[Sample | None]:
-        for received in inbox.take():
+    def _samples(self, subscription: PolledSubscription, decoder: Decoder) -> Iterator[Sample | None]:
+        for received in subscription.take():
             try:
                 decoded = decoder.decode(received.message)
             except ChannelError as error:
-                self.reject(inbox, error.reason, str(error))
+                self.reject(subscription, error.reason, str(error))
                 yield None
             else:
                 yield None if decoded is None else Sample(decoded.stamp_ns, decoded.value)
 
-    def _take(self, inbox: Inbox, take: Callable[[Sample, int], None], sample: Sample, now_ns: int) -> None:
+    def _take(self, subscription: PolledSubscription, take: Callable[[Sample, int], None], sample: Sample, now_ns: int) -> None:
         try:
             take(sample, now_ns)
         except ChannelError as error:
-            self.reject(inbox, error.reason, str(error))
+            self.reject(subscription, error.reason, str(error))
 
     def _fly(self, now_ns: int, late_ns: int) -> bool:
         before = self._controller.mode
@@ -172,8 +177,10 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
 
     def advance(self) -> bool:
         if not self._y_due:
-            self._y_due.extend(self._samples(self._y_inbox, self._y_decoder))
-        self._y_m_due.extend(sample for sample in self._samples(self._y_m_inbox, self._y_m_decoder) if sample is not None)
+            self._y_due.extend(self._samples(self._y_subscription, self._y_decoder))
+        self._y_m_due.extend(
+            sample for sample in self._samples(self._y_m_subscription, self._y_m_decoder) if sample is not None
+        )
         moved = False
         while self._y_due:
             now_ns = self._number * self._y_period_ns
@@ -182,24 +189,24 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
                 break
             self._number += 1
             if (y := self._y_due.popleft()) is not None:
-                self._take(self._y_inbox, self._controller.take_y, y, now_ns)
+                self._take(self._y_subscription, self._controller.take_y, y, now_ns)
             while self._y_m_due and self._y_m_due[0].stamp_ns <= now_ns:
-                self._take(self._y_m_inbox, self._controller.take_y_m, self._y_m_due.popleft(), now_ns)
+                self._take(self._y_m_subscription, self._controller.take_y_m, self._y_m_due.popleft(), now_ns)
             if due and not self._fly(now_ns, late_ns=0):
                 self._publish_u(self._nothing.encode(now_ns, NO_CHANNELS))
             moved = True
         return moved
 
-    def awaits(self) -> str:
-        return (self._y_m_inbox if self._y_due else self._y_inbox).name
+    def awaited_topic(self) -> str:
+        return (self._y_m_subscription if self._y_due else self._y_subscription).name
 
     def _say_what_is_missing(self, now_ns: int) -> None:
         stale = self._controller.stale(now_ns)
-        for inbox in (self._y_inbox, self._y_m_inbox):
-            if inbox.topic.name in stale:
-                self.waiting_for(inbox)
+        for subscription in (self._y_subscription, self._y_m_subscription):
+            if subscription.topic.name in stale:
+                self.warn_no_publisher(subscription)
         if not stale:
-            pair = f"no {self._y_m_inbox.name} at the stamp of {self._y_inbox.name}"
+            pair = f"no {self._y_m_subscription.name} at the stamp of {self._y_subscription.name}"
             self.get_logger().warning(f"{pair}: is one delayed, or stamped by another clock?", throttle_duration_sec=2.0)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:

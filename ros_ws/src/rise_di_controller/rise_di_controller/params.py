@@ -31,7 +31,7 @@ from rise_di_controller.feedforward import ORIGIN, Nominal, zero_dynamics
 from rise_di_controller.guard import DT_RANGE, GuardParams, Limits
 from rise_di_controller.law import LawParams, Sign, gain, total_lag
 
-LONGEST_STEP = 2.5
+MAX_STABLE_STEP = 2.5
 """A tick of Runge-Kutta times the fastest zero: up to 2.78 it is stable, here with the longest dt that the law is given."""
 
 
@@ -131,7 +131,7 @@ class ControllerParameters(KeyedParameters):
         rightmost, fastest = float(np.max(zeros.real, initial=-np.inf)), float(np.max(np.abs(zeros), initial=0.0))
         stable = "none in the right half plane: along them u_ff grows without bound"
         require(rightmost <= ORIGIN, "feedforward.A", f"zero dynamics with an eigenvalue at {rightmost:.3g} 1/s", stable)
-        limit = LONGEST_STEP / DT_RANGE[1] * self.rate
+        limit = MAX_STABLE_STEP / DT_RANGE[1] * self.rate
         slow = f"at most {limit:.3g} 1/s, which ticks of {self.rate:g} Hz can follow"
         require(fastest <= limit, "feedforward.A", f"zero dynamics as fast as {fastest:.3g} 1/s", slow)
 

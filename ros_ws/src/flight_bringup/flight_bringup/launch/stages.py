@@ -14,8 +14,8 @@ from launch.events.process import ProcessExited, ProcessIO
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from flight_analysis.scenario import Scenario
-from flight_bringup.graph import READY, NodeSpec, Told
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_bringup.graph import READY, NodeSpec, ParameterOverrides
 from flight_bringup.processes import end_with_parent
 from flight_bringup.scenarios import scenarios
 from launch import LaunchContext
@@ -49,7 +49,7 @@ def end_with_launch(context: LaunchContext) -> None:
     context.launch_configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
 
 
-def node(spec: NodeSpec, scenario: Scenario, told: Told) -> Node:
+def node(spec: NodeSpec, scenario: Scenario, told: ParameterOverrides) -> Node:
     """A node of a flight, with its section of the scenario and what it is told beside it."""
     return Node(
         package=spec.package,

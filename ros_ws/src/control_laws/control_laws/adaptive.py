@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Adaptive laws: L1 from outputs alone, and model-reference adaptive inversion from the full state."""
+
+from typing import NamedTuple
+
+from control_laws.nominal_model import NominalModel, decay, limited
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.guard import Limits
+
+ADAPTATION_POLE = 1.0
+"""1/s, of the predictor of L1. It only scales the estimate by a dt / (exp(a dt) - 1), 0.995 at 100 Hz; K takes the rest."""
+
+
+class L1Params(NamedTuple):
+    """Gains over m channels, (m, 1) or (m, N)."""
+
+    K: Array  # 1/s
+    bandwidth: Array  # of the low-pass filter C(s), rad/s
+    limits: Limits
+
+
+class L1State(NamedTuple):
+    """What L1 carries from tick to tick, (m, N)."""
+
+    y_hat: Array  # predicted for the next tick
+    sigma_hat: Array  # what y_dot is beside Omega u, estimated
+    sigma_f: Array  # filtered
+
+
+def l1(known: NominalModel, *, ahead: bool) -> ControlLaw:
+    """L1 adaptive output control with piecewise-constant adaptation. Sees y, y_m and the nominal Omega.
+
+        sigma_hat = -Phi^-1 exp(-a dt) (y_hat - y),  Phi = (1 - exp(-a dt)) / a          a = ADAPTATION_POLE
+        sigma_f  += (1 - exp(-bandwidth dt)) (sigma_hat - sigma_r - sigma_f)
+        u         = u_r - Omega^-1 (K e + sigma_f)
+        y_hat     = y + exp(-a dt) (y_hat - y) + dt Omega u + Phi sigma_hat                for the next tick
+
+    the exact step of y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat. Reference input: u_r = Omega^-1 y_m_dot and
+    sigma_r = 0; `ahead` with the feedforward, which knows the model's part of sigma along the reference, u_r = u_ff and
+    sigma_r = y_m_dot - Omega u_ff, so that it is not cancelled twice. The predictor takes the u that was commanded after its
+    limits: nothing winds up. Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
+    """
+    Omega, inverse = known.Omega, known.inverse
+
+    def start(seen: Measurements, params: L1Params) -> L1State:
+        del params
+        zero = array_namespace(seen.y).zeros_like(seen.y)
+        return L1State(seen.y, zero, zero)
+
+    def step(state: L1State, seen: Measurements, dt: Array, params: L1Params) -> tuple[L1State, Array]:
+        xp = array_namespace(seen.y)
+        off = state.y_hat - seen.y
+        a = ADAPTATION_POLE + xp.zeros_like(params.K)
+        Phi, left = decay(a, dt) / a, xp.exp(-a * dt)
+        sigma_hat = -left / Phi * off
+        u_r = seen.u_ff if ahead else inverse @ seen.y_m_dot
+        sigma_r = seen.y_m_dot - Omega @ u_r
+        sigma_f = state.sigma_f + decay(params.bandwidth, dt) * (sigma_hat - sigma_r - state.sigma_f)
+        wanted = -params.K * (seen.y - seen.y_m) - sigma_f
+        u, _ = limited(u_r + inverse @ wanted, seen, dt, params.limits)
+        y_hat = seen.y + left * off + dt * (Omega @ u) + Phi * sigma_hat
+        return L1State(y_hat, sigma_hat, sigma_f), u
+
+    return ControlLaw(start, step)
+
+
+def l1_params(gains: dict[str, FloatArray], known: NominalModel) -> L1Params:
+    """Parameters from gains K and bandwidth, shapes (m, N)."""
+    return L1Params(gains["K"], gains["bandwidth"], known.limits)
+
+
+class MracParams(NamedTuple):
+    """Gains over m channels, (m, 1) or (m, N)."""
+
+    K: Array  # 1/s
+    adaptation: Array  # of the weights of the states, 1/s^2
+    bias: Array  # of the weight of 1, 1/s^2
+    leak: Array  # (1, N) of all weights, 1/s
+    limits: Limits
+
+
+def mrac(known: NominalModel, *, vanes: bool) -> ControlLaw:
+    """Model-reference adaptive inversion. Sees x, with `vanes` relative to the air, y_m and the nominal model.
+
+        phi = [x / size, 1],  W (m, n + 1) per aircraft, W(0) = 0
+        u   = Omega^-1 (y_m_dot - C (A x + f(x)) - K e - W phi)
+        W  += dt (gamma e phi' - leak W),  gamma = adaptation in the columns of x, bias in that of 1
+
+    the inversion of the nominal model, and beside it weights that learn what it is short of; V = e'e / 2 + sum W~^2 / (2 gamma)
+    falls with e'K e where the shortage is linear in phi and leak is 0. The leak (sigma modification) bounds W under noise.
+    A channel whose u is beyond a limit learns nothing. Source: E. Lavretsky, K. A. Wise, "Robust and Adaptive Control",
+    ch. 9 to 11; P. A. Ioannou, P. V. Kokotovic, Automatica 20(5), 1984, for the leak.
+    """
+    drift, gravity = known.C @ known.A, known.C @ known.gravity
+    inverse, size = known.inverse, known.size[:, None]
+
+    def start(seen: Measurements, params: MracParams) -> Array:
+        del params
+        xp = array_namespace(seen.y)
+        return xp.zeros_like(seen.y[:, None, :] * xp.concat([seen.x, seen.x[:1]])[None, :, :])
+
+    def step(state: Array, seen: Measurements, dt: Array, params: MracParams) -> tuple[Array, Array]:
+        xp = array_namespace(seen.y)
+        x = seen.x_air if vanes else seen.x
+        e = seen.y - seen.y_m
+        phi = xp.concat([x / size, xp.ones_like(x[:1])])
+        wanted = seen.y_m_dot - drift @ x - gravity @ xp.sin(x) - params.K * e - xp.sum(state * phi[None, :, :], axis=1)
+        u, beyond = limited(inverse @ wanted, seen, dt, params.limits)
+        free = xp.where(beyond == 0.0, xp.ones_like(e), xp.zeros_like(e))
+        states = (params.adaptation * e * free)[:, None, :] * phi[None, :-1, :]
+        learned = xp.concat([states, (params.bias * e * free)[:, None, :]], axis=1)
+        return state + dt * (learned - params.leak[None, :, :] * state), u
+
+    return ControlLaw(start, step)
+
+
+def mrac_params(gains: dict[str, FloatArray], known: NominalModel) -> MracParams:
+    """Parameters from gains K, adaptation and bias (m, N), leak (1, N)."""
+    return MracParams(gains["K"], gains["adaptation"], gains["bias"], gains["leak"], known.limits)

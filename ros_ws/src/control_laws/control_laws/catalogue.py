@@ -1,0 +1,162 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Every law that is compared: what it sees, how it flies, which gains are tuned and from where the search starts."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from control_laws import adaptive, indi, inversion, lqi, mackunis, rise_di, rise_observer, super_twisting
+from control_laws.nominal_model import NominalModel
+from flight_core.vectors import FloatArray
+from rise_di_controller.control_law import ControlLaw
+from rise_di_controller.law import Sign
+
+Gains = dict[str, FloatArray]
+"""Gains by name, shape (m, N), or (1, N) where one serves all channels; all of them positive."""
+
+SHARE = 0.4
+"""Bandwidth times the lag of the loop where a search starts."""
+
+EACH = {
+    "beta": 5.0,
+    "root": 1.0,
+    "bandwidth": 15.0,
+    "share": 0.7,
+    "drift": 0.1,
+    "adaptation": 10.0,
+    "bias": 10.0,
+    "integral": 2.0,
+    "effort": 0.05,
+}
+"""Where a search starts in every channel, in scaled inputs and SI; K and Lambda start from the lag of the loop."""
+
+FOR_ALL = {"softening": 3.0, "omega": 1.5, "filter": 12.6, "leak": 0.05, "fade": 4.0, "loose": 0.01}
+"""The same where one number serves all channels."""
+
+GUST = 0.5
+"""m/s per root s, the same for each axis of the wind."""
+
+
+class Law(NamedTuple):
+    """One law."""
+
+    title: str
+    sees: str  # of the flying aircraft, beside y_m
+    model: str  # what it is given of the nominal one, beside D and how much each input does
+    control_law: Callable[[NominalModel], ControlLaw]
+    params: Callable[[Gains, NominalModel], Any]
+    tuned: tuple[str, ...]  # names of its gains
+    ahead: bool = False  # whether it flies with the feedforward
+
+
+def start(law: Law, known: NominalModel) -> Gains:
+    """The gains where the search starts, shapes (m, 1) and (1, 1)."""
+    K = SHARE / known.total_lag[:, None]
+    gains = {"K": K, "Lambda": K / 4.0}
+    gains |= {name: np.full(K.shape, value) for name, value in EACH.items()}
+    gains |= {name: np.full((1, 1), value) for name, value in FOR_ALL.items()}
+    gains["gust"] = np.full((known.wind.shape[1], 1), GUST)
+    return {name: gains[name] for name in law.tuned}
+
+
+def _rise(sign: Sign) -> Callable[[NominalModel], ControlLaw]:
+    return lambda known: rise_di.control_law(sign)
+
+
+_soft, _soft_gains = _rise(Sign.SOFT), ("K", "Lambda", "beta", "softening")
+_full, _air = "full state", "full state, vanes"
+
+LAWS: dict[str, Law] = {
+    "rise": Law("RISE-DI, softened sign", "y", "", _soft, rise_di.of_gains, _soft_gains),
+    "rise_implicit": Law(
+        "RISE-DI, implicit sign", "y", "", _rise(Sign.IMPLICIT), rise_di.of_gains, ("K", "Lambda", "beta", "omega")
+    ),
+    "rise_ff": Law("RISE-DI + feedforward", "y", "A, B, f", _soft, rise_di.of_gains, _soft_gains, ahead=True),
+    "rise_observer": Law(
+        "RISE-DI + feedforward + observer",
+        "y",
+        "A, B, f, wind",
+        partial(rise_observer.control_law, part=rise_observer.PART),
+        rise_observer.observed_params,
+        (*_soft_gains, "effort", "gust", "drift", "loose"),
+        ahead=True,
+    ),
+    "lqg": Law(
+        "LQG + feedforward",
+        "y",
+        "A, B, f, wind",
+        partial(rise_observer.control_law, part=1.0),
+        rise_observer.observed_params,
+        ("effort", "gust", "drift", "loose"),
+        ahead=True,
+    ),
+    "pi": Law("PI", "y", "", _soft, rise_di.of_gains, ("K", "Lambda")),
+    "pi_ff": Law("PI + feedforward", "y", "A, B, f", _soft, rise_di.of_gains, ("K", "Lambda"), ahead=True),
+    "l1": Law("L1", "y", "Omega", partial(adaptive.l1, ahead=False), adaptive.l1_params, ("K", "bandwidth")),
+    "l1_ff": Law(
+        "L1 + feedforward",
+        "y",
+        "A, B, f",
+        partial(adaptive.l1, ahead=True),
+        adaptive.l1_params,
+        ("K", "bandwidth"),
+        ahead=True,
+    ),
+    "twisting": Law(
+        "super-twisting", "y", "Omega", super_twisting.control_law, super_twisting.twisting_params, ("root", "beta")
+    ),
+    "mackunis": Law(
+        "MacKunis RISE, filtered difference",
+        "y",
+        "Omega",
+        partial(mackunis.control_law, ideal=False),
+        mackunis.mackunis_params,
+        ("K", "Lambda", "beta", "softening", "filter"),
+    ),
+    "mackunis_ideal": Law(
+        "MacKunis RISE, perfect y_dot",
+        "y, y_dot",
+        "Omega",
+        partial(mackunis.control_law, ideal=True),
+        mackunis.mackunis_params,
+        ("K", "Lambda", "beta", "softening"),
+    ),
+    "indi": Law("INDI", "y, actuators", "Omega", indi.control_law, indi.indi_params, ("K", "bandwidth", "share")),
+    "di": Law(
+        "dynamic inversion", _full, "A, B, f", partial(inversion.control_law, vanes=False), inversion.inversion_params, ("K",)
+    ),
+    "di_vanes": Law(
+        "dynamic inversion", _air, "A, B, f", partial(inversion.control_law, vanes=True), inversion.inversion_params, ("K",)
+    ),
+    "di_pi": Law(
+        "dynamic inversion + PI",
+        _full,
+        "A, B, f",
+        partial(inversion.control_law, vanes=False),
+        inversion.inversion_params,
+        ("K", "Lambda"),
+    ),
+    "di_pi_vanes": Law(
+        "dynamic inversion + PI",
+        _air,
+        "A, B, f",
+        partial(inversion.control_law, vanes=True),
+        inversion.inversion_params,
+        ("K", "Lambda"),
+    ),
+    "mrac": Law(
+        "MRAC", _full, "A, B, f", partial(adaptive.mrac, vanes=False), adaptive.mrac_params, ("K", "adaptation", "bias", "leak")
+    ),
+    "mrac_vanes": Law(
+        "MRAC", _air, "A, B, f", partial(adaptive.mrac, vanes=True), adaptive.mrac_params, ("K", "adaptation", "bias", "leak")
+    ),
+    "lqi": Law(
+        "LQI", _full, "A, B, f", lambda known: lqi.control_law(vanes=False), lqi.lqi_params, ("integral", "effort", "fade")
+    ),
+    "lqi_vanes": Law(
+        "LQI", _air, "A, B, f", lambda known: lqi.control_law(vanes=True), lqi.lqi_params, ("integral", "effort", "fade")
+    ),
+}

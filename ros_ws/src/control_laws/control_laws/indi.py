@@ -1,0 +1,59 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Incremental nonlinear dynamic inversion. Sees y, y_m, the measured positions of the actuators and the nominal Omega."""
+
+from typing import NamedTuple
+
+from control_laws.nominal_model import NominalModel, decay, limited
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.guard import Limits
+
+
+class IndiParams(NamedTuple):
+    """Gains over m channels, (m, 1) or (m, N)."""
+
+    K: Array  # 1/s
+    bandwidth: Array  # of both filters, rad/s
+    share: Array  # of Omega^-1 that an increment takes, 1 in the textbook
+    limits: Limits
+
+
+class IndiState(NamedTuple):
+    """What it carries from tick to tick, (m, N)."""
+
+    y: Array
+    y_dot: Array  # filtered difference of y
+    position: Array  # filtered
+
+
+def control_law(known: NominalModel) -> ControlLaw:
+    """Each tick inverts the increment of y_dot alone: what the model is wrong about is in the measured y_dot already.
+
+        y_dot_f    += a ((y - y_p) / dt - y_dot_f),  position_f += a (position - position_f),  a = 1 - exp(-bandwidth dt)
+        u           = position_f + share Omega^-1 (y_m_dot - K e - y_dot_f)
+
+    Both filters are the same, so that y_dot_f and position_f belong to one instant; no integral, so nothing winds up.
+    Source: S. Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E. J. J. Smeur, Q. P. Chu, G. C. H. E. de Croon,
+    JGCD 39(3), 2016, for the filters.
+    """
+    inverse = known.inverse
+
+    def start(seen: Measurements, params: IndiParams) -> IndiState:
+        del params
+        return IndiState(seen.y, array_namespace(seen.y).zeros_like(seen.y), seen.position)
+
+    def step(state: IndiState, seen: Measurements, dt: Array, params: IndiParams) -> tuple[IndiState, Array]:
+        a = decay(params.bandwidth, dt)
+        y_dot = state.y_dot + a * ((seen.y - state.y) / dt - state.y_dot)
+        position = state.position + a * (seen.position - state.position)
+        wanted = seen.y_m_dot - params.K * (seen.y - seen.y_m) - y_dot
+        u, _ = limited(position + params.share * (inverse @ wanted), seen, dt, params.limits)
+        return IndiState(seen.y, y_dot, position), u
+
+    return ControlLaw(start, step)
+
+
+def indi_params(gains: dict[str, FloatArray], known: NominalModel) -> IndiParams:
+    """Parameters from gains K, bandwidth and share, shapes (m, N)."""
+    return IndiParams(gains["K"], gains["bandwidth"], gains["share"], known.limits)

@@ -1,0 +1,60 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Plain dynamic inversion: the model cancelled by a full state, poles of the errors placed. Sees x (or x_air) and a model."""
+
+from typing import NamedTuple
+
+from control_laws.nominal_model import NominalModel, inwards, limited
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.guard import Limits
+
+
+class InversionParams(NamedTuple):
+    """Gains over m channels, (m, 1) or (m, N)."""
+
+    K: Array  # 1/s
+    Lambda: Array  # 1/s, 0 for inversion without an integral
+    limits: Limits
+
+
+class InversionState(NamedTuple):
+    """What it carries from tick to tick, (m, N)."""
+
+    e: Array
+    integral_e: Array
+
+
+def control_law(known: NominalModel, *, vanes: bool) -> ControlLaw:
+    """Inversion of the nominal model, with `vanes` about the state relative to the air.
+
+        u = Omega^-1 (y_m_dot - C (A x + f(x)) - K (e + Lambda integral of e))
+
+    so that on the nominal aircraft without actuators e_dot = -K (e + Lambda integral of e) - C (what f is short of). The
+    integral is a trapezoid. Source: B. L. Stevens, F. L. Lewis, E. N. Johnson, "Aircraft Control and Simulation", 5.8.
+    """
+    drift, gravity = known.C @ known.A, known.C @ known.gravity
+    Omega, inverse = known.Omega, known.inverse
+
+    def start(seen: Measurements, params: InversionParams) -> InversionState:
+        del params
+        e = seen.y - seen.y_m
+        return InversionState(e, array_namespace(e).zeros_like(e))
+
+    def step(state: InversionState, seen: Measurements, dt: Array, params: InversionParams) -> tuple[InversionState, Array]:
+        x = seen.x_air if vanes else seen.x
+        e = seen.y - seen.y_m
+        increment = dt * (e + state.e) / 2.0
+        integral_e = state.integral_e + increment
+        known_part = drift @ x + gravity @ array_namespace(e).sin(x)
+        wanted = seen.y_m_dot - known_part - params.K * (e + params.Lambda * integral_e)
+        u, beyond = limited(inverse @ wanted, seen, dt, params.limits)
+        effect = -params.K * params.Lambda * increment
+        return InversionState(e, inwards(state.integral_e, integral_e, effect, Omega @ beyond)), u
+
+    return ControlLaw(start, step)
+
+
+def inversion_params(gains: dict[str, FloatArray], known: NominalModel) -> InversionParams:
+    """Parameters from gains K and, for DI with an integral, Lambda, shapes (m, N)."""
+    return InversionParams(gains["K"], gains.get("Lambda", 0.0 * gains["K"]), known.limits)

@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Model following by linear-quadratic design with integral action. Sees the full state x (or x_air), y_m and a model."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+from control_laws.nominal_model import NominalModel, inwards, limited
+from control_laws.riccati import gain_of
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.guard import Limits
+
+LEAK = 0.01
+"""1/s. Angles and y_m decay this slowly in the design model: what neither the inputs nor the cost can hold must end."""
+
+
+class LqiParams(NamedTuple):
+    """The gain over z = [x, y_m, y_m_dot, integral of e]."""
+
+    gain: Array  # (m, n + 3 m, 1) or (m, n + 3 m, N)
+    limits: Limits
+
+
+class LqiState(NamedTuple):
+    """What it carries from tick to tick, (m, N)."""
+
+    e: Array
+    integral_e: Array
+
+
+def control_law(*, vanes: bool) -> ControlLaw:
+    """State feedback and integral: u = -gain [x, y_m, y_m_dot, integral of e], with `vanes` x relative to the air.
+
+    The integral is a trapezoid; that of channel i waits where u_i is beyond a limit and it would push on.
+    """
+
+    def start(seen: Measurements, params: LqiParams) -> LqiState:
+        del params
+        e = seen.y - seen.y_m
+        return LqiState(e, array_namespace(e).zeros_like(e))
+
+    def step(state: LqiState, seen: Measurements, dt: Array, params: LqiParams) -> tuple[LqiState, Array]:
+        xp = array_namespace(seen.y)
+        e = seen.y - seen.y_m
+        increment = dt * (e + state.e) / 2.0
+        integral_e = state.integral_e + increment
+        none = xp.zeros_like(e)
+        z = xp.concat([seen.x_air if vanes else seen.x, seen.y_m + none, seen.y_m_dot + none, integral_e])
+        u, beyond = limited(-xp.sum(params.gain * z[None, :, :], axis=1), seen, dt, params.limits)
+        m = e.shape[0]
+        own = xp.stack([params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)])
+        return LqiState(e, inwards(state.integral_e, integral_e, -own * increment, beyond)), u
+
+    return ControlLaw(start, step)
+
+
+class Design(NamedTuple):
+    """The design model in discrete time: z+ = F z + G u, and what the cost counts, e and its integral, as E z."""
+
+    F: FloatArray  # (n + 3 m, n + 3 m)
+    G: FloatArray  # (n + 3 m, m)
+    E: FloatArray  # (2 m, n + 3 m)
+
+
+def design(known: NominalModel, fade: float) -> Design:
+    """The nominal aircraft with the reference and the integral of e, sampled with u held over a period.
+
+        x_dot   = (A + gravity) x + B u      rows of angles: -LEAK angle, a disturbance that is seen
+        y_m_dot = w - LEAK y_m,  w_dot = -fade w,  integral of e: C x - y_m
+
+    Angles integrate the very rates that are to follow: with their true rows the integral of e would not be controllable.
+    """
+    n, m = known.B.shape
+    free = 1.0 - known.kinematic[:, None]
+    motion = np.zeros((n + 3 * m, n + 3 * m))
+    x, y_m, w, integral = np.split(np.arange(n + 3 * m), [n, n + m, n + 2 * m])
+    motion[np.ix_(x, x)] = free * (known.A + known.gravity) - LEAK * np.diag(known.kinematic)
+    motion[y_m, y_m], motion[y_m, w], motion[w, w] = -LEAK, 1.0, -fade
+    motion[np.ix_(integral, x)] = known.C
+    motion[integral, y_m] = -1.0
+    drive = np.vstack([free * known.B, np.zeros((3 * m, m))])
+    whole = expm(np.block([[motion, drive], [np.zeros((m, n + 4 * m))]]) * known.period)
+    E = np.zeros((2 * m, n + 3 * m))
+    E[:m, x], E[np.arange(m), y_m], E[np.arange(m, 2 * m), integral] = known.C, -1.0, 1.0
+    return Design(whole[: n + 3 * m, : n + 3 * m], whole[: n + 3 * m, n + 3 * m :], E)
+
+
+def lqi_gain(known: NominalModel, gains: dict[str, FloatArray]) -> FloatArray:
+    """The gain that is least in the sum of e'Q e + q'Q_i q + u'R u over z+ = F z + G u, of N sets of weights: (m, n + 3 m, N).
+
+        Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,  q the integral of e
+
+    Arguments: `integral` (m, N), 1/s, `effort` (m, N), s: abs(e) worth an input of unit response, `fade` (1, N), 1/s. Source:
+    E. Kreindler, D. Rothschild, AIAA J. 14(7), 1976, for the model followed; B. D. O. Anderson, J. B. Moore,
+    "Optimal Control", ch. 9.
+    """
+    size = (known.C @ known.size)[:, None]
+    found = []
+    for k, fade in enumerate(gains["fade"][0]):
+        F, G, E = design(known, float(fade))
+        weights = np.concatenate([np.ones(len(size)), gains["integral"][:, k] ** 2]) / np.tile(size[:, 0] ** 2, 2)
+        R = np.diag((gains["effort"][:, k] / known.input_scale / size[:, 0]) ** 2)
+        found.append(gain_of(F, G, E.T @ np.diag(weights) @ E, R))
+    return np.stack(found, axis=-1)
+
+
+def lqi_params(gains: dict[str, FloatArray], known: NominalModel) -> LqiParams:
+    """Parameters from weights integral and effort (m, N) and fade (1, N)."""
+    return LqiParams(lqi_gain(known, gains), known.limits)

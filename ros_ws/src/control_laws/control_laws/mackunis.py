@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The acceleration-based RISE inversion of MacKunis et al. Sees y, y_m, the nominal Omega and, in one form, a perfect y_dot."""
+
+from typing import NamedTuple
+
+from control_laws.nominal_model import NominalModel, decay, inwards, limited
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.guard import Limits
+
+
+class MacKunisParams(NamedTuple):
+    """Gains over m channels, (m, 1) or (m, N)."""
+
+    K: Array  # 1/s
+    Lambda: Array  # 1/s
+    beta: Array  # units of y / s^2
+    eps: Array  # half-width of the softened sign, units of y / s
+    bandwidth: Array  # of the filtered difference, rad/s; unused where y_dot is perfect
+    limits: Limits
+
+
+class MacKunisState(NamedTuple):
+    """What it carries from tick to tick, (m, N)."""
+
+    e_0: Array
+    e: Array
+    e_dot: Array  # filtered difference
+    integral_e: Array
+    Pi: Array
+
+
+def control_law(known: NominalModel, *, ideal: bool) -> ControlLaw:
+    """The law that needs e_dot under its sign.
+
+        r          = e_dot + Lambda e
+        Pi        += dt beta clip(r / eps, -1, 1)              the sign, softened: measured r is noisy
+        integral_e += dt (e + e_p) / 2
+        u          = -Omega^-1 (K (e - e_0 + Lambda integral_e) + Pi)
+
+    so that u_dot = -Omega^-1 (K r + beta sgn(r)). `ideal`: e_dot = y_dot - y_m_dot with the perfect derivative of C x; else
+    a filtered difference, e_dot += (1 - exp(-bandwidth dt)) ((e - e_p) / dt - e_dot).
+    Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010, its matrices replaced by those here.
+    """
+    Omega, inverse = known.Omega, known.inverse
+
+    def start(seen: Measurements, params: MacKunisParams) -> MacKunisState:
+        del params
+        e = seen.y - seen.y_m
+        zero = array_namespace(e).zeros_like(e)
+        return MacKunisState(e, e, zero, zero, zero)
+
+    def step(state: MacKunisState, seen: Measurements, dt: Array, params: MacKunisParams) -> tuple[MacKunisState, Array]:
+        xp = array_namespace(seen.y)
+        e = seen.y - seen.y_m
+        e_dot = state.e_dot + decay(params.bandwidth, dt) * ((e - state.e) / dt - state.e_dot)
+        r = (seen.y_dot - seen.y_m_dot if ideal else e_dot) + params.Lambda * e
+        one = xp.ones_like(e)
+        move = dt * params.beta * xp.minimum(xp.maximum(r / params.eps, -one), one)
+        increment = dt * (e + state.e) / 2.0
+        integral_e, Pi = state.integral_e + increment, state.Pi + move
+        wanted = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
+        u, beyond = limited(inverse @ wanted, seen, dt, params.limits)
+        past = Omega @ beyond
+        integral_e = inwards(state.integral_e, integral_e, -increment, past)
+        return MacKunisState(state.e_0, e, e_dot, integral_e, inwards(state.Pi, Pi, -move, past)), u
+
+    return ControlLaw(start, step)
+
+
+def mackunis_params(gains: dict[str, FloatArray], known: NominalModel) -> MacKunisParams:
+    """Parameters from gains K, Lambda, beta (m, N), softening (1, N) and, without ideal y_dot, filter (1, N), rad/s.
+
+    eps = beta / K softening: inside it the sign adds K / softening to K.
+    """
+    K, beta = gains["K"], gains["beta"]
+    eps = beta / K * gains["softening"]
+    return MacKunisParams(K, gains["Lambda"], beta, eps, gains.get("filter", 0.0) + 0.0 * K, known.limits)

@@ -1,0 +1,72 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""RISE dynamic inversion as a fleet flies it: the controller's guarded step, with feedforward or without; beta = 0 is a PI."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from control_laws.nominal_model import NominalModel
+from flight_core.vectors import Array, FloatArray
+from rise_di_controller import law
+from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.guard import Limits, guarded_step
+from rise_di_controller.law import LawParams, LawState, Sign
+from rise_di_controller.params import ControllerParameters
+
+
+class RiseParams(NamedTuple):
+    """LawParams without the sign, which is part of the control_law, and the limits; each (m, 1), or (m, N)."""
+
+    K: Array
+    Lambda: Array
+    beta: Array
+    D: Array
+    input_scale: Array
+    omega: Array
+    eps: Array
+    limits: Limits
+
+
+def control_law(sign: Sign) -> ControlLaw:
+    """The law with its sign sampled in one way: u = u_ff + what `guarded_step` commands inside the limits."""
+    return LAWS_BY_SIGN[sign]
+
+
+def params(controller: ControllerParameters) -> RiseParams:
+    """Those of a controller, shape (m, 1)."""
+
+    def column(values: Any) -> Any:
+        return np.asarray(values)[:, None]
+
+    named = controller.law()._asdict()
+    limits = Limits(*(column(values) for values in controller.guard().limits))
+    return RiseParams(limits=limits, **{key: column(named[key]) for key in RiseParams._fields[:-1]})
+
+
+def of_gains(gains: dict[str, FloatArray], known: NominalModel) -> RiseParams:
+    """Those of gains K, Lambda, beta (m, N) and softening or omega (1, N), the paper's in scaled inputs.
+
+    eps = beta / K softening total_lag. Without beta, a PI controller: u = -input_scale D K (e - e_0 + Lambda integral_e).
+    """
+    K = gains["K"]
+    beta = gains.get("beta", 0.0 * K)
+    eps = beta / K * gains["softening"] * known.total_lag[:, None] if "softening" in gains else 1.0 + 0.0 * K
+    omega = gains.get("omega", 1.0) + 0.0 * K
+    return RiseParams(K, gains["Lambda"], beta, known.D[:, None], known.input_scale[:, None], omega, eps, known.limits)
+
+
+def _start(seen: Measurements, params: RiseParams) -> LawState:
+    return law.engage(seen.y, seen.y_m)
+
+
+def _control_law(sign: Sign) -> ControlLaw:
+    def step(state: LawState, seen: Measurements, dt: Array, params: RiseParams) -> tuple[LawState, Array]:
+        of_law = LawParams(*params[:-1], sign)
+        after, _, u = guarded_step(state, seen.y, seen.y_m, dt, seen.u_ff, seen.u_before, of_law, params.limits)
+        return after, u
+
+    return ControlLaw(_start, step)
+
+
+LAWS_BY_SIGN = {sign: _control_law(sign) for sign in Sign}

@@ -1,0 +1,51 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The super-twisting law on each output. Sees y, y_m and the nominal Omega."""
+
+from typing import NamedTuple
+
+from control_laws.nominal_model import NominalModel, inwards, limited
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.guard import Limits
+
+
+class TwistingParams(NamedTuple):
+    """Gains over m channels, (m, 1) or (m, N)."""
+
+    root: Array  # on sgn(e) sqrt(abs(e)), (units of y)^(1/2) / s
+    beta: Array  # on the integral of sgn(e), units of y / s^2
+    limits: Limits
+
+
+def control_law(known: NominalModel) -> ControlLaw:
+    """Second-order sliding on e, by forward Euler.
+
+        z += -dt beta sgn(e)
+        u  = Omega^-1 (y_m_dot - root sgn(e) sqrt(abs(e)) + z)
+
+    so that e_dot = -root sgn(e) sqrt(abs(e)) + z + d without actuators; for abs(d_dot) <= L it reaches 0 in finite time where
+    beta > L and root^2 > 2 (beta + L)^2 / (beta - L). Source: A. Levant, Int. J. Control 58(6), 1993; J. A. Moreno,
+    M. Osorio, IEEE TAC 57(4), 2012; Y. Shtessel et al., "Sliding Mode Control and Observation", 4.3.
+    """
+    Omega, inverse = known.Omega, known.inverse
+
+    def start(seen: Measurements, params: TwistingParams) -> Array:
+        del params
+        return array_namespace(seen.y).zeros_like(seen.y)
+
+    def step(state: Array, seen: Measurements, dt: Array, params: TwistingParams) -> tuple[Array, Array]:
+        xp = array_namespace(seen.y)
+        e = seen.y - seen.y_m
+        move = -dt * params.beta * xp.sign(e)
+        z = state + move
+        wanted = seen.y_m_dot - params.root * xp.sign(e) * xp.sqrt(xp.abs(e)) + z
+        u, beyond = limited(inverse @ wanted, seen, dt, params.limits)
+        return inwards(state, z, move, Omega @ beyond), u
+
+    return ControlLaw(start, step)
+
+
+def twisting_params(gains: dict[str, FloatArray], known: NominalModel) -> TwistingParams:
+    """Parameters from gains root and beta, shapes (m, N)."""
+    return TwistingParams(gains["root"], gains["beta"], known.limits)

@@ -1,0 +1,435 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+# ruff: noqa: N802 - K, U, Phi and N_d are the paper's names
+"""Gains of the law: Theorem 1 as a procedure, and the engineering procedure beside it.
+
+The theorem's conditions are sufficient, not necessary, and know no actuator: `theorem_gains` meets them all, and on an
+aircraft with servos nothing can fly the result. `engineering_gains` starts from the lag of the loop instead. `check` says
+which of the theorem's conditions a gain set meets, `check_loop` does the same for what the loop asks.
+
+Everything is in the law's channel order and its scaled inputs v (u = input_scale v), where abs(Omega_ii) is about 1.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+
+from flight_core.parameters import require
+from flight_core.vectors import FloatArray
+from rise_di_controller import law
+from rise_di_controller.decomposition import decompose
+from rise_di_controller.law import LawParams, LawState, Sign, total_lag
+
+LEAST_K = 1.5
+"""1/s. (22) wants K > 1; a slower channel is given this K and inputs of as much less response, which is the same loop."""
+
+LEAST = 0.01
+"""The smallest k_d (1/s) and beta (units of y / s^2) handed out: (21), (22) want them positive where nothing asks for more."""
+
+K_G_MARGIN = 1.5
+"""k_g is this much above rho^2 / (4 k_g) = min(Lambda, 1): step 2 then leaves a third of the decay to step 3."""
+
+K_D_PART = 0.3
+"""What all of step 3 takes of the decay, out of that third."""
+
+MAX_CROSSOVER_LAG_PRODUCT = 0.8
+"""Bandwidth times the lag of the loop. On the `osprey` 0.63 leaves 45 ms of delay margin and 0.91 leaves 30, which is less
+than the lag of the loop itself."""
+
+LARGEST_LAMBDA = 0.5
+"""Lambda_i beside the bandwidth K_i: at 0.5 the integral takes atan(0.5) = 27 degrees of phase at the crossover."""
+
+RATE_PART = 0.7
+"""beta_i beside the actuator's rate limit: at 2/3 the `osprey`'s yaw rate flew clean, at 1 it was in a limit cycle."""
+
+UNSTABLE = 1e-6
+"""How far beyond 1 a spectral radius is unstable. Angles that integrate the outputs lie on 1 twice, which rounding splits
+by its root, 1e-8."""
+
+MOST_DELAY = 0.5
+"""s. Delay margins are looked for up to here; a loop that bears more is slower than any that this stack flies."""
+
+
+ROUNDING = 1e-5
+"""How much of a bound may be missing: gain sets are written down with six digits."""
+
+
+class GainSet(NamedTuple):
+    """The gains of (20)-(22) over m channels."""
+
+    k_g: float  # 1/s
+    k_d: FloatArray  # (m - 1,) 1/s
+    Lambda: FloatArray  # (m,) 1/s
+    beta: FloatArray  # (m,) units of y / s^2
+
+    @property
+    def K(self) -> FloatArray:
+        """Diagonal of K, equation (22), shape (m,), 1/s."""
+        return np.asarray(law.gain(np.array(self.k_g), self.k_d))
+
+
+class Bounds(NamedTuple):
+    """What Theorem 1 takes for known about the aircraft."""
+
+    U: FloatArray  # (m, m) bounds of abs(U_ij), j > i, zero elsewhere: zeta_U of (27), zeta_Psi of (30) with two indices
+    N_d: FloatArray  # (m,) zeta_Nd,i of (19), units of y / s^2
+    rho: float  # of (19), 1/s
+    gamma_2: FloatArray  # (m,) of Lemma 1, 1/s: stated, for nothing bounds it
+
+
+class Condition(NamedTuple):
+    """One condition on a gain set: found >= bound, found <= bound, or, where that is strict, found > bound."""
+
+    name: str
+    channel: int | None  # None: all of them together
+    found: float
+    bound: float
+    at_least: bool = True
+    estimate: bool = False  # rests on a figure that nothing bounds: gamma_2
+    strict: bool = False  # found at the bound itself does not meet it
+
+    @property
+    def side(self) -> str:
+        """Where found has to lie, in words: "at least", "at most" or "above" the bound."""
+        return "above" if self.strict else "at least" if self.at_least else "at most"
+
+    @property
+    def holds(self) -> bool:
+        """Whether the gain set meets it."""
+        if self.strict:
+            return self.found > self.bound
+        slack = ROUNDING * abs(self.bound)
+        return self.found >= self.bound - slack if self.at_least else self.found <= self.bound + slack
+
+    @property
+    def margin(self) -> float:
+        """By which factor it is met, below 1 where it fails; 0 where nothing could meet it, NaN for a bound of 0 below it."""
+        if self.at_least:
+            return self.found / self.bound if self.bound > 0.0 else math.nan
+        if self.bound <= 0.0:
+            return 0.0
+        return self.bound / self.found if self.found > 0.0 else math.inf
+
+    def sentence(self, channels: Sequence[str]) -> str:
+        """As errors are worded: "beta (30) of q: found 15, expected at least 29.1"; `channels` are the names of y."""
+        where = self.name if self.channel is None else f"{self.name} of {channels[self.channel]}"
+        return f"{where}: found {self.found:.4g}, expected {self.side} {self.bound:.4g}"
+
+
+def failing(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
+    """Those conditions that the gain set does not meet."""
+    return tuple(condition for condition in conditions if not condition.holds)
+
+
+# Theorem 1
+
+
+def within(lower: FloatArray, upper: FloatArray, count: int, seed: int) -> FloatArray:
+    """Samples of Omega inside an interval, shape (count, m, m): the midpoint, then by turns a corner and an inner point.
+
+    lower <= Omega <= upper entry by entry, shape (m, m). Raises ParameterError where lower exceeds upper.
+    """
+    require(bool((lower <= upper).all()), "Omega", "a lower bound above its upper one", "lower <= upper in every entry")
+    generator = np.random.default_rng(seed)
+    place = generator.random((count, *lower.shape))
+    place[1::2] = np.round(place[1::2])
+    place[0] = 0.5
+    return np.asarray(lower + place * (upper - lower))
+
+
+def bound_U(Omegas: FloatArray) -> FloatArray:
+    """Largest abs(U_ij), j > i, over samples of Omega, zero elsewhere; Omegas (N, m, m), result (m, m).
+
+    U is that of Omega = S D U (11). It bounds the off-diagonal entries of D U D as well, whose sizes are the same. Raises
+    DecompositionError where a sample has no decomposition.
+    """
+    return np.asarray(np.max([np.triu(np.abs(decompose(Omega).U), 1) for Omega in Omegas], axis=0))
+
+
+def rho(Omega: FloatArray, CAC: FloatArray, Lambda: FloatArray) -> float:
+    """Bound of norm(N~) / norm(z), (19), 1/s: the largest singular value of [I - G Lambda, G].
+
+    G = M (C A C^+ + Lambda) with M = S^-1; N~ = G (r - Lambda e) + e, the reference term of (18) moved to N_d. Arguments:
+    Omega and CAC = C A C^+, shape (m, m); Lambda (m,). Raises DecompositionError where Omega has no S D U.
+    Source: (16)-(19) of Tanyer, Tatlicioglu, Zergeroglu, with the repair of docs/theory.md.
+    """
+    G = np.linalg.solve(decompose(Omega).S, CAC + np.diag(Lambda))
+    return float(np.linalg.norm(np.hstack([np.eye(len(G)) - G * Lambda, G]), 2))
+
+
+def least_beta(Lambda: FloatArray, bounds: Bounds) -> FloatArray:
+    """Step 1 of Theorem 1: the least beta, shape (m,), from the last channel up.
+
+    beta_i = (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), i = m .. 1
+    Source: (29), (30), with the two-index bound that Lemma 2 needs (docs/theory.md).
+    """
+    beta = np.zeros(len(Lambda))
+    for i in reversed(range(len(Lambda))):
+        beta[i] = (bounds.N_d[i] + bounds.U[i] @ beta) * (1.0 + bounds.gamma_2[i] / Lambda[i])
+    return beta
+
+
+def zeta_Phi(i: int, K: FloatArray, U: FloatArray) -> float:
+    """Bound of abs(Phi_i) / norm(z), (25)-(27), 1/s: the norm over j > i of zeta_U,ij k_j. K (m,), U (m, m)."""
+    return float(np.linalg.norm(U[i, i + 1 :] * K[i + 1 :]))
+
+
+def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
+    """Gains that meet (22), (29), (30) and steps 2 and 3 of Theorem 1 for the bounds given, shape as in the fields.
+
+        least = min(Lambda, 1), the decay of e and r before N~ and Phi
+        k_g   = 1.5 rho^2 / (4 least)                                     step 2
+        k_d,i = zeta_Phi,i^2 / (4 part), part = 0.3 least / (m - 1)       step 3, i = m-1 .. 1
+        beta  = `least_beta`                                              step 1
+
+    so that rho^2 / (4 k_g) + sum zeta_Phi,i^2 / (4 k_d,i) <= (2/3 + 0.3) least. The parts 1.5 and 0.3 are this project's:
+    the paper only asks for "small". bounds.rho must be that of the same Lambda.
+    """
+    m = len(Lambda)
+    least = min(float(Lambda.min()), 1.0)
+    k_g = max(K_G_MARGIN * bounds.rho**2 / (4.0 * least), LEAST)
+    k_d = np.zeros(m - 1)
+    for i in reversed(range(m - 1)):
+        part = K_D_PART * least / (m - 1)
+        k_d[i] = max(zeta_Phi(i, np.asarray(law.gain(np.array(k_g), k_d)), bounds.U) ** 2 / (4.0 * part), LEAST)
+    return GainSet(k_g, k_d, Lambda, np.maximum(least_beta(Lambda, bounds), LEAST))
+
+
+def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
+    """Conditions of Theorem 1 on a gain set: (29), (30) from the last channel up, then steps 2 and 3.
+
+        beta_i >= (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), beta_j those of the gain set
+        k_g >= rho^2 / (4 min(Lambda, 1))
+        sum_i zeta_Phi,i^2 / (4 k_d,i) <= min(Lambda, 1) - rho^2 / (4 k_g)
+
+    The last names the channel with the largest term. (22) needs no condition: k_g and k_d are what the gain set holds.
+    Raises ParameterError where a gain is not positive.
+    """
+    for key in GainSet._fields:
+        require(bool(np.all(np.asarray(getattr(gains, key)) > 0.0)), key, getattr(gains, key), "values above 0")
+    m = len(gains.Lambda)
+    needed = (bounds.N_d + bounds.U @ gains.beta) * (1.0 + bounds.gamma_2 / gains.Lambda)
+    conditions = [
+        Condition("beta (29)" if i == m - 1 else "beta (30)", i, float(gains.beta[i]), float(needed[i]), estimate=True)
+        for i in reversed(range(m))
+    ]
+    least = min(float(gains.Lambda.min()), 1.0)
+    conditions.append(Condition("k_g, step 2", None, gains.k_g, bounds.rho**2 / (4.0 * least)))
+    terms = np.array([zeta_Phi(i, gains.K, bounds.U) ** 2 / (4.0 * gains.k_d[i]) for i in range(m - 1)])
+    if m > 1:
+        left = least - bounds.rho**2 / (4.0 * gains.k_g)
+        largest = int(np.argmax(terms))
+        conditions.append(Condition("k_d, step 3", largest, float(terms.sum()), left, at_least=False))
+    return tuple(conditions)
+
+
+# The engineering procedure
+
+
+class Loop(NamedTuple):
+    """What lies between y and the response of the aircraft, over m channels."""
+
+    lag: FloatArray  # (m,) time constants of the actuators, s; 0 where there is none
+    delay: float  # pure delay beyond sampling, s
+    period: float  # of the law, s
+
+    @property
+    def total(self) -> FloatArray:
+        """Lag of the loop, shape (m,), s."""
+        return np.asarray(total_lag(self.lag, self.delay, self.period))
+
+
+class Selected(NamedTuple):
+    """A gain set with the response of the inputs that it is for."""
+
+    gains: GainSet
+    response: FloatArray  # (m,) abs(Omega_ii) in scaled inputs: 1, or less in a channel too slow for (22)
+
+
+def bandwidths(loop: Loop, share: FloatArray) -> FloatArray:
+    """Bandwidth of each channel, share_i / (lag_i + 1.5 period + delay), shape (m,), rad/s.
+
+    Source: this project. A loop that integrates and lags by T has its phase margin from 90 degrees - share (rad), share
+    being the crossover times T: 54 degrees at 0.63.
+    """
+    return np.asarray(share / loop.total)
+
+
+def order(bandwidth: FloatArray) -> tuple[int, ...]:
+    """Channels from the fastest to the slowest, ties as they stand: (22) gives the last channel the smallest K."""
+    return tuple(int(i) for i in np.argsort(-bandwidth, kind="stable"))
+
+
+def split(K: FloatArray) -> tuple[float, FloatArray]:
+    """k_g and k_d of (22) for K = 1 + k_g + (k_d, 0), shape (m,), 1/s. k_d is at least 0.01: (22) wants it positive.
+
+    Raises ParameterError where the last K is not the smallest or not above 1: (22) has no such K.
+    """
+    require(float(K[-1]) <= float(K.min()), "K", K.tolist(), "the smallest in the last channel, as (22) has it")
+    require(float(K[-1]) > 1.0, f"K[{len(K) - 1}]", float(K[-1]), "above 1 1/s, as (22) has it")
+    return float(K[-1]) - 1.0, np.maximum(K[:-1] - K[-1], LEAST)
+
+
+def engineering_gains(bandwidth: FloatArray, slew: FloatArray, factor: float, rate_limit: FloatArray) -> Selected:
+    """Gains for a loop with lag, from bandwidths (rad/s) of which the last is the smallest; all arguments shape (m,).
+
+        K_i = max(bandwidth_i, 1.5),  response_i = bandwidth_i / K_i      K_i response_i is the bandwidth
+        Lambda_i = bandwidth_i / 4
+        beta_i = min(factor slew_i, 0.7 rate_limit_i) / response_i
+
+    `slew` is the largest rate of the ideal control and `rate_limit` that of the actuator (infinite where there is none),
+    both in inputs of unit response, units of y / s^2. Raises ParameterError as `split` does, and for a factor below 1.
+    Source: this project; beta because N_d = -D U v*_dot where e = 0, see `N_d`.
+    """
+    require(factor >= 1.0, "factor", factor, "at least 1: beta above the slew of the ideal control")
+    K = np.maximum(bandwidth, LEAST_K)
+    response = bandwidth / K
+    k_g, k_d = split(K)
+    beta = np.maximum(np.minimum(factor * slew, RATE_PART * rate_limit) / response, LEAST)
+    return Selected(GainSet(k_g, k_d, bandwidth / 4.0, beta), response)
+
+
+def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
+    """N_d of (17) along the ideal control v*, at e = 0: -D U v*_dot, shape of v_dot, (..., m), units of y / s^2.
+
+    From Omega v*_dot = y_m_ddot - C (A x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot), M Omega = D U.
+    Omega (m, m) in the inputs of v. Raises DecompositionError where it has no S D U.
+    """
+    factors = decompose(Omega)
+    return np.asarray(-v_dot @ (factors.D[:, None] * factors.U).T)
+
+
+def check_loop(
+    params: LawParams, loop: Loop, response: FloatArray, largest: FloatArray, slew: FloatArray, rate_limit: FloatArray
+) -> tuple[Condition, ...]:
+    """Conditions that the loop puts on a gain set, channel by channel.
+
+        share:            K_i response_i total_i <= 0.8
+        Lambda below K:   Lambda_i <= 0.5 K_i response_i
+        beta above slew:  beta_i >= slew_i
+        beta below rate:  beta_i <= 0.7 rate_limit_i               where there is a limit
+        softening:        eps_i K_i / beta_i >= total_i            softened sign: else the linear loop is unstable
+        implicit: lag:    lag_i + delay <= period / 2              implicit sign: else it chatters
+        implicit: omega:  omega_i >= largest_i                     the same
+
+    Arguments: response_i = abs(Omega_ii) in the inputs of the law, nominal, and the largest it can be; slew and rate_limit
+    in those same inputs, units of y / s^2, infinite where there is no limit; all of shape (m,).
+    """
+    conditions: list[Condition] = []
+    total = loop.total
+
+    def add(name: str, found: FloatArray, bound: FloatArray, *, at_least: bool) -> None:
+        pairs = enumerate(zip(found, bound, strict=True))
+        finite = ((i, float(a), float(b)) for i, (a, b) in pairs if math.isfinite(b))
+        conditions.extend(Condition(name, i, a, b, at_least) for i, a, b in finite)
+
+    add("share", params.K * response * total, np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT), at_least=False)
+    add("Lambda below K", params.Lambda, LARGEST_LAMBDA * params.K * response, at_least=False)
+    add("beta above slew", params.beta, slew, at_least=True)
+    add("beta below rate", params.beta, RATE_PART * rate_limit, at_least=False)
+    if params.sign is Sign.SOFT:
+        add("softening", params.eps * params.K / params.beta, total, at_least=True)
+    elif params.sign is Sign.IMPLICIT:
+        add("implicit: lag", loop.lag + loop.delay, np.full(len(total), loop.period / 2.0), at_least=False)
+        add("implicit: omega", params.omega, largest, at_least=True)
+    return tuple(conditions)
+
+
+# The linear loop
+
+
+class LinearPlant(NamedTuple):
+    """x_dot = A x + B u_a, y = C x with one actuator an input, lag_i u_a,i_dot = u_i - u_a,i; the law's order, SI."""
+
+    A: FloatArray  # (n, n)
+    B: FloatArray  # (n, m)
+    C: FloatArray  # (m, n)
+
+
+def law_matrix(params: LawParams, period: float) -> FloatArray:
+    """The law's step near e = 0 as a matrix, shape (4 m, 4 m): (e_p, integral_e, Pi, y) -> (e, integral_e, Pi, u), y_m = 0.
+
+    It is `law.step` of unit vectors: inside the width of its sign the step is linear. beta and eps are multiplied by 1e12,
+    which widens the sign and changes nothing inside it. Raises ParameterError for the literal sign, which has no width.
+    """
+    require(params.sign is not Sign.LITERAL, "sign", "literal", "soft or implicit, which are linear near e = 0")
+    m = len(params.K)
+    wide = params._replace(beta=1e12 * params.beta, eps=1e12 * params.eps)
+    columns = []
+    for unit in np.eye(4 * m):
+        e, integral_e, Pi, y = unit.reshape(4, m)
+        state, u = law.step(LawState(np.zeros(m), e, integral_e, Pi), y, np.zeros(m), np.array(period), wide)
+        columns.append(np.concatenate([state.e, state.integral_e, state.Pi, u]))
+    return np.array(columns).T
+
+
+def closed_loop(plant: LinearPlant, params: LawParams, loop: Loop, extra: FloatArray) -> FloatArray:
+    """One period of the sampled loop as a matrix, exact: stable where no eigenvalue lies outside the unit circle.
+
+    u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,). The state is x, the
+    actuators, (e, integral_e, Pi) of the law, and the inputs on their way. Source: K. J. Astrom, B. Wittenmark,
+    "Computer-Controlled Systems", section 2.3, for the sampling of a plant with delay.
+    """
+    n, m = plant.B.shape
+    has_lag = loop.lag > 0.0
+    rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)  # of an actuator that is none: any, it drives nothing
+    motion = np.block([[plant.A, plant.B * has_lag], [np.zeros((m, n)), -np.diag(rate)]])
+    drive = np.vstack([plant.B * ~has_lag, np.diag(rate * has_lag)])
+    whole = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
+    part = np.maximum(loop.delay + extra - whole * loop.period, 0.0)
+    held = int(whole.max()) + 1  # inputs on their way, the newest first
+
+    free, _ = _sampled(motion, drive, loop.period)
+    size = n + m + 3 * m + held * m
+    law_, flying = slice(n + m, n + 4 * m), slice(n + 4 * m, size)
+    step = law_matrix(params, loop.period)
+    output = np.zeros((m, size))
+    output[:, :n] = plant.C
+    after = step @ np.vstack([np.eye(size)[law_], output])
+    inputs = np.vstack([after[3 * m :], np.eye(size)[flying]])  # of this tick, then those before
+
+    matrix = np.zeros((size, size))
+    matrix[: n + m, : n + m] = free
+    for i in range(m):
+        rest, new = _sampled(motion, drive[:, [i]], loop.period - part[i])
+        _, old = _sampled(motion, drive[:, [i]], part[i])
+        matrix[: n + m] += np.outer(new, inputs[whole[i] * m + i]) + np.outer(rest @ old, inputs[(whole[i] + 1) * m + i])
+    matrix[law_] = after[: 3 * m]
+    matrix[flying] = inputs[: held * m]
+    return matrix
+
+
+def is_stable(plant: LinearPlant, params: LawParams, loop: Loop, extra: FloatArray) -> bool:
+    """Whether no eigenvalue of `closed_loop` lies outside the unit circle, rounding apart."""
+    radius = np.max(np.abs(np.linalg.eigvals(closed_loop(plant, params, loop, extra))))
+    return bool(radius <= 1.0 + UNSTABLE)
+
+
+def delay_margin(plant: LinearPlant, params: LawParams, loop: Loop, channel: int | None = None) -> float:
+    """Pure delay beyond loop.delay, s, at which the linear loop turns unstable, in all channels or in one of them.
+
+    0 where it is unstable already, infinite where it bears half a second. Looked for in steps of half a period, then
+    halved down to 0.1 ms. Raises ParameterError for the literal sign.
+    """
+    delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
+    if not is_stable(plant, params, loop, 0.0 * delayed):
+        return 0.0
+    lower, stride = 0.0, loop.period / 2.0
+    while is_stable(plant, params, loop, (lower + stride) * delayed):
+        lower += stride
+        if lower > MOST_DELAY:
+            return math.inf
+    while stride > 1e-4:
+        stride /= 2.0
+        lower += stride * is_stable(plant, params, loop, (lower + stride) * delayed)
+    return lower
+
+
+def _sampled(motion: FloatArray, drive: FloatArray, duration: float) -> tuple[FloatArray, FloatArray]:
+    """exp(motion T) and integral_0^T exp(motion s) ds drive, from one exponential (C. Van Loan, IEEE TAC 23(3), 1978)."""
+    n, m = drive.shape
+    exponential = expm(np.block([[motion, drive], [np.zeros((m, n + m))]]) * duration)
+    return exponential[:n, :n], exponential[:n, n:]

@@ -1,0 +1,577 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the gain procedures of the law need to know of an airframe, and the gain sets that come of it.
+
+`study` finds what the inputs have to do along a manoeuvre, on the airframe as published and on uncertain ones around it.
+`select_gains` turns that into two gain sets, of Theorem 1 and of the engineering procedure; `check_gains` judges the gain
+set of a scenario; `as_yaml` writes one down as a scenario file has it.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aircraft_sim import dynamics
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.disturbance import Gusts
+from aircraft_sim.dynamics import Aircraft
+from aircraft_sim.params import Gust
+from aircraft_sim.uncertainty import uncertain
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.design import gain_conditions as procedure
+from flight_analysis.design.airframe_properties import invariant_zeros
+from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet, LinearPlant, Loop
+from flight_analysis.design.lyapunov import KnownPlant, decay
+from flight_core.integrators import rk4
+from flight_core.parameters import ParameterError, require
+from flight_core.vectors import Array, FloatArray
+from reference_model import model
+from reference_model.command import command
+from reference_model.params import ReferenceModelParameters, zero_state
+from rise_di_controller.decomposition import DecompositionError, coupling, search, signs
+from rise_di_controller.feedforward import ORIGIN
+from rise_di_controller.law import LawParams, Sign
+from rise_di_controller.params import ControllerParameters, FeedforwardParameters
+
+SHARES: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
+"""Bandwidth of a channel times the lag of its loop, by output. Yaw leaves room to the dutch roll, speed to the engine."""
+
+CAUTIOUS_SHARE = 0.23
+"""The share of an output that SHARES does not know."""
+
+FACTOR = 1.25
+"""beta beside the largest slew of the ideal control: 1 is needed, 1.5 is the most that was ever of use on the `osprey`."""
+
+LARGEST_COUPLING = 10.0
+"""max abs(U - I) above which inputs and outputs are paired wrongly. It is 25 on the `osprey` with aileron and rudder
+swapped and 13.6 on the first edition's Aerosonde, which no gain set of either procedure holds behind servos; 2.2 at most on
+the other airframes of the library."""
+
+STEP = 0.01
+"""s. Steps of the ideal control: a gust of a second and hidden modes up to 10 1/s are resolved to 1e-6 of their size."""
+
+INPUT_LIMITS = ("lower", "upper", "slew")
+"""Limits of the controller, one an input: they stay with their inputs whatever the order."""
+
+
+class Manoeuvre(NamedTuple):
+    """What the gains are selected for."""
+
+    reference: ReferenceModelParameters
+    gusts: dict[str, Gust]
+    duration: float  # s
+
+
+class ChannelPairing(NamedTuple):
+    """Outputs and inputs in the law's order, output i paired with input i."""
+
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+
+
+class LoopSetting(NamedTuple):
+    """The loop that the gains are for, and how much they have to know."""
+
+    base: ControllerParameters  # what is not selected stays as it is here: softening, freshness, limits
+    rate: float  # Hz
+    lag: Mapping[str, float]  # s, by input; 0 for an input without
+    delay: float  # s
+    rate_limit: Mapping[str, float]  # SI, by input; an input without is not limited
+    gamma_2: float = 0.0  # 1/s, stated: 0 gives the least that (29), (30) can ask
+    factor: float = FACTOR  # beta beside the slew of the ideal control
+    shares: Mapping[str, float] = SHARES
+    inputs: tuple[str, ...] = ()  # what drives each output of the airframe, in its order; none: as the airframe has it
+    feedforward: bool = False  # whether the airframe as published goes along as the nominal model
+
+
+class Study(NamedTuple):
+    """An airframe along a manoeuvre: the nominal one first, then N - 1 uncertain ones; airframe's order, SI."""
+
+    airframe: Airframe
+    A: FloatArray  # (N, n, n)
+    B: FloatArray  # (N, n, m)
+    C: FloatArray  # (m, n)
+    gravity: FloatArray  # (n, n), the Jacobian of f at trim
+    u_dot: FloatArray  # (T, N, m) rate of the ideal control, units of u / s
+    slew: FloatArray  # (m,) largest abs(u_dot) of the nominal airframe
+    slew_calm: FloatArray  # (m,) the same in still air
+    stable: NDArray[np.bool_]  # (N,) where no zero lies in the right half plane
+    uncertainty: float
+
+    @property
+    def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name
+        """Omega = C B of the nominal airframe, shape (m, m), SI."""
+        return np.asarray(self.C @ self.B[0])
+
+
+class GainAssessment(NamedTuple):
+    """A gain set and what can be said about it."""
+
+    controller: ControllerParameters
+    theorem: tuple[Condition, ...]
+    loop: tuple[Condition, ...]
+    bounds: Bounds
+    delay_margin: float | None  # s, nominal airframe, delay in all channels; None for the literal sign
+    channel_margins: tuple[float, ...]  # s, delay in one channel alone; empty with delay_margin None
+
+    @property
+    def failing(self) -> tuple[Condition, ...]:
+        """Every condition that does not hold."""
+        return procedure.failing((*self.theorem, *self.loop))
+
+
+class Selection(NamedTuple):
+    """Both gain sets for an airframe."""
+
+    study: Study
+    setting: LoopSetting
+    theorem: GainAssessment
+    engineering: GainAssessment
+
+
+# The manoeuvre and the ideal control along it
+
+
+def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
+    """The commands and gusts of a scenario as far as an airframe has the channels and knows the gusts.
+
+    A coordinated turn stays where the airframe has both of its channels, at the airframe's own speed. Raises ParameterError
+    for an output that the scenario commands nothing for.
+    """
+    whole = scenario.reference_model
+    for name in airframe.outputs:
+        require(name in whole.outputs, f"{scenario.name}: reference_model.outputs", ", ".join(whole.outputs), f"{name} too")
+    values = whole.model_dump(exclude_none=True)
+    if set(airframe.outputs) != set(whole.outputs):
+        require("second_order" in values, f"{scenario.name}: reference_model", "linear", "second_order to leave channels out")
+        kept = [whole.outputs.index(name) for name in airframe.outputs]
+        values["outputs"] = airframe.outputs
+        values["second_order"] = {key: [row[i] for i in kept] for key, row in values["second_order"].items()}
+        for key in ("pulses", "sines"):
+            values[key] = {name: one for name, one in values[key].items() if name in airframe.outputs}
+    turn = whole.coordinated_turn
+    if turn is not None:
+        present = {turn.bank_rate, turn.turn_rate} <= set(airframe.outputs)
+        values["coordinated_turn"] = turn.model_dump() | {"speed": airframe.speed} if present else None
+    gusts = {name: gust for name, gust in scenario.aircraft.gusts.items() if name in airframe.gusts}
+    reference = ReferenceModelParameters.validate_mapping(values, "reference_model")
+    return Manoeuvre(reference, gusts, scenario.flight.duration)
+
+
+def study(airframe: Airframe, flown: Manoeuvre, uncertainty: float = 0.3, samples: int = 100, seed: int = 1) -> Study:
+    """Find the rate of the ideal control along a manoeuvre, on the airframe as published and on uncertain ones.
+
+    The ideal control holds y on y_m. With x = C' y_m + H eta, eta the states that are not outputs:
+
+        eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot         the zero dynamics, eta(0) = 0
+        u* = Omega^-1 (y_m_dot - C (A x + f)),  x_dot = A x + f + B u*
+        u*_dot = Omega^-1 (y_m_ddot - C (A x_dot + f_dot)),  f_dot along (1, x_dot)
+
+    Runge-Kutta in steps of 0.01 s; u*_dot is taken at the steps and differenced nowhere but in f_dot and u_m_dot, where the
+    difference is central and over 1e-5 s. f is that of the nominal airframe. Raises ParameterError where Omega is singular
+    or the nominal airframe has a zero in the right half plane: then Assumption 3 does not hold.
+    """
+    A, B = uncertain(airframe, uncertainty, samples, seed)
+    zeros = [invariant_zeros(*pair, airframe.matrix_c()).real.max(initial=-math.inf) for pair in zip(A, B, strict=True)]
+    stable = np.array(zeros) <= ORIGIN
+    require(bool(stable[0]), f"airframe {airframe.name}", f"a zero at {zeros[0]:.3g} 1/s", "none in the right half plane")
+    # The last column is the nominal airframe in still air: the gusts have the speed 0 there.
+    A, B = np.concatenate([A, A[:1]]), np.concatenate([B, B[:1]])
+    aircraft = _columns(airframe, flown.gusts, len(A))
+    C, n, m = airframe.matrix_c(), len(airframe.states), len(airframe.outputs)
+    H = np.eye(n)[:, ~C.any(axis=0)]
+    Omega: FloatArray = np.einsum("ij,Njk->Nik", C, B)
+    require(float(np.abs(np.linalg.det(Omega)).min()) > 0.0, "Omega", "a singular C B", "inputs that move all outputs")
+    inverse = np.asarray(np.linalg.inv(Omega), dtype=np.float64)
+    project = np.asarray(H.T @ (np.eye(n) - B @ inverse @ C), dtype=np.float64)
+    follow = H.T @ B @ inverse
+
+    reference = _references(flown, airframe)
+
+    def times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
+        return np.asarray(np.einsum("Nij,jN->iN", matrices, columns))
+
+    def state(k: int, eta: FloatArray) -> FloatArray:
+        return np.asarray((C.T @ reference.y[k])[:, None] + H @ eta)
+
+    def drift(t: Any, x: FloatArray) -> FloatArray:
+        return np.asarray(times(A, x) + dynamics.f(t, x, aircraft))
+
+    def eta_dot(t: float, eta: Array, _: None, __: None) -> Array:
+        k = round(2.0 * t / STEP)
+        return times(project, drift(t, state(k, eta))) + (follow @ reference.y_dot[k]).T
+
+    steps = (len(reference.y) - 1) // 2
+    eta = np.zeros((n - m, len(A)))
+    u_dot = np.zeros((steps + 1, len(A), m))
+    near = 1e-5
+    for k in range(steps + 1):
+        t = k * STEP
+        x = state(2 * k, eta)
+        free = drift(t, x)
+        u = times(inverse, np.asarray(reference.y_dot[2 * k][:, None] - C @ free, dtype=np.float64))
+        x_dot = free + times(B, u)
+        ahead, behind = (dynamics.f(t + step, x + step * x_dot, aircraft) for step in (near, -near))
+        drift_dot: FloatArray = times(A, x_dot) + (ahead - behind) / (2.0 * near)
+        u_dot[k] = times(inverse, reference.y_ddot[2 * k][:, None] - C @ drift_dot).T
+        if k < steps:
+            eta = rk4(eta_dot, t, eta, None, None, STEP)
+    calm, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
+    return Study(airframe, A[:-1], B[:-1], C, airframe.matrix_gravity(), u_dot[:, :-1], slew, calm, stable, uncertainty)
+
+
+class _References(NamedTuple):
+    """The reference and its derivatives every STEP / 2, for the stages of Runge-Kutta, airframe's order, (2 T - 1, m)."""
+
+    y: FloatArray
+    y_dot: FloatArray
+    y_ddot: FloatArray
+
+
+def _references(flown: Manoeuvre, airframe: Airframe) -> _References:
+    matrices, profile = flown.reference.model(), flown.reference.profile()
+    near = 1e-5
+
+    def commanded(t: Array) -> Array:
+        return command(t, profile)
+
+    x, step = zero_state(matrices), model.stepper(STEP / 2.0, matrices)
+    rows = []
+    for k in range(2 * round(flown.duration / STEP) + 1):
+        t = k * STEP / 2.0
+        x_dot = model.x_m_dot(t, x, commanded(t), matrices)
+        u_dot = (commanded(t + near) - commanded(t - near)) / (2.0 * near)
+        x_ddot = model.x_m_dot(t, x_dot, u_dot, matrices)  # (2) differentiated
+        rows.append([model.output(z, matrices) for z in (x, x_dot, x_ddot)])
+        x = model.step(x, np.concatenate([commanded(t + part * STEP / 2.0) for part in (0.0, 0.5, 1.0)]), step)
+    places = [flown.reference.outputs.index(name) for name in airframe.outputs]
+    y, y_dot, y_ddot = np.moveaxis(np.array(rows), 1, 0)[..., places]
+    return _References(y, y_dot, y_ddot)
+
+
+def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
+    """The aircraft with f for states in columns, shape (n, columns), the last column in still air."""
+    blowing = np.append(np.ones(columns - 1), 0.0)
+    start, speed, length = (
+        np.array([[getattr(gust, key)] for gust in gusts.values()]).reshape(-1, 1) for key in ("start", "speed", "length")
+    )
+    directions = [airframe.gust_direction(name) for name in gusts]
+    return Aircraft(
+        airframe.matrix_a(),
+        airframe.matrix_b(),
+        airframe.matrix_c(),
+        airframe.matrix_gravity(),
+        np.reshape(directions, (len(gusts), len(airframe.states))).T,
+        Gusts(start, speed * blowing, length),
+        np.array(airframe.speed),
+    )
+
+
+# Signs and pairing
+
+
+def require_channels(
+    Omega: FloatArray, channels: ChannelPairing, D: Sequence[int] | None = None, input_signs: Sequence[int] | None = None
+) -> FloatArray:
+    """D of a choice of channels, shape (m,), or a ParameterError that says what contradicts Omega and what fits instead.
+
+    Omega = C B in the order of the channels, (m, m), the inputs counted as the airframe counts them; `input_signs` are -1
+    where the command is to be flipped on its way (D_k flips with it, and nothing else). Refused are, in this order: a
+    pairing without a D or with max abs(U - I) above 10, input signs that do not fit the D given, a D that does not fit.
+    """
+    m = len(Omega)
+    flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)
+    try:
+        largest = coupling(Omega)
+        problem = f"max abs(U - I) = {largest:.3g}" if largest > LARGEST_COUPLING else ""
+    except DecompositionError as error:
+        problem = f"no D, for leading minor {error.minor} is zero"
+    if problem:
+        found = ", ".join(f"{output}-{name}" for output, name in zip(*channels, strict=True))
+        better = search(Omega, LARGEST_COUPLING)
+        pairs = (
+            [] if better is None else [f"{channels.outputs[i]}-{channels.inputs[j]}" for i, j in zip(*better[:2], strict=True)]
+        )
+        fits = f"another pairing: {', '.join(pairs)}" if pairs else "inputs that can be paired: no order of these can"
+        raise ParameterError(f"controller.inputs: found {found} with {problem}, expected {fits}")
+    actual = signs(Omega) * flips
+    given = actual if D is None else np.array(D, dtype=np.float64)
+    wrong = [name for name, a, b in zip(channels.inputs, actual, given, strict=True) if a != b]
+    if input_signs is not None:
+        fit = _integers(flips * actual * given)
+        require(
+            not wrong, "input_signs", list(input_signs), f"{fit} for D = {_integers(given)}: {', '.join(wrong)} the other way"
+        )
+    expected = f"{_integers(actual)}, the signs of the minors of C B; or flip {', '.join(wrong)} and keep D"
+    require(not wrong, "controller.D", _integers(given), expected)
+    return np.asarray(actual)
+
+
+def _integers(values: FloatArray) -> list[int]:
+    return [int(value) for value in values]
+
+
+# The answers
+
+
+def select_gains(found: Study, setting: LoopSetting) -> Selection:
+    """Two gain sets for an airframe: the literal one of Theorem 1 and that of the engineering procedure.
+
+    Both have the same channels (the fastest first, so that the last has the smallest K), inputs scaled by 1 / abs(Omega_ii)
+    and D from the minors. The theorem's set takes Lambda = 1 1/s, which asks for the least k_g, and `theorem_gains`; the
+    other one is `engineering_gains` with the slew of the nominal airframe. `omega` is the largest abs(Omega_ii) of the
+    samples. Raises ParameterError as `require_channels` does, and for parameters that cannot be flown.
+    """
+    airframe = found.airframe
+    known = list(airframe.inputs)
+    given = ChannelPairing(airframe.outputs, setting.inputs or tuple(known))
+    require(sorted(given.inputs) == sorted(known), "inputs", ", ".join(given.inputs), f"{', '.join(known)} in any order")
+    paired = [known.index(name) for name in given.inputs]
+    Omega, slew = found.Omega[:, paired], found.slew[paired]
+    require_channels(Omega, given)
+    share = np.array([setting.shares.get(name, CAUTIOUS_SHARE) for name in given.outputs])
+    bandwidth = procedure.bandwidths(_loop(setting, given), share)
+    places = list(procedure.order(bandwidth))
+    channels = ChannelPairing(*(tuple(names[i] for i in places) for names in given))
+    columns = [paired[i] for i in places]
+    D = require_channels(Omega[np.ix_(places, places)], channels)
+    unit = 1.0 / np.abs(np.diag(Omega))[places]
+    rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
+    selected = procedure.engineering_gains(bandwidth[places], slew[places] / unit, setting.factor, rate_limit / unit)
+    spread = np.abs(np.einsum("Nii->Ni", (found.C @ found.B)[:, places][..., columns])).max(axis=0)
+
+    def controller(gains: GainSet, response: FloatArray) -> ControllerParameters:
+        scale = unit * response
+        known = setting.base.inputs
+        limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if set(channels.inputs) <= set(known) else {}
+        values = setting.base.model_dump(exclude=set(INPUT_LIMITS)) | {
+            "rate": setting.rate,
+            "outputs": channels.outputs,
+            "inputs": channels.inputs,
+            "k_g": gains.k_g,
+            "k_d": gains.k_d.tolist(),
+            "Lambda": gains.Lambda.tolist(),
+            "beta": gains.beta.tolist(),
+            "D": _integers(D),
+            "input_scale": scale.tolist(),
+            "omega": (spread * scale).tolist(),
+            "sign": "auto",
+            "lag": _by_name(setting.lag, channels.inputs, 0.0).tolist(),
+            "delay": setting.delay,
+            "feedforward": None,
+        }
+        values |= {key: [row[known.index(name)] for name in channels.inputs] for key, row in limits.items() if row}
+        chosen = ControllerParameters.validate_mapping(values, "controller")
+        return with_feedforward(chosen, airframe) if setting.feedforward else chosen
+
+    ones = np.ones(len(places))
+    bounds, *_ = _bounds(found, places, columns, unit, D, ones, setting.gamma_2)
+    literal = controller(procedure.theorem_gains(bounds, ones), ones)
+    engineering = controller(*selected)
+    return Selection(found, setting, *(judge(found, one, setting) for one in (literal, engineering)))
+
+
+def with_feedforward(controller: ControllerParameters, airframe: Airframe) -> ControllerParameters:
+    """The same controller with the airframe as the nominal model of its feedforward, an extension of the paper.
+
+    lead = lag + delay + half a period, of the controller. Raises ParameterError for an airframe that cannot be its model,
+    such as one with a zero in the right half plane.
+    """
+    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
+    gravity = airframe.matrix_gravity()
+    model = FeedforwardParameters(
+        states=tuple(airframe.states),
+        A=tuple(airframe.matrix_a().ravel().tolist()),
+        B=tuple(airframe.matrix_b()[:, columns].ravel().tolist()),
+        gravity=tuple(gravity.ravel().tolist()) if gravity.any() else None,
+        lead=tuple(lag + controller.delay + 0.5 / controller.rate for lag in controller.lag),
+    )
+    return ControllerParameters.validate_mapping(controller.model_dump() | {"feedforward": model.model_dump()}, "controller")
+
+
+def check_gains(scenario: Scenario, found: Study, gamma_2: float = 0.0) -> GainAssessment:
+    """Judge the gain set of a scenario's controller on an airframe studied along its manoeuvre, by every condition.
+
+    Raises ParameterError where D or the pairing contradict the airframe.
+    """
+    return judge(found, scenario.controller, setting_of(scenario, gamma_2))
+
+
+def setting_of(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
+    """The loop as a scenario has it: its controller, and the rate limits of controller and actuators."""
+    controller, rates = scenario.controller, scenario.aircraft.actuators.rate
+    airframe, _ = scenario.aircraft.load()
+    own = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
+    limits = dict(zip(airframe.inputs, rates, strict=bool(rates)))
+    return LoopSetting(
+        controller,
+        controller.rate,
+        dict(zip(controller.inputs, controller.lag, strict=True)),
+        controller.delay,
+        {name: min(own.get(name, math.inf), limits.get(name, math.inf)) for name in controller.inputs},
+        gamma_2,
+    )
+
+
+def judge(found: Study, controller: ControllerParameters, setting: LoopSetting) -> GainAssessment:
+    """Every condition on a gain set. Rate, lag and delay are the controller's own; gamma_2 and rate limits of the setting.
+
+    Theorem: D and stable zero dynamics as parts of the samples where they hold; (29), (30), steps 2 and 3 with bounds that
+    are the largest over the samples where both hold; "V2_dot" is the least eigenvalue of Q in V2_dot = -z'Qz, over the
+    same samples: what steps 2 and 3 are sufficient for. Loop: `check_loop`, and the linear loop: the part of the samples
+    where it is stable, and its delay margin on the nominal airframe, which should outlast one lost tick. With the implicit
+    sign the linear loop is that inside its width, dt^2 omega beta: what its margin tells is when chatter begins, and no more
+    than half a period is to be had.
+    """
+    airframe = found.airframe
+    rows = [airframe.outputs.index(name) for name in controller.outputs]
+    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
+    channels = ChannelPairing(controller.outputs, controller.inputs)
+    D = require_channels(found.Omega[np.ix_(rows, columns)], channels, controller.D)
+    params = controller.law()
+    loop = Loop(params.K * 0.0 + controller.lag, controller.delay, 1.0 / controller.rate)
+    bounds, holds, counts = _bounds(found, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2)
+    gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
+    C, Bs = found.C[rows], found.B[:, :, columns]
+
+    least = min(_least_decay(A, B, C, params) for A, B in zip(found.A[counts], Bs[counts], strict=True))
+    theorem = (
+        Condition("D (11)", None, float(np.mean(holds)), 1.0),
+        Condition("zero dynamics", None, float(np.mean(found.stable)), 1.0),
+        *procedure.check(gains, bounds),
+        Condition("V2_dot", None, least, 0.0, strict=True),
+    )
+    responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
+    rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
+    limits = tuple(values / params.input_scale for values in (found.slew[columns], rate_limit))
+    conditions = procedure.check_loop(params, loop, responses[0], responses.max(axis=0), *limits)
+    if params.sign is Sign.LITERAL:
+        return GainAssessment(controller, theorem, conditions, bounds, None, ())
+    plants = [LinearPlant(A + found.gravity, B, C) for A, B in zip(found.A, Bs, strict=True)]
+    still = np.zeros(len(rows))
+    steady = float(np.mean([procedure.is_stable(plant, params, loop, still) for plant in plants]))
+    margin = procedure.delay_margin(plants[0], params, loop)
+    each = tuple(procedure.delay_margin(plants[0], params, loop, channel) for channel in range(len(rows)))
+    conditions += (Condition("linear stability", None, steady, 1.0),)
+    if params.sign is Sign.SOFT:
+        conditions += (Condition("delay margin", None, margin, loop.period),)
+    return GainAssessment(controller, theorem, conditions, bounds, margin, each)
+
+
+def _bounds(
+    found: Study,
+    rows: list[int],
+    columns: list[int],
+    scale: FloatArray,
+    D: FloatArray,
+    Lambda: FloatArray,
+    gamma_2: float,
+) -> tuple[Bounds, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Bounds of Theorem 1 in inputs scaled by `scale` (m,); which samples have this D; which of them count, being stable."""
+    C = found.C[rows]
+    Omegas = C @ found.B[:, :, columns] * scale
+    holds = np.array([_has(Omega, D) for Omega in Omegas])
+    counts = holds & found.stable
+    Omegas = Omegas[counts]
+    v_dot = np.moveaxis(found.u_dot[..., columns], 1, 0)[counts] / scale
+    CAC = C @ found.A[counts] @ C.T
+    bounds = Bounds(
+        U=procedure.bound_U(Omegas),
+        N_d=np.max([np.abs(procedure.N_d(*pair)).max(axis=0) for pair in zip(Omegas, v_dot, strict=True)], axis=0),
+        rho=max(procedure.rho(*pair, Lambda) for pair in zip(Omegas, CAC, strict=True)),
+        gamma_2=np.full(len(rows), gamma_2),
+    )
+    return bounds, holds, counts
+
+
+def _has(Omega: FloatArray, D: FloatArray) -> bool:
+    try:
+        return bool((signs(Omega) == D).all())
+    except DecompositionError:
+        return False
+
+
+def _least_decay(A: FloatArray, B: FloatArray, C: FloatArray, params: LawParams) -> float:
+    plant = KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x)
+    return float(np.linalg.eigvalsh(decay(plant, params)).min())
+
+
+def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) -> FloatArray:
+    return np.array([values.get(name, default) for name in names])
+
+
+def _loop(setting: LoopSetting, channels: ChannelPairing) -> Loop:
+    return Loop(_by_name(setting.lag, channels.inputs, 0.0), setting.delay, 1.0 / setting.rate)
+
+
+# Writing a gain set down
+
+
+def as_yaml(selection: Selection) -> str:
+    """The engineering gain set as the section `/**/controller` of a scenario file, units and reasons beside the numbers."""
+    controller, found = selection.engineering.controller, selection.study
+    params = controller.law()
+    bandwidth = ", ".join(f"{value:.3g}" for value in params.K * _response(selection.engineering, found))
+    places = [list(found.airframe.inputs).index(name) for name in controller.inputs]
+    slew = ", ".join(f"{value:.3g}" for value in found.slew[places] / params.input_scale)
+    reasons = {
+        "rate": "Hz",
+        "outputs": "the fastest first: the last one has the smallest gain, as (22) has it",
+        "k_g": f"1/s; K = ({', '.join(f'{value:.3g}' for value in params.K)}) by (22), bandwidths ({bandwidth}) rad/s",
+        "k_d": "1/s",
+        "Lambda": "1/s, a quarter of the bandwidths",
+        "beta": f"units of y / s^2; {selection.setting.factor:g} x the ideal control's slew ({slew}), within 0.7 x rate limit",
+        "D": "signs of the leading minors of C B",
+        "input_scale": "units of u s / units of y: 1 / abs(Omega_ii), Omega = C B",
+        "omega": f"abs(Omega_ii) in scaled inputs, the largest within +-{100 * found.uncertainty:g} %",
+        "sign": params.sign.name.lower() + " with this lag and delay",
+        "lag": "s, actuators",
+        "delay": "s, beyond sampling",
+        "softening": "1, width of the softened sign in total lags",
+    }
+    margin = selection.engineering.delay_margin
+    lines = [
+        f"# Gains for the airframe {found.airframe.name} by the engineering procedure."
+        + ("" if margin is None else f" Predicted delay margin {1e3 * margin:.0f} ms."),
+        "/**/controller:",
+        "  ros__parameters:",
+    ]
+    for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward"}).items():
+        reason = reasons.get(key, "" if key == "inputs" else ControllerParameters.model_fields[key].description)
+        lines.append(f"    {key}: {flow(value)}" + (f"  # {reason}" if reason else ""))
+    if controller.feedforward is not None:
+        lines += _feedforward_lines(controller.feedforward, found.airframe.name)
+    return "\n".join(lines) + "\n"
+
+
+def _feedforward_lines(model: FeedforwardParameters, airframe: str) -> list[str]:
+    lines = [f"    feedforward:  # an extension of the paper: the input of {airframe} along y_m is added; SI, a line a state"]
+    for key, value in model.model_dump(exclude_none=True).items():
+        columns = len(value) if key in {"states", "lead"} else len(value) // len(model.states)
+        rows = [flow(value[i : i + columns])[1:-1] for i in range(0, len(value), columns)]
+        lines.append(f"      {key}: [" + (",\n" + " " * (9 + len(key))).join(rows) + "]" + ("  # s" if key == "lead" else ""))
+    return lines
+
+
+def _response(answer: GainAssessment, found: Study) -> FloatArray:
+    """abs(Omega_ii) of the nominal airframe in the inputs of the controller, shape (m,)."""
+    rows = [found.airframe.outputs.index(name) for name in answer.controller.outputs]
+    columns = [list(found.airframe.inputs).index(name) for name in answer.controller.inputs]
+    return np.asarray(np.abs(found.Omega[rows, columns]) * answer.controller.input_scale)
+
+
+def flow(value: Any) -> str:
+    """A value in YAML's flow style; floats with six digits and always a point, which YAML 1.1 needs to see a float."""
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(flow(one) for one in value)}]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {flow(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        digits, mark, exponent = f"{value:.6g}".partition("e")
+        return (digits if "." in digits else digits + ".0") + mark + exponent
+    return str(value)

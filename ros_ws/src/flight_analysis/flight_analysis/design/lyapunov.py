@@ -1,0 +1,222 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's Lyapunov functions along a flight whose plant is known: evidence for the theorem, never part of the law.
+
+Everything is in the law's channel order and its scaled inputs v (u = input_scale v), so that Omega = C B is the matrix
+that the law acts through. Time derivatives are central differences over the samples of a flight: at a sample, where
+y_dot jumps with u, that is the mean of both sides. They are exact up to terms that vanish with the sampling period.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+
+from aircraft_sim import dynamics
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.integrators import rk4
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
+from rise_di_controller.decomposition import decompose
+from rise_di_controller.law import LawParams, Sign, engage, step
+
+
+class KnownPlant(NamedTuple):
+    """Equation (1), x_dot = A x + f(t, x) + B v, y = C x, with outputs and scaled inputs v in the law's order."""
+
+    A: FloatArray  # (n, n)
+    B: FloatArray  # (n, m), per scaled input
+    C: FloatArray  # (m, n), of full row rank
+    f: Callable[[float, FloatArray], FloatArray]  # (t, x) -> (n,)
+
+
+class FlightSamples(NamedTuple):
+    """What the evidence needs of a flight, at N >= 3 ticks of the law; the first is the engagement."""
+
+    t: FloatArray  # (N,) s
+    x: FloatArray  # (N, n)
+    f: FloatArray  # (N, n), f(x, t) of equation (1)
+    y_m: FloatArray  # (N, m)
+    Pi: FloatArray  # (N, m), equation (21), scaled input
+
+
+class Evidence(NamedTuple):
+    """The signals of the stability proof along a flight of N ticks."""
+
+    t: FloatArray  # (N,) s
+    e: FloatArray  # (N, m), equation (3)
+    e_dot: FloatArray  # (N, m)
+    r: FloatArray  # (N, m), equation (4)
+    N_d: FloatArray  # (N, m), equation (17) with every reference term in it
+    L: FloatArray  # (N,), equation (46)
+    V1: FloatArray  # (N,), equation (31)
+    P: FloatArray  # (N,), equation (47)
+    V2: FloatArray  # (N,), equation (48)
+
+
+def of_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples]:
+    """KnownPlant and flight of a scenario's tape at the ticks of the law, in its channel order and scaled inputs.
+
+    Raises ValueError where a tick has no sample of `truth` or `y_m` at its stamp. The tape may come from the simulation in
+    one process or from a bag whose clock is exact.
+    """
+    airframe, aircraft = scenario.aircraft.load()
+    controller = scenario.controller
+    outputs = [airframe.outputs.index(name) for name in controller.outputs]
+    inputs = [list(airframe.inputs).index(name) for name in controller.inputs]
+    stamps = tape["internals"].stamp_ns
+    ticks = {name: np.flatnonzero(np.isin(tape[name].stamp_ns, stamps)) for name in ("truth", "y_m")}
+    for name, found in ticks.items():
+        if len(found) != len(stamps):
+            raise ValueError(f"{name}: samples at {len(found)} of {len(stamps)} ticks of the law")
+    plant = KnownPlant(
+        aircraft.A,
+        aircraft.B[:, inputs] * controller.law().input_scale,
+        aircraft.C[outputs],
+        lambda t, x: np.asarray(dynamics.f(t, x, aircraft)),
+    )
+    truth, internals = tape["truth"], tape["internals"]
+    y_m = np.column_stack([tape["y_m"][name][ticks["y_m"]] for name in controller.outputs])
+    x, f = (truth.group(name).values[ticks["truth"]] for name in ("x", "f"))
+    return plant, FlightSamples(tape.time("internals"), x, f, y_m, internals.group("Pi").values)
+
+
+def fly(plant: KnownPlant, y_m: FloatArray, dt: float, params: LawParams, x_0: FloatArray) -> FlightSamples:
+    """The plant under the law from x_0, engaged at t = 0, one tick and one Runge-Kutta step each dt, v held in between.
+
+    Arguments: `y_m` the reference at the ticks, shape (N, m); `dt` in s; `params` with input_scale 1, since B takes v;
+    `x_0` shape (n,).
+    """
+
+    def x_dot(t: float, x: FloatArray, v: FloatArray, _: None) -> FloatArray:
+        return plant.A @ x + plant.f(t, x) + plant.B @ v
+
+    x, state, v = x_0, engage(plant.C @ x_0, y_m[0]), np.zeros(y_m.shape[1])
+    t = np.asarray(dt * np.arange(len(y_m)), dtype=np.float64)
+    xs, Pis = [x], [state.Pi]
+    for k in range(1, len(t)):
+        x = rk4(x_dot, t[k - 1], x, v, None, dt)
+        state, v = step(state, plant.C @ x, y_m[k], dt, params)
+        xs.append(x)
+        Pis.append(state.Pi)
+    f = [plant.f(float(time), x) for time, x in zip(t, xs, strict=True)]
+    return FlightSamples(t, np.array(xs), np.array(f), y_m, np.array(Pis))
+
+
+def evidence(plant: KnownPlant, flight: FlightSamples, params: LawParams, zeta_b: float = 0.0) -> Evidence:
+    """The signals of the proof along a flight, with Omega = C B = S D U (11) and M = S^-1.
+
+        e = C x - y_m (3),  r = e_dot + Lambda e (4)
+        N_d = M (C A (x_dot - C^+ e_dot) + C f_dot - y_m_ddot)            (17), the reference term of (18) moved into it
+        V1 = (e'e + r'M r) / 2                                            (31)
+        L = r' (N_d - D U D Pi_dot)                                       (46), beta Sgn(e) being Pi_dot by (21)
+        P = zeta_b - integral_0^t L  (trapezoid),  V2 = V1 + P            (47), (48)
+
+    C^+ is the pseudo-inverse: C^+ e_dot is the part of x_dot that the outputs show beyond the reference. P >= 0 is what
+    Lemma 2 claims for the zeta_b of `lemma_2`; with the default 0, P and V2 are known up to a constant.
+    Shapes as in the fields. Raises what `decompose` raises where Omega has no such decomposition.
+    """
+    S, D, U = decompose(plant.C @ plant.B)
+    M = np.linalg.inv(S)
+    t = flight.t
+
+    def derivative(signal: FloatArray) -> FloatArray:
+        return np.asarray(np.gradient(signal, t, axis=0, edge_order=2))
+
+    e = flight.x @ plant.C.T - flight.y_m
+    e_dot = derivative(e)
+    r = e_dot + params.Lambda * e
+    hidden = derivative(flight.x) - e_dot @ np.linalg.pinv(plant.C).T
+    y_m_ddot = derivative(derivative(flight.y_m))
+    N_d = (hidden @ (plant.C @ plant.A).T + derivative(flight.f) @ plant.C.T - y_m_ddot) @ M.T
+    V1 = (np.sum(e * e, axis=1) + np.sum(r * (r @ M.T), axis=1)) / 2.0
+    L = np.sum(r * (N_d - derivative(flight.Pi) @ (D[:, None] * U * D).T), axis=1)
+    P = zeta_b - integral(L, t)
+    return Evidence(t, e, e_dot, r, N_d, L, V1, P, V1 + P)
+
+
+def decay(plant: KnownPlant, params: LawParams) -> FloatArray:
+    """Q of V2_dot = -z' Q z along every flight of the continuous law, z = [e; r], symmetric, shape (2m, 2m).
+
+    z' Q z = e' Lambda e - r' N~ + r' D U D K r with N~ = G (r - Lambda e) + e, G = M (C A C^+ + Lambda). Neither beta nor
+    N_d is in it. Steps 2 and 3 of Theorem 1 are sufficient for Q > 0, which is what they are for: k_g large against N~,
+    k_d large against the off-diagonal entries of U. Source: (24), (31), (46)-(48).
+    """
+    S, D, U = decompose(plant.C @ plant.B)
+    m = len(D)
+    G = np.linalg.inv(S) @ (plant.C @ plant.A @ np.linalg.pinv(plant.C) + np.diag(params.Lambda))
+    rows = [[np.diag(params.Lambda), np.zeros((m, m))], [G * params.Lambda - np.eye(m), (D[:, None] * U * D) * params.K - G]]
+    Q = np.block(rows)
+    return np.asarray((Q + Q.T) / 2.0)
+
+
+def lemma_2(plant: KnownPlant, flown: Evidence, params: LawParams) -> float:
+    """The constant zeta_b of (47) that Lemma 2 gives for a flight: P >= 0 then follows from (29), (30).
+
+        zeta_i = max_t abs(N_d,i) + sum_(j>i) abs(U_ij) beta_j            what beta_i has to beat in (29), (30)
+        gamma_2,i = Lambda_i (beta_i / zeta_i - 1)                        the largest that (29), (30) allow
+        gamma_1,i = max_t (integral abs(e_dot_i) - gamma_2,i integral abs(e_i) - abs(e_i))    the least for (40)
+        zeta_b = sum_i beta_i abs(e_i(0)) + gamma_1,i zeta_i
+
+    Raises ValueError naming the channel where beta_i < zeta_i: then no gamma_2 >= 0 meets (29), (30).
+    """
+    U = decompose(plant.C @ plant.B).U
+    zeta = np.max(np.abs(flown.N_d), axis=0) + np.triu(np.abs(U), 1) @ params.beta
+    for i, (found, needed) in enumerate(zip(params.beta, zeta, strict=True)):
+        if found < needed:
+            raise ValueError(f"beta[{i}]: found {found:.3g}, expected at least {needed:.3g} for (29), (30)")
+    gamma_2 = params.Lambda * (params.beta / zeta - 1.0)
+    size = np.abs(flown.e)
+    slack = integral(np.abs(flown.e_dot), flown.t) - gamma_2 * integral(size, flown.t) - size
+    return float(params.beta @ size[0] + np.max(slack, axis=0) @ zeta)
+
+
+def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
+    """integral_0^t of a sampled signal by the trapezoid rule, 0 at the first sample, shape of the signal: (N,) or (N, m)."""
+    return np.asarray(cumulative_trapezoid(signal, t, axis=0, initial=0))
+
+
+def largest_rise(signal: FloatArray) -> float:
+    """How far a signal of shape (N,) climbs above any earlier value of it: max_(j<k) (s_k - s_j), 0 where it never does."""
+    return float(np.max(signal - np.minimum.accumulate(signal)))
+
+
+class Example(NamedTuple):
+    """A flight to be flown by `fly`."""
+
+    plant: KnownPlant
+    y_m: FloatArray  # (N, m) at the ticks
+    params: LawParams
+    x_0: FloatArray  # (n,)
+
+
+def example(dt: float, duration: float) -> Example:
+    """Four states, two inputs, Omega = S D U with D = diag(1, -1) and a full U, a disturbance and a reference that never rest.
+
+    Well conditioned (M between 0.8 and 1.3, zeros -1.48 and -1.02) and flown with gains that meet the conditions of
+    Theorem 1 on this flight: `decay` is positive definite and `lemma_2` finds a constant. Times in s.
+    """
+    D, U = np.array([1.0, -1.0]), np.array([[1.0, 0.4], [0.0, 1.0]])
+    S = np.array([[1.2, 0.2], [0.2, 0.9]])
+    A = np.array([[-1.0, 0.3, 0.5, -0.2], [0.2, -0.8, 0.3, 0.4], [0.4, -0.3, -1.5, 0.2], [0.1, 0.5, -0.2, -1.0]])
+    B = np.vstack([S * D @ U, 0.1 * np.eye(2)])
+
+    def f(t: float, x: FloatArray) -> FloatArray:
+        pushes = [np.sin(0.9 * t), np.cos(0.7 * t), 0.0, 0.0]
+        return np.asarray(np.array([0.3, 0.4, 0.2, 0.1]) * np.sin(x[[2, 0, 3, 1]]) + pushes)
+
+    t = dt * np.arange(round(duration / dt) + 1)
+    y_m = np.column_stack([0.5 * np.sin(t), 0.4 * np.sin(0.6 * t + 1.0)])
+    K, beta = np.array([6.0, 4.0]), np.array([5.0, 3.0])
+    params = LawParams(
+        K=K,
+        Lambda=np.array([1.0, 1.0]),
+        beta=beta,
+        D=D,
+        input_scale=np.ones(2),
+        omega=np.array([2.0, 2.0]),
+        eps=beta / K * 3.0 * 1.5 * dt,
+        sign=Sign.IMPLICIT,
+    )
+    return Example(KnownPlant(A, B, np.eye(2, 4), f), y_m, params, np.array([0.5, 0.0, 0.0, 0.0]))

@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""D of the controller beside what a channel map, and a recorded flight, do with the signs."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe, load_airframe
+from autopilot_bridge.params import ChannelMap, InputRow, OutputRow
+from autopilot_bridge.signs import SURE, Estimate, estimate, output_signs, through
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.parameters import ParameterError, require
+from flight_core.vectors import FloatArray
+from flight_log.tape_reader import read_run
+from rise_di_controller.decomposition import signs
+
+
+class Channel(NamedTuple):
+    """One channel of the law, through the map."""
+
+    output: str
+    input: str
+    effect: float  # Omega_ii as the controller sees it, SI
+    D: int  # that follows from the airframe and the map
+    D_controller: int
+    measured: float | None  # Omega_ii by a recorded flight
+    ratio: float | None  # beside its standard error
+
+
+class SignCheck(NamedTuple):
+    """What the check found."""
+
+    channels: tuple[Channel, ...]
+    contradictions: tuple[str, ...]  # sentences
+    intervals: int  # of the recorded flight
+
+
+def require_signs(chart: ChannelMap, scenario: Scenario) -> None:
+    """Raise ParameterError where a map contradicts the D of a scenario's controller, by the scenario's airframe."""
+    checked = check_scenario(chart, scenario, load_airframe(scenario.aircraft.airframe), None)
+    if checked.contradictions:
+        raise ParameterError("; ".join(checked.contradictions))
+
+
+def check_scenario(chart: ChannelMap, scenario: Scenario, frame: Airframe, bag: Path | None) -> SignCheck:
+    """Check a channel map against a scenario's controller, by an airframe and, where there is one, a recorded flight."""
+    outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
+    for key, found, expected in (
+        (f"map {chart.name}: outputs", tuple(chart.outputs), outputs),
+        (f"map {chart.name}: inputs", tuple(chart.inputs), inputs),
+        (f"airframe {frame.name}: outputs", frame.outputs, outputs),
+        (f"airframe {frame.name}: inputs", tuple(frame.inputs), inputs),
+    ):
+        require(sorted(found) == sorted(expected), key, ", ".join(found), f"the controller's: {', '.join(expected)}")
+    Omega = frame.matrix_c() @ frame.matrix_b()
+    in_map = Omega[
+        np.ix_([frame.outputs.index(one) for one in chart.outputs], [list(frame.inputs).index(one) for one in chart.inputs])
+    ]
+    measured = None
+    if bag is not None:
+        tape = read_run(bag).tape
+        for topic in ("y", "u"):
+            require(topic in tape, str(bag), f"no {topic}", "a log with y and u")
+        measured = estimate(tape["y"], tape["u"], outputs, inputs)
+    return check(chart, in_map, outputs, inputs, scenario.controller.D, measured)
+
+
+def check(
+    chart: ChannelMap,
+    Omega: FloatArray,
+    outputs: tuple[str, ...],
+    inputs: tuple[str, ...],
+    D: tuple[int, ...],
+    measured: Estimate | None = None,
+) -> SignCheck:
+    """D of diag(output signs) Omega diag(input signs) against the controller's, and against a recorded flight.
+
+    Arguments: Omega = C B of the airframe, (m, m), in the map's order; the channels and D in the controller's. Raises
+    ParameterError where the map does not fit the airframe, or Omega has no D.
+    """
+    rows, columns = (
+        [list(part).index(one) for one in names] for part, names in ((chart.outputs, outputs), (chart.inputs, inputs))
+    )
+    seen = through(chart, Omega)[np.ix_(rows, columns)]
+    follows = [int(sign) for sign in signs(seen)]
+    sentences = [
+        f"outputs.{name} of the map {chart.name} comes with the wrong sign:"
+        f" {motion_as_channel_grows(chart.outputs[name])} as it grows"
+        for name, sign in zip(chart.outputs, output_signs(chart), strict=True)
+        if sign < 0
+    ]
+    channels = []
+    for i, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
+        found = None if measured is None else float(measured.Omega[i, i])
+        ratio = None if measured is None else float(measured.ratio[i, i])
+        channels.append(Channel(output, name, float(seen[i, i]), follows[i], D[i], found, ratio))
+        if follows[i] != D[i]:
+            sentences.append(
+                f"with the map {chart.name} D of {output} and {name} is {follows[i]:+d}, the controller has {D[i]:+d}:"
+                f" a positive {name} makes the aircraft {motion_as_channel_grows(chart.inputs[name])}"
+            )
+        if found is not None and ratio is not None and ratio >= SURE and found * seen[i, i] < 0.0:
+            sentences.append(
+                f"the recorded flight has {output}_dot {'rise' if found > 0.0 else 'fall'} with {name}"
+                f" ({found:.3g}, {ratio:.0f} standard errors), the map {chart.name} says the opposite"
+            )
+    return SignCheck(tuple(channels), tuple(sentences), 0 if measured is None else measured.intervals)
+
+
+OPPOSITE = {
+    "nose up": "nose down",
+    "roll right": "roll left",
+    "nose right": "nose left",
+    "faster": "slower",
+    "more thrust": "less thrust",
+}
+
+
+def motion_as_channel_grows(row: OutputRow | InputRow) -> str:
+    """What the aircraft does as the channel, not the raw value, grows."""
+    both = OPPOSITE | {after: before for before, after in OPPOSITE.items()}
+    return row.positive if row.sign > 0 else both[row.positive]

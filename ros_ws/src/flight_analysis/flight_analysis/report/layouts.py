@@ -1,0 +1,178 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Layouts of Foxglove and PlotJuggler for the runs of a scenario: the plots an engineer wants first.
+
+Foxglove knows a channel by its place in `position`, PlotJuggler by its name; so a layout fits the scenarios with the same
+channels in the same order.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+from aircraft_sim.simulator import Simulator
+from flight_analysis.closed_loop.scenario import Scenario
+from rise_di_controller import internals
+
+COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b")
+COLUMNS = 2
+
+
+class Curve(NamedTuple):
+    """A channel of a topic."""
+
+    topic: str
+    channel: str
+
+
+class Plot(NamedTuple):
+    """Curves over time in one pair of axes, all SI and radians."""
+
+    title: str
+    curves: tuple[Curve, ...]
+
+
+class Tab(NamedTuple):
+    """Plots that are seen together."""
+
+    title: str
+    plots: tuple[Plot, ...]
+
+
+def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
+    """The channels of each topic of a run, in their order."""
+    controller = scenario.controller
+    return {
+        "y": tuple(scenario.aircraft.channels().outputs),
+        "y_m": scenario.reference_model.outputs,
+        "u": controller.inputs,
+        "internals": internals.names(controller.outputs, controller.inputs),
+        "truth": tuple(Simulator(scenario.aircraft).truth_names),
+    }
+
+
+def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
+    """The tabs: y over y_m and e by output, u with u_free, integral_e and Pi, how the controller ticked, the wind."""
+    outputs, inputs, wind = channels["y_m"], channels["u"], [name for name in channels["truth"] if name.startswith("gust.")]
+
+    def log(title: str, *names: str) -> Plot:
+        return Plot(title, tuple(Curve("internals", name) for name in names))
+
+    return (
+        Tab("tracking", tuple(Plot(f"{name}: y, y_m", (Curve("y", name), Curve("y_m", name))) for name in outputs)),
+        Tab("error", tuple(log(f"e {name}", f"e.{name}") for name in outputs)),
+        Tab("input", tuple(log(f"u {name}: u_free, u", f"u_free.{name}", f"u.{name}") for name in inputs)),
+        Tab(
+            "integrals", tuple(log(f"{group} {name}", f"{group}.{name}") for name in outputs for group in ("integral_e", "Pi"))
+        ),
+        Tab(
+            "controller",
+            (
+                log("mode: 1 engaged, 2 hold, 3 ramp, 4 trim, 5 inactive", "mode"),
+                log("limited: 1 magnitude, 2 rate", *(f"limited.{name}" for name in inputs)),
+                log("late, age (s)", "late", "age"),
+                log("dt (s)", "dt"),
+            ),
+        ),
+        Tab("wind", tuple(Plot(f"{name} (m/s)", (Curve("truth", name),)) for name in wind)),
+    )
+
+
+def foxglove(channels: Mapping[str, Sequence[str]]) -> str:
+    """A layout as Foxglove and Lichtblick import it: JSON, a panel of tabs that hold Plot panels.
+
+    Paths are "/topic.position[place]". Time is that of the log, for flight time as in the stamps of lockstep is far from it.
+    """
+    panels: dict[str, Any] = {}
+    shown = []
+    for tab in tabs_of(channels):
+        names = []
+        for number, plot in enumerate(tab.plots):
+            names.append(f"Plot!{tab.title}{number}")
+            panels[names[-1]] = _foxglove_plot(plot, channels)
+        if names:
+            shown.append({"title": tab.title, "layout": _mosaic(names)})
+    panels["Tab!rise_di"] = {"activeTabIdx": 0, "tabs": shown}
+    layout = {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": "Tab!rise_di",
+    }
+    return json.dumps(layout, indent=2) + "\n"
+
+
+def _foxglove_plot(plot: Plot, channels: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    paths = [
+        {
+            "value": f"/{topic}.position[{list(channels[topic]).index(channel)}]",
+            "label": f"{topic}: {channel}",
+            "color": colour,
+            "enabled": True,
+            "timestampMethod": "receiveTime",
+        }
+        for (topic, channel), colour in zip(plot.curves, COLOURS, strict=False)
+    ]
+    return {
+        "foxglovePanelTitle": plot.title,
+        "lichtblickPanelTitle": plot.title,
+        "paths": paths,
+        "showXAxisLabels": True,
+        "showYAxisLabels": True,
+        "showLegend": True,
+        "legendDisplay": "floating",
+        "showPlotValuesInLegend": False,
+        "isSynced": True,
+        "xAxisVal": "timestamp",
+        "sidebarDimension": 240,
+    }
+
+
+def _mosaic(names: Sequence[str]) -> Any:
+    """Panels in rows of COLUMNS, each split in two: the first and all others."""
+    rows = [_split(names[start : start + COLUMNS], "row") for start in range(0, len(names), COLUMNS)]
+    return _split(rows, "column")
+
+
+def _split(parts: Sequence[Any], direction: str) -> Any:
+    first, *others = parts
+    if not others:
+        return first
+    share = 100.0 / len(parts)
+    return {"direction": direction, "first": first, "second": _split(others, direction), "splitPercentage": share}
+
+
+def plotjuggler(channels: Mapping[str, Sequence[str]]) -> str:
+    """A layout as PlotJuggler loads it: XML, tabs of docked plots, curves named "/topic/channel/position"."""
+    root = ElementTree.Element("root")
+    window = ElementTree.SubElement(root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"})
+    for tab in tabs_of(channels):
+        if not tab.plots:
+            continue
+        element = ElementTree.SubElement(window, "Tab", {"tab_name": tab.title, "containers": "1"})
+        rows = [tab.plots[start : start + COLUMNS] for start in range(0, len(tab.plots), COLUMNS)]
+        outer = _splitter(ElementTree.SubElement(element, "Container"), "-", len(rows))
+        for row in rows:
+            inner = _splitter(outer, "|", len(row))
+            for plot in row:
+                _plotjuggler_plot(inner, plot)
+    ElementTree.SubElement(window, "currentTabIndex", {"index": "0"})
+    ElementTree.SubElement(root, "use_relative_time_offset", {"enabled": "1"})
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _splitter(parent: ElementTree.Element, orientation: str, count: int) -> ElementTree.Element:
+    sizes = ";".join([f"{1.0 / count:.6g}"] * count)
+    return ElementTree.SubElement(parent, "DockSplitter", {"orientation": orientation, "count": str(count), "sizes": sizes})
+
+
+def _plotjuggler_plot(parent: ElementTree.Element, plot: Plot) -> None:
+    area = ElementTree.SubElement(parent, "DockArea", {"name": plot.title})
+    element = ElementTree.SubElement(
+        area, "plot", {"mode": "TimeSeries", "style": "Lines", "flip_x": "false", "flip_y": "false"}
+    )
+    for (topic, channel), colour in zip(plot.curves, COLOURS, strict=False):
+        ElementTree.SubElement(element, "curve", {"name": f"/{topic}/{channel}/position", "color": colour})

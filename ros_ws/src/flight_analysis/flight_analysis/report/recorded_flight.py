@@ -1,0 +1,23 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A recorded flight, as it is drawn, exported and compared."""
+
+from typing import Any, NamedTuple
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.rates import period_ns
+from flight_core.tape import Tape
+
+
+class RecordedFlight(NamedTuple):
+    """What was flown, under the name of its run."""
+
+    name: str
+    scenario: Scenario
+    tape: Tape
+    summary: dict[str, Any]  # `summary.summarise`
+
+    @property
+    def period_ns(self) -> int:
+        """Period of the controller's ticks, ns."""
+        return period_ns(self.scenario.controller.rate, "controller.rate")

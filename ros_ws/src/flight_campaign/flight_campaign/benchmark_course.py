@@ -1,0 +1,160 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What every aircraft of a fleet meets, tick by tick: the reference, the wind, the errors of the sensors, the feedforward.
+
+None of it depends on the aircraft. It is worked out once, with the functions that the loop in one process flies by.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aircraft_sim import plant as flown
+from aircraft_sim import sensors, turbulence
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.plant import Plant
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.parameters import require
+from flight_core.rates import divide, nanoseconds, period_ns, seconds
+from flight_core.vectors import FloatArray
+from reference_model.reference import Reference
+from rise_di_controller import feedforward
+from rise_di_controller.feedforward import Nominal
+from rise_di_controller.guard import DT_RANGE
+
+HOLD, ENGAGE, STEP = range(3)
+"""What a controller does at a tick: nothing, for no new y has come; it engages; it takes a step of its law."""
+
+BLOWN_FROM = {"vertical": "alpha", "lateral": "beta"}
+"""Which angle a wind along an axis changes: alpha_air = alpha - w/V0, beta_air = beta - v/V0, small angles."""
+
+
+class Course(NamedTuple):
+    """T ticks of the controller, the last at the end of the flight; channels in the law's order, states in the airframe's."""
+
+    t: FloatArray  # (T,) s
+    phase: NDArray[np.int32]  # (T,) HOLD, ENGAGE or STEP
+    dt: FloatArray  # (T,) s since the sample used before, inside the controller's range
+    y_m: FloatArray  # (T, m) the reference at the tick
+    seen_y_m: FloatArray  # (T, m) the reference at the instant of the y that is used at the tick, and its derivative
+    seen_y_m_dot: FloatArray  # (T, m)
+    u_ff: FloatArray  # (T, m) feedforward
+    error: FloatArray  # (T, m) what the sensors add to the y of the tick
+    forcing: FloatArray  # (T, K r) mean of basis' @ of_time over each of the steps from here to the next tick
+    forcing_now: FloatArray  # (T, r) at the tick
+    air: FloatArray  # (T, n) what the wind takes from alpha and beta, rad
+    basis: FloatArray  # (n, r) orthonormal, what of_time moves x_dot along
+    order: NDArray[np.int64]  # (m,) place of the law's outputs in y
+    late: int  # ticks by which a y is late
+    period: float  # s, of the ticks
+    steps: int  # of the integration from tick to tick
+
+
+def build_course(scenario: Scenario, nominal: Nominal | None = None) -> Course:
+    """The course of a scenario; `nominal` is that of its feedforward, by default what its controller has.
+
+    Raises ParameterError where the scenario has what a fleet cannot fly: an aircraft of JSBSim, a y that is late by part of a
+    tick, losses of a y that comes more often than the ticks, or losses that outlast the age limit.
+    """
+    aircraft, controller = scenario.aircraft, scenario.controller
+    require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
+    airframe, plant = aircraft.load()[0], aircraft.plant()
+    tick_ns, sample_ns = period_ns(controller.rate, "controller.rate"), period_ns(aircraft.rate, "aircraft.rate")
+    ticks, steps = nanoseconds(scenario.flight.duration) // tick_ns + 1, divide(tick_ns, plant.step_ns, "step", "a tick")
+    outputs = list(aircraft.channels().outputs)
+    order = np.array([outputs.index(name) for name in controller.outputs])
+
+    errors = aircraft.sensor_arrays()
+    late = divide(errors.delay_ns, tick_ns, "sensors.delay", "a tick") if errors.delay_ns else 0
+    lossless = errors.dropout == 0.0 or tick_ns == sample_ns
+    require(lossless, "aircraft.rate", f"{aircraft.rate:g} Hz", f"controller.rate ({controller.rate:g} Hz) where y is lost")
+    error, drift = np.zeros((ticks, len(outputs))), sensors.initial_drift(errors)
+    for k in range(ticks):
+        error[k], drift = sensors.error(k * (tick_ns // sample_ns), drift, errors)
+
+    reference = Reference(scenario.reference_model)
+    y_m, y_m_dot = np.zeros_like(error), np.zeros_like(error)
+    places = [scenario.reference_model.outputs.index(name) for name in controller.outputs]
+    for k in range(ticks):
+        y_m[k] = reference.sample(k * tick_ns // reference.period_ns)[places]
+        y_m_dot[k] = reference.rate()[places]
+
+    phase, dt = _phases(ticks, late, seconds(tick_ns), scenario, [sensors.arrives(k, errors) for k in range(ticks)])
+    used = np.maximum(np.arange(ticks) - late, 0)
+    forcing, now, air = _wind(ticks, steps, plant, airframe)
+    _, sizes, rows = np.linalg.svd(forcing, full_matrices=False)
+    basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
+    return Course(
+        np.arange(ticks) * np.float64(seconds(tick_ns)),
+        phase,
+        dt,
+        y_m,
+        y_m[used],
+        y_m_dot[used],
+        _feedforward(controller.nominal() if nominal is None else nominal, phase, dt, y_m[used]),
+        error[:, order],
+        (forcing @ basis).reshape(ticks, -1),
+        now @ basis,
+        air,
+        basis,
+        order,
+        late,
+        seconds(tick_ns),
+        steps,
+    )
+
+
+def _phases(
+    ticks: int, late: int, period: float, scenario: Scenario, arrives: list[bool]
+) -> tuple[NDArray[np.int32], FloatArray]:
+    phase, dt = np.full(ticks, HOLD, dtype=np.int32), np.zeros(ticks)
+    last: int | None = None
+    for k in range(late, ticks):
+        if not arrives[k - late]:
+            continue
+        if last is None:
+            phase[k] = ENGAGE
+        else:
+            lost = (k - last + late) * period
+            require(lost <= scenario.controller.max_age, "sensors.dropout", f"{lost:g} s without y", "less than max_age")
+            phase[k], dt[k] = STEP, min(max((k - last) * period, DT_RANGE[0] * period), DT_RANGE[1] * period)
+        last = k
+    return phase, dt
+
+
+def _feedforward(nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArray, y_m: FloatArray) -> FloatArray:
+    u_ff = np.zeros_like(y_m)
+    if nominal is None:
+        return u_ff
+    state = feedforward.initial_state(y_m[0], nominal)
+    for k, doing in enumerate(phase):
+        if doing == ENGAGE:
+            state = feedforward.initial_state(y_m[k], nominal)
+        elif doing == STEP:
+            state, u_ff[k] = feedforward.step(state, y_m[k], dt[k], nominal)
+        elif k:
+            u_ff[k] = u_ff[k - 1]
+    return u_ff
+
+
+def _wind(ticks: int, steps: int, plant: Plant, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What drives x_dot in time: mean over each step (T K, n), at each tick (T, n); what the wind takes from the angles."""
+    forced = flown.forcing(0, ticks * steps, plant)
+    direction = np.asarray(plant.aircraft.gust_direction)
+    blown = np.zeros((ticks * steps, direction.shape[1]))
+    if (air := plant.turbulence) is not None:
+        z = turbulence.initial_state(air)
+        normals = turbulence.normals(0, ticks * steps, air.seed)
+        for k in range(ticks * steps):
+            blown[k] = turbulence.wind(z, air)
+            z = turbulence.step(z, normals[k], air)
+    rate = forced.rate
+    over_step = (rate[:-1:2] + 4.0 * rate[1::2] + rate[2::2]) / 6.0 + blown @ direction.T  # Simpson, as Runge-Kutta has it
+    wind = forced.wind[: -1 : 2 * steps] + blown[::steps]
+    angles = np.zeros((ticks, len(airframe.states)))
+    for place, axis in enumerate(airframe.gusts):
+        angle = BLOWN_FROM.get(axis)
+        if angle in airframe.states:
+            angles[:, airframe.index(angle)] = wind[:, place] / airframe.speed
+    return over_step, rate[: -1 : 2 * steps] + blown[::steps] @ direction.T, angles

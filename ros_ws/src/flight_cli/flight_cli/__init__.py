@@ -1,0 +1,3 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The rise-di command of the RISE-DI flight stack, one file a command."""

@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The `rise-di` command: what it can do. A command's module is imported when it runs, so that --help is quick."""
+
+import signal
+
+# Until the command runs, Ctrl-C ends it without a word: its imports may take a second.
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+import os
+import sys
+from importlib.metadata import version
+from pkgutil import resolve_name
+from types import MappingProxyType
+from typing import Annotated
+
+import typer
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+COMMANDS = MappingProxyType(
+    {
+        "fly": "Fly a scenario over ROS 2 topics, in real time or in lockstep, or in one process.",
+        "report": "Write the report page of a recorded run again, or one that compares several.",
+        "replay": "Compute every tick of a recorded flight again and compare it with the log bit by bit.",
+        "play": "Publish the topics of a recorded flight again with their timing.",
+        "repair": "Rebuild the log of a run whose recorder was killed, or that is damaged.",
+        "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a scenario.",
+        "gains": "Select gains for an airframe, and check every condition on them.",
+        "airframes": "Show the airframes of the library, and what the theorem asks of each.",
+        "identify": "Identify an aircraft of JSBSim and write the scenario that flies it.",
+        "check-signs": "Compare the signs of a channel map with the D of the controller.",
+        "engage": "Engage or disengage the autopilot behind a running bridge.",
+        "campaign": "Fly a Monte Carlo campaign of uncertain aircraft.",
+        "compare": "Compare RISE-DI with other control laws on the same aircraft.",
+    }
+)
+"""What each command does. The function `NAME` of the module `flight_cli.NAME` is the command, with _ for -."""
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"rise-di {version('flight_cli')}")
+        raise typer.Exit
+
+
+def _options(
+    show_version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Fly, record and analyse RISE dynamic inversion."""
+
+
+def application(words: list[str]) -> typer.Typer:
+    """The command line with the command that is among the words; the others are there by name and help alone."""
+    app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
+    app.callback()(_options)
+    for name, sentence in COMMANDS.items():
+        if name in words:
+            module = name.replace("-", "_")
+            app.command(name)(resolve_name(f"flight_cli.{module}:{module}"))
+        else:
+            app.command(name, help=sentence)(lambda: None)
+    return app
+
+
+def main() -> None:
+    """Entry point: bad input is one sentence and exit status 2, Ctrl-C is quiet."""
+    words = [*sys.argv[1:2], *os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", "")).split()]
+    try:
+        app = application(words)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        from flight_core.parameters import ParameterError  # noqa: PLC0415 - loads pydantic, which --help does without
+
+        try:
+            app(prog_name="rise-di")
+        except ParameterError as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,235 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di gains`: Theorem 1 and the engineering procedure side by side, and a scenario's gain set judged by both."""
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from aircraft_sim.airframe import Airframe, load_airframe
+from flight_analysis.design.gain_conditions import MOST_DELAY, Condition, failing
+from flight_analysis.design.gain_selection import (
+    GainAssessment,
+    Study,
+    as_yaml,
+    check_gains,
+    manoeuvre,
+    select_gains,
+    setting_of,
+    study,
+)
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError, require
+
+CONDITION_FAILS = 1
+SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
+MEANINGS = {
+    "share": "bandwidth times the lag of the loop (actuator, 1.5 periods, delay), in rad what the phase margin lacks of 90 deg",
+    "softening": "width of the softened sign in time, beside the lag of the loop: narrower than that the loop is unstable",
+    "response": "how much one unit of scaled input changes y_dot, abs(Omega_ii) input_scale; bandwidth = K x response",
+}
+"""What the words of the table mean, where its names do not say it."""
+
+
+def gains(
+    airframe: Annotated[str, typer.Argument(help="Name of an airframe, or path of an airframe file (.yaml).")],
+    uncertainty: Annotated[float, typer.Option(help="Part by which every entry of A and B may be off.")] = 0.3,
+    scenario: Annotated[str, typer.Option(help="Scenario whose commands, gusts and loop to select for.")] = "osprey_servo",
+    rate: Annotated[float | None, typer.Option(help="Rate of the law in Hz, in place of the scenario's.")] = None,
+    lag: Annotated[str | None, typer.Option(help="Lags of the actuators in s, in the airframe's order: 0.02,0.1")] = None,
+    delay: Annotated[float | None, typer.Option(help="Pure delay in s, in place of the scenario's.")] = None,
+    inputs: Annotated[str | None, typer.Option(help="What drives each output, in the airframe's order: rudder,aileron")] = None,
+    gamma_2: Annotated[float, typer.Option(help="gamma_2 of Lemma 1 in 1/s: stated, for nothing bounds it.")] = 0.0,
+    samples: Annotated[
+        int, typer.Option(min=0, max=10_000, help="How many uncertain airframes to bound the theorem's figures with.")
+    ] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain airframes.")] = 1,
+    write: Annotated[Path | None, typer.Option(help="File to write the engineering gains to, as a scenario has them.")] = None,
+    feedforward: Annotated[
+        bool, typer.Option("--feedforward", help="Write the airframe along, as the model of a feedforward (an extension).")
+    ] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Judge the gain set of the scenario instead of selecting one.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
+) -> None:
+    """Select gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on both.
+
+    Exit status: 0, or with --check 1 where a condition of the loop fails, 2 bad input.
+    """
+    chosen, flown = find_scenario(scenario), load_airframe(airframe)
+    require(rate is None or 1.0 <= rate <= 1000.0, "--rate", rate, "1 to 1000 Hz")
+    require(delay is None or 0.0 <= delay <= MOST_DELAY, "--delay", delay, f"0 to {MOST_DELAY:g} s")
+    require(0.0 <= gamma_2 < math.inf, "--gamma-2", gamma_2, "0 or more, 1/s")
+    setting = setting_of(chosen, gamma_2)._replace(inputs=tuple(inputs.split(",")) if inputs else (), feedforward=feedforward)
+    if rate is not None:
+        setting = setting._replace(rate=rate)
+    if delay is not None:
+        setting = setting._replace(delay=delay)
+    if lag is not None:
+        setting = setting._replace(lag=_lags(lag, flown))
+    if check:
+        for option, given in (("--write", write is not None), ("--feedforward", feedforward)):
+            require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
+        changed = rate is not None or delay is not None or lag is not None or inputs is not None
+        require(not changed, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
+        known, named = chosen.controller.outputs, f"airframe {flown.name}"
+        require(sorted(known) == sorted(flown.outputs), named, ", ".join(flown.outputs), f"the outputs {', '.join(known)}")
+    console = Console(quiet=as_json)
+    with console.status("following the reference on uncertain airframes"):
+        found = study(flown, manoeuvre(chosen, flown), uncertainty, samples, seed)
+        if check:
+            answers, text = {"scenario": check_gains(chosen, found, gamma_2)}, None
+        else:
+            selection = select_gains(found, setting)
+            answers, text = {"theorem": selection.theorem, "engineering": selection.engineering}, as_yaml(selection)
+    if write is not None and text is not None:
+        _write(write, text)
+    if as_json:
+        print(json.dumps(_plain(found, answers, seed)))
+    else:
+        _show(console, found, answers)
+        if write is not None:
+            console.print(f"gains: {write}")
+    if check and failing(answers["scenario"].loop):
+        raise typer.Exit(CONDITION_FAILS)
+
+
+def _lags(text: str, airframe: Airframe) -> dict[str, float]:
+    """Lags by input from "0.02,0.1", or from one value for all. Raises ParameterError."""
+    names = list(airframe.inputs)
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ParameterError(f"--lag: found {text!r}, expected seconds separated by commas") from None
+    values = values * len(names) if len(values) == 1 else values
+    require(len(values) == len(names), "--lag", f"{len(values)} values", f"one for all or one for each of {', '.join(names)}")
+    require(all(0.0 <= value < math.inf for value in values), "--lag", text, "seconds, 0 or more")
+    return dict(zip(names, values, strict=True))
+
+
+def _write(path: Path, text: str) -> None:
+    header = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
+    try:
+        path.write_text(header + text, encoding="utf-8")
+    except OSError as error:
+        raise ParameterError(f"--write: found {path}, expected a file that can be written ({error.strerror})") from None
+
+
+def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) -> None:
+    first = next(iter(answers.values()))
+    outputs = first.controller.outputs
+    samples = len(found.A) - 1
+    title = f"Gains for {found.airframe.name}, A and B +-{100 * found.uncertainty:g} % ({samples} samples); K, Lambda in 1/s,"
+    table = _table(f"{title} beta in units of y / s^2")
+    table.add_column("channel", no_wrap=True)
+    for name in answers:
+        for heading in (f"{name}\nK", "\nLambda", "\nbeta"):
+            table.add_column(heading, justify="right", no_wrap=True)
+    for i, (output, name) in enumerate(zip(outputs, first.controller.inputs, strict=True)):
+        row = [f"{output} by {name}"]
+        for answer in answers.values():
+            params = answer.controller.law()
+            row += [f"{params.K[i]:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i]:.4g}"]
+        table.add_row(*row)
+    console.print(table)
+    for name, answer in answers.items():
+        console.print(f"{name}: {_margin(answer)}", highlight=False, soft_wrap=True)
+
+    for part, heading in (("theorem", "Theorem 1"), ("loop", "The loop")):
+        table = _table(f"\n{heading}")
+        table.add_column("condition")
+        for name in answers:
+            table.add_column(f"{name}\nfound and bound", justify="right", no_wrap=True)
+            table.add_column("\nmargin", justify="right", no_wrap=True)
+        for row_ in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
+            table.add_row(_named(row_, outputs), *(cell for condition in row_ for cell in _cells(condition)))
+        console.print(table)
+    gamma_2 = first.bounds.gamma_2[0]
+    console.print(
+        f"margin: above 1 holds, ! fails; ~ estimate, for gamma_2 = {gamma_2:g} 1/s is stated, not bounded", soft_wrap=True
+    )
+    for word, meaning in MEANINGS.items():
+        console.print(f"{word}: {meaning}", highlight=False, soft_wrap=True)
+    for name, answer in answers.items():
+        failed = answer.failing
+        console.print(f"{name}: {'every condition holds' if not failed else f'{len(failed)} conditions fail'}", highlight=False)
+        for condition in failed if len(answers) == 1 else ():
+            console.print(f"  {condition.sentence(outputs)}", highlight=False)
+
+
+def _table(title: str) -> Table:
+    return Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+
+
+def _named(row: tuple[Condition, ...], outputs: tuple[str, ...]) -> str:
+    """Name of a row; the channel where all agree on it, since the largest term of step 3 may be in another one for each."""
+    where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
+    channel = where.pop() if len(where) == 1 else None
+    return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
+
+
+def _margin(answer: GainAssessment) -> str:
+    if answer.delay_margin is None:
+        return "no linear loop (literal sign)"
+    if answer.delay_margin == 0.0:
+        return "predicted delay margin none: the linear loop is unstable with this lag"
+    each = zip(answer.controller.outputs, answer.channel_margins, strict=True)
+    alone = ", ".join(f"{output} {_milliseconds(margin)}" for output, margin in each)
+    return f"predicted delay margin {_milliseconds(answer.delay_margin)}; in one channel alone: {alone}"
+
+
+def _milliseconds(margin: float) -> str:
+    return f"{1e3 * margin:.0f} ms" if math.isfinite(margin) else "over 500 ms"
+
+
+def _cells(condition: Condition) -> tuple[str, str]:
+    margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
+    side = SIDES[condition.side]
+    return f"{condition.found:.4g} {side} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
+
+
+def _plain(found: Study, answers: dict[str, GainAssessment], seed: int) -> dict[str, Any]:
+    inputs = list(found.airframe.inputs)
+    return {
+        "airframe": found.airframe.name,
+        "uncertainty": found.uncertainty,
+        "samples": len(found.A) - 1,
+        "seed": seed,
+        "slew": dict(zip(inputs, found.slew.tolist(), strict=True)),
+        "slew_calm": dict(zip(inputs, found.slew_calm.tolist(), strict=True)),
+    } | {
+        name: {
+            "controller": answer.controller.model_dump(exclude_none=True),
+            "delay_margin": _number(answer.delay_margin),
+            "channel_margins": [_number(margin) for margin in answer.channel_margins],
+            "bounds": {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")}
+            | {"rho": answer.bounds.rho},
+            "conditions": [
+                {
+                    "name": condition.name,
+                    "part": part,
+                    "channel": None if condition.channel is None else answer.controller.outputs[condition.channel],
+                    "found": _number(condition.found),
+                    condition.side.replace(" ", "_"): _number(condition.bound),
+                    "margin": _number(condition.margin),
+                    "holds": condition.holds,
+                    "estimate": condition.estimate,
+                }
+                for part in ("theorem", "loop")
+                for condition in getattr(answer, part)
+            ],
+        }
+        for name, answer in answers.items()
+    }
+
+
+def _number(value: float | None) -> float | None:
+    # JSON has neither NaN nor infinity.
+    return value if value is not None and math.isfinite(value) else None

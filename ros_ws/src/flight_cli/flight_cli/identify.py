@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di identify`: an aircraft of JSBSim trimmed, stepped, given gains, flown, and written down as a scenario."""
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, PREFIX, RESIDUALS, STATES, require_aircraft
+from flight_analysis.design.identification import Identified
+from flight_analysis.design.identification import identify as identify_aircraft
+from flight_core.outcome import FlightEnded
+from flight_core.parameters import ParameterError, require
+from flight_core.units import SI_PER_UNIT
+
+CANNOT_FLY = 3
+LINEAR = 0.8  # a spread of slopes below this part is worth a word
+MILLI = 1e3
+UNITS = {"rad/s": ("mrad/s", MILLI), "m/s": ("m/s", 1.0)}  # of errors, for people
+
+
+def identify(
+    airframe: Annotated[str, typer.Argument(help="jsbsim:NAME, an aircraft of JSBSim.")],
+    speed: Annotated[float, typer.Option(help="True airspeed to trim and fly at, m/s.")],
+    altitude: Annotated[float, typer.Option(help="Altitude above sea level to trim and fly at, m.")],
+    output: Annotated[
+        Path | None, typer.Option(help="Scenario file to write; by default jsbsim_NAME.yaml here, never over another.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
+) -> None:
+    """Identify an aircraft of JSBSim by step tests, select its gains, fly it and write the scenario that `rise-di fly` flies.
+
+    Exit status: 0, 2 bad input, 3 the aircraft does not trim or does not fly.
+    """
+    require(airframe.startswith(PREFIX), "airframe", f"{airframe!r}", f"an aircraft of JSBSim, {PREFIX}NAME")
+    name = require_aircraft(airframe)
+    require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
+    require(0.0 <= altitude < math.inf, "--altitude", altitude, "0 m or more")
+    path = output or Path(f"jsbsim_{name}.yaml")
+    require(output is not None or not path.exists(), "--output", f"none, and {path} exists", "a file to write over, or another")
+    require(path.suffix == ".yaml", "--output", path, "a name that ends in .yaml, as scenario files do")
+    require(path.parent.is_dir(), "--output", path, "a file in a folder that exists")
+    console = Console(quiet=as_json)
+    try:
+        with console.status("trim") as status:
+            found = identify_aircraft(name, speed, altitude, status.update)
+    except FlightEnded as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise typer.Exit(CANNOT_FLY) from None
+    try:
+        path.write_text(found.text, encoding="utf-8")
+    except OSError as error:
+        raise ParameterError(f"--output: found {path}, expected a file that can be written ({error.strerror})") from None
+    if as_json:
+        print(json.dumps(_plain(found, path)))
+    else:
+        _show(console, found)
+        console.print(f"scenario: {path}", highlight=False)
+    if found.lost:
+        print(f"error: {found.point.title} does not fly: {found.lost}", file=sys.stderr)
+        raise typer.Exit(CANNOT_FLY)
+
+
+def _show(console: Console, found: Identified) -> None:
+    trim, steps = found.trim, found.responses
+    states = dict(zip(STATES, trim.states, strict=True))
+    degrees = {name: states[name] / SI_PER_UNIT["deg"] for name in ("alpha", "beta", "phi")}
+    console.print(
+        f"{found.point.title} in trim: V {states['V']:.4g} m/s, altitude {states['altitude']:.5g} m, "
+        + ", ".join(f"{name} {value:.3g} deg" for name, value in degrees.items())
+        + f"; largest acceleration left {np.max(np.abs(trim.residuals[:3])):.1g} m/s^2,"
+        f" {np.max(np.abs(trim.residuals[3:])):.1g} rad/s^2",
+        highlight=False,
+        soft_wrap=True,
+    )
+    stops = _table("Commands: in trim, and how far down and up from there")
+    for heading in ("input", "trim", "down", "up"):
+        stops.add_column(heading, justify="left" if heading == "input" else "right", no_wrap=True)
+    answers = _table("What steps of a command change: Omega per unit of it, rad/s^2 and m/s^2")
+    for heading in ("input", "steps of", *(f"{name}_dot" for name in OUTPUTS), "lag, s", "D"):
+        answers.add_column(heading, justify="left" if heading == "input" else "right", no_wrap=True)
+    for j, name in enumerate(INPUTS):
+        stops.add_row(name, *(f"{value + 0.0:.3f}" for value in (trim.commands[j], trim.lower[j], trim.upper[j])))
+        column = [f"{value:.3g}" if abs(value) > 1e-3 else "0" for value in steps.Omega[:, j]]
+        answers.add_row(name, f"{steps.size[j]:.3g}", *column, f"{steps.lag[j]:.3f}", f"{found.D[j]:+d}")
+    console.print(stops)
+    console.print(answers)
+    for name, spread in zip(INPUTS, steps.spread, strict=True):
+        if spread < LINEAR:
+            console.print(
+                f"{name} is not linear: the slopes of its steps differ by a factor of {1.0 / spread:.2g}; the largest counts"
+            )
+    for sentence in steps.rejected:
+        console.print(f"rejected: {sentence}", highlight=False, soft_wrap=True)
+
+    answer = found.selection.engineering
+    controller, params = answer.controller, answer.controller.law()
+    table = _table("Gains: bandwidth and Lambda in 1/s, beta in units of y / s^2")
+    for heading in ("channel", "bandwidth", "Lambda", "beta", "lag, s"):
+        table.add_column(heading, justify="left" if heading == "channel" else "right", no_wrap=True)
+    for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
+        response = abs(steps.Omega[list(OUTPUTS).index(output), list(INPUTS).index(name)]) * params.input_scale[i]
+        figures = (params.K[i] * response, params.Lambda[i], params.beta[i], controller.lag[i])
+        table.add_row(f"{output} by {name}", *(f"{figure:.3g}" for figure in figures))
+    console.print(table)
+    margin = "" if answer.delay_margin is None else f"; the loop bears {MILLI * answer.delay_margin:.0f} ms more delay"
+    if found.zero > 0.0:
+        console.print(
+            f"with p and r held, sideslip grows at {found.zero:.2g} 1/s: a zero in the right half plane, outside the theorem",
+            highlight=False,
+            soft_wrap=True,
+        )
+    console.print(f"coupling max abs(U - I) = {found.coupling:.2g}; {params.sign.name.lower()} sign{margin}", highlight=False)
+    _show_flights(console, found)
+
+
+def _show_flights(console: Console, found: Identified) -> None:
+    flights = _table("Flown for 60 s in one process: rms of the error, and how it ended")
+    largest = _table("Largest deviation of a command from trim")
+    for table in (flights, largest):
+        table.add_column("flight", no_wrap=True)
+    for name, unit in OUTPUTS.items():
+        flights.add_column(f"{name}\n{UNITS[unit][0]}", justify="right", no_wrap=True)
+    flights.add_column("outcome")
+    for name in INPUTS:
+        largest.add_column(name, justify="right", no_wrap=True)
+    for title, one in found.flights.items():
+        errors = [f"{one.rms[name] * UNITS[unit][1]:.3g}" for name, unit in OUTPUTS.items()]
+        flights.add_row(title, *errors, one.outcome)
+        largest.add_row(title, *(f"{one.largest[name]:.2g}" for name in INPUTS))
+    console.print(flights)
+    console.print(largest)
+
+
+def _table(title: str) -> Table:
+    return Table(title=f"\n{title}", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+
+
+def _plain(found: Identified, path: Path) -> dict[str, Any]:
+    trim, steps = found.trim, found.responses
+    by_input = {
+        name: {
+            "trim": float(trim.commands[j]),
+            "lower": float(trim.lower[j]),
+            "upper": float(trim.upper[j]),
+            "step": float(steps.size[j]),
+            "spread": float(steps.spread[j]),
+            "Omega": dict(zip(OUTPUTS, steps.Omega[:, j].tolist(), strict=True)),
+            "lag": float(steps.lag[j]),
+            "D": found.D[j],
+        }
+        for j, name in enumerate(INPUTS)
+    }
+    return {
+        "airframe": found.point.title,
+        "speed": found.point.speed,
+        "altitude": found.point.altitude,
+        "trim": dict(zip(STATES, trim.states.tolist(), strict=True)),
+        "residuals": dict(zip(RESIDUALS, trim.residuals.tolist(), strict=True)),
+        "inputs": by_input,
+        "rejected": list(steps.rejected),
+        "coupling": found.coupling,
+        "sideslip_zero": found.zero,
+        "lost": found.lost,
+        "delay_margin": found.selection.engineering.delay_margin,
+        "controller": found.selection.engineering.controller.model_dump(exclude_defaults=True),
+        "flights": {title: one._asdict() for title, one in found.flights.items()},
+        "scenario": str(path),
+    }

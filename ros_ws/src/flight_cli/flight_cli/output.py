@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the commands print and write: tables, paths, exit statuses."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from flight_analysis.metrics import PARTS
+from flight_analysis.report.recorded_flight import RecordedFlight
+from flight_analysis.report.summary import ERROR_COLUMNS, INPUT_COLUMNS, Column, display_units, limited_cell, table_rows
+
+ENDED_EARLY, INTERRUPTED = 3, 130
+"""Exit statuses; bad input is 2 (`flight_cli.cli`)."""
+
+
+def show_flight(console: Console, flight: RecordedFlight) -> None:
+    """Print the tables of a flight."""
+    summary, units = flight.summary, display_units(flight.scenario)
+    console.print(
+        grouped_table(
+            f"Tracking error ({summary['error']}), {summary['duration']:.1f} s flown",
+            "channel",
+            ERROR_COLUMNS,
+            table_rows(summary["errors"], ERROR_COLUMNS, units),
+        )
+    )
+    rows = table_rows(summary["inputs"], INPUT_COLUMNS, units)
+    limited = [limited_cell(of) for of in summary["inputs"].values()]
+    if rows:
+        columns = (*INPUT_COLUMNS, Column("limited", "%", ()))
+        console.print(
+            grouped_table(
+                "Inputs about trim, and mean abs(u_dot) a second",
+                "input",
+                columns,
+                [[*row, share] for row, share in zip(rows, limited, strict=True)],
+            )
+        )
+    console.print(f"{PARTS}. bound: the largest error in calm", style="dim", highlight=False)
+    for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"])):
+        console.print(line, highlight=False)
+
+
+def grouped_table(title: str, first: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Table:
+    """A table whose neighbouring columns of one group share a head."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0)
+    table.add_column(f"\n{first}", no_wrap=True)
+    for column, before in zip(columns, (None, *columns), strict=False):
+        begins = before is None or column.group != before.group
+        table.add_column(f"{column.group if begins else ''}\n{column.head}", justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _timing(summary: Mapping[str, Any]) -> list[str]:
+    lines = []
+    if (ticks := summary["ticks"]) is not None:
+        ms = {key: f"{value * 1e3:.3f}" for key, value in ticks.items()}
+        lines.append(
+            f"ticks: {ticks['ticks']}, {ticks['without_new_y']} without a new y; period mean {ms['period_mean']} ms,"
+            f" p99 {ms['period_p99']}, max {ms['period_max']}; late p99 {ms['late_p99']} ms, max {ms['late_max']}"
+        )
+    if (latency := summary["latency"]) is not None:
+        median, p99, largest = (f"{value * 1e3:.3f}" for value in latency.values())
+        lines.append(f"y sent to u sent: median {median} ms, p99 {p99}, max {largest}")
+    return lines
+
+
+def display_path(path: Path) -> str:
+    """A path as it is best shown: relative where it is below the working folder."""
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

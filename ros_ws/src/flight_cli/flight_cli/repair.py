@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di repair`: the log of a killed recorder made one that every reader of rosbag2 takes."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flight_analysis.report.run_folder import PARAMETERS
+from flight_core.files import parse_yaml
+from flight_core.parameters import ParameterError
+from flight_core.rates import seconds
+from flight_log.bag import METADATA
+from flight_log.repair import Repaired
+from flight_log.repair import repair as repair_bag
+from flight_log.tape_reader import read_run
+
+
+def repair(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> None:
+    """Rebuild the log of a run whose recorder was killed, or that is damaged; leave an intact one alone.
+
+    What could be read is kept, with an index and metadata.yaml; the damaged file stays beside it as *.damaged.
+    """
+    repaired = repair_bag(run)
+    for file in repaired.files:
+        if file.damaged is not None:
+            print(f"{file.path.name} had {file.faults}: {file.kept} messages kept; as it was: {file.damaged.name}")
+    if repaired.wrote_metadata:
+        print(f"{METADATA} written; {_end(run, repaired.files[-1])}")
+    else:
+        print(f"{run} is intact: nothing to repair")
+
+
+def _end(run: Path, last: Repaired) -> str:
+    """How much is missing, compared with what is known of the end: what the files say, else how long the flight was to be."""
+    if (missing := seconds(last.known_end_ns - last.last_ns)) > 0:
+        return f"{missing:.3f} s are missing at its end"
+    if not last.faults:
+        return "nothing is missing"
+    try:
+        recorded = read_run(run)
+    except ParameterError:
+        return "nothing says how much is missing at its end"
+    end = max(float(recorded.tape.time(name)[-1]) for name in recorded.tape.signals)
+    for stored in recorded.attachments:
+        if stored.name == PARAMETERS:
+            try:
+                parameters = parse_yaml(stored.content, PARAMETERS, "a scenario file")
+                duration = float(parameters["/**/flight"]["ros__parameters"]["duration"])
+            except (ParameterError, LookupError, OverflowError, TypeError, ValueError):
+                continue  # a file of any content may have this name
+            return f"the log ends at t = {end:.3f} s of the {duration:g} s that were to be flown"
+    return f"the log ends at t = {end:.3f} s; nothing says how much is missing"

@@ -1,0 +1,16 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+setup(
+    name="flight_cli",
+    version="0.1.0",
+    description="The rise-di command of the RISE-DI flight stack, one file a command.",
+    license="Apache-2.0",
+    packages=["flight_cli"],
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/flight_cli"]),
+        ("share/flight_cli", ["package.xml"]),
+    ],
+    entry_points={"console_scripts": ["rise-di = flight_cli.cli:main"]},
+)
