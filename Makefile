@@ -4,7 +4,7 @@
 # make fly     set up what is needed, fly the default scenario     make fly SCENARIO=... ARGS="--duration 10"
 # make test    set up what is needed, run all checks and tests
 # make evidence   measure what has not been measured yet, write docs/evidence.md     make evidence ARGS="--again speed"
-# make setup   the set-up alone: .venv/, the workspace built, .venv/bin/rise-di
+# make setup   what flying and its report need: .venv/, the workspace built, .venv/bin/rise-di; make setup-all: campaigns and tests too
 
 PYTHON ?= python3
 SCENARIO ?= osprey_gust
@@ -17,7 +17,12 @@ PACKAGES := $(notdir $(patsubst %/package.xml,%,$(wildcard ros_ws/src/*/package.
 # With symlinks in place only these need another build; Python sources are live.
 BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/config/*.yaml ros_ws/src/*/launch/*.py)
 
-.PHONY: fly test check evidence setup lock clean
+FLY_GROUPS := --group ros --group core --group report --group build
+ALL_GROUPS := $(FLY_GROUPS) --group campaign --group dev
+# uv holds every package to the version and the hashes of the lock.
+INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
+
+.PHONY: fly test check evidence setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
@@ -25,35 +30,46 @@ fly: setup
 test: check
 	$(BIN)/python -m pytest $(ARGS)
 
-check: setup
+check: setup-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-evidence: setup
+evidence: setup-all
 	@$(BIN)/python -m benchmarks.evidence $(ARGS)
 
 setup: .venv/.workspace
 
-.venv/.installed: requirements.lock
+setup-all: .venv/.all .venv/.workspace
+
+.venv/.uv:
 	@command -v $(PYTHON) > /dev/null || { echo "error: no $(PYTHON) here; install Python 3.11 to 3.13, or say make PYTHON=..." >&2; exit 2; }
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
 	  || { echo "error: $$($(PYTHON) --version) found, but the ROS 2 wheels are for 3.11 to 3.13; say make PYTHON=python3.12" >&2; exit 2; }
 	$(PYTHON) -m venv --clear .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
-	$(BIN)/uv pip sync --quiet --compile-bytecode --python $(BIN)/python requirements.lock
 	@touch $@
 
-.venv/.workspace: .venv/.installed $(BUILD_INPUTS)
+.venv/.fly: requirements.lock | .venv/.uv
+	$(INSTALL) $(FLY_GROUPS)
+	@touch $@
+
+.venv/.all: requirements.lock | .venv/.uv
+	$(INSTALL) $(ALL_GROUPS)
+	@touch .venv/.fly $@
+
+.venv/.workspace: $(BUILD_INPUTS) | .venv/.fly
 	cd ros_ws && PATH="$(BIN):$$PATH" colcon build --symlink-install --event-handlers console_cohesion- status-
 	@printf '%s\n' $(PACKAGES:%=$(CURDIR)/ros_ws/build/%) \
 	  > "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/rise_di_workspace.pth"
 	@ln -sf ../../ros_ws/install/flight_cli/lib/flight_cli/rise-di .venv/bin/rise-di
 	@touch $@
 
-lock: .venv/.installed
-	$(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-	  --custom-compile-command "make lock" requirements.in -o requirements.lock
+lock: | .venv/.uv
+	$(BIN)/uv pip compile --quiet --upgrade $(LOCK)
+
+LOCK := $(ALL_GROUPS) --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
+  --custom-compile-command "make lock" --output-file requirements.lock
 
 clean:
 	rm -rf .venv ros_ws/build ros_ws/install ros_ws/log

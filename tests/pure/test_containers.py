@@ -3,6 +3,7 @@
 """The images and the compose file fit the tree: what can be shown without a container engine."""
 
 import re
+import tomllib
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -108,12 +109,11 @@ def test_images_are_installed_by_the_same_uv_as_the_makefile() -> None:
 
 
 def test_the_lists_of_packages_agree() -> None:
-    flight, _, rest = (ROOT / "requirements.in").read_text(encoding="utf-8").partition("\n# Build")
-    assert "\n# Checks" in rest, "the headings that Dockerfile cuts at"
-    direct = {match.lower() for match in re.findall(r"^([\w.-]+)", flight, re.MULTILINE)}
+    groups = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["dependency-groups"]
+    direct = {re.split(r"[<=>\[]", name)[0].lower() for group in ("core", "report", "campaign") for name in groups[group]}
     main, ros = pins(ROOT / "requirements.lock"), pins(DOCKER / "requirements-ros.lock")
     mend = "make -C docker requirements-ros.lock"
-    assert {name for name in direct if not name.startswith("ros-")} <= ros.keys(), mend
+    assert direct <= ros.keys(), mend
     assert not {name for name in ros if name.startswith("ros-")}, "ROS 2 comes with the image"
     assert all(hashes for _, hashes in ros.values())
     assert ros["numpy"][0] == {"1.26.4"}, "Ubuntu 24.04's, which the messages are compiled with"
