@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.table import Table
 
 from flight_analysis.closed_loop.scenario import load_scenario
+from flight_core.vectors import StampedVector
 from rise_di_controller import guard
-from rise_di_controller.guard import Sample
 from rise_di_controller.law import engage, step
 
 SCENARIO = Path(__file__).resolve().parents[1] / "ros_ws/src/flight_bringup/config/osprey_gust.yaml"
@@ -48,14 +48,16 @@ def measure() -> dict[str, tuple[float, float, float]]:
     y, y_m = rng.normal(size=(REPEATS, 4)) * 0.01, np.zeros(4)
     dt, zero = 0.01, np.zeros(4)
     law_state = engage(y[0], y_m)
-    engaged, _ = guard.tick(guard.initial_state(4), 0, Sample(0, y[0]), [Sample(0, y_m)], limits, law)
+    engaged, _ = guard.tick(guard.initial_state(4), 0, StampedVector(0, y[0]), [StampedVector(0, y_m)], limits, law)
 
     def guarded(k: int) -> object:
         return guard.guarded_step(law_state, y[k], y_m, dt, zero, zero, law, limits.limits)
 
     def whole_tick(k: int) -> object:
         stamp_ns = limits.period_ns
-        return guard.tick(engaged, stamp_ns, Sample(stamp_ns, y[k]), [Sample(0, y_m), Sample(stamp_ns, y_m)], limits, law)
+        return guard.tick(
+            engaged, stamp_ns, StampedVector(stamp_ns, y[k]), [StampedVector(0, y_m), StampedVector(stamp_ns, y_m)], limits, law
+        )
 
     return {
         FLOOR: percentiles(lambda k: law.K * y[k] + y_m),

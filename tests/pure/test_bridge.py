@@ -172,7 +172,7 @@ def test_y_is_given_once_at_the_instant_of_its_rate_sample_and_only_while_all_ar
     sample = bridge.y(at(0.03))
     assert sample is not None
     assert sample.stamp_ns == at(0.03)
-    assert sample.y.tolist() == [-0.5, -25.0, 0.0, 0.0]
+    assert sample.value.tolist() == [-0.5, -25.0, 0.0, 0.0]
     assert bridge.y(at(0.04)) is None
     bridge.take_output("q", 0.5, at(0.25), at(0.25))  # the others are 0.23 s old, beyond 0.2 s
     assert bridge.y(at(0.25)) is None

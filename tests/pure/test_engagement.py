@@ -18,9 +18,9 @@ from aircraft_sim.plant import AircraftState
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import seconds
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard
-from rise_di_controller.guard import ControllerState, Mode, Sample
+from rise_di_controller.guard import ControllerState, Mode
 from rise_di_controller.law import LawParams, control, retune
 from rise_di_controller.params import ControllerParameters
 
@@ -76,16 +76,16 @@ def fly(given: Callable[[int], Given]) -> list[Tick]:
     """Fly the scenario; new parameters are taken between two ticks, without a jump, as the node takes them."""
     hardware = SERVO.aircraft.plant()
     aircraft, state, old = plant.initial_state(hardware), guard.initial_state(4), given(0).parameters.law()
-    y: Sample | None = None
-    y_m: list[Sample] = []
+    y: StampedVector | None = None
+    y_m: list[StampedVector] = []
     flown = []
     for k in range(TICKS):
         now_ns, now = k * PERIOD_NS, given(k)
         if k > 0:
             aircraft = plant.advance(now_ns - PERIOD_NS, aircraft, state.u[INPUTS], PERIOD_NS, hardware)
         measured, reference = dynamics.y(aircraft.x, hardware.aircraft)[OUTPUTS], references()[k]
-        y = Sample(now_ns, measured) if now.y else y
-        y_m = [*y_m[-15:], Sample(now_ns, reference)] if now.y_m else y_m
+        y = StampedVector(now_ns, measured) if now.y else y
+        y_m = [*y_m[-15:], StampedVector(now_ns, reference)] if now.y_m else y_m
         before, law = state, now.parameters.law()
         if state.law is not None and now.parameters != given(max(k - 1, 0)).parameters:
             state = state._replace(law=retune(state.law, old, law))
@@ -225,7 +225,9 @@ def thrown(*, latched: bool) -> tuple[FloatArray, FloatArray]:
     e, u = [], []
     for k in range(600):
         now_ns, y = k * PERIOD_NS, dynamics.y(aircraft.x, hardware.aircraft)[OUTPUTS]
-        state, _ = guard.tick(state, now_ns, Sample(now_ns, y), [Sample(now_ns, zero)], parameters.guard(), parameters.law())
+        state, _ = guard.tick(
+            state, now_ns, StampedVector(now_ns, y), [StampedVector(now_ns, zero)], parameters.guard(), parameters.law()
+        )
         if k == 0 and not latched and state.law is not None:
             state = state._replace(law=state.law._replace(e_0=zero))
         e.append(y)

@@ -22,11 +22,11 @@ from flight_cli.cli import COMMANDS, application
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import feedforward, guard
 from rise_di_controller import law as rise
 from rise_di_controller.feedforward import Nominal
-from rise_di_controller.guard import ControllerState, Sample
+from rise_di_controller.guard import ControllerState
 from rise_di_controller.params import ControllerParameters
 
 app = application([*COMMANDS])
@@ -86,7 +86,7 @@ def reference(t: float) -> FloatArray:
 def largest_error(params: ControllerParameters) -> float:
     """Largest error in 6 s behind the guard, sampled at the controller's rate, integrated in steps of a tenth of it."""
     limits, law, state, x = params.guard(), params.law(), guard.initial_state(2), np.zeros(4)
-    samples: list[Sample] = []
+    samples: list[StampedVector] = []
     errors = []
 
     def x_dot(t: float, x: FloatArray, u: FloatArray, _: None) -> FloatArray:
@@ -94,8 +94,8 @@ def largest_error(params: ControllerParameters) -> float:
 
     for k in range(round(6.0 * params.rate)):
         now_ns, t = k * limits.period_ns, k / params.rate
-        samples = [*samples[-2:], Sample(now_ns, reference(t))]
-        state, _ = guard.tick(state, now_ns, Sample(now_ns, x[:2]), samples, limits, law)
+        samples = [*samples[-2:], StampedVector(now_ns, reference(t))]
+        state, _ = guard.tick(state, now_ns, StampedVector(now_ns, x[:2]), samples, limits, law)
         errors.append(np.abs(x[:2] - reference(t)).max())
         for _ in range(10):
             x = rk4(x_dot, 0.0, x, state.u, None, 0.1 / params.rate)
@@ -210,11 +210,11 @@ def ticks(
 ) -> list[ControllerState]:
     """Every 10 ms from 0.5 to 1.5 s, in the middle of the reference's motion; no samples come in `missing`."""
     state, states = guard.initial_state(2), []
-    y_now, y_m_samples = Sample(0, np.zeros(2)), [Sample(0, np.zeros(2))]
+    y_now, y_m_samples = StampedVector(0, np.zeros(2)), [StampedVector(0, np.zeros(2))]
     for k in range(50, 150):
         t, now_ns = k / 100, k * 10 * MS
         if not missing[0] < t < missing[1]:
-            y_now, y_m_samples = Sample(now_ns, y(t)), [*y_m_samples[-2:], Sample(now_ns, reference(t))]
+            y_now, y_m_samples = StampedVector(now_ns, y(t)), [*y_m_samples[-2:], StampedVector(now_ns, reference(t))]
         state, _ = guard.tick(state, now_ns, y_now, y_m_samples, params.guard(), params.law())
         states.append(state)
     return states
@@ -248,7 +248,7 @@ def test_new_gains_leave_the_feedforward_and_the_input_where_they_were() -> None
     law = rise.retune(state.law, old.law(), new.law())
     retuned = state._replace(law=law)
     assert rise.control(law, law, new.law()) == pytest.approx(rise.control(state.law, state.law, old.law()))
-    now = Sample(1500 * MS, reference(1.5))
+    now = StampedVector(1500 * MS, reference(1.5))
     after = [
         guard.tick(one, now.stamp_ns, now, [now], params.guard(), params.law())[0]
         for one, params in ((state, old), (retuned, new))

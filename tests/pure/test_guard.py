@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard, internals
-from rise_di_controller.guard import ControllerState, Limits, Mode, Sample, align
+from rise_di_controller.guard import ControllerState, Limits, Mode, align
 from rise_di_controller.internals import Limited
 from rise_di_controller.law import LawParams, LawState, Sign, control, engage, retune, step
 from rise_di_controller.params import ControllerParameters
@@ -25,8 +25,8 @@ def params() -> ControllerParameters:
     return PARAMS
 
 
-def sample(ms: float, value: float = 0.0) -> Sample:
-    return Sample(round(ms * MS), np.full(4, value))
+def sample(ms: float, value: float = 0.0) -> StampedVector:
+    return StampedVector(round(ms * MS), np.full(4, value))
 
 
 def test_reference_is_taken_at_the_stamp_of_y() -> None:
@@ -53,7 +53,7 @@ def test_a_single_sample_is_held_for_one_period() -> None:
 def test_a_reference_whose_samples_bunch_up_is_not_thrown_far_by_their_noise() -> None:
     # Two samples 1 us apart that differ by 1: a straight line through them is 8000 off 8 ms later. The slope is taken from
     # samples at least a twentieth of the reach apart, here of the first and the last; without such it is held.
-    bunch = [Sample(2 * MS, np.array([1.0])), Sample(2 * MS + 1000, np.array([2.0]))]
+    bunch = [StampedVector(2 * MS, np.array([1.0])), StampedVector(2 * MS + 1000, np.array([2.0]))]
     value = align([sample(0, 0.0), *bunch], 10 * MS, 10 * MS)
     assert value is not None
     assert value[0] == pytest.approx(2.0 * 10.0 / 2.001, rel=1e-12)
@@ -67,7 +67,7 @@ def test_a_straight_line_is_reproduced_at_any_instant(ms: float) -> None:
     assert value[0] == pytest.approx(round(ms * MS) / MS, abs=1e-9)
 
 
-def fly(params: ControllerParameters, *ticks: tuple[float, Sample | None, list[Sample]]) -> list[ControllerState]:
+def fly(params: ControllerParameters, *ticks: tuple[float, StampedVector | None, list[StampedVector]]) -> list[ControllerState]:
     state, states = guard.initial_state(4), []
     for now_ms, y, y_m in ticks:
         state, _ = guard.tick(state, round(now_ms * MS), y, y_m, params.guard(), params.law())
@@ -181,7 +181,7 @@ def test_the_input_never_jumps_but_by_a_step_of_the_law(instants: list[tuple[int
     for wait_ms, fresh, value in instants:
         now_ns += wait_ms * MS
         if fresh:
-            y, y_m = Sample(now_ns, np.full(4, value)), [Sample(now_ns, np.zeros(4))]
+            y, y_m = StampedVector(now_ns, np.full(4, value)), [StampedVector(now_ns, np.zeros(4))]
         before = state
         state, _ = guard.tick(state, now_ns, y, y_m, PARAMS.guard(), PARAMS.law())
         if state.mode is Mode.ENGAGED and before.mode is not Mode.ENGAGED:

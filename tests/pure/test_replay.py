@@ -29,13 +29,13 @@ from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
-from flight_core.vectors import ChannelError, FloatArray
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from flight_log.bag import BagWriter, Enclosed
 from flight_log.stored_messages import PARAMETER_EVENT, parameter_changes
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import Mode, Sample
+from rise_di_controller.guard import Mode
 from rise_di_controller.params import ControllerParameters
 
 app = application([*COMMANDS])
@@ -112,8 +112,8 @@ def driven(parameters: ControllerParameters, ticks: Sequence[Tick], start_ns: in
                 continue
             t = k / parameters.rate - age / 1e3
             phase = 1.0 if name == "y" else 0.9
-            sample = Sample(now_ns - age * MS, 0.05 * np.sin(7.0 * t * phase + np.arange(len(outputs))))
-            rows[name].append(sample)
+            sample = StampedVector(now_ns - age * MS, 0.05 * np.sin(7.0 * t * phase + np.arange(len(outputs))))
+            rows[name].append((sample.stamp_ns, sample.value))
             with contextlib.suppress(ChannelError):  # out of order
                 take(sample, now_ns)
         if tick.event == "configured":
@@ -375,8 +375,8 @@ def test_other_gains_on_the_recorded_inputs_give_what_the_controller_gives_on_th
     controller, us = Controller(others), []
     for number, (stamp_ns, y) in enumerate(zip(tape["y"].stamp_ns.tolist(), tape["y"].values, strict=True)):
         order = [tape["y"].names.index(name) for name in others.outputs]
-        controller.take_y(Sample(stamp_ns, y[order]), stamp_ns)
-        controller.take_y_m(Sample(stamp_ns, tape["y_m"].values[number][order]), stamp_ns)
+        controller.take_y(StampedVector(stamp_ns, y[order]), stamp_ns)
+        controller.take_y_m(StampedVector(stamp_ns, tape["y_m"].values[number][order]), stamp_ns)
         if stamp_ns % controller.period_ns == 0 and (commanded := controller.tick(stamp_ns)) is not None:
             us.append(commanded.u)
     result = replay(tape, GUST.controller, others)

@@ -9,7 +9,7 @@ import pytest
 
 from aircraft_sim import sensors as sensor_maths
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.sensors import Drift, Sample, Sensors, Underway, arrives, initial_drift, measure, noise, transmit, walk
+from aircraft_sim.sensors import Drift, Sensors, Underway, arrives, initial_drift, measure, noise, transmit, walk
 from aircraft_sim.simulator import AirframeVehicle, Simulator
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -17,7 +17,7 @@ from flight_analysis.metrics import error_figures, known_error, tracking_error, 
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard
 
 MS = 1_000_000
@@ -102,13 +102,13 @@ def test_a_delay_shifts_the_arrival_by_whole_samples_and_keeps_the_stamp() -> No
     history = []
     for k in range(5):
         underway, arrived = transmit(underway, 2 * k * MS, np.array([float(k)]), params)
-        history.append([(sample.stamp_ns // MS, float(sample.y[0])) for sample in arrived])
+        history.append([(sample.stamp_ns // MS, float(sample.value[0])) for sample in arrived])
     assert history == [[], [], [(0, 0.0)], [(2, 1.0)], [(4, 2.0)]]
 
 
 def test_without_delay_a_sample_arrives_at_its_instant() -> None:
     y = np.array([1.0])
-    assert transmit((), 6 * MS, y, sensors(NOISE)) == ((), (Sample(6 * MS, y),))
+    assert transmit((), 6 * MS, y, sensors(NOISE)) == ((), (StampedVector(6 * MS, y),))
 
 
 def test_a_lost_sample_leaves_a_hole_and_holds_nothing_up() -> None:
@@ -145,7 +145,7 @@ def test_a_measured_sample_is_the_output_with_its_noise_or_nothing() -> None:
         arrivals.append(len(arrived))
         for sample in arrived:
             assert sample.stamp_ns == k * 10 * MS
-            assert (sample.y == flying.y() + error).all()
+            assert (sample.value == flying.y() + error).all()
     assert set(arrivals) == {0, 1}
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.rates import nanoseconds
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.publisher_lock import PublisherLock
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import Mode, Sample
+from rise_di_controller.guard import Mode
 
 AGE, STRANGE = 100, 1000
 
@@ -59,10 +59,10 @@ def test_a_reference_that_comes_late_is_waited_for_up_to_the_age_limit(
     seen, stamps = set(), []
     for k in range(200):
         now_ns = k * period_ns
-        controller.take_y(Sample(now_ns, np.zeros(4)), now_ns)
+        controller.take_y(StampedVector(now_ns, np.zeros(4)), now_ns)
         behind_ns = nanoseconds(late) if k >= 100 else 0
         if k < 100 or now_ns - behind_ns >= 100 * period_ns:
-            controller.take_y_m(Sample(now_ns - behind_ns, np.zeros(4)), now_ns)
+            controller.take_y_m(StampedVector(now_ns - behind_ns, np.zeros(4)), now_ns)
         commanded = controller.tick(now_ns)
         seen.add(controller.mode)
         if commanded is not None and controller.mode is Mode.ENGAGED:

@@ -65,7 +65,7 @@ class Autopilot:
             while (rest := begin + number * period - time.monotonic()) > 0.0:
                 rclpy.spin_once(self.node, timeout_sec=rest)
             (sample,) = self._simulator.sample(number, np.array(self._u()))
-            self._say(*sample.y.tolist())
+            self._say(*sample.value.tolist())
             truth = self._simulator.truth()[places]
             print("y", time.time_ns(), *truth.tolist(), flush=True)
             number = max(number + 1, int((time.monotonic() - begin) / period))  # it may have been stopped for a while

@@ -8,12 +8,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
 from flight_core.rates import nanoseconds, period_ns, seconds
-from flight_core.vectors import ChannelError, FloatArray
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from flight_ros.flight_node import FlightNode
-from flight_ros.messages import NO_CHANNELS, StampedVector, instant, stamp_of
+from flight_ros.messages import NO_CHANNELS, instant, stamp_of
 from flight_ros.publisher_lock import PublisherLock
 from flight_ros.ticker import Tick
-from flight_ros.topics import CLOCK, RECORDED, TRUTH, U, Y
+from flight_ros.topics import CLOCK, RECORDED, TRUTH, NodeState, U, Y
 
 WINDOW = 100
 """Samples that a lockstep flight may be ahead of its log: less than publishers keep for a recorder that is held up."""
@@ -61,7 +61,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
     def _publish(self, number: int, start_ns: int, u: FloatArray) -> bool:
         arrived = self._simulator.sample(number, u)
         for sample in arrived:
-            self._publish_y(self._y_encoder.encode(start_ns + sample.stamp_ns, sample.y))
+            self._publish_y(self._y_encoder.encode(start_ns + sample.stamp_ns, sample.value))
         stamp_ns = start_ns + number * self.period_ns()
         self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
         return bool(arrived)
@@ -79,6 +79,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         self._answered = t_ns % self._control_ns != 0
         self._number += 1
         if self._finished():
+            self.publish_state(NodeState.COMPLETED)
             self.get_logger().info(f"flown to its end at t = {seconds(t_ns):g} s")
         return True
 

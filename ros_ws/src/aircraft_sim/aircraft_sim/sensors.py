@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim import draws
-from flight_core.vectors import Array, FloatArray, array_namespace
+from flight_core.vectors import Array, FloatArray, StampedVector, array_namespace
 
 
 class Sensors(NamedTuple):
@@ -37,14 +37,7 @@ class Measured(NamedTuple):
     drift: Drift
 
 
-class Sample(NamedTuple):
-    """A measured y and the instant it belongs to."""
-
-    stamp_ns: int
-    y: FloatArray  # (m,)
-
-
-Underway = tuple[Sample, ...]
+Underway = tuple[StampedVector, ...]
 
 
 def initial_drift(params: Sensors) -> Drift:
@@ -114,6 +107,6 @@ def transmit(underway: Underway, now_ns: int, y: FloatArray | None, params: Sens
     The y of now, None where it is lost, sets out with the stamp now; whatever has been under way for the delay arrives, the
     oldest first. A stamp stays the instant that its sample belongs to.
     """
-    sent = underway if y is None else (*underway, Sample(now_ns, y))
+    sent = underway if y is None else (*underway, StampedVector(now_ns, y))
     arrived = sum(sample.stamp_ns + params.delay_ns <= now_ns for sample in sent)
     return sent[arrived:], sent[:arrived]

@@ -13,7 +13,7 @@ import numpy as np
 from autopilot_bridge.channel_map import to_channel, to_raw
 from autopilot_bridge.params import ChannelMap
 from flight_core.rates import nanoseconds, seconds
-from flight_core.vectors import ChannelError, FloatArray
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
 
 
 class Phase(IntEnum):
@@ -30,13 +30,6 @@ class Reading(NamedTuple):
 
     stamp_ns: int
     value: float
-
-
-class Sample(NamedTuple):
-    """y at an instant: shape (m,) in the map's order, deviations from trim, SI."""
-
-    stamp_ns: int
-    y: FloatArray
 
 
 class Bridge:
@@ -165,13 +158,13 @@ class Bridge:
 
     # What goes out
 
-    def y(self, now_ns: int) -> Sample | None:
+    def y(self, now_ns: int) -> StampedVector | None:
         """The newest value of each output, at the instant of the map's `instant`; None where it was given, or one is stale."""
         newest = self._readings.get(self.chart.instant)
         if newest is None or newest.stamp_ns <= self._given_ns or self.stale(now_ns):
             return None
         self._given_ns = newest.stamp_ns
-        return Sample(newest.stamp_ns, np.array([self._readings[name].value for name in self.outputs]))
+        return StampedVector(newest.stamp_ns, np.array([self._readings[name].value for name in self.outputs]))
 
     def flown(self) -> FloatArray:
         """The raw values for the newest u inside its limits, shape (m,): raw of trim + min(max(u, lower), upper)."""

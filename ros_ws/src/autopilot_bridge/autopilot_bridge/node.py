@@ -84,7 +84,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
                 self._read(subscription, rows, received.message, received.received_ns or now_ns, now_ns)
         sample = self._bridge.y(now_ns)
         if sample is not None:
-            self._publish_y(self._y_encoder.encode(sample.stamp_ns, sample.y))
+            self._publish_y(self._y_encoder.encode(sample.stamp_ns, sample.value))
         if self._take_u(now_ns):
             self._publish_would_send(self._would_send_encoder.encode(now_ns, self._bridge.flown()))
         self._bridge.step(now_ns)

@@ -3,7 +3,7 @@
 """Named vectors: values travel with their channel names and are matched by name, never by place."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import array_api_compat
 import numpy as np
@@ -25,6 +25,14 @@ def array_namespace(array: Array) -> Any:
     NumPy's at once, for most of the time of a step of a few small arrays would go into looking what else it could be.
     """
     return NUMPY if isinstance(array, (np.ndarray, np.generic)) else array_api_compat.array_namespace(array)
+
+
+class StampedVector(NamedTuple):
+    """The values of a sample, shape (m,), the instant to which they belong, and the publisher that sent them."""
+
+    stamp_ns: int
+    value: FloatArray
+    sender: str = ""  # empty where the sample was not received
 
 
 class ChannelError(ValueError):

@@ -10,7 +10,6 @@ one is not: it leaves what was in memory between two strings.
 import math
 import struct
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -19,7 +18,7 @@ from sensor_msgs.msg import JointState
 
 from flight_core.authentication import BLANK, MARK, MessageAuthenticator, mac_slice
 from flight_core.rates import NANOSECONDS
-from flight_core.vectors import ChannelError, FloatArray, select
+from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from flight_ros.rclpy_private import DeserializationError
 
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
@@ -27,14 +26,6 @@ STAMP = struct.Struct("<iI")  # seconds and nanoseconds, right behind the encaps
 STAMP_PLACE = len(ENCAPSULATION)
 COUNT = struct.Struct("<I")  # of a sequence or a string, in front of it
 NO_CHANNELS: FloatArray = np.zeros(0)
-
-
-class StampedVector(NamedTuple):
-    """A received sample: the instant it belongs to, its values in the order asked for, and who sent it."""
-
-    stamp_ns: int
-    value: FloatArray
-    sender: str
 
 
 def to_message(stamp_ns: int, names: Sequence[str], values: FloatArray, frame_id: str) -> JointState:

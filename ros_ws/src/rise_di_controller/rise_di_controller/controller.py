@@ -8,9 +8,9 @@ from functools import partial
 from typing import NamedTuple
 
 from flight_core.rates import seconds
-from flight_core.vectors import ChannelError, FloatArray
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from rise_di_controller import guard, internals
-from rise_di_controller.guard import Mode, Sample
+from rise_di_controller.guard import Mode
 from rise_di_controller.law import Sign, retune
 from rise_di_controller.params import ControllerParameters
 
@@ -38,8 +38,8 @@ class Controller:
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
         self._digest = parameters.digest()
-        self._y: deque[Sample] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
-        self._y_m: deque[Sample] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
+        self._y: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
+        self._y_m: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
 
     @property
     def mode(self) -> Mode:
@@ -64,7 +64,7 @@ class Controller:
             self._state = self._state._replace(law=retune(self._state.law, self._law, law))
         self._law, self._guard, self._digest = law, parameters.guard(), digest
 
-    def take_y(self, sample: Sample, now_ns: int) -> None:
+    def take_y(self, sample: StampedVector, now_ns: int) -> None:
         """A sample of y, shape (m,), in the law's order.
 
         Raises ChannelError, "future" or "order", for a stamp ahead of the clock by more than the age limit, or not after the
@@ -72,11 +72,11 @@ class Controller:
         """
         self._take(self._y, sample, now_ns)
 
-    def take_y_m(self, sample: Sample, now_ns: int) -> None:
+    def take_y_m(self, sample: StampedVector, now_ns: int) -> None:
         """A sample of y_m, likewise."""
         self._take(self._y_m, sample, now_ns)
 
-    def _take(self, samples: deque[Sample], sample: Sample, now_ns: int) -> None:
+    def _take(self, samples: deque[StampedVector], sample: StampedVector, now_ns: int) -> None:
         if sample.stamp_ns > now_ns + self._guard.max_age_ns:
             raise ChannelError("future", f"stamp {seconds(sample.stamp_ns - now_ns):g} s ahead of the clock")
         if samples and sample.stamp_ns <= samples[-1].stamp_ns:
@@ -95,7 +95,7 @@ class Controller:
         log = partial(internals.values, self._state, used, limits, seconds(late_ns), age, self._number, digest)
         return ControlOutput(used.stamp_ns, self._state.u, log)
 
-    def _newest_pair(self) -> Sample | None:
+    def _newest_pair(self) -> StampedVector | None:
         """The newest y that y_m reaches; where y_m comes late, a tick takes the y before instead of letting go of u."""
         if not self._y_m:
             return self._y[-1] if self._y else None

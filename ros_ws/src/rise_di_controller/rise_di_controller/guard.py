@@ -10,7 +10,7 @@ import numpy as np
 
 from flight_core.failsafe import failsafe_scale
 from flight_core.rates import seconds
-from flight_core.vectors import Array, FloatArray, array_namespace
+from flight_core.vectors import Array, FloatArray, StampedVector, array_namespace
 from rise_di_controller import feedforward
 from rise_di_controller import law as rise
 from rise_di_controller.feedforward import FeedforwardState, Nominal
@@ -26,13 +26,6 @@ class Mode(IntEnum):
     RAMP = 3  # stale for longer: u goes to trim
     TRIM = 4  # u is at trim
     INACTIVE = 5  # deactivated: u is held or goes to trim
-
-
-class Sample(NamedTuple):
-    """Values that belong to an instant."""
-
-    stamp_ns: int
-    value: FloatArray
 
 
 class Limits(NamedTuple):
@@ -73,7 +66,7 @@ class ControllerState(NamedTuple):
 
     mode: Mode
     law: LawState | None  # None until engaged
-    y: Sample | None  # the newest y used
+    y: StampedVector | None  # the newest y used
     y_m: FloatArray | None  # the reference at its stamp
     u: FloatArray  # commanded, after limits
     u_free: FloatArray  # before limits
@@ -100,7 +93,7 @@ def initial_state(m: int) -> ControllerState:
     return ControllerState(Mode.WAITING, None, None, None, zero, zero, zero, 0, zero, zero)
 
 
-def align(samples: Sequence[Sample], stamp_ns: int, reach_ns: int) -> FloatArray | None:
+def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> FloatArray | None:
     """The signal at an instant, shape (m,), None where no sample reaches it.
 
     The sample of that stamp, else linear between its neighbours, else linear beyond the newest by at most `reach_ns`, by the
@@ -174,8 +167,8 @@ def guarded_step(
 def tick(
     state: ControllerState,
     now_ns: int,
-    y: Sample | None,
-    y_m: Sequence[Sample],
+    y: StampedVector | None,
+    y_m: Sequence[StampedVector],
     guard: GuardParams,
     law: LawParams,
     active: bool = True,

@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from flight_core.rates import nanoseconds, period_ns, seconds
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import NO_CHANNELS, Decoder
 from flight_ros.publisher_lock import PublisherLock
@@ -17,7 +17,7 @@ from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import Mode, Sample
+from rise_di_controller.guard import Mode
 from rise_di_controller.params import ControllerParameters
 
 # What may be changed in flight: gains and guards. What decides the sign or the meaning of a channel may not.
@@ -64,8 +64,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
             self._nothing = self.encoder(U, ())
             self._number = 0  # of the y that comes next
             self._y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
-            self._y_due: deque[Sample | None] = deque()
-            self._y_m_due: deque[Sample] = deque()
+            self._y_due: deque[StampedVector | None] = deque()
+            self._y_m_due: deque[StampedVector] = deque()
         self._y_source, self._y_m_source = PublisherLock(), PublisherLock()
         self._last_ns = 0  # of the last tick
         if self.parameters.autostart:
@@ -128,7 +128,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         subscription: PolledSubscription,
         decoder: Decoder,
         source: PublisherLock,
-        take: Callable[[Sample, int], None],
+        take: Callable[[StampedVector, int], None],
         now_ns: int,
     ) -> None:
         """All that has come, but for samples that are bad, or of a second publisher.
@@ -141,12 +141,12 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
                 decoded = decoder.decode(received.message)
                 if decoded is not None:
                     source.require(decoded.sender, now_ns, self._max_age_ns, strange_ns)
-                    take(Sample(decoded.stamp_ns, decoded.value), now_ns)
+                    take(decoded, now_ns)
                     source.hear(decoded.sender, now_ns)
             except ChannelError as error:
                 self.reject(subscription, error.reason, str(error))
 
-    def _samples(self, subscription: PolledSubscription, decoder: Decoder) -> Iterator[Sample | None]:
+    def _samples(self, subscription: PolledSubscription, decoder: Decoder) -> Iterator[StampedVector | None]:
         for received in subscription.take():
             try:
                 decoded = decoder.decode(received.message)
@@ -154,9 +154,11 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
                 self.reject(subscription, error.reason, str(error))
                 yield None
             else:
-                yield None if decoded is None else Sample(decoded.stamp_ns, decoded.value)
+                yield decoded
 
-    def _take(self, subscription: PolledSubscription, take: Callable[[Sample, int], None], sample: Sample, now_ns: int) -> None:
+    def _take(
+        self, subscription: PolledSubscription, take: Callable[[StampedVector, int], None], sample: StampedVector, now_ns: int
+    ) -> None:
         try:
             take(sample, now_ns)
         except ChannelError as error:

@@ -15,10 +15,10 @@ from flight_core.parameters import flatten, nest, require
 from flight_core.rates import NANOSECONDS
 from flight_core.scenario import read_sections
 from flight_core.tape import Signal, Tape
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, StampedVector
 from flight_log.tape_reader import StoredFile
 from rise_di_controller import feedforward, guard, internals
-from rise_di_controller.guard import ControllerState, GuardParams, Mode, Sample
+from rise_di_controller.guard import ControllerState, GuardParams, Mode
 from rise_di_controller.law import LawParams, LawState, retune
 from rise_di_controller.params import ControllerParameters
 
@@ -242,7 +242,7 @@ class _Ticks:
         ahead = None if computed is None else computed.feedforward
         if limits.nominal is not None and self._engages[k]:
             ahead = feedforward.initial_state(y_m, limits.nominal)
-        y = Sample(int(self.stamp_ns[k]), row["y"])
+        y = StampedVector(int(self.stamp_ns[k]), row["y"])
         return ControllerState(mode, law, y, y_m, u, row["u_free"], row["u_trim"], 0, u, row["u_ff"], ahead)
 
     def tick(self, k: int, state: ControllerState, limits: GuardParams, law: LawParams) -> tuple[ControllerState, FloatArray]:
@@ -250,8 +250,8 @@ class _Ticks:
         stamp_ns = int(self.stamp_ns[k])
         y, y_m = None, []
         if self.flies[k]:
-            y = Sample(stamp_ns, self._y[k])
-            y_m = [Sample(stamp_ns, self._groups["y_m"][k])]
+            y = StampedVector(stamp_ns, self._y[k])
+            y_m = [StampedVector(stamp_ns, self._groups["y_m"][k])]
             if (offset_ns := int(self._offset_ns[k])) > 0:
                 y_m.append(y_m[0]._replace(stamp_ns=stamp_ns + offset_ns))
         if self._engages[k] and state.mode is Mode.ENGAGED:

@@ -12,10 +12,9 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
 from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
-from flight_core.vectors import ChannelError, FloatArray, select
+from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import Sample
 
 
 class _Track:
@@ -59,13 +58,13 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
         for t_ns in range(0, nanoseconds(scenario.flight.duration) + 1, base_ns):
             if t_ns % aircraft.period_ns == 0:
                 for sample in aircraft.sample(t_ns // aircraft.period_ns, u):
-                    tracks["y"].add(sample.stamp_ns, sample.y)
-                    controller.take_y(Sample(sample.stamp_ns, select(outputs, aircraft.outputs, sample.y)), t_ns)
+                    tracks["y"].add(sample.stamp_ns, sample.value)
+                    controller.take_y(StampedVector(sample.stamp_ns, select(outputs, aircraft.outputs, sample.value)), t_ns)
                 tracks["truth"].add(t_ns, aircraft.truth())
             if t_ns % reference.period_ns == 0:
                 y_m = reference.sample(t_ns // reference.period_ns)
                 tracks["y_m"].add(t_ns, y_m)
-                controller.take_y_m(Sample(t_ns, select(outputs, scenario.reference_model.outputs, y_m)), t_ns)
+                controller.take_y_m(StampedVector(t_ns, select(outputs, scenario.reference_model.outputs, y_m)), t_ns)
             if t_ns % controller.period_ns == 0 and (commanded := controller.tick(t_ns)) is not None:
                 u = select(aircraft.inputs, inputs, commanded.u)
                 tracks["u"].add(commanded.stamp_ns, commanded.u)
