@@ -26,12 +26,12 @@ OUTPUTS = ("q", "V", "p", "r")
 class Peer:
     """Event-driven: `until` spins until a condition holds."""
 
-    def __init__(self, context: Context, listen: tuple[str, ...]) -> None:
+    def __init__(self, context: Context, topics: tuple[str, ...]) -> None:
         self.node = Node("peer", context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
-        self.heard: dict[str, list[Any]] = {topic: [] for topic in listen}
-        for topic, messages in self.heard.items():
+        self.received: dict[str, list[Any]] = {topic: [] for topic in topics}
+        for topic, messages in self.received.items():
             kind = DiagnosticArray if topic == "/diagnostics" else JointState
             self.node.create_subscription(kind, topic, messages.append, QoSProfile(depth=100))
         self._publishers: dict[str, Any] = {}
@@ -67,21 +67,21 @@ class Peer:
 
     def modes(self) -> list[int]:
         """The modes in `internals`, repeats left out."""
-        modes = [int(message.position[message.name.index("mode")]) for message in self.heard["internals"]]
+        modes = [int(message.position[message.name.index("mode")]) for message in self.received["internals"]]
         return [mode for index, mode in enumerate(modes) if index == 0 or modes[index - 1] != mode]
 
     def u(self) -> np.ndarray[Any, np.dtype[np.float64]]:
         """All inputs heard, shape (N, m)."""
-        return np.array([message.position for message in self.heard["u"]])
+        return np.array([message.position for message in self.received["u"]])
 
 
 @contextmanager
-def peer(listen: tuple[str, ...] = ("u", "internals", "/diagnostics")) -> Iterator[Peer]:
+def peer(topics: tuple[str, ...] = ("u", "internals", "/diagnostics")) -> Iterator[Peer]:
     """A peer in a context of its own, that listens to these topics."""
     transport.prepare()
     context = Context()
     rclpy.init(context=context)
-    made = Peer(context, listen)
+    made = Peer(context, topics)
     try:
         yield made
     finally:

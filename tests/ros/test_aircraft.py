@@ -17,8 +17,8 @@ INPUTS = ("elevator", "thrust", "aileron", "rudder")
 
 
 @pytest.fixture
-def someone() -> Iterator[Peer]:
-    with peer(listen=("truth", "/diagnostics")) as made:
+def peer_node() -> Iterator[Peer]:
+    with peer(topics=("truth", "/diagnostics")) as made:
         yield made
 
 
@@ -26,42 +26,42 @@ def aircraft(start: Start, scenario: Scenario, *arguments: str) -> Process:
     return start("aircraft_sim.main", "--ros-args", "--params-file", str(scenario.path), *arguments)
 
 
-def command(someone: Peer, sender: str, aileron: float) -> None:
-    someone.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.0, 0.0, aileron, 0.0]), sender))
+def command(peer_node: Peer, sender: str, aileron: float) -> None:
+    peer_node.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.0, 0.0, aileron, 0.0]), sender))
 
 
-def aileron(someone: Peer) -> list[float]:
-    return [m.position[m.name.index("actuator.aileron")] for m in someone.heard["truth"]]
+def aileron(peer_node: Peer) -> list[float]:
+    return [m.position[m.name.index("actuator.aileron")] for m in peer_node.received["truth"]]
 
 
 def test_a_silent_controller_is_held_then_let_go_to_trim_and_may_come_back(
-    start: Start, osprey_gust: Scenario, someone: Peer
+    start: Start, osprey_gust: Scenario, peer_node: Peer
 ) -> None:
     process = aircraft(start, osprey_gust, "-p", "max_age:=0.1", "-p", "hold:=0.1", "-p", "ramp:=0.2")
-    someone.until(lambda: aileron(someone)[-1:] == [0.01], each=lambda: command(someone, "first", 0.01))
-    someone.heard["truth"].clear()
-    someone.until(lambda: aileron(someone)[-1:] == [0.0])  # nothing is sent any more
-    held = aileron(someone)
+    peer_node.until(lambda: aileron(peer_node)[-1:] == [0.01], each=lambda: command(peer_node, "first", 0.01))
+    peer_node.received["truth"].clear()
+    peer_node.until(lambda: aileron(peer_node)[-1:] == [0.0])  # nothing is sent any more
+    held = aileron(peer_node)
     assert (np.diff(held) <= 0).all()
     # 500 Hz over a ramp of 0.2 s: no step beyond 0.01 / 100, ten times that where the machine was late
     assert np.abs(np.diff(held)).max() <= 1e-3
     process.wait_for("waiting for /u")
-    someone.until(lambda: aileron(someone)[-1:] == [0.02], each=lambda: command(someone, "second", 0.02))
+    peer_node.until(lambda: aileron(peer_node)[-1:] == [0.02], each=lambda: command(peer_node, "second", 0.02))
     process.wait_for("flown by second")
 
 
-def test_a_second_controller_is_refused_while_the_first_one_flies(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+def test_a_second_controller_is_refused_while_the_first_one_flies(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
     process = aircraft(start, osprey_gust)
-    someone.until(lambda: aileron(someone)[-1:] == [0.01], each=lambda: command(someone, "first", 0.01))
+    peer_node.until(lambda: aileron(peer_node)[-1:] == [0.01], each=lambda: command(peer_node, "first", 0.01))
 
     def both() -> None:
-        command(someone, "first", 0.01)
-        command(someone, "second", -0.5)
+        command(peer_node, "first", 0.01)
+        command(peer_node, "second", -0.5)
 
     def counted() -> bool:
-        values = [v for array in someone.heard["/diagnostics"] for status in array.status for v in status.values]
+        values = [v for array in peer_node.received["/diagnostics"] for status in array.status for v in status.values]
         return any(value.key == "refused u: sender" and int(value.value) > 5 for value in values)
 
-    someone.until(counted, each=both)
+    peer_node.until(counted, each=both)
     process.wait_for("second publishes too, beside first")
-    assert min(aileron(someone)) == 0.0
+    assert min(aileron(peer_node)) == 0.0

@@ -53,15 +53,15 @@ INPUTS = ("elevator", "thrust", "aileron", "rudder")
 class Sky:
     """The processes around a bridge, and an ear at what the autopilot is sent."""
 
-    def __init__(self, start: Start, someone: Peer, folder: Path) -> None:
+    def __init__(self, start: Start, peer_node: Peer, folder: Path) -> None:
         self._start = start
         self.map = str(folder / "ardupilot.yaml")
         Path(self.map).write_bytes((LIBRARY / "ardupilot.yaml").read_bytes())
         for place in (("silence",), *(("outputs", name) for name in ("q", "V", "p", "r"))):
             self.change_map(*place, max_age=MAX_AGE)
-        self.peer = someone
+        self.peer = peer_node
         self.joys: list[Joy] = []
-        someone.node.create_subscription(Joy, "/ap/joy", self.joys.append, BEST_EFFORT)
+        peer_node.node.create_subscription(Joy, "/ap/joy", self.joys.append, BEST_EFFORT)
 
     def change_map(self, *place: str, **values: object) -> None:
         """Change some keys of one row of the map."""
@@ -100,8 +100,8 @@ class Sky:
     def take_over(self) -> None:
         """As docs/autopilots.md says: deactivate, wait for trim, engage, activate."""
         self.law(Transition.TRANSITION_DEACTIVATE)
-        self.peer.heard["u"].clear()
-        self.peer.until(lambda: self.peer.heard["u"] and not any(self.peer.heard["u"][-1].position))
+        self.peer.received["u"].clear()
+        self.peer.until(lambda: self.peer.received["u"] and not any(self.peer.received["u"][-1].position))
         self.peer.until(lambda: self.engage() == "")
         self.law(Transition.TRANSITION_ACTIVATE)
         self.joys.clear()
@@ -134,14 +134,14 @@ def stamp(message: Any) -> float:
 @pytest.fixture
 def sky(start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Sky]:
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))  # for tests.ros.autopilot
-    with peer(listen=("u", "y", "y_m", "internals", "bridge/would_send")) as someone:
-        yield Sky(start, someone, tmp_path)
+    with peer(topics=("u", "y", "y_m", "internals", "bridge/would_send")) as peer_node:
+        yield Sky(start, peer_node, tmp_path)
 
 
 def true_error(autopilot: Process, sky: Sky) -> dict[str, Any]:
     """The aircraft's y without noise less y_m, from 7 s of the reference model's time on, by output."""
     rows = np.array([[float(part) for part in line.split()[1:]] for line in autopilot.lines if line.startswith("y ")])
-    references = sky.peer.heard["y_m"]
+    references = sky.peer.received["y_m"]
     t_m = np.array([stamp(message) for message in references])
     t = rows[:, 0] / NANOSECONDS
     flown = (t > t_m[0] + 7.0) & (t < t_m[-1])
@@ -157,12 +157,12 @@ def test_the_unchanged_controller_tracks_through_the_map_and_its_death_gives_the
     controller = sky.node("rise_di_controller.main")
     controller.wait_for("ready")
     sky.node("reference_model.main")
-    sky.peer.until(lambda: sky.peer.heard["u"])
+    sky.peer.until(lambda: sky.peer.received["u"])
     assert not sky.joys  # nothing is sent before it is engaged
     sky.take_over()
     bridge.wait_for("DISENGAGED -> ENGAGED")
-    begin = stamp(sky.peer.heard["y_m"][0])
-    sky.peer.until(lambda: stamp(sky.peer.heard["y_m"][-1]) > begin + 14.5)
+    begin = stamp(sky.peer.received["y_m"][0])
+    sky.peer.until(lambda: stamp(sky.peer.received["y_m"][-1]) > begin + 14.5)
     error = true_error(autopilot, sky)
     largest = {name: float(np.abs(one).max()) for name, one in error.items()}
     # Measured 0.033 rad/s, 0.19 m/s, 0.083 and 0.016 rad/s: the loop is little faster than the commands. An aircraft that stays
@@ -187,7 +187,7 @@ def test_pilot_silent_autopilot_and_end_of_the_bridge_each_give_the_channels_bac
     bridge = sky.bridge("-p", "dry_run:=false")
     sky.node("rise_di_controller.main").wait_for("ready")
     sky.node("reference_model.main")
-    sky.peer.until(lambda: sky.peer.heard["u"])
+    sky.peer.until(lambda: sky.peer.received["u"])
 
     gamepad = sky.peer.node.create_publisher(Joy, "/joy", 10)
     sky.peer.until(lambda: gamepad.get_subscription_count() == 1)
@@ -250,7 +250,7 @@ def test_a_stale_u_brings_neutral_then_releasing_values_then_nothing_each_for_it
         last = time.time()
         sky.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([commanded, 0.0, 0.0, 0.0]), "test"))
 
-    heard = sky.peer.heard
+    heard = sky.peer.received
     sky.peer.until(lambda: heard["y"] and heard["bridge/would_send"], timeout=60.0, each=command)
     client = sky.peer.node.create_client(SetBool, "bridge/engage")
     sky.peer.until(client.service_is_ready, each=command)
@@ -308,12 +308,12 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
 
     sky.peer.until(lambda: player.popen.poll() is not None, timeout=60.0, each=command)
     assert player.end() == 0, player.output
-    heard = sky.peer.heard["y"]
+    heard = sky.peer.received["y"]
     assert len(heard) > 50  # as many as had both topics fresh when the bridge looked
     assert all(list(y.name) == ["q", "V", "p", "r"] for y in heard)
     assert {(y.position[0], y.position[2], y.position[3]) for y in heard} <= rates  # to the last bit
     assert max(abs(y.position[1]) for y in heard) < 0.2  # m/s from trim: noise of 0.03 m/s
-    assert sky.peer.heard["bridge/would_send"][-1].position[0] == pytest.approx(0.1 / FULL)
+    assert sky.peer.received["bridge/would_send"][-1].position[0] == pytest.approx(0.1 / FULL)
     assert not sky.joys
 
 
@@ -322,7 +322,7 @@ def test_rise_di_fly_has_the_bridge_in_the_aircrafts_place_and_logs_what_the_aut
 ) -> None:
     sky.autopilot()
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", sky.map, "--duration", "12", "--json")
-    sky.peer.until(lambda: sky.peer.heard["bridge/would_send"], timeout=60.0)
+    sky.peer.until(lambda: sky.peer.received["bridge/would_send"], timeout=60.0)
     refused = start("flight_cli.cli", "engage")
     sky.peer.until(lambda: flight.popen.poll() is not None, timeout=90.0)
     assert refused.end() == 1
@@ -353,12 +353,12 @@ def test_a_dry_run_says_what_it_would_send_and_sends_nothing(sky: Sky) -> None:
     def command() -> None:
         sky.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.1, 0.1, 9.0, -0.1]), "test"))
 
-    heard = sky.peer.heard["bridge/would_send"]
-    sky.peer.until(lambda: len(heard) > 20 and sky.peer.heard["y"], each=command)
+    heard = sky.peer.received["bridge/would_send"]
+    sky.peer.until(lambda: len(heard) > 20 and sky.peer.received["y"], each=command)
     assert list(heard[-1].name) == ["joy.axes[1]", "joy.axes[2]", "joy.axes[0]", "joy.axes[3]"]
     assert list(heard[-1].position) == pytest.approx([0.1 / FULL, 0.2, 0.5, -0.1 / FULL], rel=1e-5)  # aileron at its limit
-    assert list(sky.peer.heard["y"][-1].name) == ["q", "V", "p", "r"]
-    assert np.abs(sky.peer.heard["y"][-1].position).max() < 0.2  # in trim: noise of 0.03 m/s in V, little else
+    assert list(sky.peer.received["y"][-1].name) == ["q", "V", "p", "r"]
+    assert np.abs(sky.peer.received["y"][-1].position).max() < 0.2  # in trim: noise of 0.03 m/s in V, little else
     assert sky.engage() == "dry_run is true: nothing is sent"
     sky.spin(0.3)
     assert not sky.joys
@@ -366,7 +366,7 @@ def test_a_dry_run_says_what_it_would_send_and_sends_nothing(sky: Sky) -> None:
 
 def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Start) -> None:
     bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot")
-    with peer(listen=()) as other:
+    with peer(topics=()) as other:
         other.node.create_publisher(TwistStamped, "/ap/airspeed", 10)  # as an AP_DDS would whose type has changed
         other.node.create_subscription(Imu, "/ap/joy", lambda _: None, 10)
         bridge.wait_for(

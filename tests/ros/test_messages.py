@@ -52,11 +52,11 @@ def test_the_middleware_reads_what_was_encoded() -> None:
 def test_wanted_channels_come_back_by_name_the_first_time_and_every_time(
     names: list[str], values: list[float], stamp_ns: int
 ) -> None:
-    decoder, encoder = Decoder(("p", "V")), Encoder(names, "someone")
+    decoder, encoder = Decoder(("p", "V")), Encoder(names, "/aircraft#1")
     for _ in range(2):  # the second sample takes the short way
         sample = decoder.decode(encoder.encode(stamp_ns, np.array(values)))
         assert sample is not None
-        assert (sample.stamp_ns, sample.sender) == (stamp_ns, "someone")
+        assert (sample.stamp_ns, sample.sender) == (stamp_ns, "/aircraft#1")
         assert sample.value.tolist() == [values[names.index("p")], values[names.index("V")]]
 
 

@@ -63,11 +63,11 @@ def test_a_node_without_its_peer_says_so_keeps_waiting_and_ends_cleanly(
 def test_a_node_that_is_stopped_while_it_loads_ends_cleanly(
     number: signal.Signals, start: Start, osprey_gust: Scenario
 ) -> None:
-    with peer(listen=()) as someone:
+    with peer(topics=()) as peer_node:
         node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
         early_participant = f"_start_{node.popen.pid}"
-        someone.until(
-            lambda: early_participant in someone.node.get_node_names() or "ready" in node.output
+        peer_node.until(
+            lambda: early_participant in peer_node.node.get_node_names() or "ready" in node.output
         )  # at times it is that quick
         node.popen.send_signal(number)
         assert node.end(5.0) == 0
@@ -75,22 +75,22 @@ def test_a_node_that_is_stopped_while_it_loads_ends_cleanly(
 
 
 def test_what_holds_a_nodes_place_while_it_loads_goes(start: Start, osprey_gust: Scenario) -> None:
-    with peer(listen=()) as someone:
+    with peer(topics=()) as peer_node:
         node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
         node.wait_for("ready")
-        someone.until(lambda: set(someone.node.get_node_names()) == {"peer", "controller"})
+        peer_node.until(lambda: set(peer_node.node.get_node_names()) == {"peer", "controller"})
 
 
 def test_nothing_is_loaded_once_a_node_is_ready(start: Start, osprey_gust: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
     # What a function of a library loads at its first call, it would load in the middle of a tick.
     monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
-    with peer(listen=("/diagnostics",)) as someone:
+    with peer(topics=("/diagnostics",)) as peer_node:
         nodes = [start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path)) for package in NODES]
 
         def reports(name: str) -> int:
-            return sum(one.status[0].name == f"/{name}" for one in someone.heard["/diagnostics"])
+            return sum(one.status[0].name == f"/{name}" for one in peer_node.received["/diagnostics"])
 
-        someone.until(lambda: all(reports(name) >= 3 for name in NODES.values()))
+        peer_node.until(lambda: all(reports(name) >= 3 for name in NODES.values()))
     assert any("ENGAGED" in node.output for node in nodes)
     for node in nodes:
         assert [line for line in node.output.partition("]: ready")[2].splitlines() if "import time:" in line] == []

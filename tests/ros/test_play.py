@@ -46,17 +46,19 @@ class Listener:
         rclpy.init(context=self._context)
         self._node = Node("listener", context=self._context)
         self._polled_subscriptions = [PolledSubscription(self._node, topic, LOCKSTEP, raw=True) for topic in topics]
-        self.heard: dict[str, list[bytes]] = {topic.name: [] for topic in topics}
+        self.received: dict[str, list[bytes]] = {topic.name: [] for topic in topics}
         self.sent: dict[str, list[int]] = {topic.name: [] for topic in topics}
 
     def until(self, topic: Topic, count: int, timeout: float = 40.0) -> None:
         """Until so many messages have come on a topic."""
         deadline = time.monotonic() + timeout
-        while len(self.heard[topic.name]) < count:
-            assert time.monotonic() < deadline, f"{len(self.heard[topic.name])} of {count} on {topic.name} within {timeout} s"
+        while len(self.received[topic.name]) < count:
+            assert time.monotonic() < deadline, (
+                f"{len(self.received[topic.name])} of {count} on {topic.name} within {timeout} s"
+            )
             for subscription in self._polled_subscriptions:
                 for received in subscription.take():
-                    self.heard[subscription.topic.name].append(bytes(received.message))
+                    self.received[subscription.topic.name].append(bytes(received.message))
                     self.sent[subscription.topic.name].append(received.sent_ns)
             time.sleep(0.002)
 
@@ -86,9 +88,9 @@ def test_a_flight_is_played_byte_by_byte_with_its_timing_and_the_clock_of_the_lo
         ears.until(Y_M, 1001)
         assert process.end() == 0, process.output
         ears.until(CLOCK, 201)
-    assert ears.heard["y"] == of(run, "y")
-    assert ears.heard["y_m"] == of(run, "y_m")
-    assert [stamp_of(clock) for clock in ears.heard["/clock"]] == [k * 10 * MS for k in range(201)]
+    assert ears.received["y"] == of(run, "y")
+    assert ears.received["y_m"] == of(run, "y_m")
+    assert [stamp_of(clock) for clock in ears.received["/clock"]] == [k * 10 * MS for k in range(201)]
     # 2 s at twice the rate, on absolute deadlines: what the machine delays is made up for, and never adds up
     sent = np.array(ears.sent["y"])
     late = (sent - sent[0]) / NANOSECONDS - np.arange(1001) * 0.001
@@ -100,16 +102,18 @@ def test_stamps_are_moved_to_now_at_the_rate_and_all_else_stays_as_recorded(run:
         process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--rate", "2", "--start", "1.5")
         ears.until(Y, 251)
         assert process.end() == 0, process.output
-    stamps = np.array([stamp_of(message) for message in ears.heard["y"]])
+    stamps = np.array([stamp_of(message) for message in ears.received["y"]])
     assert set(np.diff(stamps)) == {MS}  # 2 ms at twice the rate
     assert np.median(np.abs(stamps - np.array(ears.sent["y"]))) < 50 * MS  # as fresh as they were
     recorded = of(run, "y")[-251:]
-    assert [message[:4] + message[12:] for message in ears.heard["y"]] == [message[:4] + message[12:] for message in recorded]
+    assert [message[:4] + message[12:] for message in ears.received["y"]] == [
+        message[:4] + message[12:] for message in recorded
+    ]
 
 
 def test_a_domain_in_which_somebody_publishes_the_topic_is_refused(run: Path, start: Start, domain: int) -> None:
-    with peer(()) as someone:
-        someone.publish("y", to_message(0, ("q",), np.zeros(1), "peer"))
+    with peer(()) as peer_node:
+        peer_node.publish("y", to_message(0, ("q",), np.zeros(1), "peer"))
         process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
         assert process.end() == 2
     (said,) = process.lines
@@ -127,7 +131,7 @@ def test_a_loop_goes_on_until_it_is_interrupted(run: Path, start: Start) -> None
         assert process.end() == 130
     assert time.monotonic() - begin < 3.0
     assert "Traceback" not in process.output
-    stamps = [stamp_of(message) for message in ears.heard["y"]]
+    stamps = [stamp_of(message) for message in ears.received["y"]]
     assert stamps == sorted(stamps)  # also from one pass to the next
 
 
@@ -152,19 +156,19 @@ def test_a_controller_alone_answers_a_lockstep_flight_with_the_same_bytes(
         ears.until(U, len(u))
         ears.until(INTERNALS, len(said))
         assert process.end() == 0, process.output
-    assert ears.heard["u"] == u
-    assert ears.heard["internals"] == said
+    assert ears.received["u"] == u
+    assert ears.received["internals"] == said
 
 
 def test_a_controller_in_real_time_flies_along_a_recorded_flight(run: Path, osprey_gust: Scenario, start: Start) -> None:
-    with peer() as someone:
+    with peer() as peer_node:
         node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
         node.wait_for("ready")
         process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
         node.wait_for("WAITING -> ENGAGED")
-        someone.until(lambda: process.popen.poll() is not None)
+        peer_node.until(lambda: process.popen.poll() is not None)
         assert process.end() == 0, process.output
-        answered = someone.u()
+        answered = peer_node.u()
     # The recorded aircraft does not fly this u, and these ticks see other samples of y than the recorded ones did: it is near,
     # not equal. In 2 s the recorded u goes to 0.06.
     log = read_run(run).tape["u"].values

@@ -55,31 +55,31 @@ def allowed() -> dict[str, Access]:
     return found
 
 
-def graph(someone: Peer, node: str) -> Access:
+def graph(peer_node: Peer, node: str) -> Access:
     """What a node has."""
     lists = []
     for kind in ("publisher", "subscriber", "service", "client"):
-        find = getattr(someone.node, f"get_{kind}_names_and_types_by_node")
+        find = getattr(peer_node.node, f"get_{kind}_names_and_types_by_node")
         lists.append(frozenset(name for name, _ in find(node, "/")))
     return Access(*lists)
 
 
-def seen(someone: Peer, nodes: tuple[str, ...], policy: dict[str, Access]) -> dict[str, Access]:
+def seen(peer_node: Peer, nodes: tuple[str, ...], policy: dict[str, Access]) -> dict[str, Access]:
     """What the nodes have, once all that is allowed in either way of flying has been found, or nothing more comes."""
     found: dict[str, Access] = {}
 
     def stands() -> bool:
-        there = {name for name, _ in someone.node.get_node_names_and_namespaces()}
+        there = {name for name, _ in peer_node.node.get_node_names_and_namespaces()}
         if not there >= set(nodes):
             return False
         before = dict(found)
-        found.update({node: graph(someone, node) for node in nodes})
+        found.update({node: graph(peer_node, node) for node in nodes})
         return found == before and all(one.publish and one.reply for one in found.values())
 
     for _ in range(3):  # endpoints of a node come one by one
-        someone.until(stands, timeout=60.0)
-        waited = someone.node.get_clock().now().nanoseconds + 500_000_000
-        someone.until(lambda end=waited: someone.node.get_clock().now().nanoseconds > end)  # type: ignore[misc]
+        peer_node.until(stands, timeout=60.0)
+        waited = peer_node.node.get_clock().now().nanoseconds + 500_000_000
+        peer_node.until(lambda end=waited: peer_node.node.get_clock().now().nanoseconds > end)  # type: ignore[misc]
     return found
 
 
@@ -91,26 +91,26 @@ def test_the_policy_names_every_topic_and_service_of_a_flight_and_no_other(
 ) -> None:
     policy, file = allowed(), str(osprey_gust.path)
     modules = {"rise_di_controller": "controller", "reference_model": "reference_model", "aircraft_sim": "aircraft"}
-    with peer(listen=()) as someone:
+    with peer(topics=()) as peer_node:
         processes = [start(f"{module}.main", "--ros-args", "--params-file", file) for module in modules]
         processes.append(start("flight_recorder.main", "--ros-args", "--params-file", file))
         for process in processes:
             process.wait_for("ready", timeout=60.0)
-        real_time = seen(someone, ROLES, policy)
+        real_time = seen(peer_node, ROLES, policy)
         for process in processes:
             process.interrupt()
             process.end()
         told = [f"{role}:lockstep:=true" for role in ROLES] + ["aircraft:control_rate:=100.0", "controller:y_rate:=500.0"]
         told.append(f"recorder:directory:={tmp_path / 'run'}")
         start("flight_bringup.main", "--ros-args", "--params-file", file, *(word for one in told for word in ("-p", one)))
-        lockstep = seen(someone, ROLES, policy)
+        lockstep = seen(peer_node, ROLES, policy)
     for role in ROLES:
         assert real_time[role].merged(lockstep[role]) == policy[role], role
 
 
 def test_the_policy_names_what_the_monitor_of_a_flight_has(osprey_gust: Scenario) -> None:
-    with peer(listen=()) as someone, FlightMonitor(osprey_gust.controller.outputs, lockstep=False):
-        assert seen(someone, ("monitor",), allowed())["monitor"] == allowed()["monitor"]
+    with peer(topics=()) as peer_node, FlightMonitor(osprey_gust.controller.outputs, lockstep=False):
+        assert seen(peer_node, ("monitor",), allowed())["monitor"] == allowed()["monitor"]
 
 
 def test_the_policy_names_what_the_bridge_has_with_every_map(start: Start) -> None:
@@ -119,9 +119,9 @@ def test_the_policy_names_what_the_bridge_has_with_every_map(start: Start) -> No
     sent = {topic for key, topic, _ in used if key.startswith("messages.")}
     heard = {topic for key, topic, _ in used if not key.startswith("messages.")}
     policy = allowed()["bridge"]
-    with peer(listen=()) as someone:
+    with peer(topics=()) as peer_node:
         start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot").wait_for("dry run")  # its message types are here
-        own = seen(someone, ("bridge",), allowed())["bridge"]
+        own = seen(peer_node, ("bridge",), allowed())["bridge"]
     assert own.publish | sent == policy.publish
     assert own.subscribe | heard == policy.subscribe
     assert (own.reply, own.request) == (policy.reply, policy.request)

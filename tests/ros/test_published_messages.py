@@ -114,8 +114,8 @@ def test_inputs_are_put_into_real_messages(name: str) -> None:
 class Px4:
     """Says y as PX4 does, hears what PX4 takes."""
 
-    def __init__(self, someone: Peer) -> None:
-        self._node, self._someone = someone.node, someone
+    def __init__(self, peer_node: Peer) -> None:
+        self._node, self._someone = peer_node.node, peer_node
         self._odometry, self._airspeed = self._make("VehicleOdometry"), self._make("AirspeedValidated")
         self._sends = [
             (self._node.create_publisher(type(message), topic, BEST_EFFORT), message)
@@ -124,13 +124,17 @@ class Px4:
                 ("/fmu/out/airspeed_validated", self._airspeed),
             )
         ]
-        self.heard: dict[str, list[Any]] = {"OffboardControlMode": [], "VehicleTorqueSetpoint": [], "VehicleThrustSetpoint": []}
+        self.received: dict[str, list[Any]] = {
+            "OffboardControlMode": [],
+            "VehicleTorqueSetpoint": [],
+            "VehicleThrustSetpoint": [],
+        }
         for name, topic in (
             ("OffboardControlMode", "offboard_control_mode"),
             ("VehicleTorqueSetpoint", "vehicle_torque_setpoint"),
             ("VehicleThrustSetpoint", "vehicle_thrust_setpoint"),
         ):
-            self._node.create_subscription(type(self._make(name)), f"/fmu/in/{topic}", self.heard[name].append, BEST_EFFORT)
+            self._node.create_subscription(type(self._make(name)), f"/fmu/in/{topic}", self.received[name].append, BEST_EFFORT)
 
     def _make(self, name: str) -> Any:
         return getattr(import_module("px4_msgs.msg"), name)()
@@ -144,9 +148,9 @@ class Px4:
         self._someone.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.02, 0.0, 0.0, 0.0]), "test"))
 
 
-def spin(someone: Peer, duration: float) -> None:
+def spin(peer_node: Peer, duration: float) -> None:
     end = time.monotonic() + duration
-    someone.until(lambda: time.monotonic() > end)
+    peer_node.until(lambda: time.monotonic() > end)
 
 
 def test_a_bridge_speaks_to_px4_in_its_own_messages(start: Start) -> None:
@@ -154,24 +158,24 @@ def test_a_bridge_speaks_to_px4_in_its_own_messages(start: Start) -> None:
     needs("px4_msgs")
     bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false")
     bridge.wait_for("ready")
-    with peer(listen=("y",)) as someone:
-        px4 = Px4(someone)
-        someone.until(lambda: someone.heard["y"] and len(px4.heard["OffboardControlMode"]) > 2, each=px4.say)
-        y = someone.heard["y"][-1]
+    with peer(topics=("y",)) as peer_node:
+        px4 = Px4(peer_node)
+        peer_node.until(lambda: peer_node.received["y"] and len(px4.received["OffboardControlMode"]) > 2, each=px4.say)
+        y = peer_node.received["y"][-1]
         assert dict(zip(y.name, y.position, strict=True)) == pytest.approx({**MOTION, "V": 2.0}, abs=1e-6)
-        assert not px4.heard["VehicleTorqueSetpoint"]
-        assert px4.heard["OffboardControlMode"][-1].thrust_and_torque
-        client = someone.node.create_client(SetBool, "bridge/engage")
-        someone.until(client.service_is_ready, each=px4.say)
+        assert not px4.received["VehicleTorqueSetpoint"]
+        assert px4.received["OffboardControlMode"][-1].thrust_and_torque
+        client = peer_node.node.create_client(SetBool, "bridge/engage")
+        peer_node.until(client.service_is_ready, each=px4.say)
         future = client.call_async(SetBool.Request(data=True))
-        someone.until(future.done, each=px4.say)
+        peer_node.until(future.done, each=px4.say)
         assert future.result().success, future.result().message
-        someone.until(lambda: len(px4.heard["VehicleThrustSetpoint"]) > 5, each=px4.say)
-        assert list(px4.heard["VehicleTorqueSetpoint"][-1].xyz) == pytest.approx([0.0, 0.02 / 0.523599, 0.0], abs=1e-6)
-        assert list(px4.heard["VehicleThrustSetpoint"][-1].xyz) == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
-        someone.until(lambda: any("-> DISENGAGED: " in line for line in bridge.lines))
-        spin(someone, 0.2)  # what was still under way
-        for messages in px4.heard.values():
+        peer_node.until(lambda: len(px4.received["VehicleThrustSetpoint"]) > 5, each=px4.say)
+        assert list(px4.received["VehicleTorqueSetpoint"][-1].xyz) == pytest.approx([0.0, 0.02 / 0.523599, 0.0], abs=1e-6)
+        assert list(px4.received["VehicleThrustSetpoint"][-1].xyz) == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
+        peer_node.until(lambda: any("-> DISENGAGED: " in line for line in bridge.lines))
+        spin(peer_node, 0.2)  # what was still under way
+        for messages in px4.received.values():
             messages.clear()
-        spin(someone, 0.5)
-        assert not any(px4.heard.values())
+        spin(peer_node, 0.5)
+        assert not any(px4.received.values())

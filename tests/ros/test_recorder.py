@@ -39,8 +39,8 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 @pytest.fixture
-def someone() -> Iterator[Peer]:
-    with peer(listen=("/diagnostics",)) as made:
+def peer_node() -> Iterator[Peer]:
+    with peer(topics=("/diagnostics",)) as made:
         yield made
 
 
@@ -54,17 +54,17 @@ def stop(process: Process) -> None:
     assert process.end() == 0, process.output
 
 
-def said(someone: Peer) -> tuple[int, str, dict[str, str]]:
+def said(peer_node: Peer) -> tuple[int, str, dict[str, str]]:
     """Level, sentence and figures of the recorder's newest diagnostics."""
-    for message in reversed(someone.heard["/diagnostics"]):
+    for message in reversed(peer_node.received["/diagnostics"]):
         if message.status[0].name == "/recorder":
             status = message.status[0]
             return status.level[0], status.message, {one.key: one.value for one in status.values}
     return -1, "", {}
 
 
-def recorded(someone: Peer, topic: str) -> int:
-    return int(said(someone)[2].get(f"messages {topic}", 0))
+def recorded(peer_node: Peer, topic: str) -> int:
+    return int(said(peer_node)[2].get(f"messages {topic}", 0))
 
 
 def messages(run: Path) -> dict[str, list[tuple[int, bytes]]]:
@@ -85,13 +85,13 @@ def errors(process: Process) -> list[str]:
 
 
 def test_logs_and_changes_of_parameters_are_recorded(
-    start: Start, osprey_gust: Scenario, someone: Peer, tmp_path: Path
+    start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
 ) -> None:
-    someone.node.get_logger().info("said before there was a recorder")
+    peer_node.node.get_logger().info("said before there was a recorder")
     process = recorder(start, osprey_gust, "run")
-    someone.until(lambda: recorded(someone, "/rosout") > 1)
-    someone.node.declare_parameter("gain", 3.0)
-    someone.until(lambda: recorded(someone, "/parameter_events") > 0)
+    peer_node.until(lambda: recorded(peer_node, "/rosout") > 1)
+    peer_node.node.declare_parameter("gain", 3.0)
+    peer_node.until(lambda: recorded(peer_node, "/parameter_events") > 0)
     stop(process)
     with AnyReader([tmp_path / "run"]) as reader:
         found = [(one.topic, reader.deserialize(data, one.msgtype)) for one, _, data in reader.messages()]
@@ -103,17 +103,17 @@ def test_logs_and_changes_of_parameters_are_recorded(
 
 
 def test_further_topics_are_recorded_whatever_their_publishers_offer(
-    start: Start, osprey_gust: Scenario, someone: Peer, tmp_path: Path
+    start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
 ) -> None:
-    latched = someone.node.create_publisher(String, "/latched", LATCHED)
+    latched = peer_node.node.create_publisher(String, "/latched", LATCHED)
     latched.publish(String(data="before"))
     process = recorder(start, osprey_gust, "run", "topics:=[/latched, relative/pressure, /late, /y]")
     process.wait_for("ready")
-    weak = someone.node.create_publisher(FluidPressure, "/relative/pressure", BEST_EFFORT)
-    someone.until(lambda: recorded(someone, "/relative/pressure") > 2, each=lambda: weak.publish(FluidPressure()))
-    late = someone.node.create_publisher(Temperature, "/late", QoSProfile(depth=5))
-    someone.until(lambda: recorded(someone, "/late") > 2, each=lambda: late.publish(Temperature(temperature=1.0)))
-    someone.until(lambda: recorded(someone, "/latched") > 0)
+    weak = peer_node.node.create_publisher(FluidPressure, "/relative/pressure", BEST_EFFORT)
+    peer_node.until(lambda: recorded(peer_node, "/relative/pressure") > 2, each=lambda: weak.publish(FluidPressure()))
+    late = peer_node.node.create_publisher(Temperature, "/late", QoSProfile(depth=5))
+    peer_node.until(lambda: recorded(peer_node, "/late") > 2, each=lambda: late.publish(Temperature(temperature=1.0)))
+    peer_node.until(lambda: recorded(peer_node, "/latched") > 0)
     stop(process)
     found = messages(tmp_path / "run")
     assert len(found["/latched"]) == 1  # sent before the recorder was there
@@ -123,43 +123,43 @@ def test_further_topics_are_recorded_whatever_their_publishers_offer(
 
 
 def test_a_weaker_publisher_that_comes_later_is_recorded_too(
-    start: Start, osprey_gust: Scenario, someone: Peer, tmp_path: Path
+    start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
 ) -> None:
-    strong = someone.node.create_publisher(String, "/mixed", LATCHED)
+    strong = peer_node.node.create_publisher(String, "/mixed", LATCHED)
     strong.publish(String(data="strong"))
     process = recorder(start, osprey_gust, "run", "topics:=[/mixed]")
-    someone.until(lambda: recorded(someone, "/mixed") == 1)
-    weak = someone.node.create_publisher(String, "/mixed", BEST_EFFORT)
+    peer_node.until(lambda: recorded(peer_node, "/mixed") == 1)
+    weak = peer_node.node.create_publisher(String, "/mixed", BEST_EFFORT)
     process.wait_for("/mixed: now recorded with best_effort")
-    someone.until(lambda: recorded(someone, "/mixed") > 3, each=lambda: weak.publish(String(data="weak")))
+    peer_node.until(lambda: recorded(peer_node, "/mixed") > 3, each=lambda: weak.publish(String(data="weak")))
     stop(process)
     texts = [data for _, data in messages(tmp_path / "run")["/mixed"]]
     assert sum(b"strong" in text for text in texts) == 1
     assert sum(b"weak" in text for text in texts) > 2
 
 
-def test_a_topic_that_never_appears_is_named(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
+def test_a_topic_that_never_appears_is_named(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
     process = recorder(start, osprey_gust, "run", "topics:=[/never]")
     process.wait_for("nobody publishes /never; recorded as soon as somebody does")
-    someone.until(lambda: said(someone)[2].get("missing /never") == "nobody publishes it")
+    peer_node.until(lambda: said(peer_node)[2].get("missing /never") == "nobody publishes it")
     stop(process)
     assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: nobody publisher_qos it" in line)
 
 
 def test_a_topic_whose_type_is_not_installed_is_named(
-    start: Start, osprey_gust: Scenario, someone: Peer, tmp_path: Path
+    start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
 ) -> None:
     # The recorder runs in this folder, whose packages come first: there lifecycle_msgs has no messages.
     (tmp_path / "lifecycle_msgs").mkdir()
     (tmp_path / "lifecycle_msgs" / "__init__.py").touch()
-    someone.node.create_publisher(State, "/strange", LATCHED)
+    peer_node.node.create_publisher(State, "/strange", LATCHED)
     process = recorder(start, osprey_gust, "run", "topics:=[/strange]")
     process.wait_for("/strange is not recorded: its type lifecycle_msgs/msg/State is not installed")
     stop(process)
 
 
-def test_a_publisher_of_another_type_is_named(start: Start, osprey_gust: Scenario, someone: Peer) -> None:
-    someone.node.create_publisher(String, "/u_m", LATCHED)
+def test_a_publisher_of_another_type_is_named(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
+    peer_node.node.create_publisher(String, "/u_m", LATCHED)
     process = recorder(start, osprey_gust, "run")
     process.wait_for("/u_m: /peer publishes std_msgs/msg/String, expected sensor_msgs/msg/JointState")
     stop(process)
@@ -172,12 +172,12 @@ def test_a_topic_that_cannot_be_one_is_refused(start: Start, osprey_gust: Scenar
     assert not (tmp_path / "run").exists()
 
 
-def test_what_is_lost_is_counted_and_said(start: Start, osprey_gust: Scenario, someone: Peer, tmp_path: Path) -> None:
+def test_what_is_lost_is_counted_and_said(start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path) -> None:
     process = recorder(start, osprey_gust, "run")
     process.wait_for("ready")
     names, sent = [f"x.{k}" for k in range(100)], 0
-    publisher = someone.node.create_publisher(JointState, "truth", PUBLISH)
-    someone.until(lambda: publisher.get_subscription_count() == 1)
+    publisher = peer_node.node.create_publisher(JointState, "truth", PUBLISH)
+    peer_node.until(lambda: publisher.get_subscription_count() == 1)
 
     def send(count: int) -> None:
         nonlocal sent
@@ -192,11 +192,11 @@ def test_what_is_lost_is_counted_and_said(start: Start, osprey_gust: Scenario, s
         recording.resume()
 
     send_to_one_that_stands_still(1500)  # a publisher keeps 2000
-    someone.until(lambda: recorded(someone, "/truth") == sent)
-    assert "lost /truth" not in said(someone)[2]
+    peer_node.until(lambda: recorded(peer_node, "/truth") == sent)
+    assert "lost /truth" not in said(peer_node)[2]
     send_to_one_that_stands_still(8000)  # and what the socket holds is less than the rest
-    someone.until(lambda: int(said(someone)[2].get("lost /truth", 0)) > 0)
-    someone.until(lambda: sent == recorded(someone, "/truth") + int(said(someone)[2]["lost /truth"]))
+    peer_node.until(lambda: int(said(peer_node)[2].get("lost /truth", 0)) > 0)
+    peer_node.until(lambda: sent == recorded(peer_node, "/truth") + int(said(peer_node)[2]["lost /truth"]))
     stop(process)
     run = read_run(tmp_path / "run")
     lost = int(run.metadata["rise_di_lost"]["/truth"])
@@ -233,19 +233,19 @@ def test_a_full_disk_ends_the_log_with_one_error_and_not_the_flight(
     reason: str,
     start: Start,
     osprey_gust: Scenario,
-    someone: Peer,
+    peer_node: Peer,
     disk: Path,
     publisher: subprocess.Popen[str],
 ) -> None:
     process = recorder(start, osprey_gust, disk / "run", f"min_free:={least}", "lockstep:=true")
     process.wait_for("recording ended")
-    someone.until(lambda: said(someone)[0] == 2)
-    _, sentence, figures = said(someone)
+    peer_node.until(lambda: said(peer_node)[0] == 2)
+    _, sentence, figures = said(peer_node)
     assert re.match(f"recording ended: {reason}", sentence)
     # It goes on listening: in lockstep the aircraft would otherwise wait for it.
     heard: list[object] = []
-    someone.node.create_subscription(Time, "recorded", heard.append, QoSProfile(depth=10))
-    someone.until(lambda: len(heard) > 5)
+    peer_node.node.create_subscription(Time, "recorded", heard.append, QoSProfile(depth=10))
+    peer_node.until(lambda: len(heard) > 5)
     stop(process)
     assert len([line for line in errors(process) if "recording ended" in line]) == 1
     assert len(errors(process)) == 1
@@ -307,10 +307,10 @@ def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
 
 
 def test_twenty_kills_cost_three_tenths_of_a_second_at_most(
-    start: Start, osprey_gust: Scenario, tmp_path: Path, publisher: subprocess.Popen[str], someone: Peer
+    start: Start, osprey_gust: Scenario, tmp_path: Path, publisher: subprocess.Popen[str], peer_node: Peer
 ) -> None:
     generator = np.random.default_rng(1)
-    witness = PolledSubscription(someone.node, Y, NEWEST_SAMPLES, raw=True)
+    witness = PolledSubscription(peer_node.node, Y, NEWEST_SAMPLES, raw=True)
     missing = []
     following = recorder(start, osprey_gust, "run0")
     for k in range(20):

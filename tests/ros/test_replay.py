@@ -25,7 +25,7 @@ from rise_di_controller.guard import Mode
 
 
 @pytest.fixture
-def someone() -> Iterator[Peer]:
+def peer_node() -> Iterator[Peer]:
     with peer(("internals",)) as made:
         yield made
 
@@ -70,30 +70,30 @@ def test_lockstep_with_feedforward_limits_and_lost_samples_comes_again(
 
 
 def test_a_flight_in_real_time_comes_again_through_changes_outages_and_a_busy_machine(
-    start: Start, tmp_path: Path, someone: Peer
+    start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
     flight = fly(start, scenario_file(tmp_path, 120.0, "osprey_gust"))  # ended below
 
     def modes() -> list[int]:
-        return someone.modes()[-1:]
+        return peer_node.modes()[-1:]
 
     def more(count: int) -> None:
-        until = len(someone.heard["internals"]) + count
-        someone.until(lambda: len(someone.heard["internals"]) >= until, timeout=60.0)
+        until = len(peer_node.received["internals"]) + count
+        peer_node.until(lambda: len(peer_node.received["internals"]) >= until, timeout=60.0)
 
-    someone.until(lambda: modes() == [Mode.ENGAGED], timeout=60.0)
-    assert set_parameters(someone, k_g=1.5, Lambda=[4.0, 4.0, 2.0, 0.4])[0]
+    peer_node.until(lambda: modes() == [Mode.ENGAGED], timeout=60.0)
+    assert set_parameters(peer_node, k_g=1.5, Lambda=[4.0, 4.0, 2.0, 0.4])[0]
     more(50)
-    assert set_parameters(someone, upper=[0.01] * 4)[0]
+    assert set_parameters(peer_node, upper=[0.01] * 4)[0]
     with both_cores_busy():  # ticks are late, and some are missed
         more(50)
-    assert transition(someone, Transition.TRANSITION_DEACTIVATE)
-    someone.until(lambda: modes() == [Mode.INACTIVE])
+    assert transition(peer_node, Transition.TRANSITION_DEACTIVATE)
+    peer_node.until(lambda: modes() == [Mode.INACTIVE])
     more(20)
-    assert transition(someone, Transition.TRANSITION_CLEANUP)
-    assert transition(someone, Transition.TRANSITION_CONFIGURE)  # the law starts anew from the u that it was at
-    assert transition(someone, Transition.TRANSITION_ACTIVATE)
-    someone.until(lambda: modes() == [Mode.ENGAGED])
+    assert transition(peer_node, Transition.TRANSITION_CLEANUP)
+    assert transition(peer_node, Transition.TRANSITION_CONFIGURE)  # the law starts anew from the u that it was at
+    assert transition(peer_node, Transition.TRANSITION_ACTIVATE)
+    peer_node.until(lambda: modes() == [Mode.ENGAGED])
     more(50)
     flight.interrupt()
     assert flight.end(timeout=60) == 130, flight.output
@@ -114,8 +114,8 @@ def test_what_a_killed_recorder_left_comes_again(start: Start, tmp_path: Path) -
         log[:] = tmp_path.rglob("*.mcap")
         return bool(log) and log[0].stat().st_size > 200_000
 
-    with peer(()) as someone:
-        someone.until(written, timeout=60.0)
+    with peer(()) as peer_node:
+        peer_node.until(written, timeout=60.0)
     next(one for one in flight.children() if "flight_recorder.main" in one.cmdline()).kill()
     assert flight.end(timeout=60) == 3, flight.output
     found = replayed(start, log[0].parent)
@@ -124,20 +124,20 @@ def test_what_a_killed_recorder_left_comes_again(start: Start, tmp_path: Path) -
 
 
 def test_a_recorder_that_comes_late_leaves_its_first_tick_unchecked_and_says_what_is_missing(
-    start: Start, tmp_path: Path, someone: Peer
+    start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
     scenario = scenario_file(tmp_path, 1e3, "osprey_gust")
     for module in ("rise_di_controller", "aircraft_sim", "reference_model"):
         start(f"{module}.main", "--ros-args", "--params-file", str(scenario))
     more_than_kept = PUBLISH.depth + 200
-    someone.until(lambda: len(someone.heard["internals"]) > more_than_kept, timeout=90.0)
+    peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_kept, timeout=90.0)
     recorder = start(
         *("flight_recorder.main", "--ros-args", "--params-file", str(scenario)),
         *("-p", f"scenario_file:={scenario}", "-p", "directory:=run"),
     )
     recorder.wait_for("recording to")
-    count = len(someone.heard["internals"])
-    someone.until(lambda: len(someone.heard["internals"]) > count + 200)
+    count = len(peer_node.received["internals"])
+    peer_node.until(lambda: len(peer_node.received["internals"]) > count + 200)
     recorder.interrupt()
     assert recorder.end() == 0, recorder.output
     found = replayed(start, tmp_path / "run")

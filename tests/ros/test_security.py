@@ -158,27 +158,27 @@ def test_with_the_key_it_is_flown(start: Start, osprey_gust: Scenario, keys: tup
 
 
 @pytest.fixture
-def someone() -> Iterator[Peer]:
-    with peer(listen=("/diagnostics",)) as made:
+def peer_node() -> Iterator[Peer]:
+    with peer(topics=("/diagnostics",)) as made:
         yield made
 
 
-def counted(someone: Peer, reason: str) -> Callable[[], bool]:
+def counted(peer_node: Peer, reason: str) -> Callable[[], bool]:
     """Whether the diagnostics say that u were refused for it."""
 
     def is_counted() -> bool:
-        values = [value for array in someone.heard["/diagnostics"] for status in array.status for value in status.values]
+        values = [value for array in peer_node.received["/diagnostics"] for status in array.status for value in status.values]
         return any(value.key == f"refused u: {reason}" and int(value.value) > 0 for value in values)
 
     return is_counted
 
 
 def test_what_was_overheard_is_not_flown_again(
-    start: Start, osprey_gust: Scenario, keys: tuple[Path, Path], someone: Peer
+    start: Start, osprey_gust: Scenario, keys: tuple[Path, Path], peer_node: Peer
 ) -> None:
     before = time.time_ns()
     first = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
-    publisher = someone.node.create_publisher(U.type, U.name, 10)
+    publisher = peer_node.node.create_publisher(U.type, U.name, 10)
     sealed_u = Encoder(INPUTS, "/controller#1", sealed())
     overheard: list[bytes] = []
 
@@ -186,16 +186,16 @@ def test_what_was_overheard_is_not_flown_again(
         overheard.append(sealed_u.encode(time.time_ns(), np.zeros(4)))
         publisher.publish(overheard[-1])
 
-    someone.until(lambda: "flown by" in first.output, BUSY, each=send)
+    peer_node.until(lambda: "flown by" in first.output, BUSY, each=send)
     again = overheard[-1]
-    someone.until(counted(someone, "order"), BUSY, each=lambda: publisher.publish(again))
+    peer_node.until(counted(peer_node, "order"), BUSY, each=lambda: publisher.publish(again))
     first.interrupt()
     assert first.end(BUSY) == 0
     # An aircraft that is started anew remembers nothing, and refuses what is older than itself.
-    someone.heard["/diagnostics"].clear()
+    peer_node.received["/diagnostics"].clear()
     second = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
-    someone.until(counted(someone, "order"), BUSY, each=lambda: publisher.publish(again))
-    someone.until(counted(someone, "mac"), BUSY, each=lambda: publisher.publish(u_message(before)))
+    peer_node.until(counted(peer_node, "order"), BUSY, each=lambda: publisher.publish(again))
+    peer_node.until(counted(peer_node, "mac"), BUSY, each=lambda: publisher.publish(u_message(before)))
     assert "flown by" not in second.output
 
 

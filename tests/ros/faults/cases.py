@@ -344,9 +344,9 @@ def second(role: str, topic: str) -> Callable[[Flight, Generator], None]:
 def weak_publisher(flight: Flight, random: Generator) -> None:
     """A publisher of y that is best effort, which the recorder cannot take reliably."""
     unsaid(flight, "recorder", QUALITY, UNFIT)
-    with peer(listen=()) as someone:
+    with peer(topics=()) as peer_node:
         flight.fault()
-        someone.node.create_publisher(JointState, "y", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+        peer_node.node.create_publisher(JointState, "y", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
         flight.until(lambda: WEAK(flight), 20.0, "the weak publisher named")
     flight.over()
 
@@ -354,10 +354,10 @@ def weak_publisher(flight: Flight, random: Generator) -> None:
 def demanding_listener(flight: Flight, random: Generator) -> None:
     """A listener of u that asks for a deadline that the controller does not offer, and so never hears it."""
     unsaid(flight, "controller", QUALITY, UNFIT)
-    with peer(listen=()) as someone:
+    with peer(topics=()) as peer_node:
         flight.fault()
         asked = QoSProfile(depth=1, deadline=Duration(seconds=0.02))
-        someone.node.create_subscription(JointState, "u", lambda _: None, asked)
+        peer_node.node.create_subscription(JointState, "u", lambda _: None, asked)
         flight.until(lambda: DEMANDING(flight), 20.0, "the demanding listener named")
     flight.over()
 
@@ -439,11 +439,11 @@ def parameters(flight: Flight, random: Generator) -> None:
     """Two thousand changes of the controller's gains, half of them bad, the first one too; eight always under way."""
     valid = random.random(STORM_OF_PARAMETERS) < 0.5
     valid[0] = False
-    with peer(listen=()) as someone:
-        client = someone.node.create_client(SetParameters, "controller/set_parameters")
-        someone.until(client.service_is_ready)
+    with peer(topics=()) as peer_node:
+        client = peer_node.node.create_client(SetParameters, "controller/set_parameters")
+        peer_node.until(client.service_is_ready)
         first = client.call_async(SetParameters.Request(parameters=[number("k_g", 1.0)]))
-        someone.until(first.done)  # from then on each knows of the other
+        peer_node.until(first.done)  # from then on each knows of the other
         flight.fault()
         futures: list[Any] = []
         done = 0
@@ -457,13 +457,13 @@ def parameters(flight: Flight, random: Generator) -> None:
                 futures.append(client.call_async(SetParameters.Request(parameters=[change])))
 
         feed()
-        someone.until(lambda: done == STORM_OF_PARAMETERS, 100.0, each=feed)
+        peer_node.until(lambda: done == STORM_OF_PARAMETERS, 100.0, each=feed)
         flight.over()
         flight.measured["changes_per_second"] = STORM_OF_PARAMETERS / (flight.end - flight.begin)
         accepted = [future.result().results[0].successful for future in futures]
         assert accepted == valid.tolist()
         future = client.call_async(SetParameters.Request(parameters=[number("k_g", 1.0)]))
-        someone.until(future.done)
+        peer_node.until(future.done)
 
 
 def number(name: str, value: float) -> Parameter:
