@@ -23,6 +23,7 @@ from flight_ros import transport
 from flight_ros.flight_node import FlightNode
 from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, destroy_participant, ready_callback
 from flight_ros.ticker import Ticker, disable_timer_slack
+from flight_ros.topics import NodeState
 
 ENDED_EARLY = 3  # exit status
 
@@ -126,6 +127,7 @@ def _begin(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
     gc.freeze()  # a collection then takes microseconds, not tens of milliseconds, as the one of now would
     gc.enable()
     for node in nodes:
+        node.publish_state(NodeState.READY)
         node.get_logger().info("ready")
     return executor
 

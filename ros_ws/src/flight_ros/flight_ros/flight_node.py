@@ -29,7 +29,7 @@ from flight_ros.publisher_lock import SENDER
 from flight_ros.rclpy_private import raw_publish
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
-from flight_ros.topics import DIAGNOSTICS, LOCKSTEP, NEWEST_SAMPLES, PUBLISH, Topic, publisher_qos
+from flight_ros.topics import DIAGNOSTICS, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, PUBLISH, STATE, NodeState, Topic, publisher_qos
 
 P = TypeVar("P", bound=NodeParameters)
 
@@ -67,6 +67,7 @@ class FlightNode(Node, Generic[P]):
         self._flight_publishers: list[Publisher] = []
         self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to say it next
         self._diagnostics = self.create_publisher(DIAGNOSTICS.type, DIAGNOSTICS.name, PUBLISH)
+        self._node_state = self.create_publisher(NODE_STATE.type, NODE_STATE.name, STATE)
         self._periods: list[int] = []
         self._compute: list[int] = []
         self._missed = 0
@@ -263,6 +264,13 @@ class FlightNode(Node, Generic[P]):
         if self.parameters.lockstep and not (self.peers and self.peers.missing()):
             for publisher in self.publishers:
                 publisher.wait_for_all_acked(ACKNOWLEDGE_TIMEOUT)
+
+    def publish_state(self, state: NodeState) -> None:
+        """Publish the state of this node on `node_state`.
+
+        The key names the process too, in lockstep as well: a subscriber tells the nodes of two flights apart by it.
+        """
+        self._node_state.publish(KeyValue(key=f"{self.get_fully_qualified_name()}#{os.getpid()}", value=state))
 
     def publish_diagnostics(self) -> None:
         """The 1 Hz report: loop period, compute time, missed ticks, refused samples, and what the node adds."""

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The topics of a flight: name, type and quality of service, in one place."""
 
+from enum import StrEnum
 from typing import NamedTuple
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, KeyValue
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
@@ -31,6 +32,10 @@ RECORD = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durabili
 # less.
 RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 
+# A late subscriber gets the last state of each node. The queue of a subscriber holds the states of many nodes.
+STATE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+STATES = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
 HISTORY_NS = 2 * NANOSECONDS
 
 
@@ -44,6 +49,13 @@ def publisher_qos(period_ns: int) -> QoSProfile:
         reliability=PUBLISH.reliability,
         durability=PUBLISH.durability,
     )
+
+
+class NodeState(StrEnum):
+    """What a node publishes on `node_state`: its loop begins; the aircraft has flown a lockstep flight to its end."""
+
+    READY = "ready"
+    COMPLETED = "completed"
 
 
 class Topic(NamedTuple):
@@ -63,5 +75,6 @@ TRUTH = Topic("truth", JointState)
 DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, foreign=True)
 CLOCK = Topic("/clock", Clock)
 RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the log is complete
+NODE_STATE = Topic("node_state", KeyValue)  # key: the process, "/controller#4711"; value: a NodeState
 
 FLIGHT = (Y, Y_M, U, U_M, INTERNALS, TRUTH, DIAGNOSTICS)
