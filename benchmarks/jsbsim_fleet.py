@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, aircraft_names
-from flight_analysis.design.identification import Identified, ManoeuvreResult, fly_all, identify, without_beta
+from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, aircraft_names
+from flight_analysis.design.identification import IdentifiedAircraft, ManoeuvreResult, fly_all, identify, without_beta
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import ParameterError
 
@@ -92,8 +92,8 @@ def main() -> None:
             reasons.append(f"| {name} | {where.speed:g} kt, {where.altitude:g} ft | {error} |")
             continue
         rows.append(_row(name, where, found))
-        if found.lost:
-            reasons.append(f"| {name} | {where.speed:g} kt, {where.altitude:g} ft | {found.lost} |")
+        if found.failure:
+            reasons.append(f"| {name} | {where.speed:g} kt, {where.altitude:g} ft | {found.failure} |")
     flights = [f"{title}{law}" for title in ("calm", "gust", "turbulence") for law in ("", ", PI")]
     headings = ("aircraft", "Omega_ii", "D", "lag (s)", "zero (1/s)", *flights, "largest u")
     print(f"| {' | '.join(headings)} |\n|{'---|' * len(headings)}")
@@ -102,7 +102,7 @@ def main() -> None:
     print("\n".join(reasons))
 
 
-def _row(name: str, where: Condition, found: Identified) -> str:
+def _row(name: str, where: Condition, found: IdentifiedAircraft) -> str:
     steps = found.responses
     pi = fly_all(without_beta(found.scenario()))
     return " | ".join(
@@ -111,7 +111,7 @@ def _row(name: str, where: Condition, found: Identified) -> str:
             " / ".join(f"{value:.3g}" for value in np.diag(steps.Omega)),
             " ".join(f"{sign:+d}"[0] for sign in found.D),
             " / ".join(f"{lag:.2g}" for lag in steps.lag),
-            f"{found.zero:.2g}",
+            f"{found.sideslip_zero:.2g}",
             *(_errors(one) for title in found.flights for one in (found.flights[title], pi[title])),
             " / ".join(f"{found.flights['turbulence'].largest[one]:.2g}" for one in INPUTS) + " |",
         )

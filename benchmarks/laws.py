@@ -16,8 +16,8 @@ from rich.progress import track
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
-from flight_campaign.law_comparison import Compared, compare
-from flight_campaign.tuning import Benchmark, TuningResult, benchmark, file_of, load
+from flight_campaign.law_comparison import LawResult, compare
+from flight_campaign.tuning import Benchmark, TuningResult, benchmark, load, tuned_file
 
 LAWS = ("rise", "rise_ff", "rise_observer", "lqg", "pi", "pi_ff", "l1", "indi", "lqi_vanes")
 OBSERVER = "rise_observer"
@@ -59,14 +59,14 @@ def main(
 ) -> None:
     """Print scores of laws tuned on osprey_servo's manoeuvre and gusts, on courses that they were not tuned on."""
     scenario = find_scenario("osprey_servo")
-    tuned = load(file_of(scenario))
+    tuned = load(tuned_file(scenario))
     chosen: dict[str, dict[str, TuningResult]] = {name: {"uncertain": tuned[name]["uncertain"]} for name in LAWS}
     chosen[OBSERVER] |= {"late": tuned[OBSERVER]["late"]}
     flown: list[tuple[str, Benchmark, dict[str, dict[str, TuningResult]]]] = [
         (name, benchmark(one), chosen) for name, one in courses(scenario).items()
     ]
     flown += [(name, one, {OBSERVER: chosen[OBSERVER]}) for name, one in wrong_wind(benchmark(scenario))]
-    rows: list[tuple[str, Compared]] = []
+    rows: list[tuple[str, LawResult]] = []
     for name, here, laws in track(flown, "courses", console=Console(stderr=True)):
         rows += [(name, one) for one in compare(here, laws, aircraft, LEVELS, seed)]
     levels = tuple(f"+-{100.0 * level:g} %" for level in LEVELS)
@@ -74,7 +74,7 @@ def main(
     table = new_table(title, ("course", "law", "tuned on", "nominal", *levels), texts=3)
     for name, one in rows:
         cells = (f"{level.mean:.2f} ({level.worst:.2f})" for level in one.levels)
-        table.add_row(name, one.law, one.aims, f"{one.score:.2f}", *cells)
+        table.add_row(name, one.law, one.objective, f"{one.score:.2f}", *cells)
     console = Console()
     console.width = max(console.width, WIDTH)
     console.print(table)

@@ -24,7 +24,7 @@ from flight_analysis.metrics import true_error
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define
-from flight_campaign.statistics import KEPT, Figure, Tally, score, score_units
+from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
@@ -76,7 +76,7 @@ def test_the_worst_are_kept_and_those_that_diverged_lead_them() -> None:
     diverged = scores == 4.0
     halves = [Tally.of(first, diverged[first : first + 15], {"score": scores[first : first + 15]}) for first in (0, 15)]
     total = halves[0] + halves[1]
-    assert [one.number for one in total.worst] == [4, *range(29, 29 - KEPT + 1, -1)]
+    assert [one.number for one in total.worst] == [4, *range(29, 29 - WORST_KEPT + 1, -1)]
     assert total.worst[0].score is None
     assert (total.flights, total.diverged, total.lost) == (30, 1, 19)  # 11 to 29 are above 10
     assert total.figures["score"].count == 29

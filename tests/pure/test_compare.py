@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from control_laws.catalogue import LAWS, start
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import error_figures, true_error
+from flight_analysis.metrics import error_metrics, true_error
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet, tuning
 from flight_campaign import law_comparison as side_by_side
@@ -41,20 +41,20 @@ def test_a_score_counts_each_channel_in_its_unit_and_a_cost_adds_activity(short:
     assert tuning.cost(flown, short) == pytest.approx([6.5])
     lost = flown._replace(diverged=np.array([True]))
     assert tuning.score(lost, short.unit) == [np.inf]
-    assert tuning.cost(lost, short) == [tuning.MOST_COST]
-    assert tuning.cost(flown._replace(rms=np.nan * rms), short) == [tuning.MOST_COST]
+    assert tuning.cost(lost, short) == [tuning.MAX_COST]
+    assert tuning.cost(flown._replace(rms=np.nan * rms), short) == [tuning.MAX_COST]
 
 
-@pytest.mark.parametrize(("aims", "flights"), [("nominal", 3), ("uncertain", 15), ("late", 21)])
+@pytest.mark.parametrize(("objective", "flights"), [("nominal", 3), ("uncertain", 15), ("late", 21)])
 def test_an_evaluation_weighs_aircraft_evenly_and_calm_gusts_and_delay_once_each(
-    aims: str, flights: int, short: Benchmark
+    objective: str, flights: int, short: Benchmark
 ) -> None:
-    costed = tuning.costed(aims, short)
-    wind, late = np.asarray(costed.fleet.wind), np.asarray(costed.fleet.late)
+    evaluation = tuning.evaluation(objective, short)
+    wind, late = np.asarray(evaluation.fleet.wind), np.asarray(evaluation.fleet.late)
     assert len(wind) == flights
-    assert costed.weight.sum() == pytest.approx(3.0)
-    for part in (wind == 0.0, (wind == 1.0) & (late == 0), late == tuning.SPARE_TICKS):
-        assert costed.weight[part].sum() == pytest.approx(1.0)
+    assert evaluation.weight.sum() == pytest.approx(3.0)
+    for part in (wind == 0.0, (wind == 1.0) & (late == 0), late == tuning.EXTRA_DELAY_TICKS):
+        assert evaluation.weight[part].sum() == pytest.approx(1.0)
 
 
 def test_a_search_repeats_itself_and_gets_better_than_its_start(short: Benchmark) -> None:
@@ -63,7 +63,7 @@ def test_a_search_repeats_itself_and_gets_better_than_its_start(short: Benchmark
     assert found[0] == found[1]
     assert found[0].cost == min(found[0].costs)
     assert found[0].evaluations == 6 * tuning.POPULATION
-    flights, weight = tuning.costed(tuning.NOMINAL, short)
+    flights, weight = tuning.evaluation(tuning.NOMINAL, short)
     costs = [
         float(
             tuning.cost(fleet.fly(flights, short.vehicle, short.courses[False], law.control_law(short.known), params), short)
@@ -92,7 +92,7 @@ def test_the_fleet_s_score_is_that_of_the_loop_in_one_process(short: Benchmark) 
     (found,) = side_by_side.compare(short, {"rise": {"nominal": gains}}, 1, [0.3], 1)
     error = true_error(simulate(short.scenario))
     assert error is not None
-    rms = np.array([error_figures(error[name]).rms for name in controller.outputs])
+    rms = np.array([error_metrics(error[name]).rms for name in controller.outputs])
     # the fleet holds over a tick what the loop follows through it: far below the 1 % that a score needs
     np.testing.assert_allclose(found.rms, rms, rtol=2e-3)
     assert found.score == pytest.approx(float(np.sum(rms / short.unit)), rel=2e-3)
@@ -116,7 +116,7 @@ def test_every_law_ships_with_gains_for_both_worlds(name: str) -> None:
     for law, by_aim in shipped.items():
         assert {"nominal", "uncertain"} <= set(by_aim), law
         for found in by_aim.values():
-            assert found.cost == min(found.costs) < tuning.MOST_COST
+            assert found.cost == min(found.costs) < tuning.MAX_COST
             assert {key: len(values) for key, values in found.gains.items()} == {
                 key: len(gain) for key, gain in start(LAWS[law], here.known).items()
             }

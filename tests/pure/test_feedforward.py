@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_selection import manoeuvre, study, with_feedforward
+from flight_analysis.design.gain_selection import manoeuvre, study_airframe, with_feedforward
 from flight_bringup.scenarios import find_scenario
-from flight_campaign.campaign import chunk_flown, define
+from flight_campaign.campaign import define, fly_chunk_figures
 from flight_cli.cli import COMMANDS, application
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError
@@ -325,7 +325,7 @@ def test_what_is_left_to_beta_is_the_slew_that_the_model_did_not_foresee() -> No
     # N_d is -D U times the slew of the ideal control, less that of u_ff. Over 20 aircraft at +-30 % in calm air 20 %, 17 %,
     # 20 % and 37 % of it are left in the mean, of elevator, thrust, aileron and rudder; half stands for "most of it is gone".
     airframe = load_airframe("osprey")
-    found = study(airframe, manoeuvre(short(), airframe)._replace(gusts={}), 0.3, 20)
+    found = study_airframe(airframe, manoeuvre(short(), airframe)._replace(gusts={}), 0.3, 20)
     whole = np.abs(found.u_dot[:, 1:]).max(axis=0)
     left = np.abs(found.u_dot[:, 1:] - found.u_dot[:, :1]).max(axis=0)
     assert (left.mean(axis=0) < 0.5 * whole.mean(axis=0)).all()
@@ -346,7 +346,7 @@ def scores() -> dict[str, FloatArray]:
 
     def of(one: Scenario, level: float, aircraft: int) -> FloatArray:
         text = define(one, aircraft, level, 1, aircraft).model_dump_json()
-        return chunk_flown(text, (0, 0)).figures["score"]
+        return fly_chunk_figures(text, (0, 0)).figures["score"]
 
     return {
         name: np.column_stack([of(one, level, aircraft) for one in both(base)])

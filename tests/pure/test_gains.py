@@ -15,7 +15,7 @@ import yaml
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import uncertain
+from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import gain_conditions
@@ -31,7 +31,7 @@ from rise_di_controller.decomposition import decompose, unit_diagonal
 from rise_di_controller.law import LawParams, Sign, engage, step
 from rise_di_controller.params import ControllerParameters
 
-SERVOS: LoopSetting = selection.setting_of(find_scenario("osprey_servo"))._replace(delay=0.0, rate_limit={})
+SERVOS: LoopSetting = selection.loop_setting(find_scenario("osprey_servo"))._replace(delay=0.0, rate_limit={})
 HAND = Bounds(
     U=np.array([[0.0, 2.0, 1.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]),
     N_d=np.array([1.0, 2.0, 3.0]),
@@ -45,7 +45,7 @@ def osprey() -> Study:
     """The osprey and twenty airframes around it along the manoeuvre of the default scenario, with its gusts."""
     scenario = find_scenario("osprey_gust")
     airframe = load_airframe("osprey")
-    return selection.study(airframe, selection.manoeuvre(scenario, airframe), samples=20)
+    return selection.study_airframe(airframe, selection.manoeuvre(scenario, airframe), samples=20)
 
 
 @pytest.fixture(scope="module")
@@ -111,9 +111,9 @@ def test_a_gain_that_22_does_not_allow_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"^k_d: found \[0\.\], expected values above 0$"):
         gain_conditions.check(GainSet(1.0, np.zeros(1), np.ones(2), np.ones(2)), HAND)
     with pytest.raises(ParameterError, match="the smallest in the last channel"):
-        gain_conditions.split(np.array([2.0, 3.0]))
+        gain_conditions.split_gain(np.array([2.0, 3.0]))
     with pytest.raises(ParameterError, match=r"^K\[1\]: found 0\.9, expected above 1"):
-        gain_conditions.split(np.array([2.0, 0.9]))
+        gain_conditions.split_gain(np.array([2.0, 0.9]))
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_the_literal_conditions_ask_the_osprey_for_bandwidths_no_servo_has(
 
 def test_bounds_of_U_are_those_of_the_worst_sample() -> None:
     lower, upper = np.array([[0.9, 0.0], [0.0, 0.9]]), np.array([[1.1, 0.3], [0.2, 1.1]])
-    samples = gain_conditions.within(lower, upper, 400, seed=3)
+    samples = gain_conditions.interval_samples(lower, upper, 400, seed=3)
     assert ((samples >= lower) & (samples <= upper)).all()
     # U_12 = W_12 - L_21 with D = I: largest with W_12 = 0.3 / 0.9, L_21 = 0, which is a corner
     assert gain_conditions.bound_U(samples)[0, 1] == pytest.approx(0.3 / 0.9)
@@ -167,15 +167,15 @@ def test_the_ideal_control_of_the_osprey_slews_as_measured_before(osprey: Study)
     # slower (36 and 9.3 with steps), the gusts are the same
     shown = np.degrees([1.0, 0.0, 1.0, 1.0]) + np.array([0.0, 100.0, 0.0, 0.0])
     np.testing.assert_allclose(osprey.slew * shown, [23.3, 114.0, 9.7, 43.7], rtol=0.01)
-    np.testing.assert_allclose((osprey.slew_calm * shown)[[0, 2]], [2.1, 9.7], rtol=0.01)
-    np.testing.assert_allclose((osprey.slew_calm * shown)[[1, 3]], [32.2, 7.35], rtol=0.01)
+    np.testing.assert_allclose((osprey.slew_undisturbed * shown)[[0, 2]], [2.1, 9.7], rtol=0.01)
+    np.testing.assert_allclose((osprey.slew_undisturbed * shown)[[1, 3]], [32.2, 7.35], rtol=0.01)
 
 
 def test_the_ideal_control_is_what_a_tight_loop_settles_to(osprey_gust: Scenario) -> None:
     # The rate of u of the flown law is the reference: the implicit sign holds e below 1e-3, so u is u* but for sampling.
     short = osprey_gust.vary(flight={"duration": 4.0})
     airframe = load_airframe("osprey")
-    found = selection.study(airframe, selection.manoeuvre(short, airframe), samples=0)
+    found = selection.study_airframe(airframe, selection.manoeuvre(short, airframe), samples=0)
     u = simulate(short)["u"]
     flown = np.array([np.max(np.abs(np.diff(u[name]) / 0.01)) for name in airframe.inputs])
     # 3 %: differences over a period average the corners of the reference's acceleration; the first input moves most
@@ -184,13 +184,13 @@ def test_the_ideal_control_is_what_a_tight_loop_settles_to(osprey_gust: Scenario
 
 def test_uncertain_airframes_keep_what_is_kinematic() -> None:
     airframe = load_airframe("osprey")
-    A, B = uncertain(airframe, 0.3, 50, seed=1)
+    A, B = nominal_and_sampled(airframe, 0.3, 50, seed=1)
     for state in ("theta", "phi"):
         assert (A[:, airframe.index(state)] == airframe.matrix_a()[airframe.index(state)]).all()
     part = B[1:, airframe.index("q"), 0] / B[0, airframe.index("q"), 0] - 1.0
     assert 0.2 < np.abs(part).max() <= 0.3  # fifty uniform draws: the largest is above 0.2 but for 1 in 1e9
     with pytest.raises(ParameterError, match=r"uncertainty: found 1\.5"):
-        uncertain(airframe, 1.5, 1, seed=1)
+        nominal_and_sampled(airframe, 1.5, 1, seed=1)
 
 
 def test_an_airframe_with_an_unstable_zero_is_refused(osprey_gust: Scenario) -> None:
@@ -198,7 +198,7 @@ def test_an_airframe_with_an_unstable_zero_is_refused(osprey_gust: Scenario) -> 
     rows = [list(row) for row in osprey.A]
     rows[osprey.index("beta")][osprey.index("beta")] = 0.69  # the zero at -0.69 1/s is that entry
     with pytest.raises(ParameterError, match=r"^airframe osprey: found a zero at 0\.69 1/s, expected none in the right"):
-        selection.study(osprey.model_copy(update={"A": rows}), selection.manoeuvre(osprey_gust, osprey))
+        selection.study_airframe(osprey.model_copy(update={"A": rows}), selection.manoeuvre(osprey_gust, osprey))
 
 
 # The engineering procedure
@@ -255,7 +255,7 @@ def test_a_written_gain_set_is_read_back(selected: selection.Selection) -> None:
         elif isinstance(value, (float, tuple)):
             np.testing.assert_allclose(getattr(read, key), value, rtol=1e-5, err_msg=key)  # six digits
     assert all(type(one) is float for one in section["k_d"])  # ROS takes lists of one type only
-    again = selection.judge(selected.study, read, SERVOS)
+    again = selection.assess_gains(selected.study, read, SERVOS)
     assert names(again.failing, read.outputs) == names(selected.engineering.failing, read.outputs)
 
 
@@ -314,7 +314,7 @@ def test_the_pairing_that_a_refusal_proposes_can_be_selected_for(osprey_gust: Sc
     airframe = load_airframe("aerosonde_first_edition_lateral")
     flown = selection.manoeuvre(osprey_gust.vary(flight={"duration": 1.0}), airframe)
     assert flown.reference.outputs == ("p", "r")
-    found = selection.study(airframe, flown, samples=3)
+    found = selection.study_airframe(airframe, flown, samples=3)
     with pytest.raises(ParameterError, match="expected another pairing: p-rudder, r-aileron"):
         selection.select_gains(found, SERVOS)
     answer = selection.select_gains(found, SERVOS._replace(inputs=("rudder", "aileron"))).engineering

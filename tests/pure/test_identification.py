@@ -19,13 +19,13 @@ from flight_analysis.design.identification import (
     SIZES,
     SPAN,
     Fly,
-    Identified,
+    IdentifiedAircraft,
     fly_all,
     identify,
-    moderate,
-    reference,
-    responses,
-    tangent,
+    moderate_turbulence,
+    reference_parameters,
+    steepest_tangent,
+    step_responses,
 )
 from flight_bringup.scenarios import find_scenario
 from flight_core.outcome import COMPLETED, FlightEnded
@@ -68,7 +68,7 @@ def test_a_linear_system_gives_back_its_omega_and_its_lags(
     # The last chord begins 0.5 - 0.025 s after the step: what is left of the lag there is exp(-4.75) = 0.9 % of the slope,
     # and (0.475 + 0.1) / 0.1 times that of the lag.
     known = np.diag(np.array(Omega) * signs) @ np.array([[1.0, coupled], [coupled, 1.0]])
-    found = responses(lagged(known, np.array(lag)), -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+    found = step_responses(lagged(known, np.array(lag)), -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
     assert found.Omega == pytest.approx(known, rel=0.015, abs=1e-6)
     assert found.lag == pytest.approx(np.array(lag), rel=0.06)
     assert found.spread == pytest.approx(np.ones(2))
@@ -79,7 +79,7 @@ def test_a_damped_rate_shows_its_first_slope() -> None:
     # y = b/a (1 - exp(-a t)): the first chord of s = 25 ms has the slope b (1 - exp(-a s)) / (a s) and, at its middle, no lag.
     a, b = 8.0, -5.0
     t = DT * np.arange(101)
-    found = tangent(b / a * (1.0 - np.exp(-a * t)), DT)
+    found = steepest_tangent(b / a * (1.0 - np.exp(-a * t)), DT)
     assert found is not None
     assert found.slope == pytest.approx(b * (1.0 - math.exp(-a * SPAN)) / (a * SPAN))
     assert found.lag == pytest.approx(0.0, abs=1e-12)
@@ -90,13 +90,13 @@ def test_the_first_maximum_of_the_slope_counts() -> None:
     # A slope of 1 that fades, and one of -50 that comes after it, as when the aircraft answers to its own change of path.
     t = DT * np.arange(2001)
     y = np.sin(t) * (t < 6.0) - 50.0 * np.maximum(t - 6.0, 0.0)
-    found = tangent(y, DT)
+    found = steepest_tangent(y, DT)
     assert found is not None
     assert found.slope == pytest.approx(1.0, rel=1e-3)
 
 
 def test_nothing_that_moves_has_no_tangent() -> None:
-    assert tangent(np.zeros(101), DT) is None
+    assert steepest_tangent(np.zeros(101), DT) is None
 
 
 def test_drift_and_all_that_is_even_drop_out() -> None:
@@ -108,7 +108,7 @@ def test_drift_and_all_that_is_even_drop_out() -> None:
         return np.asarray(straight(u, duration) + 0.3 * t**2 + 5.0 * t * (u @ u))
 
     ends = (-WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
-    found, clean = responses(drifting, *ends), responses(straight, *ends)
+    found, clean = step_responses(drifting, *ends), step_responses(straight, *ends)
     assert found.Omega == pytest.approx(clean.Omega, abs=1e-9)
     assert found.lag == pytest.approx(clean.lag, abs=1e-9)
 
@@ -120,7 +120,7 @@ def test_of_a_dead_zone_the_largest_step_counts() -> None:
     def dead(u: FloatArray, duration: float) -> FloatArray:
         return straight(u - np.clip(u, -0.06, 0.06), duration)
 
-    found = responses(dead, -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+    found = step_responses(dead, -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
     assert found.size == pytest.approx([SIZES[-1]] * 2)
     assert np.diag(found.Omega) == pytest.approx([0.7 * 3.0] * 2, rel=0.01)
     assert found.rejected == ("elevator by 0.05: q does not move", "aileron by 0.05: p does not move")
@@ -134,7 +134,7 @@ def test_steps_stay_inside_the_stops() -> None:
         asked.append(float(np.max(np.abs(u))))
         return straight(u, duration)
 
-    responses(fly, -WIDE, np.array([0.1, 10.0]), ("q", "p"), ("elevator", "aileron"), DT)
+    step_responses(fly, -WIDE, np.array([0.1, 10.0]), ("q", "p"), ("elevator", "aileron"), DT)
     assert sorted(set(asked)) == pytest.approx([0.05, 0.09, 0.1, 0.2])
 
 
@@ -146,14 +146,14 @@ def test_a_step_that_ends_the_flight_is_left_out_and_told() -> None:
             raise FlightEnded("gave up at t = 0.10 s")
         return straight(u, duration)
 
-    found = responses(fragile, -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+    found = step_responses(fragile, -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
     assert np.diag(found.Omega) == pytest.approx([3.0, 3.0], rel=0.01)
     assert found.rejected == ("elevator by 0.2: gave up at t = 0.10 s", "aileron by 0.2: gave up at t = 0.10 s")
 
 
 def test_an_output_that_answers_to_nothing_ends_the_identification() -> None:
     with pytest.raises(FlightEnded, match=r"^p does not answer to aileron: .*p does not move"):
-        responses(lagged(np.diag([3.0, 0.0]), np.full(2, 0.02)), -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+        step_responses(lagged(np.diag([3.0, 0.0]), np.full(2, 0.02)), -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
 
 
 # The manoeuvre
@@ -163,7 +163,7 @@ def test_an_output_that_answers_to_nothing_ends_the_identification() -> None:
 def test_the_commanded_airspeed_asks_for_a_third_of_the_throttle(speed: float, authority: float) -> None:
     # The filter's answer to a step, 2 m/s (1 - (1 + w t) exp(-w t)), is steepest at t = 1/w: 2 m/s w / e. The pulse's edge of
     # 0.1 s rounds that off by less than 1 %.
-    params = ReferenceModelParameters.validate_mapping(reference(speed, authority), "reference_model")
+    params = ReferenceModelParameters.validate_mapping(reference_parameters(speed, authority), "reference_model")
     y_m, row = Reference(params), list(params.outputs).index("V")
     samples = np.array([y_m.sample(k)[row] for k in range(round(30.0 * params.rate))])
     steepest = float(np.max(np.abs(np.diff(samples)))) * params.rate
@@ -174,31 +174,31 @@ def test_the_commanded_airspeed_asks_for_a_third_of_the_throttle(speed: float, a
 
 @pytest.mark.parametrize(("altitude", "keys"), [(100.0, {"wind"}), (500.0, {"wind", "sigma"}), (3000.0, {"sigma"})])
 def test_moderate_turbulence_is_stated_as_its_altitude_asks(altitude: float, keys: set[str]) -> None:
-    assert set(moderate(altitude)) == {"altitude", "seed"} | keys
+    assert set(moderate_turbulence(altitude)) == {"altitude", "seed"} | keys
     section = {"airframe": "jsbsim:c172p", "speed": 46.3, "altitude": altitude, "rate": 200.0, "step": 0.005}
-    find_scenario("jsbsim_c172p").vary(aircraft=section | {"turbulence": moderate(altitude)})  # is accepted
+    find_scenario("jsbsim_c172p").vary(aircraft=section | {"turbulence": moderate_turbulence(altitude)})  # is accepted
 
 
 # An aircraft
 
 
 @pytest.fixture(scope="module")
-def cessna() -> Identified:
+def cessna() -> IdentifiedAircraft:
     return identify("c172p", 46.3, 1219.2)
 
 
-def test_signs_and_pairing_of_an_aircraft_are_found(cessna: Identified) -> None:
+def test_signs_and_pairing_of_an_aircraft_are_found(cessna: IdentifiedAircraft) -> None:
     # Elevator and rudder of JSBSim's convention turn nose down and nose left: the signs of all its conventional aircraft.
     assert cessna.D == (-1, 1, 1, -1)
     assert cessna.coupling < 1.0
-    assert cessna.zero < 0.0
+    assert cessna.sideslip_zero < 0.0
     # Its surfaces act one step of 5 ms later; its engine has to speed up the propeller, which takes about a second.
     assert cessna.responses.lag[[0, 2, 3]] == pytest.approx([DT] * 3, abs=1e-3)
     assert 0.5 < cessna.responses.lag[1] < 2.0
-    assert cessna.lost == ""
+    assert cessna.failure == ""
 
 
-def test_the_scenario_that_ships_is_what_the_command_writes(cessna: Identified) -> None:
+def test_the_scenario_that_ships_is_what_the_command_writes(cessna: IdentifiedAircraft) -> None:
     # Numbers in the file have six digits; other machines may round the last ones of a flight differently.
     shipped = yaml.safe_load(find_scenario("jsbsim_c172p").path.read_text(encoding="utf-8"))
     written = yaml.safe_load(cessna.text)

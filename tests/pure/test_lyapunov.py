@@ -20,14 +20,14 @@ from flight_analysis.design.lyapunov import (
     Evidence,
     Example,
     KnownPlant,
-    decay,
+    decay_matrix,
     evidence,
     example,
     fly,
+    from_tape,
     integral,
     largest_rise,
     lemma_2,
-    of_tape,
 )
 from flight_bringup.scenarios import find_scenario
 from rise_di_controller.decomposition import decompose
@@ -56,7 +56,7 @@ def osprey(rate: float, beta_factor: float = 1.0, duration: float = 12.0) -> tup
         reference_model={"rate": rate},
         controller={"rate": rate, "beta": beta, "sign": "implicit"},
     )
-    plant, flight = of_tape(scenario, simulate(scenario))
+    plant, flight = from_tape(scenario, simulate(scenario))
     return scenario, plant, evidence(plant, flight, scenario.controller.law())
 
 
@@ -79,7 +79,7 @@ def test_V2_falls_by_the_integral_of_its_quadratic_form_up_to_sampling() -> None
     for dt in PERIODS:
         case, params, found = flown(dt, 6.0)
         z = np.hstack([found.e, found.r])
-        fallen = integral(np.einsum("ki,ij,kj->k", z, decay(case.plant, params), z), found.t)
+        fallen = integral(np.einsum("ki,ij,kj->k", z, decay_matrix(case.plant, params), z), found.t)
         worst.append(float(np.max(np.abs(found.V2 - found.V2[0] + fallen))))
     assert all(after < 0.8 * before for before, after in pairwise(worst))
     assert worst[-1] < 0.05
@@ -116,7 +116,7 @@ def test_the_constant_of_lemma_2_is_the_hand_worked_one() -> None:
 
 def test_P_stays_positive_with_the_constant_of_lemma_2() -> None:
     case, params, found = flown(0.005, 12.0)
-    assert np.linalg.eigvalsh(decay(case.plant, params)).min() > 0.9  # measured 0.93: steps 2 and 3 of the theorem hold
+    assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() > 0.9  # measured 0.93: steps 2 and 3 of the theorem hold
     zeta_b = lemma_2(case.plant, found, params)
     flight = fly(case.plant, case.y_m, 0.005, params, case.x_0)
     P = evidence(case.plant, flight, params, zeta_b).P
@@ -147,7 +147,7 @@ def test_with_K_too_small_V2_rises_at_every_period() -> None:
     # K below G in (16): Q has the eigenvalue -7.0, V2 climbs by 3.0, 3.0 and 3.1, which is no sampling term.
     for dt in (0.01, 0.005, 0.0025):
         case, params, found = flown(dt, 20.0, K=np.array([1.2, 1.1]), Lambda=np.array([4.0, 4.0]))
-        assert np.linalg.eigvalsh(decay(case.plant, params)).min() < -6.0
+        assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() < -6.0
         assert largest_rise(found.V2) > 2.5
         assert tail(found.e, found.t, 15.0) < 1e-3  # the conditions are sufficient, not necessary
 
@@ -190,9 +190,9 @@ def test_along_the_osprey_P_needs_beta_above_the_largest_N_d() -> None:
 def test_the_osprey_flies_with_gains_below_what_steps_2_and_3_ask_for() -> None:
     scenario, plant, _ = osprey(100.0, duration=0.1)
     law = scenario.controller.law()
-    assert np.linalg.eigvalsh(decay(plant, law)).min() < -7.0  # measured -7.8
+    assert np.linalg.eigvalsh(decay_matrix(plant, law)).min() < -7.0  # measured -7.8
     raised = law._replace(K=np.array([30.0, 50.0, 18.0, 4.0]), Lambda=np.array([1.0, 1.0, 1.0, 0.5]))
-    assert np.linalg.eigvalsh(decay(plant, raised)).min() > 0.25  # measured 0.30
+    assert np.linalg.eigvalsh(decay_matrix(plant, raised)).min() > 0.25  # measured 0.30
 
 
 def test_a_tape_without_truth_at_the_ticks_is_refused() -> None:
@@ -201,4 +201,4 @@ def test_a_tape_without_truth_at_the_ticks_is_refused() -> None:
     truth = tape["truth"]
     short = replace(tape, signals={**tape.signals, "truth": replace(truth, stamp_ns=truth.stamp_ns + 1)})
     with pytest.raises(ValueError, match="truth: samples at 0 of 11 ticks"):
-        of_tape(scenario, short)
+        from_tape(scenario, short)

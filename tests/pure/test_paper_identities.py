@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 
 from aircraft_sim import dynamics
 from aircraft_sim.params import AircraftParameters, Gust
-from flight_analysis.design.lyapunov import KnownPlant, decay, evidence, example, fly
+from flight_analysis.design.lyapunov import KnownPlant, decay_matrix, evidence, example, fly
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from reference_model.command import Profile, command
@@ -331,9 +331,9 @@ def test_V1_dot_of_32_has_the_gain_22_as_three_squares(loop: Loop) -> None:
 
 
 def test_V2_dot_is_a_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> None:
-    # The sum of (32) and -L (46): what `flight_analysis.design.lyapunov.decay` says, on a plant that module did not choose.
+    # The sum of (32) and -L (46), as `flight_analysis.design.lyapunov.decay_matrix` has it, on a plant of this test.
     p = loop.p
-    Q = decay(KnownPlant(p.A, p.B, p.C, p.f), law_of(p))
+    Q = decay_matrix(KnownPlant(p.A, p.B, p.C, p.f), law_of(p))
     for t in INSTANTS:
         N_d, _, term = loop.split(t)
         L = loop.r(t) @ (N_d + term - loop.DUD() @ (p.beta * np.sign(loop.e(t))))
@@ -426,7 +426,7 @@ def coupled_flight(beta: FloatArray) -> float:
     U = np.array([[1.0, 3.0], [0.0, 1.0]])
     plant = case.plant._replace(B=np.vstack([S * D @ U, 0.1 * np.eye(2)]))
     params = case.params._replace(K=np.array([60.0, 4.0]), omega=2.0 * np.abs(np.diag(S * D @ U)), beta=beta)
-    assert np.linalg.eigvalsh(decay(plant, params)).min() > 0.0
+    assert np.linalg.eigvalsh(decay_matrix(plant, params)).min() > 0.0
     found = evidence(plant, fly(plant, case.y_m, 0.0025, params, case.x_0), params)
     assert np.all(np.max(np.abs(found.N_d), axis=0) < [2.0, 2.0])
     return float(np.max(np.abs(found.e[found.t > 6.0])))

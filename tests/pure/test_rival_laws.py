@@ -13,7 +13,7 @@ from scipy.linalg import solve_discrete_are
 
 from control_laws import adaptive, indi, inversion, lqi, mackunis, riccati, rise_di, rise_observer, super_twisting
 from control_laws.catalogue import LAWS, start
-from control_laws.nominal_model import NominalModel, inwards
+from control_laws.nominal_model import NominalModel, conditional_integration
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import tuning
 from flight_core.vectors import FloatArray
@@ -209,7 +209,7 @@ def test_the_filtered_difference_of_a_ramp_comes_to_its_slope() -> None:
 
 def test_the_predictor_of_l1_knows_a_constant_disturbance_after_one_tick() -> None:
     known = integrator()
-    control_law, params = adaptive.l1(known, ahead=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
+    control_law, params = adaptive.l1(known, feedforward=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
     flight = fly(control_law, params, 3, 0.1, 0.7, known)
     x = adaptive.ADAPTATION_POLE * DT
     assert flight.state.sigma_hat.item() == pytest.approx(0.7 * x / (np.exp(x) - 1.0), rel=1e-9)
@@ -217,7 +217,7 @@ def test_the_predictor_of_l1_knows_a_constant_disturbance_after_one_tick() -> No
 
 def test_l1_rejects_what_its_filter_lets_through_with_a_wrong_input_gain() -> None:
     known = integrator()
-    control_law, params = adaptive.l1(known, ahead=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
+    control_law, params = adaptive.l1(known, feedforward=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
     flight = fly(control_law, params, 1500, 0.0, 0.7, known, Omega=1.4 * known.Omega[0, 0])
     # at rest y_hat - y is constant: K e = d (1 - k) where k = 0.995 is what the pole leaves of the estimate
     assert abs(flight.y[-1]) < 0.7 * 0.006 / 3.0
@@ -226,7 +226,7 @@ def test_l1_rejects_what_its_filter_lets_through_with_a_wrong_input_gain() -> No
 
 def test_l1_with_feedforward_does_not_cancel_what_the_feedforward_cancels() -> None:
     known = integrator()
-    control_law, params = adaptive.l1(known, ahead=True), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
+    control_law, params = adaptive.l1(known, feedforward=True), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
     y, state, u = 0.0, None, np.zeros(COLUMN)
     d, y_m_dot = 0.7, 0.5
     u_ff = np.full(COLUMN, (y_m_dot - d) / known.Omega[0, 0])  # a model that knows d
@@ -327,7 +327,7 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
 
 def test_the_observer_finds_the_states_the_wind_and_the_disturbance_of_the_aircraft_that_it_knows(osprey: NominalModel) -> None:
     model = rise_observer.observer(osprey)
-    _, corrections = rise_observer.gains_of(model, osprey, start(LAWS["lqg"], osprey))
+    _, corrections = rise_observer.observer_gains(model, osprey, start(LAWS["lqg"], osprey))
     correction = corrections[..., 0]
     generator = np.random.default_rng(1)
     z, z_hat = 0.01 * generator.standard_normal(len(model.F)), np.zeros(len(model.F))
@@ -353,10 +353,10 @@ def test_what_the_observer_adds_is_bounded_whatever_it_sees() -> None:
     for k in range(200):
         state, _ = control_law.step(state, at(100.0 * (-1.0) ** (k // 40)), np.array(DT), params)
         added.append(state.u_o.item())
-    part = rise_observer.PART * 0.5
+    part = rise_observer.AUTHORITY_FRACTION * 0.5
     assert max(added) == part == -min(added)
-    # from one bound to the other in twice WITHIN
-    assert np.abs(np.diff([0.0, *added])).max() == pytest.approx(part * DT / rise_observer.WITHIN, rel=1e-9)
+    # from one bound to the other in twice RAMP_TIME
+    assert np.abs(np.diff([0.0, *added])).max() == pytest.approx(part * DT / rise_observer.RAMP_TIME, rel=1e-9)
 
 
 def test_without_an_observer_s_gain_it_is_the_law_with_feedforward(osprey: NominalModel) -> None:
@@ -380,7 +380,7 @@ def test_without_an_observer_s_gain_it_is_the_law_with_feedforward(osprey: Nomin
 
 def test_integrals_stop_where_they_push_on_and_go_where_they_come_back() -> None:
     before, after = np.zeros(3), np.ones(3)
-    assert inwards(before, after, np.array([1.0, 1.0, 1.0]), np.array([0.5, -0.5, 0.0])).tolist() == [0.0, 1.0, 1.0]
+    assert conditional_integration(before, after, np.array([1.0, 1.0, 1.0]), np.array([0.5, -0.5, 0.0])).tolist() == [0.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize("name", list(LAWS))

@@ -4,7 +4,7 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, decay, limited
+from control_laws.nominal_model import NominalModel, filter_gain, saturate
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
@@ -29,7 +29,7 @@ class L1State(NamedTuple):
     sigma_f: Array  # filtered
 
 
-def l1(known: NominalModel, *, ahead: bool) -> ControlLaw:
+def l1(known: NominalModel, *, feedforward: bool) -> ControlLaw:
     """L1 adaptive output control with piecewise-constant adaptation. Sees y, y_m and the nominal Omega.
 
         sigma_hat = -Phi^-1 exp(-a dt) (y_hat - y),  Phi = (1 - exp(-a dt)) / a          a = ADAPTATION_POLE
@@ -38,7 +38,7 @@ def l1(known: NominalModel, *, ahead: bool) -> ControlLaw:
         y_hat     = y + exp(-a dt) (y_hat - y) + dt Omega u + Phi sigma_hat                for the next tick
 
     the exact step of y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat. Reference input: u_r = Omega^-1 y_m_dot and
-    sigma_r = 0; `ahead` with the feedforward, which knows the model's part of sigma along the reference, u_r = u_ff and
+    sigma_r = 0; `feedforward` with the feedforward, which knows the model's part of sigma along the reference, u_r = u_ff and
     sigma_r = y_m_dot - Omega u_ff, so that it is not cancelled twice. The predictor takes the u that was commanded after its
     limits: nothing winds up. Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
     """
@@ -53,13 +53,13 @@ def l1(known: NominalModel, *, ahead: bool) -> ControlLaw:
         xp = array_namespace(seen.y)
         off = state.y_hat - seen.y
         a = ADAPTATION_POLE + xp.zeros_like(params.K)
-        Phi, left = decay(a, dt) / a, xp.exp(-a * dt)
+        Phi, left = filter_gain(a, dt) / a, xp.exp(-a * dt)
         sigma_hat = -left / Phi * off
-        u_r = seen.u_ff if ahead else inverse @ seen.y_m_dot
+        u_r = seen.u_ff if feedforward else inverse @ seen.y_m_dot
         sigma_r = seen.y_m_dot - Omega @ u_r
-        sigma_f = state.sigma_f + decay(params.bandwidth, dt) * (sigma_hat - sigma_r - state.sigma_f)
+        sigma_f = state.sigma_f + filter_gain(params.bandwidth, dt) * (sigma_hat - sigma_r - state.sigma_f)
         wanted = -params.K * (seen.y - seen.y_m) - sigma_f
-        u, _ = limited(u_r + inverse @ wanted, seen, dt, params.limits)
+        u, _ = saturate(u_r + inverse @ wanted, seen, dt, params.limits)
         y_hat = seen.y + left * off + dt * (Omega @ u) + Phi * sigma_hat
         return L1State(y_hat, sigma_hat, sigma_f), u
 
@@ -107,7 +107,7 @@ def mrac(known: NominalModel, *, vanes: bool) -> ControlLaw:
         e = seen.y - seen.y_m
         phi = xp.concat([x / size, xp.ones_like(x[:1])])
         wanted = seen.y_m_dot - drift @ x - gravity @ xp.sin(x) - params.K * e - xp.sum(state * phi[None, :, :], axis=1)
-        u, beyond = limited(inverse @ wanted, seen, dt, params.limits)
+        u, beyond = saturate(inverse @ wanted, seen, dt, params.limits)
         free = xp.where(beyond == 0.0, xp.ones_like(e), xp.zeros_like(e))
         states = (params.adaptation * e * free)[:, None, :] * phi[None, :-1, :]
         learned = xp.concat([states, (params.bias * e * free)[:, None, :]], axis=1)

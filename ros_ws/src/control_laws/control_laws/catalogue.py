@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every law that is compared: what it sees, how it flies, which gains are tuned and from where the search starts."""
+"""Every law that is compared: what it measures, how it flies, which gains are tuned and from where the search starts."""
 
 from collections.abc import Callable
 from functools import partial
@@ -17,10 +17,10 @@ from rise_di_controller.law import Sign
 Gains = dict[str, FloatArray]
 """Gains by name, shape (m, N), or (1, N) where one serves all channels; all of them positive."""
 
-SHARE = 0.4
+INITIAL_CROSSOVER_LAG_PRODUCT = 0.4
 """Bandwidth times the lag of the loop where a search starts."""
 
-EACH = {
+INITIAL_CHANNEL_GAINS = {
     "beta": 5.0,
     "root": 1.0,
     "bandwidth": 15.0,
@@ -33,10 +33,10 @@ EACH = {
 }
 """Where a search starts in every channel, in scaled inputs and SI; K and Lambda start from the lag of the loop."""
 
-FOR_ALL = {"softening": 3.0, "omega": 1.5, "filter": 12.6, "leak": 0.05, "fade": 4.0, "loose": 0.01}
+INITIAL_COMMON_GAINS = {"softening": 3.0, "omega": 1.5, "filter": 12.6, "leak": 0.05, "fade": 4.0, "loose": 0.01}
 """The same where one number serves all channels."""
 
-GUST = 0.5
+INITIAL_GUST_INTENSITY = 0.5
 """m/s per root s, the same for each axis of the wind."""
 
 
@@ -44,21 +44,21 @@ class Law(NamedTuple):
     """One law."""
 
     title: str
-    sees: str  # of the flying aircraft, beside y_m
-    model: str  # what it is given of the nominal one, beside D and how much each input does
+    measurements: str  # of the flying aircraft, beside y_m
+    model_data: str  # what it is given of the nominal one, beside D and how much each input does
     control_law: Callable[[NominalModel], ControlLaw]
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of its gains
-    ahead: bool = False  # whether it flies with the feedforward
+    feedforward: bool = False  # whether it flies with the feedforward
 
 
 def start(law: Law, known: NominalModel) -> Gains:
     """The gains where the search starts, shapes (m, 1) and (1, 1)."""
-    K = SHARE / known.total_lag[:, None]
+    K = INITIAL_CROSSOVER_LAG_PRODUCT / known.total_lag[:, None]
     gains = {"K": K, "Lambda": K / 4.0}
-    gains |= {name: np.full(K.shape, value) for name, value in EACH.items()}
-    gains |= {name: np.full((1, 1), value) for name, value in FOR_ALL.items()}
-    gains["gust"] = np.full((known.wind.shape[1], 1), GUST)
+    gains |= {name: np.full(K.shape, value) for name, value in INITIAL_CHANNEL_GAINS.items()}
+    gains |= {name: np.full((1, 1), value) for name, value in INITIAL_COMMON_GAINS.items()}
+    gains["gust"] = np.full((known.wind.shape[1], 1), INITIAL_GUST_INTENSITY)
     return {name: gains[name] for name in law.tuned}
 
 
@@ -74,36 +74,36 @@ LAWS: dict[str, Law] = {
     "rise_implicit": Law(
         "RISE-DI, implicit sign", "y", "", _rise(Sign.IMPLICIT), rise_di.of_gains, ("K", "Lambda", "beta", "omega")
     ),
-    "rise_ff": Law("RISE-DI + feedforward", "y", "A, B, f", _soft, rise_di.of_gains, _soft_gains, ahead=True),
+    "rise_ff": Law("RISE-DI + feedforward", "y", "A, B, f", _soft, rise_di.of_gains, _soft_gains, feedforward=True),
     "rise_observer": Law(
         "RISE-DI + feedforward + observer",
         "y",
         "A, B, f, wind",
-        partial(rise_observer.control_law, part=rise_observer.PART),
-        rise_observer.observed_params,
+        partial(rise_observer.control_law, authority=rise_observer.AUTHORITY_FRACTION),
+        rise_observer.observer_params,
         (*_soft_gains, "effort", "gust", "drift", "loose"),
-        ahead=True,
+        feedforward=True,
     ),
     "lqg": Law(
         "LQG + feedforward",
         "y",
         "A, B, f, wind",
-        partial(rise_observer.control_law, part=1.0),
-        rise_observer.observed_params,
+        partial(rise_observer.control_law, authority=1.0),
+        rise_observer.observer_params,
         ("effort", "gust", "drift", "loose"),
-        ahead=True,
+        feedforward=True,
     ),
     "pi": Law("PI", "y", "", _soft, rise_di.of_gains, ("K", "Lambda")),
-    "pi_ff": Law("PI + feedforward", "y", "A, B, f", _soft, rise_di.of_gains, ("K", "Lambda"), ahead=True),
-    "l1": Law("L1", "y", "Omega", partial(adaptive.l1, ahead=False), adaptive.l1_params, ("K", "bandwidth")),
+    "pi_ff": Law("PI + feedforward", "y", "A, B, f", _soft, rise_di.of_gains, ("K", "Lambda"), feedforward=True),
+    "l1": Law("L1", "y", "Omega", partial(adaptive.l1, feedforward=False), adaptive.l1_params, ("K", "bandwidth")),
     "l1_ff": Law(
         "L1 + feedforward",
         "y",
         "A, B, f",
-        partial(adaptive.l1, ahead=True),
+        partial(adaptive.l1, feedforward=True),
         adaptive.l1_params,
         ("K", "bandwidth"),
-        ahead=True,
+        feedforward=True,
     ),
     "twisting": Law(
         "super-twisting", "y", "Omega", super_twisting.control_law, super_twisting.twisting_params, ("root", "beta")

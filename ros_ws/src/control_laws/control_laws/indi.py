@@ -4,7 +4,7 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, decay, limited
+from control_laws.nominal_model import NominalModel, filter_gain, saturate
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
@@ -44,11 +44,11 @@ def control_law(known: NominalModel) -> ControlLaw:
         return IndiState(seen.y, array_namespace(seen.y).zeros_like(seen.y), seen.position)
 
     def step(state: IndiState, seen: Measurements, dt: Array, params: IndiParams) -> tuple[IndiState, Array]:
-        a = decay(params.bandwidth, dt)
+        a = filter_gain(params.bandwidth, dt)
         y_dot = state.y_dot + a * ((seen.y - state.y) / dt - state.y_dot)
         position = state.position + a * (seen.position - state.position)
         wanted = seen.y_m_dot - params.K * (seen.y - seen.y_m) - y_dot
-        u, _ = limited(position + params.share * (inverse @ wanted), seen, dt, params.limits)
+        u, _ = saturate(position + params.share * (inverse @ wanted), seen, dt, params.limits)
         return IndiState(seen.y, y_dot, position), u
 
     return ControlLaw(start, step)

@@ -4,7 +4,7 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, inwards, limited
+from control_laws.nominal_model import NominalModel, conditional_integration, saturate
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
@@ -48,9 +48,9 @@ def control_law(known: NominalModel, *, vanes: bool) -> ControlLaw:
         integral_e = state.integral_e + increment
         known_part = drift @ x + gravity @ array_namespace(e).sin(x)
         wanted = seen.y_m_dot - known_part - params.K * (e + params.Lambda * integral_e)
-        u, beyond = limited(inverse @ wanted, seen, dt, params.limits)
+        u, beyond = saturate(inverse @ wanted, seen, dt, params.limits)
         effect = -params.K * params.Lambda * increment
-        return InversionState(e, inwards(state.integral_e, integral_e, effect, Omega @ beyond)), u
+        return InversionState(e, conditional_integration(state.integral_e, integral_e, effect, Omega @ beyond)), u
 
     return ControlLaw(start, step)
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import expm
 
-from control_laws.nominal_model import NominalModel, inwards, limited
+from control_laws.nominal_model import NominalModel, conditional_integration, saturate
 from control_laws.riccati import gain_of
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
@@ -49,10 +49,10 @@ def control_law(*, vanes: bool) -> ControlLaw:
         integral_e = state.integral_e + increment
         none = xp.zeros_like(e)
         z = xp.concat([seen.x_air if vanes else seen.x, seen.y_m + none, seen.y_m_dot + none, integral_e])
-        u, beyond = limited(-xp.sum(params.gain * z[None, :, :], axis=1), seen, dt, params.limits)
+        u, beyond = saturate(-xp.sum(params.gain * z[None, :, :], axis=1), seen, dt, params.limits)
         m = e.shape[0]
         own = xp.stack([params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)])
-        return LqiState(e, inwards(state.integral_e, integral_e, -own * increment, beyond)), u
+        return LqiState(e, conditional_integration(state.integral_e, integral_e, -own * increment, beyond)), u
 
     return ControlLaw(start, step)
 

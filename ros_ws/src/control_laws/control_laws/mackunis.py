@@ -4,7 +4,7 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, decay, inwards, limited
+from control_laws.nominal_model import NominalModel, conditional_integration, filter_gain, saturate
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
@@ -54,17 +54,17 @@ def control_law(known: NominalModel, *, ideal: bool) -> ControlLaw:
     def step(state: MacKunisState, seen: Measurements, dt: Array, params: MacKunisParams) -> tuple[MacKunisState, Array]:
         xp = array_namespace(seen.y)
         e = seen.y - seen.y_m
-        e_dot = state.e_dot + decay(params.bandwidth, dt) * ((e - state.e) / dt - state.e_dot)
+        e_dot = state.e_dot + filter_gain(params.bandwidth, dt) * ((e - state.e) / dt - state.e_dot)
         r = (seen.y_dot - seen.y_m_dot if ideal else e_dot) + params.Lambda * e
         one = xp.ones_like(e)
         move = dt * params.beta * xp.minimum(xp.maximum(r / params.eps, -one), one)
         increment = dt * (e + state.e) / 2.0
         integral_e, Pi = state.integral_e + increment, state.Pi + move
         wanted = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
-        u, beyond = limited(inverse @ wanted, seen, dt, params.limits)
+        u, beyond = saturate(inverse @ wanted, seen, dt, params.limits)
         past = Omega @ beyond
-        integral_e = inwards(state.integral_e, integral_e, -increment, past)
-        return MacKunisState(state.e_0, e, e_dot, integral_e, inwards(state.Pi, Pi, -move, past)), u
+        integral_e = conditional_integration(state.integral_e, integral_e, -increment, past)
+        return MacKunisState(state.e_0, e, e_dot, integral_e, conditional_integration(state.Pi, Pi, -move, past)), u
 
     return ControlLaw(start, step)
 

@@ -52,13 +52,13 @@ class NominalModel(NamedTuple):
         return Limits(self.lower[:, None], self.upper[:, None], self.rate[:, None])
 
 
-def limited(u: Array, seen: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:
+def saturate(u: Array, seen: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:
     """The u that is commanded and what of the u asked for lies beyond it, both shape (m, N)."""
     commanded = guard.limit(u, seen.u_before, dt, limits)
     return commanded, u - commanded
 
 
-def inwards(before: Array, after: Array, effect: Array, beyond: Array) -> Array:
+def conditional_integration(before: Array, after: Array, effect: Array, beyond: Array) -> Array:
     """An integral that stops where it would push further against a limit: `before` where effect * beyond > 0, else `after`.
 
     Conditional integration. Arguments: what the increment moves u (or the scaled input) by and what lies beyond the limit, in
@@ -67,6 +67,6 @@ def inwards(before: Array, after: Array, effect: Array, beyond: Array) -> Array:
     return array_namespace(before).where(effect * beyond > 0.0, before, after)
 
 
-def decay(rate: Array, dt: Array) -> Array:
+def filter_gain(rate: Array, dt: Array) -> Array:
     """1 - exp(-rate dt): what a low-pass filter of first order takes of its input in one tick, exact for a held input."""
     return -array_namespace(rate).expm1(-rate * dt)

@@ -24,17 +24,17 @@ from rise_di_controller.law import LawParams, LawState, Sign
 LEAK = 0.01
 """1/s. Angles and disturbances decay this slowly in the observer's model, so that each of its modes can be seen or ends."""
 
-GUST = 0.6
+GUST_TIME_CONSTANT = 0.6
 """s, within which a wind is taken to change: the time to the peak of the 1-cosine gust, H / V0."""
 
-PART, WITHIN = 0.6, 0.1
+AUTHORITY_FRACTION, RAMP_TIME = 0.6, 0.1
 """Part of the limits of u up to which the observer may add to the trim of RISE-DI, and s from 0 to there: what it adds is
 bounded, and so is its derivative, whatever it sees."""
 
-STILL = 1e-6  # rad or 1 per root s, noise of the actuators' positions: as good as none
+ACTUATOR_NOISE = 1e-6  # rad or 1 per root s, noise of the actuators' positions: as good as none
 
 
-class ObservedParams(NamedTuple):
+class ObserverParams(NamedTuple):
     """Those of RISE-DI, and the two gains of the observer."""
 
     rise: RiseParams
@@ -42,7 +42,7 @@ class ObservedParams(NamedTuple):
     correction: Array  # (s, m, N) of the estimate by the innovation
 
 
-class ObservedState(NamedTuple):
+class ObserverState(NamedTuple):
     """What is carried from tick to tick."""
 
     law: LawState
@@ -50,7 +50,7 @@ class ObservedState(NamedTuple):
     u_o: Array  # (m, N) what the observer adds to the trim
 
 
-class Observer(NamedTuple):
+class ObserverModel(NamedTuple):
     """The observer's model of the deviation from the reference, z = [dx, position, wind, d], s = n + m + G + m.
 
     In discrete time, u held over a period: z+ = F z + G (u - u_ff), e = H z.
@@ -61,11 +61,11 @@ class Observer(NamedTuple):
     H: FloatArray  # (m, s)
 
 
-def observer(known: NominalModel) -> Observer:
+def observer(known: NominalModel) -> ObserverModel:
     """The nominal aircraft around its reference, its actuators, wind and a disturbance of each output.
 
         dx_dot       = (A + gravity) dx + B position + wind_direction w + C' d
-        position_dot = (u - u_ff - position) / lag,  w_dot = -w / GUST,  d_dot = -LEAK d
+        position_dot = (u - u_ff - position) / lag,  w_dot = -w / GUST_TIME_CONSTANT,  d_dot = -LEAK d
 
     Angles decay with LEAK besides. The reference's own motion is u_ff's: the model is that of small deviations from it.
     """
@@ -76,15 +76,15 @@ def observer(known: NominalModel) -> Observer:
     motion, drive = np.zeros((s, s)), np.zeros((s, m))
     motion[np.ix_(x, x)] = known.A + known.gravity - LEAK * np.diag(known.kinematic)
     motion[np.ix_(x, p)], motion[np.ix_(x, w)], motion[np.ix_(x, d)] = known.B, known.wind, known.C.T
-    motion[p, p], motion[w, w], motion[d, d] = -1.0 / lag, -1.0 / GUST, -LEAK
+    motion[p, p], motion[w, w], motion[d, d] = -1.0 / lag, -1.0 / GUST_TIME_CONSTANT, -LEAK
     drive[p, np.arange(m)] = 1.0 / lag
     whole = expm(np.block([[motion, drive], [np.zeros((m, s + m))]]) * known.period)
     H = np.zeros((m, s))
     H[:, x] = known.C
-    return Observer(whole[:s, :s], whole[:s, s:], H)
+    return ObserverModel(whole[:s, :s], whole[:s, s:], H)
 
 
-def gains_of(model: Observer, known: NominalModel, gains: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
+def observer_gains(model: ObserverModel, known: NominalModel, gains: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Gain (m, s, N) and correction (s, m, N), the linear-quadratic ones of N sets of weights.
 
     Control: sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2 with `effort` (m, N), s. Estimate: the wind driven
@@ -96,7 +96,7 @@ def gains_of(model: Observer, known: NominalModel, gains: dict[str, FloatArray])
     Q = np.tile(model.H.T @ np.diag(1.0 / size[:, 0] ** 2) @ model.H, (count, 1, 1))
     R = diagonals((gains["effort"] / known.input_scale[:, None] / size) ** 2)
     gain = gain_of(model.F, model.G, Q, R)
-    states, positions = gains["loose"] * known.size[:, None], np.full((len(size), count), STILL)
+    states, positions = gains["loose"] * known.size[:, None], np.full((len(size), count), ACTUATOR_NOISE)
     process = np.concatenate([states, positions, gains["gust"], gains["drift"] * size]) ** 2 * known.period
     noise = np.tile(np.diag(known.noise**2), (count, 1, 1))
     S = riccati(model.F.T, model.H.T, diagonals(process), noise)
@@ -104,11 +104,11 @@ def gains_of(model: Observer, known: NominalModel, gains: dict[str, FloatArray])
     return np.moveaxis(gain, 0, -1), np.moveaxis(correction, 0, -1)
 
 
-def control_law(known: NominalModel, *, part: float) -> ControlLaw:
+def control_law(known: NominalModel, *, authority: float) -> ControlLaw:
     """The law's step from a trim that the observer moves within a part of the limits.
 
         z_hat = z + correction (e - H z)
-        u_o   = -gain z_hat, held inside `part` of the limits and of their upper ones / WITHIN in rate
+        u_o   = -gain z_hat, held inside `authority` of the limits and of their upper ones / RAMP_TIME in rate
         u     = `guarded_step` from the trim u_ff + u_o
         z+    = F z_hat + G (u - u_ff)
 
@@ -116,28 +116,28 @@ def control_law(known: NominalModel, *, part: float) -> ControlLaw:
     """
     model = observer(known)
 
-    def start(seen: Measurements, params: ObservedParams) -> ObservedState:
+    def start(seen: Measurements, params: ObserverParams) -> ObserverState:
         xp = array_namespace(seen.y)
         e = seen.y - seen.y_m
-        return ObservedState(feedback.engage(seen.y, seen.y_m), model.H.T @ e, xp.zeros_like(e))
+        return ObserverState(feedback.engage(seen.y, seen.y_m), model.H.T @ e, xp.zeros_like(e))
 
-    def step(state: ObservedState, seen: Measurements, dt: Array, params: ObservedParams) -> tuple[ObservedState, Array]:
+    def step(state: ObserverState, seen: Measurements, dt: Array, params: ObserverParams) -> tuple[ObserverState, Array]:
         xp = array_namespace(seen.y)
         limits = params.rise.limits
         off = seen.y - seen.y_m - model.H @ state.z
         z = state.z + xp.sum(params.correction * off[None, :, :], axis=1)
-        inside = Limits(part * limits.lower, part * limits.upper, part / WITHIN * limits.upper)
+        inside = Limits(authority * limits.lower, authority * limits.upper, authority / RAMP_TIME * limits.upper)
         u_o = guard.limit(-xp.sum(params.gain * z[None, :, :], axis=1), state.u_o, dt, inside)
         law = LawParams(*params.rise[:-1], Sign.SOFT)
         after, _, u = guard.guarded_step(state.law, seen.y, seen.y_m, dt, seen.u_ff + u_o, seen.u_before, law, limits)
-        return ObservedState(after, model.F @ z + model.G @ (u - seen.u_ff), u_o), u
+        return ObserverState(after, model.F @ z + model.G @ (u - seen.u_ff), u_o), u
 
     return ControlLaw(start, step)
 
 
-def observed_params(gains: dict[str, FloatArray], known: NominalModel) -> ObservedParams:
+def observer_params(gains: dict[str, FloatArray], known: NominalModel) -> ObserverParams:
     """Parameters from the gains of RISE-DI, where it has any, and from effort and drift (m, N), gust (G, N), loose (1, N)."""
     none = 0.0 * gains["effort"]
-    return ObservedParams(
-        rise_di.of_gains({"K": none, "Lambda": none} | gains, known), *gains_of(observer(known), known, gains)
+    return ObserverParams(
+        rise_di.of_gains({"K": none, "Lambda": none} | gains, known), *observer_gains(observer(known), known, gains)
     )

@@ -4,7 +4,7 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, inwards, limited
+from control_laws.nominal_model import NominalModel, conditional_integration, saturate
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
@@ -40,8 +40,8 @@ def control_law(known: NominalModel) -> ControlLaw:
         move = -dt * params.beta * xp.sign(e)
         z = state + move
         wanted = seen.y_m_dot - params.root * xp.sign(e) * xp.sqrt(xp.abs(e)) + z
-        u, beyond = limited(inverse @ wanted, seen, dt, params.limits)
-        return inwards(state, z, move, Omega @ beyond), u
+        u, beyond = saturate(inverse @ wanted, seen, dt, params.limits)
+        return conditional_integration(state, z, move, Omega @ beyond), u
 
     return ControlLaw(start, step)
 

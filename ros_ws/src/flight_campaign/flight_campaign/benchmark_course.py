@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from aircraft_sim import plant as flown
 from aircraft_sim import sensors, turbulence
 from aircraft_sim.airframe import Airframe
-from aircraft_sim.plant import Plant
+from aircraft_sim.plant import PlantParams
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.parameters import require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
@@ -26,7 +26,7 @@ from rise_di_controller.guard import DT_RANGE
 HOLD, ENGAGE, STEP = range(3)
 """What a controller does at a tick: nothing, for no new y has come; it engages; it takes a step of its law."""
 
-BLOWN_FROM = {"vertical": "alpha", "lateral": "beta"}
+WIND_ANGLE = {"vertical": "alpha", "lateral": "beta"}
 """Which angle a wind along an axis changes: alpha_air = alpha - w/V0, beta_air = beta - v/V0, small angles."""
 
 
@@ -41,10 +41,10 @@ class Course(NamedTuple):
     seen_y_m_dot: FloatArray  # (T, m)
     u_ff: FloatArray  # (T, m) feedforward
     error: FloatArray  # (T, m) what the sensors add to the y of the tick
-    forcing: FloatArray  # (T, K r) mean of basis' @ of_time over each of the steps from here to the next tick
+    forcing: FloatArray  # (T, K r) mean of basis' @ f_time over each of the steps from here to the next tick
     forcing_now: FloatArray  # (T, r) at the tick
     air: FloatArray  # (T, n) what the wind takes from alpha and beta, rad
-    basis: FloatArray  # (n, r) orthonormal, what of_time moves x_dot along
+    basis: FloatArray  # (n, r) orthonormal, what f_time moves x_dot along
     order: NDArray[np.int64]  # (m,) place of the law's outputs in y
     late: int  # ticks by which a y is late
     period: float  # s, of the ticks
@@ -138,7 +138,7 @@ def _feedforward(nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArr
     return u_ff
 
 
-def _wind(ticks: int, steps: int, plant: Plant, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _wind(ticks: int, steps: int, plant: PlantParams, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What drives x_dot in time: mean over each step (T K, n), at each tick (T, n); what the wind takes from the angles."""
     forced = flown.forcing(0, ticks * steps, plant)
     direction = np.asarray(plant.aircraft.gust_direction)
@@ -154,7 +154,7 @@ def _wind(ticks: int, steps: int, plant: Plant, airframe: Airframe) -> tuple[Flo
     wind = forced.wind[: -1 : 2 * steps] + blown[::steps]
     angles = np.zeros((ticks, len(airframe.states)))
     for place, axis in enumerate(airframe.gusts):
-        angle = BLOWN_FROM.get(axis)
+        angle = WIND_ANGLE.get(axis)
         if angle in airframe.states:
             angles[:, airframe.index(angle)] = wind[:, place] / airframe.speed
     return over_step, rate[: -1 : 2 * steps] + blown[::steps] @ direction.T, angles

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import matrices
+from aircraft_sim.uncertainty import sampled_matrices
 from control_laws import rise_di
 from control_laws.rise_di import RiseParams
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, check_together
@@ -126,10 +126,10 @@ class Chunk(NamedTuple):
 
 def fly_chunk(text: str, job: Job) -> str:
     """Fly a chunk of a campaign: its definition as JSON, the job -> its Tally as JSON. It depends on nothing else."""
-    return Tally.of(*chunk_flown(text, job)).model_dump_json()
+    return Tally.of(*fly_chunk_figures(text, job)).model_dump_json()
 
 
-def chunk_flown(text: str, job: Job) -> Chunk:
+def fly_chunk_figures(text: str, job: Job) -> Chunk:
     """Fly a chunk of a campaign, aircraft by aircraft."""
     from flight_campaign import fleet  # noqa: PLC0415 - JAX, which the command needs only once it flies
 
@@ -140,7 +140,7 @@ def chunk_flown(text: str, job: Job) -> Chunk:
     count = definition.size(job)
     part = definition.uncertainty
     # The last chunk flies as many as the others, so that nothing is compiled again; those beyond the campaign are left out.
-    A, B = matrices(load_airframe(scenario.aircraft.airframe), part, part, definition.seed, first, definition.chunk)
+    A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), part, part, definition.seed, first, definition.chunk)
     flying = fleet.assemble(A, B, scenario.aircraft.plant(), course)
     flown = fleet.fly(flying, vehicle, course, rise_di.control_law(scenario.controller.law().sign), params)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (flown.rms, flown.max, flown.slew))

@@ -16,7 +16,7 @@ from flight_analysis.report.plotting import Samples, cell, framed, grid
 from flight_analysis.report.summary import PLAIN, Column, DisplayUnit, display_units
 from flight_analysis.report.tables import table
 from flight_campaign.campaign import Definition
-from flight_campaign.statistics import EDGES, LOST, PER_DECADE, Figure, Tally
+from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
 from flight_core.vectors import FloatArray
 
 COARSE = PER_DECADE // 50
@@ -34,7 +34,7 @@ def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cas
         f"<h1>{escape(title)}</h1><p>{tallies[0].flights} aircraft, every entry of A and B within"
         f" &plusmn;{100 * definition.uncertainty:g} % of the airframe, seed {definition.seed}; the airframe's own gusts, the"
         f" same noise for all; true errors, seen at the controller's ticks. Score: the sum over the channels of rms error in"
-        f" 10 mrad/s (p: 20) and 0.1 m/s; lost: a score above {LOST:g}.</p>"
+        f" 10 mrad/s (p: 20) and 0.1 m/s; lost: a score above {LOSS_OF_TRACK_SCORE:g}.</p>"
     )
     shown = [_ends(labels, cases), *(_figures(label, one, units) for label, one in zip(labels, tallies, strict=True))]
     shown.append(_worst(labels, cases))

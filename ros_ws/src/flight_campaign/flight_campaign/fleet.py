@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from aircraft_sim import actuators, dynamics, sensors
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.dynamics import Aircraft, Coupling
-from aircraft_sim.plant import DIVERGENCE_LIMIT, Plant
+from aircraft_sim.plant import DIVERGENCE_LIMIT, PlantParams
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_campaign.benchmark_course import Course
 from flight_core.integrators import rk4
@@ -59,7 +59,7 @@ class Vehicle(NamedTuple):
     outputs: Array  # (m,) places of the outputs in the state, in the law's order
     inputs: Array  # (m,) places of the law's inputs in the airframe's order
     felt: Array  # (c,) places of the states that make the rest
-    rest: Aircraft  # what of it makes the rest: of_state takes x[felt], gives what acts on `acting` states
+    rest: Aircraft  # what of it makes the rest: f_state takes x[felt], gives what acts on `acting` states
     actuators: Actuators  # (m, 1), airframe's order
     quantum: Array | None  # (m, 1), law's order
     dt: float  # s, of a step of the integration
@@ -90,7 +90,7 @@ class FleetResult(NamedTuple):
     diverged: Array  # (N,) bool: the state went beyond DIVERGENCE_LIMIT, the other figures mean nothing
 
 
-def assemble(A: FloatArray, B: FloatArray, plant: Plant, course: Course, wind: Array = 1.0, late: Array = 0) -> Fleet:
+def assemble(A: FloatArray, B: FloatArray, plant: PlantParams, course: Course, wind: Array = 1.0, late: Array = 0) -> Fleet:
     """The matrices of N aircraft, A of shape (N, n, n) and B of (N, n, m).
 
     With L = A + gravity, Phi and Gamma the matrices of one Runge-Kutta step of x_dot = L x + u with u held,
@@ -131,7 +131,7 @@ def assemble(A: FloatArray, B: FloatArray, plant: Plant, course: Course, wind: A
 
 
 def acting(aircraft: Aircraft) -> NDArray[np.int64]:
-    """Places of the states that of_state acts on, (q,)."""
+    """Places of the states that f_state acts on, (q,)."""
     acts = aircraft.gravity.any(axis=1)
     if aircraft.coupling is not None:
         acts = acts | aircraft.coupling.gain.any(axis=1)
@@ -139,8 +139,8 @@ def acting(aircraft: Aircraft) -> NDArray[np.int64]:
 
 
 def of_rest(felt: Array, rest: Aircraft) -> Array:
-    """What of_state has beyond its linear part, (q, N): gravity @ (sin(x) - x) + gain @ (x[first] x[second])."""
-    return dynamics.of_state(felt, rest) - rest.gravity @ felt
+    """What f_state has beyond its linear part, (q, N): gravity @ (sin(x) - x) + gain @ (x[first] x[second])."""
+    return dynamics.f_state(felt, rest) - rest.gravity @ felt
 
 
 def _rest(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
@@ -272,7 +272,7 @@ def _fly(
         command, position, positions = acting[jnp.argsort(vehicle.inputs)], now.position, []
         for k in range(steps):
             moved = actuators.step(position, command, vehicle.dt, vehicle.actuators)
-            position = actuators.fail(segment.t + k * vehicle.dt, position, moved, vehicle.actuators)
+            position = actuators.apply_faults(segment.t + k * vehicle.dt, position, moved, vehicle.actuators)
             positions.extend(position)
         rest = of_rest(now.x[vehicle.felt], vehicle.rest)
         moves = [*now.x, *positions, *(1.5 * rest - 0.5 * now.rest)]

@@ -22,9 +22,9 @@ SCORE_UNIT = {"rad/s": 0.010, "m/s": 0.1}
 
 SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel, in place of its unit's
 
-LOST = 10.0  # a score above it: the aircraft no longer tracks; 1 to 4 is usual
+LOSS_OF_TRACK_SCORE = 10.0  # a score above it: the aircraft no longer tracks; 1 to 4 is usual
 QUANTILES = (0.5, 0.95, 0.99)
-KEPT = 10  # of the worst flights
+WORST_KEPT = 10  # of the worst flights
 
 
 class Figure(Parameters):
@@ -99,7 +99,7 @@ class Tally(Parameters):
 
     flights: int = 0
     diverged: int = 0
-    lost: int = 0  # did not diverge, score above LOST
+    lost: int = 0  # did not diverge, score above LOSS_OF_TRACK_SCORE
     figures: dict[str, Figure] = Field(
         default_factory=dict
     )  # by name: "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
@@ -110,11 +110,11 @@ class Tally(Parameters):
         """Of the aircraft first, first + 1, ...; every figure of shape (N,), one of them the "score"."""
         flew, score = ~np.asarray(diverged, dtype=bool), np.asarray(figures["score"])
         rank = np.where(flew, score, np.inf)
-        order = np.argsort(-rank, kind="stable")[:KEPT]
+        order = np.argsort(-rank, kind="stable")[:WORST_KEPT]
         return cls(
             flights=len(flew),
             diverged=int((~flew).sum()),
-            lost=int((score[flew] > LOST).sum()),
+            lost=int((score[flew] > LOSS_OF_TRACK_SCORE).sum()),
             figures={name: Figure.of(np.asarray(values)[flew]) for name, values in figures.items()},
             worst=tuple(Worst(number=first + int(k), score=float(score[k]) if flew[k] else None) for k in order),
         )
@@ -127,10 +127,10 @@ class Tally(Parameters):
             diverged=self.diverged + other.diverged,
             lost=self.lost + other.lost,
             figures={name: self.figures.get(name, Figure()) + other.figures.get(name, Figure()) for name in names},
-            worst=tuple(worst[:KEPT]),
+            worst=tuple(worst[:WORST_KEPT]),
         )
 
-    def plain(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """As figures for a file, SI."""
         shares = {}
         for word, count in (("diverged", self.diverged), ("lost", self.lost)):

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 import yaml
 
-from aircraft_sim.plant import Plant
-from aircraft_sim.uncertainty import KINEMATIC, uncertain
+from aircraft_sim.plant import PlantParams
+from aircraft_sim.uncertainty import KINEMATIC, nominal_and_sampled
 from control_laws.catalogue import LAWS, Gains, Law, start
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.scenario import Scenario
@@ -27,7 +27,7 @@ from flight_core.vectors import FloatArray
 TUNED = Path(__file__).parent / "tuned"
 """Where the gains that were found lie, a file a scenario."""
 
-BUSY = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
+ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
 """rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error. 60 deg/s and 600 %/s."""
 
 NOMINAL, UNCERTAIN, LATE = "nominal", "uncertain", "late"
@@ -39,18 +39,18 @@ OBJECTIVES = {
     LATE: "the nominal and 6 uncertain aircraft at +-40 %, with late inputs on all of them",
 }
 
-AROUND, LEVEL, DRAW = 6, 0.4, 40
-"""So many uncertain aircraft, at +-LEVEL, with a seed that no campaign and no comparison draws from by default."""
+UNCERTAIN_AIRCRAFT, UNCERTAINTY, UNCERTAINTY_SEED = 6, 0.4, 40
+"""So many uncertain aircraft, at +-UNCERTAINTY, with a seed that no campaign and no comparison draws from by default."""
 
-SPARE_TICKS = 2
+EXTRA_DELAY_TICKS = 2
 """Ticks by which u is late in the third of the three flights of a cost: 20 ms at 100 Hz. Without actuators one tick, for the
 loop's own lag is then 15 ms."""
 
-POPULATION, GENERATIONS, A_GAIN, SPREAD = 16, 88, 6, 0.4
-"""GENERATIONS, 1408 evaluations a law and seed, or A_GAIN of them a gain where that is more, which it is from 15 gains on.
-SPREAD is the first standard deviation of log(gain)."""
+POPULATION, GENERATIONS, GENERATIONS_PER_GAIN, INITIAL_SIGMA = 16, 88, 6, 0.4
+"""GENERATIONS, 1408 evaluations a law and seed, or GENERATIONS_PER_GAIN of them a gain where that is more, which it is from 15 gains on.
+INITIAL_SIGMA is the first standard deviation of log(gain)."""
 
-MOST_COST = 1000.0
+MAX_COST = 1000.0
 """Cost of a flight that diverged, and the most that any flight costs."""
 
 STEP = 0.005
@@ -63,11 +63,11 @@ class Benchmark(NamedTuple):
     scenario: Scenario
     known: NominalModel
     unit: FloatArray  # (m,) of the errors in a score
-    busy: FloatArray  # (m,) of the mean abs(u_dot) in a cost
-    plant: Plant
+    activity_unit: FloatArray  # (m,) of the mean abs(u_dot) in a cost
+    plant: PlantParams
     vehicle: Vehicle
     courses: dict[bool, Course]  # without and with the feedforward
-    spare: int  # ticks by which u is late in a cost
+    extra_delay: int  # ticks by which u is late in a cost
 
 
 def benchmark(scenario: Scenario) -> Benchmark:
@@ -115,11 +115,11 @@ def benchmark(scenario: Scenario) -> Benchmark:
         scenario,
         known,
         unit,
-        np.array([BUSY[airframe.inputs[name].unit] for name in controller.inputs]),
+        np.array([ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]),
         scenario.aircraft.plant(),
         fleet.vehicle(scenario),
         {False: build_course(scenario), True: build_course(ahead)},
-        SPARE_TICKS if any(controller.lag) else 1,
+        EXTRA_DELAY_TICKS if any(controller.lag) else 1,
     )
 
 
@@ -130,41 +130,41 @@ def score(flown: FleetResult, unit: FloatArray) -> FloatArray:
 
 
 def cost(flown: FleetResult, here: Benchmark) -> FloatArray:
-    """Score + sum over the channels of mean abs(u_dot) / busy, shape (N,), at most MOST_COST."""
-    activity = np.sum(np.asarray(flown.slew) / here.busy[:, None], axis=0)
+    """Score + sum over the channels of mean abs(u_dot) / activity_unit, shape (N,), at most MAX_COST."""
+    activity = np.sum(np.asarray(flown.slew) / here.activity_unit[:, None], axis=0)
     total = score(flown, here.unit) + activity
-    return np.where(np.isfinite(total), np.minimum(total, MOST_COST), MOST_COST)
+    return np.where(np.isfinite(total), np.minimum(total, MAX_COST), MAX_COST)
 
 
-def fleet_of(A: FloatArray, B: FloatArray, wind: FloatArray, late: FloatArray, here: Benchmark) -> Fleet:
+def benchmark_fleet(A: FloatArray, B: FloatArray, wind: FloatArray, late: FloatArray, here: Benchmark) -> Fleet:
     """Aircraft in the benchmark, shapes as in `fleet.assemble`."""
     return fleet.assemble(A, B, here.plant, here.courses[False], wind, late)
 
 
-class Costed(NamedTuple):
+class Evaluation(NamedTuple):
     """The flights of one evaluation and what each weighs."""
 
     fleet: Fleet
     weight: FloatArray  # (F,) of their costs in the sum
 
 
-def costed(aims: str, here: Benchmark) -> Costed:
-    """The flights of one evaluation: every aircraft in calm air and in gusts, some in gusts with u late by `spare` ticks.
+def evaluation(objective: str, here: Benchmark) -> Evaluation:
+    """The flights of one evaluation: every aircraft in calm air and in gusts, some in gusts with u late by `extra_delay` ticks.
 
     The cost is the mean over the aircraft in calm air + that in the gusts + that of late flights.
     """
     airframe, _ = here.scenario.aircraft.load()
-    A, B = uncertain(airframe, LEVEL, 0 if aims == NOMINAL else AROUND, DRAW)
+    A, B = nominal_and_sampled(airframe, UNCERTAINTY, 0 if objective == NOMINAL else UNCERTAIN_AIRCRAFT, UNCERTAINTY_SEED)
     aircraft = np.arange(len(A))
-    delayed = aircraft if aims == LATE else aircraft[:1]
+    delayed = aircraft if objective == LATE else aircraft[:1]
     of = np.concatenate([aircraft, aircraft, delayed])
     wind = np.repeat([0.0, 1.0, 1.0], [len(A), len(A), len(delayed)])
-    late = np.repeat([0, 0, here.spare], [len(A), len(A), len(delayed)])
+    late = np.repeat([0, 0, here.extra_delay], [len(A), len(A), len(delayed)])
     weight = np.repeat([1.0 / len(A), 1.0 / len(A), 1.0 / len(delayed)], [len(A), len(A), len(delayed)])
-    return Costed(fleet_of(A[of], B[of], wind, late, here), weight)
+    return Evaluation(benchmark_fleet(A[of], B[of], wind, late, here), weight)
 
 
-def repeated(flights: Fleet, times: int) -> Fleet:
+def repeat_flights(flights: Fleet, times: int) -> Fleet:
     """The same flights so many times over, one set after the other."""
 
     def tiled(one: FloatArray) -> FloatArray:
@@ -218,14 +218,14 @@ class TuningResult(NamedTuple):
     evaluations: int  # of each
 
 
-def length(law: Law, here: Benchmark) -> int:
+def generation_count(law: Law, here: Benchmark) -> int:
     """Generations of a search."""
-    return max(GENERATIONS, A_GAIN * len(space(start(law, here.known)).origin))
+    return max(GENERATIONS, GENERATIONS_PER_GAIN * len(space(start(law, here.known)).origin))
 
 
 def tune(
     law: Law,
-    aims: str,
+    objective: str,
     here: Benchmark,
     seeds: tuple[int, ...],
     generations: int | None = None,
@@ -234,21 +234,21 @@ def tune(
 ) -> TuningResult:
     """The gains of least cost that CMA-ES finds from `begin`, the best of several seeds; all seeds fly together.
 
-    The cost of a candidate is the weighted sum over the flights of `costed`. `progress` is told the generation and the least
+    The cost of a candidate is the weighted sum over the flights of `evaluation`. `progress` is told the generation and the least
     cost so far. Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package `cma`.
     """
     import cma  # noqa: PLC0415 - it takes its plotting along, which nothing here draws with
 
     searched = space(start(law, here.known) if begin is None else begin)
-    flights, weight = costed(aims, here)
+    flights, weight = evaluation(objective, here)
     each, candidates = len(weight), POPULATION * len(seeds)
-    flown, control_law, course = repeated(flights, candidates), law.control_law(here.known), here.courses[law.ahead]
+    flown, control_law, course = repeat_flights(flights, candidates), law.control_law(here.known), here.courses[law.feedforward]
     searches = [
-        cma.CMAEvolutionStrategy(searched.origin, SPREAD, {"seed": seed, "popsize": POPULATION, "verbose": -9})
+        cma.CMAEvolutionStrategy(searched.origin, INITIAL_SIGMA, {"seed": seed, "popsize": POPULATION, "verbose": -9})
         for seed in seeds
     ]
     best: list[tuple[float, FloatArray]] = [(np.inf, searched.origin)] * len(seeds)
-    generations = length(law, here) if generations is None else generations
+    generations = generation_count(law, here) if generations is None else generations
     for generation in range(generations):
         asked = [np.array(search.ask()) for search in searches]
         vectors = np.concatenate(asked)
@@ -271,7 +271,7 @@ def tune(
 # The files of gains
 
 
-def file_of(scenario: Scenario) -> Path:
+def tuned_file(scenario: Scenario) -> Path:
     """Where the tuned gains of a scenario lie."""
     return TUNED / f"{scenario.name}.yaml"
 
@@ -282,7 +282,7 @@ def load(path: Path) -> dict[str, dict[str, TuningResult]]:
         return {}
     found = read_yaml(path, path.name, "a file of tuned gains")
     try:
-        return {law: {aims: TuningResult(**entry) for aims, entry in by_aim.items()} for law, by_aim in found["laws"].items()}
+        return {law: {objective: TuningResult(**entry) for objective, entry in by_aim.items()} for law, by_aim in found["laws"].items()}
     except (TypeError, KeyError, AttributeError) as error:
         raise ParameterError(f"{path.name}: found {error}, expected laws, each with gains by aim") from None
 
@@ -290,7 +290,7 @@ def load(path: Path) -> dict[str, dict[str, TuningResult]]:
 def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], command: str) -> None:
     """Write tuned gains, what they cost and the command that finds them."""
     path.parent.mkdir(exist_ok=True)
-    laws = {law: {aims: entry._asdict() for aims, entry in by_aim.items()} for law, by_aim in tuned.items()}
+    laws = {law: {objective: entry._asdict() for objective, entry in by_aim.items()} for law, by_aim in tuned.items()}
     head = (
         "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
         "# Gains found by CMA-ES, in the law's order of channels and its scaled inputs; cost, seed, evaluations of a search.\n"

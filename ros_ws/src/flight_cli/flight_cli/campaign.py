@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di campaign`: thousands of uncertain aircraft through a scenario, and where they end."""
+"""`rise-di campaign`: a Monte Carlo campaign, a scenario campaign_run by thousands of uncertain aircraft."""
 
 import json
 import time
@@ -9,29 +9,25 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from flight_analysis.closed_loop.scenario import scenario_yaml
-from flight_analysis.report.run_folder import new_run
+from flight_analysis.report.run_folder import REPORT, SUMMARY, new_run
 from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import Campaign, Definition, Sweep, define
 from flight_campaign.campaign_report import write_page
-from flight_campaign.statistics import LOST, Tally
-from flight_cli.output import display_path
+from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
+from flight_cli.output import INTERRUPTED, display_path, new_table, progress_bar
 from flight_core.parameters import ParameterError, require
 
-INTERRUPTED = 130
-SUMMARY, PAGE = "summary.json", "report.html"
-RERUN = 3  # of the worst aircraft of a case get a scenario of their own
+RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
 
 
 class EngineName(StrEnum):
-    """Where chunks are flown."""
+    """Where chunks are computed."""
 
     THREADS = "threads"
     DASK = "dask"
@@ -42,53 +38,51 @@ def campaign(
         str | None, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml); none with --resume.")
     ] = None,
     aircraft: Annotated[int, typer.Option(min=1, help="How many uncertain aircraft.")] = 1000,
-    uncertainty: Annotated[
-        float, typer.Option(help="By which part of itself each entry of A and B differs at most, 0 to 1.")
-    ] = 0.3,
+    uncertainty: Annotated[float, typer.Option(help="Largest relative deviation of each entry of A and B, 0 to 1.")] = 0.3,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the aircraft.")] = 1,
     sweep: Annotated[
-        str | None, typer.Option(help="A parameter of the controller times each of some factors, as in beta=0.5,1,2.")
+        str | None, typer.Option(help="A controller parameter and factors to multiply it by, as in beta=0.5,1,2.")
     ] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")] = None,
-    chunk: Annotated[int, typer.Option(min=1, help="How many aircraft fly at once; more where there is a GPU.")] = 1000,
-    engine: Annotated[EngineName, typer.Option(help="Threads of this process, or processes and machines by dask.")] = (
+    chunk: Annotated[int, typer.Option(min=1, help="Aircraft computed at once; use more on a GPU.")] = 1000,
+    engine: Annotated[EngineName, typer.Option(help="Threads of this process, or processes and hosts of dask.")] = (
         EngineName.THREADS
     ),
     workers: Annotated[int | None, typer.Option(min=1, help="Threads or processes; by default one a core.")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler, as in tcp://host:8786.")] = None,
     runs: Annotated[Path, typer.Option(help="Folder that the campaign's folder is made in.")] = Path("runs"),
-    resume: Annotated[Path | None, typer.Option(help="Folder of a campaign that was stopped: fly what is missing.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="Folder of an interrupted campaign to continue.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON, nothing else.")] = False,
 ) -> None:
-    """Fly a scenario with thousands of aircraft drawn around its airframe, many at once, and show how well and how badly.
+    """Fly a Monte Carlo campaign: thousands of uncertain aircraft around the airframe of a scenario, many at once.
 
-    Exit status: 0 all flown, 2 bad input, 130 interrupted; --resume goes on where it stopped.
+    Exit status: 0 all flown, 2 bad input, 130 interrupted; --resume continues it.
     """
     require((scenario is None) == (resume is not None), "SCENARIO", scenario, "one of a scenario and --resume")
     require(scheduler is None or engine is EngineName.DASK, "--scheduler", scheduler, "--engine dask with it")
     if resume is not None:
-        flown = Campaign.resume(resume)
+        campaign_run = Campaign.resume(resume)
     else:
         chosen = find_scenario(str(scenario))
         if duration is not None:
             chosen = chosen.vary(flight={"duration": duration})
-        definition = define(chosen, aircraft, uncertainty, seed, chunk, None if sweep is None else _sweep(sweep))
-        flown = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
+        definition = define(chosen, aircraft, uncertainty, seed, chunk, None if sweep is None else _parse_sweep(sweep))
+        campaign_run = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
-    speed = _fly(flown, flies, Console(stderr=True, quiet=as_json))
-    figures = _conclude(flown)
+    speed = _fly_missing(campaign_run, flies, quiet=as_json)
+    figures = _write_results(campaign_run)
     if as_json:
         print(json.dumps(figures))
         return
     console = Console()
-    for case in range(flown.definition.cases):
-        _show(console, flown.definition, case, flown.tally(case), figures["cases"][case])
+    for case in range(campaign_run.definition.cases):
+        _show(console, campaign_run.definition, case, campaign_run.tally(case), figures["cases"][case])
     if speed is not None:
         print(f"flown:   {speed:,.0f} aircraft-seconds per second")
-    print(f"folder:  {display_path(flown.folder)}\nreport:  {display_path(flown.folder / PAGE)}")
+    print(f"folder:  {display_path(campaign_run.folder)}\nreport:  {display_path(campaign_run.folder / REPORT)}")
 
 
-def _sweep(text: str) -> Sweep:
+def _parse_sweep(text: str) -> Sweep:
     name, _, values = text.partition("=")
     try:
         factors = tuple(float(value) for value in values.split(","))
@@ -97,10 +91,10 @@ def _sweep(text: str) -> Sweep:
     return Sweep(parameter=name.removeprefix("controller."), factors=factors)
 
 
-def _fly(flown: Campaign, flies: engines.Engine, console: Console) -> float | None:
-    """Fly what is missing; aircraft-seconds per second, None where nothing was."""
-    definition = flown.definition
-    total, missing = definition.aircraft * definition.cases, flown.missing()
+def _fly_missing(campaign_run: Campaign, engine: engines.Engine, *, quiet: bool) -> float | None:
+    """Fly the chunks that are missing; aircraft-seconds per second, None if none is."""
+    definition = campaign_run.definition
+    total, missing = definition.aircraft * definition.cases, campaign_run.missing()
     there = total - sum(definition.size(job) for job in missing)
     if not missing:
         return None
@@ -113,27 +107,29 @@ def _fly(flown: Campaign, flies: engines.Engine, console: Console) -> float | No
         TextColumn("{task.fields[shown]}"),
     )
     try:
-        with Progress(*columns, console=console) as bar:
+        with progress_bar(*columns, quiet=quiet) as bar:
             task = bar.add_task("campaign", total=total, completed=there, shown="compiling")
-            for flights in flown.fly(flies):
+            for flights in campaign_run.fly(engine):
                 done += flights
                 speed = done * seconds / (time.monotonic() - begin)
                 bar.update(task, completed=there + done, shown=f"{speed:,.0f} aircraft-seconds per second")
     except KeyboardInterrupt:
         print(
-            f"interrupted after {there + done} of {total}; go on with: rise-di campaign --resume {display_path(flown.folder)}"
+            f"interrupted after {there + done} of {total}; continue with: rise-di campaign --resume {display_path(campaign_run.folder)}"
         )
         raise typer.Exit(INTERRUPTED) from None
     return done * seconds / (time.monotonic() - begin)
 
 
-def _conclude(flown: Campaign) -> dict[str, Any]:
-    """Write summary, page and the scenarios of the worst aircraft; the summary."""
-    definition = flown.definition
+def _write_results(campaign_run: Campaign) -> dict[str, Any]:
+    """Write the summary, the report and the scenarios of the worst aircraft; returns the summary."""
+    definition = campaign_run.definition
     cases = []
     for case in range(definition.cases):
-        tally = flown.tally(case)
-        cases.append({"factor": definition.factor(case), **tally.plain(), "fly_again": _fly_again(flown, case, tally)})
+        tally = campaign_run.tally(case)
+        cases.append(
+            {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(campaign_run, case, tally)}
+        )
     figures = {
         "scenario": definition.name,
         "aircraft": definition.aircraft,
@@ -142,18 +138,18 @@ def _conclude(flown: Campaign) -> dict[str, Any]:
         "sweep": None if definition.sweep is None else definition.sweep.parameter,
         "cases": cases,
     }
-    (flown.folder / SUMMARY).write_text(json.dumps(figures, indent=1), encoding="utf-8")
-    write_page(flown.folder / PAGE, definition, [flown.tally(case) for case in range(definition.cases)], cases)
+    (campaign_run.folder / SUMMARY).write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    write_page(campaign_run.folder / REPORT, definition, [campaign_run.tally(case) for case in range(definition.cases)], cases)
     return figures
 
 
-def _fly_again(flown: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
-    """Write the scenarios of the worst few; each with the command that flies it again."""
+def _write_worst(campaign_run: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
+    """Write the scenarios of the worst aircraft; returns them with the command that flies each."""
     again = []
     for one in tally.worst[:RERUN]:
-        suffix = "" if flown.definition.sweep is None else f"_{flown.definition.factor(case):g}"
-        path = flown.folder / f"{flown.definition.name}{suffix}_{one.number}.yaml"
-        path.write_text(scenario_yaml(flown.definition.aircraft_scenario(one.number, case)), encoding="utf-8")
+        suffix = "" if campaign_run.definition.sweep is None else f"_{campaign_run.definition.factor(case):g}"
+        path = campaign_run.folder / f"{campaign_run.definition.name}{suffix}_{one.number}.yaml"
+        path.write_text(scenario_yaml(campaign_run.definition.aircraft_scenario(one.number, case)), encoding="utf-8")
         command = f"rise-di fly {display_path(path)} --in-process"
         again.append({"number": one.number, "score": one.score, "command": command})
     return again
@@ -164,10 +160,7 @@ def _show(console: Console, definition: Definition, case: int, tally: Tally, fig
     title = f"\n{definition.name}: {tally.flights} aircraft within +-{100 * definition.uncertainty:g} %, seed {definition.seed}"
     if definition.sweep is not None:
         title += f", {definition.sweep.parameter} times {definition.factor(case):g}"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("figure", no_wrap=True)
-    for heading in ("mean", "median", "95 %", "99 %", "worst"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = new_table(title, ("figure", "mean", "median", "95 %", "99 %", "worst"), left=("figure",))
     for name, figure in tally.figures.items():
         kind, _, channel = name.partition(".")
         unit = units.get(channel)
@@ -177,7 +170,7 @@ def _show(console: Console, definition: Definition, case: int, tally: Tally, fig
         values = (figure.mean, figure.quantile(0.5), figure.quantile(0.95), figure.quantile(0.99), figure.largest)
         table.add_row(label, *(f"{value * factor:.3g}" for value in values))
     console.print(table)
-    for word, count in (("diverged", tally.diverged), (f"lost track (score above {LOST:g})", tally.lost)):
+    for word, count in (("diverged", tally.diverged), (f"lost track (score above {LOSS_OF_TRACK_SCORE:g})", tally.lost)):
         share, low, high = tally.share(count)
         console.print(f"{word}: {count} of {tally.flights}, {100 * share:.3g} % (95 %: {100 * low:.2g} to {100 * high:.2g})")
     for one in figures["fly_again"]:

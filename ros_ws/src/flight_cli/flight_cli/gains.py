@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di gains`: Theorem 1 and the engineering procedure side by side, and a scenario's gain set judged by both."""
+"""`rise-di gains`: select gains by Theorem 1 and by the engineering procedure, or check those of a scenario."""
 
 import json
 import math
@@ -8,23 +8,22 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from flight_analysis.design.gain_conditions import MOST_DELAY, Condition, failing
+from flight_analysis.design.gain_conditions import MAX_DELAY_MARGIN, Condition, failing
 from flight_analysis.design.gain_selection import (
     GainAssessment,
     Study,
     as_yaml,
     check_gains,
+    loop_setting,
     manoeuvre,
     select_gains,
-    setting_of,
-    study,
+    study_airframe,
 )
 from flight_bringup.scenarios import find_scenario
+from flight_cli.output import new_table
 from flight_core.parameters import ParameterError, require
 
 CONDITION_FAILS = 1
@@ -34,56 +33,57 @@ MEANINGS = {
     "softening": "width of the softened sign in time, beside the lag of the loop: narrower than that the loop is unstable",
     "response": "how much one unit of scaled input changes y_dot, abs(Omega_ii) input_scale; bandwidth = K x response",
 }
-"""What the words of the table mean, where its names do not say it."""
+"""Terms of the table and their meaning."""
 
 
 def gains(
     airframe: Annotated[str, typer.Argument(help="Name of an airframe, or path of an airframe file (.yaml).")],
-    uncertainty: Annotated[float, typer.Option(help="Part by which every entry of A and B may be off.")] = 0.3,
-    scenario: Annotated[str, typer.Option(help="Scenario whose commands, gusts and loop to select for.")] = "osprey_servo",
-    rate: Annotated[float | None, typer.Option(help="Rate of the law in Hz, in place of the scenario's.")] = None,
+    uncertainty: Annotated[float, typer.Option(help="Largest relative deviation of each entry of A and B.")] = 0.3,
+    scenario: Annotated[str, typer.Option(help="Scenario with the commands, the gusts and the loop.")] = "osprey_servo",
+    rate: Annotated[float | None, typer.Option(help="Rate of the law in Hz; by default that of the scenario.")] = None,
     lag: Annotated[str | None, typer.Option(help="Lags of the actuators in s, in the airframe's order: 0.02,0.1")] = None,
-    delay: Annotated[float | None, typer.Option(help="Pure delay in s, in place of the scenario's.")] = None,
-    inputs: Annotated[str | None, typer.Option(help="What drives each output, in the airframe's order: rudder,aileron")] = None,
-    gamma_2: Annotated[float, typer.Option(help="gamma_2 of Lemma 1 in 1/s: stated, for nothing bounds it.")] = 0.0,
+    delay: Annotated[float | None, typer.Option(help="Pure delay in s; by default that of the scenario.")] = None,
+    inputs: Annotated[str | None, typer.Option(help="Input of each output, in the airframe's order: rudder,aileron")] = None,
+    gamma_2: Annotated[float, typer.Option(help="gamma_2 of Lemma 1 in 1/s. It is an assumption: nothing bounds it.")] = 0.0,
     samples: Annotated[
-        int, typer.Option(min=0, max=10_000, help="How many uncertain airframes to bound the theorem's figures with.")
+        int, typer.Option(min=0, max=10_000, help="Number of uncertain airframes for the bounds of the theorem.")
     ] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain airframes.")] = 1,
-    write: Annotated[Path | None, typer.Option(help="File to write the engineering gains to, as a scenario has them.")] = None,
+    write: Annotated[Path | None, typer.Option(help="File for the engineering gains, as a section of a scenario.")] = None,
     feedforward: Annotated[
-        bool, typer.Option("--feedforward", help="Write the airframe along, as the model of a feedforward (an extension).")
+        bool,
+        typer.Option("--feedforward", help="Write the airframe too, as the nominal model of the feedforward (an extension)."),
     ] = False,
     check: Annotated[
-        bool, typer.Option("--check", help="Judge the gain set of the scenario instead of selecting one.")
+        bool, typer.Option("--check", help="Check the gain set of the scenario instead of selecting one.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
-    """Select gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on both.
+    """Select gains for an airframe by Theorem 1 and by the engineering procedure, and show every condition on both.
 
-    Exit status: 0, or with --check 1 where a condition of the loop fails, 2 bad input.
+    Exit status: 0; 1 if a condition of the loop fails with --check; 2 bad input.
     """
-    chosen, flown = find_scenario(scenario), load_airframe(airframe)
+    chosen, frame = find_scenario(scenario), load_airframe(airframe)
     require(rate is None or 1.0 <= rate <= 1000.0, "--rate", rate, "1 to 1000 Hz")
-    require(delay is None or 0.0 <= delay <= MOST_DELAY, "--delay", delay, f"0 to {MOST_DELAY:g} s")
+    require(delay is None or 0.0 <= delay <= MAX_DELAY_MARGIN, "--delay", delay, f"0 to {MAX_DELAY_MARGIN:g} s")
     require(0.0 <= gamma_2 < math.inf, "--gamma-2", gamma_2, "0 or more, 1/s")
-    setting = setting_of(chosen, gamma_2)._replace(inputs=tuple(inputs.split(",")) if inputs else (), feedforward=feedforward)
+    setting = loop_setting(chosen, gamma_2)._replace(inputs=tuple(inputs.split(",")) if inputs else (), feedforward=feedforward)
     if rate is not None:
         setting = setting._replace(rate=rate)
     if delay is not None:
         setting = setting._replace(delay=delay)
     if lag is not None:
-        setting = setting._replace(lag=_lags(lag, flown))
+        setting = setting._replace(lag=_parse_lags(lag, frame))
     if check:
         for option, given in (("--write", write is not None), ("--feedforward", feedforward)):
             require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
         changed = rate is not None or delay is not None or lag is not None or inputs is not None
         require(not changed, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
-        known, named = chosen.controller.outputs, f"airframe {flown.name}"
-        require(sorted(known) == sorted(flown.outputs), named, ", ".join(flown.outputs), f"the outputs {', '.join(known)}")
+        known, named = chosen.controller.outputs, f"airframe {frame.name}"
+        require(sorted(known) == sorted(frame.outputs), named, ", ".join(frame.outputs), f"the outputs {', '.join(known)}")
     console = Console(quiet=as_json)
-    with console.status("following the reference on uncertain airframes"):
-        found = study(flown, manoeuvre(chosen, flown), uncertainty, samples, seed)
+    with console.status("simulating the ideal control on uncertain airframes"):
+        found = study_airframe(frame, manoeuvre(chosen, frame), uncertainty, samples, seed)
         if check:
             answers, text = {"scenario": check_gains(chosen, found, gamma_2)}, None
         else:
@@ -92,7 +92,7 @@ def gains(
     if write is not None and text is not None:
         _write(write, text)
     if as_json:
-        print(json.dumps(_plain(found, answers, seed)))
+        print(json.dumps(_as_json(found, answers, seed)))
     else:
         _show(console, found, answers)
         if write is not None:
@@ -101,7 +101,7 @@ def gains(
         raise typer.Exit(CONDITION_FAILS)
 
 
-def _lags(text: str, airframe: Airframe) -> dict[str, float]:
+def _parse_lags(text: str, airframe: Airframe) -> dict[str, float]:
     """Lags by input from "0.02,0.1", or from one value for all. Raises ParameterError."""
     names = list(airframe.inputs)
     try:
@@ -127,11 +127,8 @@ def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) ->
     outputs = first.controller.outputs
     samples = len(found.A) - 1
     title = f"Gains for {found.airframe.name}, A and B +-{100 * found.uncertainty:g} % ({samples} samples); K, Lambda in 1/s,"
-    table = _table(f"{title} beta in units of y / s^2")
-    table.add_column("channel", no_wrap=True)
-    for name in answers:
-        for heading in (f"{name}\nK", "\nLambda", "\nbeta"):
-            table.add_column(heading, justify="right", no_wrap=True)
+    headings = [heading for name in answers for heading in (f"{name}\nK", "\nLambda", "\nbeta")]
+    table = new_table(f"{title} beta in units of y / s^2", ["channel", *headings], left=("channel",))
     for i, (output, name) in enumerate(zip(outputs, first.controller.inputs, strict=True)):
         row = [f"{output} by {name}"]
         for answer in answers.values():
@@ -140,20 +137,18 @@ def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) ->
         table.add_row(*row)
     console.print(table)
     for name, answer in answers.items():
-        console.print(f"{name}: {_margin(answer)}", highlight=False, soft_wrap=True)
+        console.print(f"{name}: {_format_delay_margin(answer)}", highlight=False, soft_wrap=True)
 
     for part, heading in (("theorem", "Theorem 1"), ("loop", "The loop")):
-        table = _table(f"\n{heading}")
-        table.add_column("condition")
-        for name in answers:
-            table.add_column(f"{name}\nfound and bound", justify="right", no_wrap=True)
-            table.add_column("\nmargin", justify="right", no_wrap=True)
+        headings = [text for name in answers for text in (f"{name}\nvalue and bound", "\nmargin")]
+        table = new_table(f"\n{heading}", ["condition", *headings], left=("condition",), wrapped=("condition",))
         for row_ in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
-            table.add_row(_named(row_, outputs), *(cell for condition in row_ for cell in _cells(condition)))
+            table.add_row(_condition_name(row_, outputs), *(cell for condition in row_ for cell in _cells(condition)))
         console.print(table)
     gamma_2 = first.bounds.gamma_2[0]
     console.print(
-        f"margin: above 1 holds, ! fails; ~ estimate, for gamma_2 = {gamma_2:g} 1/s is stated, not bounded", soft_wrap=True
+        f"margin: a condition holds above 1 and fails (!) below; ~ is an estimate: gamma_2 = {gamma_2:g} 1/s is an assumption",
+        soft_wrap=True,
     )
     for word, meaning in MEANINGS.items():
         console.print(f"{word}: {meaning}", highlight=False, soft_wrap=True)
@@ -164,18 +159,14 @@ def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) ->
             console.print(f"  {condition.sentence(outputs)}", highlight=False)
 
 
-def _table(title: str) -> Table:
-    return Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-
-
-def _named(row: tuple[Condition, ...], outputs: tuple[str, ...]) -> str:
-    """Name of a row; the channel where all agree on it, since the largest term of step 3 may be in another one for each."""
+def _condition_name(row: tuple[Condition, ...], outputs: tuple[str, ...]) -> str:
+    """Name of a row, with the channel if it is the same in every gain set."""
     where = {None if condition.channel is None else outputs[condition.channel] for condition in row}
     channel = where.pop() if len(where) == 1 else None
     return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
 
 
-def _margin(answer: GainAssessment) -> str:
+def _format_delay_margin(answer: GainAssessment) -> str:
     if answer.delay_margin is None:
         return "no linear loop (literal sign)"
     if answer.delay_margin == 0.0:
@@ -195,7 +186,7 @@ def _cells(condition: Condition) -> tuple[str, str]:
     return f"{condition.found:.4g} {side} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
 
 
-def _plain(found: Study, answers: dict[str, GainAssessment], seed: int) -> dict[str, Any]:
+def _as_json(found: Study, answers: dict[str, GainAssessment], seed: int) -> dict[str, Any]:
     inputs = list(found.airframe.inputs)
     return {
         "airframe": found.airframe.name,
@@ -203,12 +194,12 @@ def _plain(found: Study, answers: dict[str, GainAssessment], seed: int) -> dict[
         "samples": len(found.A) - 1,
         "seed": seed,
         "slew": dict(zip(inputs, found.slew.tolist(), strict=True)),
-        "slew_calm": dict(zip(inputs, found.slew_calm.tolist(), strict=True)),
+        "slew_calm": dict(zip(inputs, found.slew_undisturbed.tolist(), strict=True)),
     } | {
         name: {
             "controller": answer.controller.model_dump(exclude_none=True),
-            "delay_margin": _number(answer.delay_margin),
-            "channel_margins": [_number(margin) for margin in answer.channel_margins],
+            "delay_margin": _finite(answer.delay_margin),
+            "channel_margins": [_finite(margin) for margin in answer.channel_margins],
             "bounds": {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")}
             | {"rho": answer.bounds.rho},
             "conditions": [
@@ -216,9 +207,9 @@ def _plain(found: Study, answers: dict[str, GainAssessment], seed: int) -> dict[
                     "name": condition.name,
                     "part": part,
                     "channel": None if condition.channel is None else answer.controller.outputs[condition.channel],
-                    "found": _number(condition.found),
-                    condition.side.replace(" ", "_"): _number(condition.bound),
-                    "margin": _number(condition.margin),
+                    "found": _finite(condition.found),
+                    condition.side.replace(" ", "_"): _finite(condition.bound),
+                    "margin": _finite(condition.margin),
                     "holds": condition.holds,
                     "estimate": condition.estimate,
                 }
@@ -230,6 +221,6 @@ def _plain(found: Study, answers: dict[str, GainAssessment], seed: int) -> dict[
     }
 
 
-def _number(value: float | None) -> float | None:
+def _finite(value: float | None) -> float | None:
     # JSON has neither NaN nor infinity.
     return value if value is not None and math.isfinite(value) else None

@@ -27,11 +27,11 @@ from rise_di_controller.feedforward import ORIGIN
 
 ComplexArray = NDArray[np.complex128]
 
-FASTEST_ZERO = 1e4
+MAX_FINITE_ZERO = 1e4
 """1/s. Zeros beyond it are the pencil's infinite ones: they are double, so rounding may bring them in, but to no less than
 about 1e7 (the inverse root of 2e-16). The fastest finite one in the library is 7.2."""
 
-UNCONTROLLABLE = 1e-9
+RANK_TOLERANCE = 1e-9
 """Singular values below this part of the largest are zero: rounding leaves 1e-15, published figures have five digits."""
 
 
@@ -129,7 +129,7 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
     pencil = np.block([[A, B], [C, np.zeros((m, m))]])
     weights = np.diag(np.concatenate([np.ones(n), np.zeros(m)]))
     numerators, denominators = eig(pencil, weights, right=False, homogeneous_eigvals=True)
-    finite = np.abs(numerators) < FASTEST_ZERO * np.abs(denominators)
+    finite = np.abs(numerators) < MAX_FINITE_ZERO * np.abs(denominators)
     return np.sort_complex(numerators[finite] / denominators[finite])
 
 
@@ -148,4 +148,4 @@ def controllable(A: FloatArray, B: FloatArray) -> bool:
     """
     n = len(A)
     modes = (np.hstack([A - s * np.eye(n), B]) for s in eigvals(A))
-    return all(int(np.linalg.matrix_rank(mode, rtol=UNCONTROLLABLE)) == n for mode in modes)
+    return all(int(np.linalg.matrix_rank(mode, rtol=RANK_TOLERANCE)) == n for mode in modes)

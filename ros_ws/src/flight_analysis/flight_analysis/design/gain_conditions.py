@@ -23,37 +23,37 @@ from rise_di_controller import law
 from rise_di_controller.decomposition import decompose
 from rise_di_controller.law import LawParams, LawState, Sign, total_lag
 
-LEAST_K = 1.5
+MIN_K = 1.5
 """1/s. (22) wants K > 1; a slower channel is given this K and inputs of as much less response, which is the same loop."""
 
-LEAST = 0.01
+MIN_GAIN = 0.01
 """The smallest k_d (1/s) and beta (units of y / s^2) handed out: (21), (22) want them positive where nothing asks for more."""
 
 K_G_MARGIN = 1.5
 """k_g is this much above rho^2 / (4 k_g) = min(Lambda, 1): step 2 then leaves a third of the decay to step 3."""
 
-K_D_PART = 0.3
+MAX_STEP_3_FRACTION = 0.3
 """What all of step 3 takes of the decay, out of that third."""
 
 MAX_CROSSOVER_LAG_PRODUCT = 0.8
 """Bandwidth times the lag of the loop. On the `osprey` 0.63 leaves 45 ms of delay margin and 0.91 leaves 30, which is less
 than the lag of the loop itself."""
 
-LARGEST_LAMBDA = 0.5
+MAX_LAMBDA_TO_BANDWIDTH = 0.5
 """Lambda_i beside the bandwidth K_i: at 0.5 the integral takes atan(0.5) = 27 degrees of phase at the crossover."""
 
-RATE_PART = 0.7
+MAX_BETA_TO_RATE_LIMIT = 0.7
 """beta_i beside the actuator's rate limit: at 2/3 the `osprey`'s yaw rate flew clean, at 1 it was in a limit cycle."""
 
-UNSTABLE = 1e-6
+SPECTRAL_RADIUS_TOLERANCE = 1e-6
 """How far beyond 1 a spectral radius is unstable. Angles that integrate the outputs lie on 1 twice, which rounding splits
 by its root, 1e-8."""
 
-MOST_DELAY = 0.5
+MAX_DELAY_MARGIN = 0.5
 """s. Delay margins are looked for up to here; a loop that bears more is slower than any that this stack flies."""
 
 
-ROUNDING = 1e-5
+BOUND_TOLERANCE = 1e-5
 """How much of a bound may be missing: gain sets are written down with six digits."""
 
 
@@ -101,7 +101,7 @@ class Condition(NamedTuple):
         """Whether the gain set meets it."""
         if self.strict:
             return self.found > self.bound
-        slack = ROUNDING * abs(self.bound)
+        slack = BOUND_TOLERANCE * abs(self.bound)
         return self.found >= self.bound - slack if self.at_least else self.found <= self.bound + slack
 
     @property
@@ -127,7 +127,7 @@ def failing(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
 # Theorem 1
 
 
-def within(lower: FloatArray, upper: FloatArray, count: int, seed: int) -> FloatArray:
+def interval_samples(lower: FloatArray, upper: FloatArray, count: int, seed: int) -> FloatArray:
     """Samples of Omega inside an interval, shape (count, m, m): the midpoint, then by turns a corner and an inner point.
 
     lower <= Omega <= upper entry by entry, shape (m, m). Raises ParameterError where lower exceeds upper.
@@ -190,12 +190,12 @@ def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
     """
     m = len(Lambda)
     least = min(float(Lambda.min()), 1.0)
-    k_g = max(K_G_MARGIN * bounds.rho**2 / (4.0 * least), LEAST)
+    k_g = max(K_G_MARGIN * bounds.rho**2 / (4.0 * least), MIN_GAIN)
     k_d = np.zeros(m - 1)
     for i in reversed(range(m - 1)):
-        part = K_D_PART * least / (m - 1)
-        k_d[i] = max(zeta_Phi(i, np.asarray(law.gain(np.array(k_g), k_d)), bounds.U) ** 2 / (4.0 * part), LEAST)
-    return GainSet(k_g, k_d, Lambda, np.maximum(least_beta(Lambda, bounds), LEAST))
+        part = MAX_STEP_3_FRACTION * least / (m - 1)
+        k_d[i] = max(zeta_Phi(i, np.asarray(law.gain(np.array(k_g), k_d)), bounds.U) ** 2 / (4.0 * part), MIN_GAIN)
+    return GainSet(k_g, k_d, Lambda, np.maximum(least_beta(Lambda, bounds), MIN_GAIN))
 
 
 def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
@@ -242,7 +242,7 @@ class Loop(NamedTuple):
         return np.asarray(total_lag(self.lag, self.delay, self.period))
 
 
-class Selected(NamedTuple):
+class ScaledGains(NamedTuple):
     """A gain set with the response of the inputs that it is for."""
 
     gains: GainSet
@@ -263,17 +263,17 @@ def order(bandwidth: FloatArray) -> tuple[int, ...]:
     return tuple(int(i) for i in np.argsort(-bandwidth, kind="stable"))
 
 
-def split(K: FloatArray) -> tuple[float, FloatArray]:
+def split_gain(K: FloatArray) -> tuple[float, FloatArray]:
     """k_g and k_d of (22) for K = 1 + k_g + (k_d, 0), shape (m,), 1/s. k_d is at least 0.01: (22) wants it positive.
 
     Raises ParameterError where the last K is not the smallest or not above 1: (22) has no such K.
     """
     require(float(K[-1]) <= float(K.min()), "K", K.tolist(), "the smallest in the last channel, as (22) has it")
     require(float(K[-1]) > 1.0, f"K[{len(K) - 1}]", float(K[-1]), "above 1 1/s, as (22) has it")
-    return float(K[-1]) - 1.0, np.maximum(K[:-1] - K[-1], LEAST)
+    return float(K[-1]) - 1.0, np.maximum(K[:-1] - K[-1], MIN_GAIN)
 
 
-def engineering_gains(bandwidth: FloatArray, slew: FloatArray, factor: float, rate_limit: FloatArray) -> Selected:
+def engineering_gains(bandwidth: FloatArray, slew: FloatArray, factor: float, rate_limit: FloatArray) -> ScaledGains:
     """Gains for a loop with lag, from bandwidths (rad/s) of which the last is the smallest; all arguments shape (m,).
 
         K_i = max(bandwidth_i, 1.5),  response_i = bandwidth_i / K_i      K_i response_i is the bandwidth
@@ -285,11 +285,11 @@ def engineering_gains(bandwidth: FloatArray, slew: FloatArray, factor: float, ra
     Source: this project; beta because N_d = -D U v*_dot where e = 0, see `N_d`.
     """
     require(factor >= 1.0, "factor", factor, "at least 1: beta above the slew of the ideal control")
-    K = np.maximum(bandwidth, LEAST_K)
+    K = np.maximum(bandwidth, MIN_K)
     response = bandwidth / K
-    k_g, k_d = split(K)
-    beta = np.maximum(np.minimum(factor * slew, RATE_PART * rate_limit) / response, LEAST)
-    return Selected(GainSet(k_g, k_d, bandwidth / 4.0, beta), response)
+    k_g, k_d = split_gain(K)
+    beta = np.maximum(np.minimum(factor * slew, MAX_BETA_TO_RATE_LIMIT * rate_limit) / response, MIN_GAIN)
+    return ScaledGains(GainSet(k_g, k_d, bandwidth / 4.0, beta), response)
 
 
 def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
@@ -327,9 +327,9 @@ def check_loop(
         conditions.extend(Condition(name, i, a, b, at_least) for i, a, b in finite)
 
     add("share", params.K * response * total, np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT), at_least=False)
-    add("Lambda below K", params.Lambda, LARGEST_LAMBDA * params.K * response, at_least=False)
+    add("Lambda below K", params.Lambda, MAX_LAMBDA_TO_BANDWIDTH * params.K * response, at_least=False)
     add("beta above slew", params.beta, slew, at_least=True)
-    add("beta below rate", params.beta, RATE_PART * rate_limit, at_least=False)
+    add("beta below rate", params.beta, MAX_BETA_TO_RATE_LIMIT * rate_limit, at_least=False)
     if params.sign is Sign.SOFT:
         add("softening", params.eps * params.K / params.beta, total, at_least=True)
     elif params.sign is Sign.IMPLICIT:
@@ -405,7 +405,7 @@ def closed_loop(plant: LinearPlant, params: LawParams, loop: Loop, extra: FloatA
 def is_stable(plant: LinearPlant, params: LawParams, loop: Loop, extra: FloatArray) -> bool:
     """Whether no eigenvalue of `closed_loop` lies outside the unit circle, rounding apart."""
     radius = np.max(np.abs(np.linalg.eigvals(closed_loop(plant, params, loop, extra))))
-    return bool(radius <= 1.0 + UNSTABLE)
+    return bool(radius <= 1.0 + SPECTRAL_RADIUS_TOLERANCE)
 
 
 def delay_margin(plant: LinearPlant, params: LawParams, loop: Loop, channel: int | None = None) -> float:
@@ -420,7 +420,7 @@ def delay_margin(plant: LinearPlant, params: LawParams, loop: Loop, channel: int
     lower, stride = 0.0, loop.period / 2.0
     while is_stable(plant, params, loop, (lower + stride) * delayed):
         lower += stride
-        if lower > MOST_DELAY:
+        if lower > MAX_DELAY_MARGIN:
             return math.inf
     while stride > 1e-4:
         stride /= 2.0

@@ -19,12 +19,12 @@ from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.params import Gust
-from aircraft_sim.uncertainty import uncertain
+from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.design import gain_conditions as procedure
+from flight_analysis.design import gain_conditions
 from flight_analysis.design.airframe_properties import invariant_zeros
 from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet, LinearPlant, Loop
-from flight_analysis.design.lyapunov import KnownPlant, decay
+from flight_analysis.design.lyapunov import KnownPlant, decay_matrix
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import Array, FloatArray
@@ -36,16 +36,16 @@ from rise_di_controller.feedforward import ORIGIN
 from rise_di_controller.law import LawParams, Sign
 from rise_di_controller.params import ControllerParameters, FeedforwardParameters
 
-SHARES: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
+CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
 """Bandwidth of a channel times the lag of its loop, by output. Yaw leaves room to the dutch roll, speed to the engine."""
 
-CAUTIOUS_SHARE = 0.23
-"""The share of an output that SHARES does not know."""
+DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23
+"""The share of an output that CROSSOVER_LAG_PRODUCTS does not know."""
 
-FACTOR = 1.25
+BETA_TO_SLEW = 1.25
 """beta beside the largest slew of the ideal control: 1 is needed, 1.5 is the most that was ever of use on the `osprey`."""
 
-LARGEST_COUPLING = 10.0
+MAX_COUPLING = 10.0
 """max abs(U - I) above which inputs and outputs are paired wrongly. It is 25 on the `osprey` with aileron and rudder
 swapped and 13.6 on the first edition's Aerosonde, which no gain set of either procedure holds behind servos; 2.2 at most on
 the other airframes of the library."""
@@ -81,8 +81,8 @@ class LoopSetting(NamedTuple):
     delay: float  # s
     rate_limit: Mapping[str, float]  # SI, by input; an input without is not limited
     gamma_2: float = 0.0  # 1/s, stated: 0 gives the least that (29), (30) can ask
-    factor: float = FACTOR  # beta beside the slew of the ideal control
-    shares: Mapping[str, float] = SHARES
+    factor: float = BETA_TO_SLEW  # beta beside the slew of the ideal control
+    crossover_lag_products: Mapping[str, float] = CROSSOVER_LAG_PRODUCTS
     inputs: tuple[str, ...] = ()  # what drives each output of the airframe, in its order; none: as the airframe has it
     feedforward: bool = False  # whether the airframe as published goes along as the nominal model
 
@@ -97,7 +97,7 @@ class Study(NamedTuple):
     gravity: FloatArray  # (n, n), the Jacobian of f at trim
     u_dot: FloatArray  # (T, N, m) rate of the ideal control, units of u / s
     slew: FloatArray  # (m,) largest abs(u_dot) of the nominal airframe
-    slew_calm: FloatArray  # (m,) the same in still air
+    slew_undisturbed: FloatArray  # (m,) the same in still air
     stable: NDArray[np.bool_]  # (N,) where no zero lies in the right half plane
     uncertainty: float
 
@@ -120,7 +120,7 @@ class GainAssessment(NamedTuple):
     @property
     def failing(self) -> tuple[Condition, ...]:
         """Every condition that does not hold."""
-        return procedure.failing((*self.theorem, *self.loop))
+        return gain_conditions.failing((*self.theorem, *self.loop))
 
 
 class Selection(NamedTuple):
@@ -161,7 +161,7 @@ def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
     return Manoeuvre(reference, gusts, scenario.flight.duration)
 
 
-def study(airframe: Airframe, flown: Manoeuvre, uncertainty: float = 0.3, samples: int = 100, seed: int = 1) -> Study:
+def study_airframe(airframe: Airframe, flown: Manoeuvre, uncertainty: float = 0.3, samples: int = 100, seed: int = 1) -> Study:
     """Find the rate of the ideal control along a manoeuvre, on the airframe as published and on uncertain ones.
 
     The ideal control holds y on y_m. With x = C' y_m + H eta, eta the states that are not outputs:
@@ -174,7 +174,7 @@ def study(airframe: Airframe, flown: Manoeuvre, uncertainty: float = 0.3, sample
     difference is central and over 1e-5 s. f is that of the nominal airframe. Raises ParameterError where Omega is singular
     or the nominal airframe has a zero in the right half plane: then Assumption 3 does not hold.
     """
-    A, B = uncertain(airframe, uncertainty, samples, seed)
+    A, B = nominal_and_sampled(airframe, uncertainty, samples, seed)
     zeros = [invariant_zeros(*pair, airframe.matrix_c()).real.max(initial=-math.inf) for pair in zip(A, B, strict=True)]
     stable = np.array(zeros) <= ORIGIN
     require(bool(stable[0]), f"airframe {airframe.name}", f"a zero at {zeros[0]:.3g} 1/s", "none in the right half plane")
@@ -286,12 +286,12 @@ def require_channels(
     flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)
     try:
         largest = coupling(Omega)
-        problem = f"max abs(U - I) = {largest:.3g}" if largest > LARGEST_COUPLING else ""
+        problem = f"max abs(U - I) = {largest:.3g}" if largest > MAX_COUPLING else ""
     except DecompositionError as error:
         problem = f"no D, for leading minor {error.minor} is zero"
     if problem:
         found = ", ".join(f"{output}-{name}" for output, name in zip(*channels, strict=True))
-        better = search(Omega, LARGEST_COUPLING)
+        better = search(Omega, MAX_COUPLING)
         pairs = (
             [] if better is None else [f"{channels.outputs[i]}-{channels.inputs[j]}" for i, j in zip(*better[:2], strict=True)]
         )
@@ -332,15 +332,15 @@ def select_gains(found: Study, setting: LoopSetting) -> Selection:
     paired = [known.index(name) for name in given.inputs]
     Omega, slew = found.Omega[:, paired], found.slew[paired]
     require_channels(Omega, given)
-    share = np.array([setting.shares.get(name, CAUTIOUS_SHARE) for name in given.outputs])
-    bandwidth = procedure.bandwidths(_loop(setting, given), share)
-    places = list(procedure.order(bandwidth))
+    share = np.array([setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT) for name in given.outputs])
+    bandwidth = gain_conditions.bandwidths(_loop(setting, given), share)
+    places = list(gain_conditions.order(bandwidth))
     channels = ChannelPairing(*(tuple(names[i] for i in places) for names in given))
     columns = [paired[i] for i in places]
     D = require_channels(Omega[np.ix_(places, places)], channels)
     unit = 1.0 / np.abs(np.diag(Omega))[places]
     rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
-    selected = procedure.engineering_gains(bandwidth[places], slew[places] / unit, setting.factor, rate_limit / unit)
+    selected = gain_conditions.engineering_gains(bandwidth[places], slew[places] / unit, setting.factor, rate_limit / unit)
     spread = np.abs(np.einsum("Nii->Ni", (found.C @ found.B)[:, places][..., columns])).max(axis=0)
 
     def controller(gains: GainSet, response: FloatArray) -> ControllerParameters:
@@ -369,9 +369,9 @@ def select_gains(found: Study, setting: LoopSetting) -> Selection:
 
     ones = np.ones(len(places))
     bounds, *_ = _bounds(found, places, columns, unit, D, ones, setting.gamma_2)
-    literal = controller(procedure.theorem_gains(bounds, ones), ones)
+    literal = controller(gain_conditions.theorem_gains(bounds, ones), ones)
     engineering = controller(*selected)
-    return Selection(found, setting, *(judge(found, one, setting) for one in (literal, engineering)))
+    return Selection(found, setting, *(assess_gains(found, one, setting) for one in (literal, engineering)))
 
 
 def with_feedforward(controller: ControllerParameters, airframe: Airframe) -> ControllerParameters:
@@ -397,10 +397,10 @@ def check_gains(scenario: Scenario, found: Study, gamma_2: float = 0.0) -> GainA
 
     Raises ParameterError where D or the pairing contradict the airframe.
     """
-    return judge(found, scenario.controller, setting_of(scenario, gamma_2))
+    return assess_gains(found, scenario.controller, loop_setting(scenario, gamma_2))
 
 
-def setting_of(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
+def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     """The loop as a scenario has it: its controller, and the rate limits of controller and actuators."""
     controller, rates = scenario.controller, scenario.aircraft.actuators.rate
     airframe, _ = scenario.aircraft.load()
@@ -416,7 +416,7 @@ def setting_of(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     )
 
 
-def judge(found: Study, controller: ControllerParameters, setting: LoopSetting) -> GainAssessment:
+def assess_gains(found: Study, controller: ControllerParameters, setting: LoopSetting) -> GainAssessment:
     """Every condition on a gain set. Rate, lag and delay are the controller's own; gamma_2 and rate limits of the setting.
 
     Theorem: D and stable zero dynamics as parts of the samples where they hold; (29), (30), steps 2 and 3 with bounds that
@@ -441,20 +441,20 @@ def judge(found: Study, controller: ControllerParameters, setting: LoopSetting) 
     theorem = (
         Condition("D (11)", None, float(np.mean(holds)), 1.0),
         Condition("zero dynamics", None, float(np.mean(found.stable)), 1.0),
-        *procedure.check(gains, bounds),
+        *gain_conditions.check(gains, bounds),
         Condition("V2_dot", None, least, 0.0, strict=True),
     )
     responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
     rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
     limits = tuple(values / params.input_scale for values in (found.slew[columns], rate_limit))
-    conditions = procedure.check_loop(params, loop, responses[0], responses.max(axis=0), *limits)
+    conditions = gain_conditions.check_loop(params, loop, responses[0], responses.max(axis=0), *limits)
     if params.sign is Sign.LITERAL:
         return GainAssessment(controller, theorem, conditions, bounds, None, ())
     plants = [LinearPlant(A + found.gravity, B, C) for A, B in zip(found.A, Bs, strict=True)]
     still = np.zeros(len(rows))
-    steady = float(np.mean([procedure.is_stable(plant, params, loop, still) for plant in plants]))
-    margin = procedure.delay_margin(plants[0], params, loop)
-    each = tuple(procedure.delay_margin(plants[0], params, loop, channel) for channel in range(len(rows)))
+    steady = float(np.mean([gain_conditions.is_stable(plant, params, loop, still) for plant in plants]))
+    margin = gain_conditions.delay_margin(plants[0], params, loop)
+    each = tuple(gain_conditions.delay_margin(plants[0], params, loop, channel) for channel in range(len(rows)))
     conditions += (Condition("linear stability", None, steady, 1.0),)
     if params.sign is Sign.SOFT:
         conditions += (Condition("delay margin", None, margin, loop.period),)
@@ -479,9 +479,9 @@ def _bounds(
     v_dot = np.moveaxis(found.u_dot[..., columns], 1, 0)[counts] / scale
     CAC = C @ found.A[counts] @ C.T
     bounds = Bounds(
-        U=procedure.bound_U(Omegas),
-        N_d=np.max([np.abs(procedure.N_d(*pair)).max(axis=0) for pair in zip(Omegas, v_dot, strict=True)], axis=0),
-        rho=max(procedure.rho(*pair, Lambda) for pair in zip(Omegas, CAC, strict=True)),
+        U=gain_conditions.bound_U(Omegas),
+        N_d=np.max([np.abs(gain_conditions.N_d(*pair)).max(axis=0) for pair in zip(Omegas, v_dot, strict=True)], axis=0),
+        rho=max(gain_conditions.rho(*pair, Lambda) for pair in zip(Omegas, CAC, strict=True)),
         gamma_2=np.full(len(rows), gamma_2),
     )
     return bounds, holds, counts
@@ -496,7 +496,7 @@ def _has(Omega: FloatArray, D: FloatArray) -> bool:
 
 def _least_decay(A: FloatArray, B: FloatArray, C: FloatArray, params: LawParams) -> float:
     plant = KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x)
-    return float(np.linalg.eigvalsh(decay(plant, params)).min())
+    return float(np.linalg.eigvalsh(decay_matrix(plant, params)).min())
 
 
 def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) -> FloatArray:
@@ -541,7 +541,7 @@ def as_yaml(selection: Selection) -> str:
     ]
     for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward"}).items():
         reason = reasons.get(key, "" if key == "inputs" else ControllerParameters.model_fields[key].description)
-        lines.append(f"    {key}: {flow(value)}" + (f"  # {reason}" if reason else ""))
+        lines.append(f"    {key}: {yaml_flow(value)}" + (f"  # {reason}" if reason else ""))
     if controller.feedforward is not None:
         lines += _feedforward_lines(controller.feedforward, found.airframe.name)
     return "\n".join(lines) + "\n"
@@ -551,7 +551,7 @@ def _feedforward_lines(model: FeedforwardParameters, airframe: str) -> list[str]
     lines = [f"    feedforward:  # an extension of the paper: the input of {airframe} along y_m is added; SI, a line a state"]
     for key, value in model.model_dump(exclude_none=True).items():
         columns = len(value) if key in {"states", "lead"} else len(value) // len(model.states)
-        rows = [flow(value[i : i + columns])[1:-1] for i in range(0, len(value), columns)]
+        rows = [yaml_flow(value[i : i + columns])[1:-1] for i in range(0, len(value), columns)]
         lines.append(f"      {key}: [" + (",\n" + " " * (9 + len(key))).join(rows) + "]" + ("  # s" if key == "lead" else ""))
     return lines
 
@@ -563,12 +563,12 @@ def _response(answer: GainAssessment, found: Study) -> FloatArray:
     return np.asarray(np.abs(found.Omega[rows, columns]) * answer.controller.input_scale)
 
 
-def flow(value: Any) -> str:
+def yaml_flow(value: Any) -> str:
     """A value in YAML's flow style; floats with six digits and always a point, which YAML 1.1 needs to see a float."""
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(flow(one) for one in value)}]"
+        return f"[{', '.join(yaml_flow(one) for one in value)}]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {flow(one)}" for key, one in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {yaml_flow(one)}" for key, one in value.items()) + "}"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):

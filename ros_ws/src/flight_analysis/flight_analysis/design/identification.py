@@ -18,7 +18,9 @@ import numpy as np
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import AXES, Gusts
-from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, FlightCondition, JsbsimVehicle, Trim, WindModel, sideslip_zero
+from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, FlightCondition, Trim, WindModel
+from aircraft_sim.jsbsim_model import JsbsimModel
+from aircraft_sim.jsbsim_trim import sideslip_zero
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -29,12 +31,12 @@ from flight_analysis.design.gain_selection import (
     Selection,
     Study,
     as_yaml,
-    flow,
     require_channels,
     select_gains,
-    study,
+    study_airframe,
+    yaml_flow,
 )
-from flight_analysis.metrics import error_figures, known_error
+from flight_analysis.metrics import error_metrics, best_error
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.rates import divide, nanoseconds
 from flight_core.tape import Tape
@@ -84,7 +86,7 @@ class Responses(NamedTuple):
     rejected: tuple[str, ...]  # steps that show nothing, and why
 
 
-def tangent(y: FloatArray, dt: float) -> Tangent | None:
+def steepest_tangent(y: FloatArray, dt: float) -> Tangent | None:
     """The steepest tangent of a unit step response, y of shape (N,) every dt; None where nothing moves.
 
     A chord joins samples 25 ms apart. The first maximum of its slope counts, which is passed when the slope has fallen to 0.7
@@ -102,7 +104,7 @@ def tangent(y: FloatArray, dt: float) -> Tangent | None:
     return Tangent(float(slopes[k]), max(float(lag), 0.0), k, k + count)
 
 
-def responses(
+def step_responses(
     fly: Fly,
     lower: FloatArray,
     upper: FloatArray,
@@ -133,7 +135,7 @@ def responses(
             except FlightEnded as error:
                 rejected.append(f"{name} by {step:.3g}: {error}")
                 continue
-            found = tangent(y[:, j], dt)
+            found = steepest_tangent(y[:, j], dt)
             if found is None:
                 rejected.append(f"{name} by {step:.3g}: {output} does not move")
                 continue
@@ -160,7 +162,7 @@ GUST_START = 50.0  # s
 MODERATE_WIND, MODERATE_SIGMA = 15.4, 3.05  # m/s, of moderate turbulence: 30 kt at 20 ft, MIL-F-8785C 3.7.3.4; 10 ft/s
 
 
-def reference(speed: float, authority: float) -> dict[str, Any]:
+def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
     """Parameters of the reference model for an aircraft of a trim speed (m/s) and an authority of its throttle (m/s^2).
 
         q   0.05 rad/s, or 1 g / speed where that is less, up and down for 1 s each: the path is as it was after each pair
@@ -189,7 +191,7 @@ def reference(speed: float, authority: float) -> dict[str, Any]:
     }
 
 
-def moderate(altitude: float) -> dict[str, Any]:
+def moderate_turbulence(altitude: float) -> dict[str, Any]:
     """Parameters of moderate turbulence at an altitude, m; at high altitude the intensity is 10 ft/s."""
     values: dict[str, Any] = {"altitude": max(altitude, LOWEST), "seed": 1}
     if altitude < HIGH:
@@ -210,16 +212,16 @@ class ManoeuvreResult(NamedTuple):
     largest: dict[str, float]  # abs(u) by input
 
 
-class Identified(NamedTuple):
+class IdentifiedAircraft(NamedTuple):
     """An aircraft, identified, and the scenario that flies it."""
 
-    point: FlightCondition
+    condition: FlightCondition
     trim: Trim
     responses: Responses
     coupling: float  # max abs(U - I), inputs of unit response, outputs in units of the manoeuvre
     selection: Selection
     text: str  # of the scenario file
-    zero: float  # 1/s, of sideslip with p and r held: positive, and Assumption 3 does not hold
+    sideslip_zero: float  # 1/s, of sideslip with p and r held: positive, and Assumption 3 does not hold
     flights: dict[str, ManoeuvreResult]  # "calm", "gust", "turbulence"
 
     @property
@@ -233,7 +235,7 @@ class Identified(NamedTuple):
         return _load(self.text)
 
     @property
-    def lost(self) -> str:
+    def failure(self) -> str:
         """Why it does not fly the manoeuvre; empty where it does: each flight to its end, calm with less error than command."""
         for title, one in self.flights.items():
             if one.outcome != COMPLETED:
@@ -242,7 +244,7 @@ class Identified(NamedTuple):
         return f"calm: the error of {', '.join(lost)} is larger than the command" if lost else ""
 
 
-def identify(name: str, speed: float, altitude: float, progress: Callable[[str], None] = lambda _: None) -> Identified:
+def identify(name: str, speed: float, altitude: float, progress: Callable[[str], None] = lambda _: None) -> IdentifiedAircraft:
     """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s, altitude in m.
 
     1. Trim, tried in another process first. 2. Step tests: `responses`. 3. The pairing, outputs scaled by the manoeuvre's
@@ -266,10 +268,10 @@ def identify(name: str, speed: float, altitude: float, progress: Callable[[str],
         return np.array(rows)
 
     outputs, inputs = tuple(OUTPUTS), tuple(INPUTS)
-    found = responses(fly, trim.lower, trim.upper, outputs, inputs, STEP, progress)
+    found = step_responses(fly, trim.lower, trim.upper, outputs, inputs, STEP, progress)
     throttle = inputs.index("throttle")
     authority = abs(found.Omega[throttle, throttle]) * min(-trim.lower[throttle], trim.upper[throttle])
-    commands = reference(speed, float(authority))
+    commands = reference_parameters(speed, float(authority))
     scaled = found.Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
     require_channels(scaled, ChannelPairing(outputs, inputs))
     studied = _study(point, found.Omega, commands)
@@ -280,17 +282,17 @@ def identify(name: str, speed: float, altitude: float, progress: Callable[[str],
 
     progress("slew of the inputs")
     first = select_gains(studied, setting)
-    turbulent = _load(scenario_text(first)).vary(aircraft={"turbulence": moderate(altitude)})
+    turbulent = _load(scenario_text(first)).vary(aircraft={"turbulence": moderate_turbulence(altitude)})
     tape = simulate(without_beta(turbulent))
     chosen = select_gains(studied._replace(slew=_slew(tape, found.lag)), setting)
     text = scenario_text(chosen)
     flights = fly_all(_load(text), progress)
-    return Identified(point, trim, found, coupling(scaled), chosen, text, sideslip_zero(point), flights)
+    return IdentifiedAircraft(point, trim, found, coupling(scaled), chosen, text, sideslip_zero(point), flights)
 
 
 def fly_all(scenario: Scenario, progress: Callable[[str], None] = lambda _: None) -> dict[str, ManoeuvreResult]:
     """Fly a scenario of `identify` three times: "calm", with its "gust", and in moderate "turbulence" without the gust."""
-    air = moderate(scenario.aircraft.flight_condition().altitude)
+    air = moderate_turbulence(scenario.aircraft.flight_condition().altitude)
     flights = {}
     for title, changes in (("calm", {"gusts": {}}), ("gust", {}), ("turbulence", {"gusts": {}, "turbulence": air})):
         progress(f"flight: {title}")
@@ -300,8 +302,8 @@ def fly_all(scenario: Scenario, progress: Callable[[str], None] = lambda _: None
 
 def flown(tape: Tape) -> ManoeuvreResult:
     """Figures of a tape: rms errors and the largest commands."""
-    _, error = known_error(tape)
-    rms = {name: error_figures(error[name]).rms for name in error.names}
+    _, error = best_error(tape)
+    rms = {name: error_metrics(error[name]).rms for name in error.names}
     largest = {name: float(np.max(np.abs(tape["u"][name]), initial=0.0)) for name in tape["u"].names}
     return ManoeuvreResult(tape.outcome, rms, largest)
 
@@ -311,9 +313,9 @@ def without_beta(scenario: Scenario) -> Scenario:
     return scenario.vary(controller={"beta": [1e-9] * len(scenario.controller.beta)})
 
 
-def _vehicle(point: FlightCondition) -> JsbsimVehicle:
+def _vehicle(point: FlightCondition) -> JsbsimModel:
     none = np.zeros(len(AXES))
-    return JsbsimVehicle(point, Actuators(), WindModel(Gusts(none, none, none + 1.0), None))
+    return JsbsimModel(point, Actuators(), WindModel(Gusts(none, none, none + 1.0), None))
 
 
 def _study(point: FlightCondition, Omega: FloatArray, commands: Mapping[str, Any]) -> Study:
@@ -332,7 +334,7 @@ def _study(point: FlightCondition, Omega: FloatArray, commands: Mapping[str, Any
         f"airframe {point.title}",
     )
     manoeuvre = Manoeuvre(ReferenceModelParameters.validate_mapping(commands, "reference_model"), {}, DURATION)
-    return study(airframe, manoeuvre, samples=SAMPLES)
+    return study_airframe(airframe, manoeuvre, samples=SAMPLES)
 
 
 def _setting(trim: Trim, lag: FloatArray) -> LoopSetting:
@@ -373,7 +375,7 @@ def _text(point: FlightCondition, trim: Trim, found: Responses, commands: Mappin
     diagonal = ", ".join(
         f"{output} by {name} {value:.3g}" for output, name, value in zip(OUTPUTS, INPUTS, np.diag(found.Omega), strict=True)
     )
-    shown_pulses = "\n".join(f"      {name}: {flow(one)}" for name, one in pulses.items())
+    shown_pulses = "\n".join(f"      {name}: {yaml_flow(one)}" for name, one in pulses.items())
     return f"""# SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 #
@@ -384,33 +386,33 @@ def _text(point: FlightCondition, trim: Trim, found: Responses, commands: Mappin
 
 /**/flight:
   ros__parameters:
-    duration: {flow(DURATION)}             # s
+    duration: {yaml_flow(DURATION)}             # s
 
 /**/aircraft:
   ros__parameters:
     airframe: {point.title}
-    speed: {flow(point.speed)}  # m/s, true airspeed in trim
-    altitude: {flow(point.altitude)}  # m, above sea level
-    rate: {flow(RATE)}                # Hz, y and truth
-    step: {flow(STEP)}                # s, of JSBSim
+    speed: {yaml_flow(point.speed)}  # m/s, true airspeed in trim
+    altitude: {yaml_flow(point.altitude)}  # m, above sea level
+    rate: {yaml_flow(RATE)}                # Hz, y and truth
+    step: {yaml_flow(STEP)}                # s, of JSBSim
     gusts:                     # 1-cosine; entry in s, peak speed in m/s (down), distance H to the peak in m
-      vertical: {flow({"start": GUST_START, "speed": GUST_SPEED, "length": GUST_LENGTH})}
-    # turbulence: {flow(moderate(point.altitude))}  # moderate, to fly in instead
+      vertical: {yaml_flow({"start": GUST_START, "speed": GUST_SPEED, "length": GUST_LENGTH})}
+    # turbulence: {yaml_flow(moderate_turbulence(point.altitude))}  # moderate, to fly in instead
     actuators:                 # elevator, throttle, aileron, rudder: deviations of the normalised commands from trim
-      lower: {flow(trim.lower.tolist())}
-      upper: {flow(trim.upper.tolist())}
+      lower: {yaml_flow(trim.lower.tolist())}
+      upper: {yaml_flow(trim.upper.tolist())}
 
 /**/reference_model:
   ros__parameters:
-    rate: {flow(RATE)}                # Hz
-    outputs: {flow(commands["outputs"])}
+    rate: {yaml_flow(RATE)}                # Hz
+    outputs: {yaml_flow(commands["outputs"])}
     second_order:
-      natural_frequency: {flow(filters["natural_frequency"])}  # rad/s; that of V asks for a third of the throttle's authority
-      damping: {flow(filters["damping"])}
-    rise: {flow(commands["rise"])}                  # s, edge of a pulse: bounds u_m_dot
+      natural_frequency: {yaml_flow(filters["natural_frequency"])}  # rad/s; that of V asks for a third of the throttle's authority
+      damping: {yaml_flow(filters["damping"])}
+    rise: {yaml_flow(commands["rise"])}                  # s, edge of a pulse: bounds u_m_dot
     pulses:                    # s, s, and rad/s or m/s
 {shown_pulses}
-    coordinated_turn: {flow(commands["coordinated_turn"])}  # r += g/V0 sin(bank commanded)
+    coordinated_turn: {yaml_flow(commands["coordinated_turn"])}  # r += g/V0 sin(bank commanded)
 
 # Omega and the lags are those of step tests; the slew behind beta is that of u with K and Lambda alone in moderate turbulence.
 {as_yaml(selection)}

@@ -55,7 +55,7 @@ class Evidence(NamedTuple):
     V2: FloatArray  # (N,), equation (48)
 
 
-def of_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples]:
+def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples]:
     """KnownPlant and flight of a scenario's tape at the ticks of the law, in its channel order and scaled inputs.
 
     Raises ValueError where a tick has no sample of `truth` or `y_m` at its stamp. The tape may come from the simulation in
@@ -136,7 +136,7 @@ def evidence(plant: KnownPlant, flight: FlightSamples, params: LawParams, zeta_b
     return Evidence(t, e, e_dot, r, N_d, L, V1, P, V1 + P)
 
 
-def decay(plant: KnownPlant, params: LawParams) -> FloatArray:
+def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
     """Q of V2_dot = -z' Q z along every flight of the continuous law, z = [e; r], symmetric, shape (2m, 2m).
 
     z' Q z = e' Lambda e - r' N~ + r' D U D K r with N~ = G (r - Lambda e) + e, G = M (C A C^+ + Lambda). Neither beta nor
