@@ -18,7 +18,7 @@ from benchmarks.sampling import new_table
 from rich.console import Console
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import matrices
+from aircraft_sim.uncertainty import sampled_matrices
 from control_laws import rise_di
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -76,7 +76,7 @@ def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray
     Also the speed of the loop in one process at the scenario's own step, aircraft-seconds per second.
     """
     course = build_course(scenario)
-    A, B = matrices(load_airframe(scenario.aircraft.airframe), PART, PART, SEED, 0, count)
+    A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), PART, PART, SEED, 0, count)
     flown = fleet.fly(
         fleet.assemble(A, B, scenario.aircraft.plant(), course),
         fleet.vehicle(scenario),

@@ -13,10 +13,10 @@ from aircraft_sim import plant
 from aircraft_sim.actuators import Actuators, step
 from aircraft_sim.dynamics import x_dot
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.plant import AircraftState, Plant, advance
+from aircraft_sim.plant import AircraftState, PlantParams, advance
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import error_figures, true_error
+from flight_analysis.metrics import error_metrics, true_error
 from flight_bringup.scenarios import find_scenario
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError
@@ -170,7 +170,7 @@ def test_no_command_moves_it_faster_than_its_rate_or_past_its_stops(
     assert np.abs(np.diff(history)).max() <= rate * 0.01 * (1.0 + 1e-9) + 1e-15
 
 
-def osprey(step_ms: float = 2.0, **actuators: list[float]) -> Plant:
+def osprey(step_ms: float = 2.0, **actuators: list[float]) -> PlantParams:
     values = {"airframe": "osprey", "rate": 100.0, "step": step_ms / 1e3, "actuators": actuators}
     return AircraftParameters.validate_mapping(values, "aircraft").plant()
 
@@ -239,7 +239,7 @@ def rms(scenario: Scenario) -> FloatArray:
     """Root mean square of the true error over the whole flight, q, V, p, r in mrad/s and m/s."""
     error = true_error(simulate(scenario))
     assert error is not None
-    return np.array([error_figures(error[name]).rms * factor for name, factor in SHOWN.items()])
+    return np.array([error_metrics(error[name]).rms * factor for name, factor in SHOWN.items()])
 
 
 def test_the_servo_scenario_softens_the_sign_of_its_own_accord(servo: Scenario) -> None:

@@ -17,7 +17,7 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.disturbance import Gusts, one_minus_cosine
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.plant import AircraftState, Plant, advance, initial_state
+from aircraft_sim.plant import AircraftState, PlantParams, advance, initial_state
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
@@ -30,7 +30,7 @@ def osprey(**gusts: dict[str, float]) -> Aircraft:
     return plant(**gusts).aircraft
 
 
-def plant(**gusts: dict[str, float]) -> Plant:
+def plant(**gusts: dict[str, float]) -> PlantParams:
     values = {"airframe": "osprey", "rate": 500.0, "step": 0.002, "gusts": gusts}
     return AircraftParameters.validate_mapping(values, "aircraft").plant()
 
@@ -167,7 +167,7 @@ def test_steps_taken_together_are_runge_kutta_steps_of_equation_1() -> None:
     for k, normal in enumerate(turbulence.normals(7 * T, T, air.seed)):
         t = 0.28 + 0.002 * k
         moved = actuators.step(position, u, 0.002, parts.actuators)
-        position = actuators.fail(t, position, moved, parts.actuators)
+        position = actuators.apply_faults(t, position, moved, parts.actuators)
         x_dot = partial(dynamics.x_dot, turbulence=turbulence.wind(z, air))
         x = rk4(x_dot, t, x, position, parts.aircraft, 0.002)
         z = turbulence.step(z, normal, air)

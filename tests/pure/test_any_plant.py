@@ -17,7 +17,7 @@ from aircraft_sim import dynamics, plant
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
-from aircraft_sim.plant import AircraftState, Plant
+from aircraft_sim.plant import AircraftState, PlantParams
 from flight_core.integrators import rk4
 from flight_core.rates import nanoseconds
 from flight_core.vectors import FloatArray
@@ -145,7 +145,7 @@ def fly(task: Task, law: LawParams, dt: float, bound: float = 100.0) -> FloatArr
     """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above the bound: there the flight ends."""
     period_ns, m = nanoseconds(dt), len(task.D)
     ideal = Actuators(np.zeros(m), np.full(m, -np.inf), np.full(m, np.inf), np.full(m, np.inf))
-    hardware = Plant(task.aircraft, ideal, period_ns)
+    hardware = PlantParams(task.aircraft, ideal, period_ns)
     y = task.reference.at(0.0) + task.e_0
     flying, u = AircraftState(task.rotation[:, :m] @ y, np.zeros(m)), np.zeros(m)
     state = rise.engage(y, task.reference.at(0.0))

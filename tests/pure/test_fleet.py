@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import matrices
+from aircraft_sim.uncertainty import sampled_matrices
 from control_laws import rise_di
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -45,7 +45,7 @@ class Flight(NamedTuple):
 def flown(scenario: Scenario, part: float = 0.3, seed: int = 5) -> fleet.FleetResult:
     """The aircraft NUMBERS of a seed, as a fleet."""
     course = build_course(scenario)
-    A, B = matrices(load_airframe(scenario.aircraft.airframe), part, part, seed, NUMBERS[0], len(NUMBERS))
+    A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), part, part, seed, NUMBERS[0], len(NUMBERS))
     ships = fleet.assemble(A, B, scenario.aircraft.plant(), course)
     control_law, params = rise_di.control_law(scenario.controller.law().sign), rise_di.params(scenario.controller)
     return fleet.fly(ships, fleet.vehicle(scenario), course, control_law, params)
@@ -126,7 +126,7 @@ def test_each_aircraft_of_a_fleet_flies_what_it_flies_alone(scenario: Scenario) 
 
 def test_every_aircraft_may_have_its_own_gains_wind_and_delay() -> None:
     course, vehicle, plant = build_course(SERVO), fleet.vehicle(SERVO), SERVO.aircraft.plant()
-    A, B = matrices(load_airframe("osprey"), 0.3, 0.3, 5, 0, 1)
+    A, B = sampled_matrices(load_airframe("osprey"), 0.3, 0.3, 5, 0, 1)
     control_law, params = rise_di.control_law(SERVO.controller.law().sign), rise_di.params(SERVO.controller)
     wind, late = np.array([1.0, 0.0, 1.0, 1.0]), np.array([0, 0, 2, 0])
     beta = params.beta * np.array([1.0, 1.0, 1.0, 0.5])
@@ -159,7 +159,7 @@ def _pulse(delay: int) -> ControlLaw:
 def test_a_late_u_acts_as_many_ticks_later() -> None:
     calm = SERVO.vary(aircraft={"gusts": {}}, flight={"duration": 2.0})
     course, vehicle, plant = build_course(calm), fleet.vehicle(calm), calm.aircraft.plant()
-    A, B = matrices(load_airframe("osprey"), 0.0, 0.0, 1, 0, 1)
+    A, B = sampled_matrices(load_airframe("osprey"), 0.0, 0.0, 1, 0, 1)
     late = fleet.fly(fleet.assemble(A, B, plant, course, late=3), vehicle, course, _pulse(0), ())
     later = fleet.fly(fleet.assemble(A, B, plant, course), vehicle, course, _pulse(3), ())
     for name in ("rms", "max"):
@@ -169,7 +169,7 @@ def test_a_late_u_acts_as_many_ticks_later() -> None:
 
 def test_an_aircraft_that_diverges_says_so_and_leaves_the_others_alone() -> None:
     course, vehicle, plant = build_course(SERVO), fleet.vehicle(SERVO), SERVO.aircraft.plant()
-    A, B = matrices(load_airframe("osprey"), 0.0, 0.0, 1, 0, 2)
+    A, B = sampled_matrices(load_airframe("osprey"), 0.0, 0.0, 1, 0, 2)
     B = B * np.array([1.0, -1.0])[:, None, None]  # every sign wrong: the law drives it away
     vehicle = vehicle._replace(actuators=vehicle.actuators._replace(lower=None, upper=None, rate=None))
     params = rise_di.params(SERVO.controller)

@@ -157,6 +157,7 @@ def test_the_command_line_shows_its_help_without_loading_what_commands_need() ->
         ("reference_model", {"scipy", "jsbsim", "plotly", "jax", "rosbags"}),
         ("autopilot_bridge", {"scipy", "jsbsim", "plotly", "jax", "rosbags"}),
         ("flight_recorder", {"scipy", "jsbsim", "plotly", "jax", "rosbags"}),
+        ("aircraft_sim", {"scipy", "jsbsim", "plotly", "jax", "rosbags"}),
     ],
 )
 def test_a_node_loads_nothing_heavy_that_it_does_not_need(node: str, heavy: set[str]) -> None:

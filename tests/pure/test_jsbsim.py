@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft of JSBSim behind the vehicle's interface: trim, signs, wind, repeatability, and every way it can go wrong."""
+"""Aircraft of JSBSim as flight dynamics models: trim, signs, wind, repeatability, process isolation, and every failure."""
 
 import ctypes
 import math
@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aircraft_sim import guarded, jsbsim_plant
+from aircraft_sim import isolated, jsbsim_trim
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, Gusts
-from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, STATES, Command, FlightCondition, JsbsimVehicle, WindModel, sideslip_zero
+from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, OUTPUTS, STATES, Command, FlightCondition, WindModel
+from aircraft_sim.jsbsim_model import JsbsimModel
+from aircraft_sim.jsbsim_trim import sideslip_zero
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.simulate import simulate
@@ -28,22 +30,22 @@ from flight_core.vectors import FloatArray
 
 STEP_NS = 5_000_000
 CESSNA = FlightCondition("c172p", 46.3, 1219.2, STEP_NS)
-NONE = np.zeros(len(AXES))
-STILL = WindModel(Gusts(NONE, NONE, NONE + 1.0), None)
+ZEROS = np.zeros(len(AXES))
+NO_WIND = WindModel(Gusts(ZEROS, ZEROS, ZEROS + 1.0), None)
 SECTION: dict[str, Any] = {"airframe": "jsbsim:c172p", "speed": 46.3, "altitude": 1219.2, "rate": 200.0, "step": 0.005}
 
 
-def cessna(air: WindModel = STILL, point: FlightCondition = CESSNA) -> JsbsimVehicle:
-    return JsbsimVehicle(point, Actuators(), air)
+def cessna(wind_model: WindModel = NO_WIND, condition: FlightCondition = CESSNA) -> JsbsimModel:
+    return JsbsimModel(condition, Actuators(), wind_model)
 
 
-def flown(vehicle: JsbsimVehicle, u: FloatArray, duration: float) -> dict[str, FloatArray]:
+def fly(model: JsbsimModel, u: FloatArray, duration: float) -> dict[str, FloatArray]:
     """Truth by channel, one row a step, with u held."""
-    rows = [vehicle.truth(0)]
+    rows = [model.truth(0)]
     for k in range(round(duration * 1e9) // STEP_NS):
-        vehicle.advance(k * STEP_NS, u, STEP_NS)
-        rows.append(vehicle.truth((k + 1) * STEP_NS))
-    return dict(zip(vehicle.truth_names, np.array(rows).T, strict=True))
+        model.advance(k * STEP_NS, u, STEP_NS)
+        rows.append(model.truth((k + 1) * STEP_NS))
+    return dict(zip(model.truth_names, np.array(rows).T, strict=True))
 
 
 def command(**values: float) -> FloatArray:
@@ -52,45 +54,47 @@ def command(**values: float) -> FloatArray:
 
 def one_gust(axis: str, speed: float, length: float) -> WindModel:
     strength = np.array([speed * (name == axis) for name in AXES])
-    return WindModel(Gusts(NONE, strength, NONE + length), None)
+    return WindModel(Gusts(ZEROS, strength, ZEROS + length), None)
 
 
 # Trim
 
 
 @pytest.mark.parametrize(
-    "point",
-    # JSBSim's own trim; one that it does not find, for the engine of c182 does not run in it; and DHC6, where what it finds
-    # does not last, for the turboprops are not settled.
+    "condition",
+    # c172p: JSBSim's own trim. c182: JSBSim's trim fails, because the engine does not run in it. DHC6: JSBSim's trim does not
+    # last, because the turboprops have not settled.
     [CESSNA, FlightCondition("c182", 56.6, 1219.2, STEP_NS), FlightCondition("DHC6", 66.9, 1828.8, STEP_NS)],
-    ids=lambda point: point.name,
+    ids=lambda condition: condition.name,
 )
-def test_trim_is_an_equilibrium_that_lasts(point: FlightCondition) -> None:
-    # JSBSim's own trim stops at 3e-4 m/s^2 and 1e-4 rad/s^2. Left alone for 5 s, residuals of that size come to 1e-3 m/s and
-    # 5e-4 rad/s at most, and 4 mm to a few cm of altitude; where DHC6 is left in JSBSim's own trim it loses 1 m/s.
-    vehicle = cessna(point=point)
-    assert np.max(np.abs(vehicle.trim.residuals[:3])) < 3e-3
-    assert np.max(np.abs(vehicle.trim.residuals[3:])) < 3e-4
-    truth = flown(vehicle, command(), 5.0)
+def test_trim_is_an_equilibrium_that_lasts(condition: FlightCondition) -> None:
+    # JSBSim's own trim stops at 3e-4 m/s^2 and 1e-4 rad/s^2. Over 5 s without control, residuals of that size give at most
+    # 1e-3 m/s, 5e-4 rad/s, and 4 mm to a few cm of altitude. DHC6 in JSBSim's own trim loses 1 m/s.
+    model = cessna(condition=condition)
+    assert np.max(np.abs(model.trim.residuals[:3])) < 3e-3
+    assert np.max(np.abs(model.trim.residuals[3:])) < 3e-4
+    truth = fly(model, command(), 5.0)
     assert np.max(np.abs(truth["x.V"])) < 0.01
     assert max(np.max(np.abs(truth[f"x.{name}"])) for name in ("p", "q", "r")) < 5e-4
     assert np.max(np.abs(truth["x.altitude"])) < 0.1
 
 
 def test_in_trim_every_deviation_is_zero() -> None:
-    vehicle = cessna()
+    model = cessna()
     # To rounding: altitude is a difference of radii of 6.4e6 m, whose last digit is 1e-9 m.
-    assert np.max(np.abs(vehicle.y())) < 1e-12
-    assert np.max(np.abs(vehicle.truth(0))) < 1e-8
-    assert vehicle.trim.states[list(STATES).index("V")] == pytest.approx(46.3, rel=1e-6)
-    assert vehicle.trim.states[list(STATES).index("altitude")] == pytest.approx(1219.2, rel=1e-6)
+    assert np.max(np.abs(model.y())) < 1e-12
+    assert np.max(np.abs(model.truth(0))) < 1e-8
+    assert model.trim.states[list(STATES).index("V")] == pytest.approx(46.3, rel=1e-6)
+    assert model.trim.states[list(STATES).index("altitude")] == pytest.approx(1219.2, rel=1e-6)
 
 
 def test_end_stops_are_those_of_the_whole_command() -> None:
     trim = cessna().trim
-    assert trim.commands + trim.upper == pytest.approx([1.0, 1.0, 1.0, 1.0])  # the nose-down pitch trim takes of the elevator
+    assert trim.commands + trim.upper == pytest.approx(
+        [1.0, 1.0, 1.0, 1.0]
+    )  # the nose-down pitch trim uses a part of the elevator
     assert trim.commands[1] + trim.lower[1] == pytest.approx(0.0)
-    assert trim.lower[0] == -1.0  # the other way the stick itself is at its stop first
+    assert trim.lower[0] == -1.0  # the other way the stick reaches its own stop first
 
 
 # The channel map
@@ -105,30 +109,29 @@ def test_end_stops_are_those_of_the_whole_command() -> None:
         ("rudder", "r", -1.0, 0.2),  # nose left
     ],
 )
-def test_a_positive_command_does_what_the_table_says(name: str, output: str, sign: float, duration: float) -> None:
-    truth = flown(cessna(), command(**{name: 0.1}), duration)
-    own = sign * truth[f"x.{output}"][-1]
-    # A tenth of the travel for this long moves its own output by 0.016 (the rudder's) to 0.08 rad/s, or 0.07 m/s.
-    assert own > 0.01
+def test_a_positive_command_has_the_sign_of_the_table(name: str, output: str, sign: float, duration: float) -> None:
+    truth = fly(cessna(), command(**{name: 0.1}), duration)
+    # A tenth of the travel for this long moves its own output by 0.016 (rudder) to 0.08 rad/s, or 0.07 m/s.
+    assert sign * truth[f"x.{output}"][-1] > 0.01
     rates = {one: abs(truth[f"x.{one}"][-1]) for one in ("q", "p", "r")}
     assert output == "V" or max(rates, key=lambda one: rates[one]) == output
 
 
 def test_every_engine_gets_the_throttle() -> None:
-    # On a twin one engine alone would yaw: both at once leave r where it was.
-    truth = flown(cessna(point=FlightCondition("737", 154.3, 6096.0, STEP_NS)), command(throttle=0.1), 1.0)
+    # One engine of a twin alone would yaw the aircraft. Both together leave r unchanged.
+    truth = fly(cessna(condition=FlightCondition("737", 154.3, 6096.0, STEP_NS)), command(throttle=0.1), 1.0)
     assert truth["x.V"][-1] > 0.05
     assert np.max(np.abs(truth["x.r"])) < 1e-6
 
 
 @pytest.mark.parametrize(
     ("axis", "state", "scale"),
-    # A wind w along x, y, z of the flight path is -w of airspeed, -w/V0 of sideslip, -w/V0 of alpha.
+    # A wind w along x, y, z of the flight path adds -w to airspeed, -w/V0 to sideslip, -w/V0 to alpha.
     [("longitudinal", "V", -1.0), ("lateral", "beta", -1.0 / 46.3), ("vertical", "alpha", -1.0 / 46.3)],
 )
-def test_wind_is_felt_along_the_axes_of_trim(axis: str, state: str, scale: float) -> None:
-    # The whole gust is passed within 0.1 s: at its peak the aircraft itself has hardly moved (alpha' about 4 1/s: a fifth).
-    truth = flown(cessna(one_gust(axis, 2.0, 46.3 * 0.05)), command(), 0.05)
+def test_wind_acts_along_the_axes_of_trim(axis: str, state: str, scale: float) -> None:
+    # The gust lasts 0.1 s: at its peak the aircraft itself has hardly moved (alpha responds at about 4 1/s: a fifth).
+    truth = fly(cessna(one_gust(axis, 2.0, 46.3 * 0.05)), command(), 0.05)
     peak = truth[f"gust.{axis}"][-1]
     assert peak == pytest.approx(2.0, rel=0.01)
     assert truth[f"x.{state}"][-1] == pytest.approx(scale * peak, rel=0.2)
@@ -137,100 +140,104 @@ def test_wind_is_felt_along_the_axes_of_trim(axis: str, state: str, scale: float
 
 
 def test_the_wind_turns_with_the_heading() -> None:
-    vehicle = cessna(one_gust("lateral", 2.0, 46.3 * 0.05))
-    node = vehicle._node("attitude/psi-rad")
-    vehicle._fdm["ic/psi-true-deg"] = 90.0
-    vehicle._fdm.run_ic()
+    model = cessna(one_gust("lateral", 2.0, 46.3 * 0.05))
+    node = model._node("attitude/psi-rad")
+    model._fdm["ic/psi-true-deg"] = 90.0
+    model._fdm.run_ic()
     assert node.get_double_value() == pytest.approx(math.pi / 2.0)
-    vehicle.advance(0, command(), 10 * STEP_NS)
-    # Heading east, wind to the right is wind to the south.
-    assert vehicle._fdm["atmosphere/wind-north-fps"] * jsbsim_plant.FOOT == pytest.approx(-2.0, rel=0.01)
-    assert vehicle._fdm["atmosphere/wind-east-fps"] == pytest.approx(0.0, abs=1e-2)
+    model.advance(0, command(), 10 * STEP_NS)
+    # The aircraft heads east, so wind to the right blows to the south.
+    assert model._fdm["atmosphere/wind-north-fps"] * FOOT == pytest.approx(-2.0, rel=0.01)
+    assert model._fdm["atmosphere/wind-east-fps"] == pytest.approx(0.0, abs=1e-2)
 
 
-def test_turbulence_is_felt_from_the_first_sample_on() -> None:
+def test_turbulence_acts_from_the_first_sample_on() -> None:
     values = SECTION | {"turbulence": {"altitude": 1219.2, "sigma": 3.05, "seed": 1}}
     simulator = Simulator(AircraftParameters.validate_mapping(values, "aircraft"))
     simulator.sample(0, command())
     truth = dict(zip(simulator.truth_names, simulator.truth(), strict=True))
     assert abs(truth["gust.longitudinal"]) > 0.1
-    # Airspeed is the length of flight less wind, flight being 46.3 m/s along the first axis.
+    # Airspeed is the norm of ground velocity less wind; the ground velocity is 46.3 m/s along the first axis.
     wind = np.array([truth[f"gust.{axis}"] for axis in AXES])
     assert 46.3 + truth["x.V"] == pytest.approx(float(np.linalg.norm([46.3, 0.0, 0.0] - wind)), rel=1e-3)
 
 
-def test_actuators_stand_before_the_aircraft() -> None:
-    # Stuck from the start, the aileron does nothing; a lag of 0.1 s has let 63 % through after 0.1 s.
-    stuck = JsbsimVehicle(CESSNA, Actuators(stuck_at=np.array([np.inf, np.inf, 0.0, np.inf])), STILL)
-    truth = flown(stuck, command(aileron=0.1), 0.5)
+def test_actuators_act_before_the_aircraft() -> None:
+    # An aileron stuck from the start has no effect. A lag of 0.1 s passes 63 % after 0.1 s.
+    stuck = JsbsimModel(CESSNA, Actuators(stuck_at=np.array([np.inf, np.inf, 0.0, np.inf])), NO_WIND)
+    truth = fly(stuck, command(aileron=0.1), 0.5)
     assert np.max(np.abs(truth["x.p"])) < 1e-4
-    slow = JsbsimVehicle(CESSNA, Actuators(lag=np.full(4, 0.1)), STILL)
-    assert flown(slow, command(aileron=0.1), 0.1)["actuator.aileron"][-1] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)))
+    slow = JsbsimModel(CESSNA, Actuators(lag=np.full(4, 0.1)), NO_WIND)
+    assert fly(slow, command(aileron=0.1), 0.1)["actuator.aileron"][-1] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)))
 
 
-# Repeatability, silence
+# Repeatability, console output
 
 
 def test_two_flights_agree_to_the_last_bit() -> None:
     u = command(elevator=-0.05, throttle=0.1, aileron=0.1, rudder=0.02)
-    first, second = (flown(cessna(one_gust("vertical", 5.0, 30.0)), u, 3.0) for _ in range(2))
+    first, second = (fly(cessna(one_gust("vertical", 5.0, 30.0)), u, 3.0) for _ in range(2))
     assert all(np.array_equal(first[name], second[name]) for name in first)
 
 
 def test_a_flight_in_another_process_agrees_to_the_last_bit() -> None:
-    # c182 needs the solver's trim: it is found in a third process, and both follow what that found.
+    # c182 needs the solver's trim. A third process finds it, and both apply its result.
     code = (
         "from tests.pure.test_jsbsim import *\n"
-        "truth = flown(cessna(point=FlightCondition('c182', 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)\n"
+        "truth = fly(cessna(condition=FlightCondition('c182', 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)\n"
         "print(np.array(list(truth.values())).tobytes().hex())\n"
     )
     root = Path(__file__).resolve().parents[2]
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root).stdout
-    truth = flown(cessna(point=FlightCondition("c182", 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)
-    assert said.strip() == np.array(list(truth.values())).tobytes().hex()
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root).stdout
+    truth = fly(cessna(condition=FlightCondition("c182", 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)
+    assert output.strip() == np.array(list(truth.values())).tobytes().hex()
 
 
 def test_nothing_is_printed_and_nothing_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    flown(cessna(point=FlightCondition("global5000", 169.8, 7620.0, STEP_NS)), command(), 0.1)  # writes a table if it is let
+    fly(
+        cessna(condition=FlightCondition("global5000", 169.8, 7620.0, STEP_NS)), command(), 0.1
+    )  # its model asks for a table as output
     assert not list(tmp_path.iterdir())
     assert capfd.readouterr() == ("", "")
 
 
-# What can go wrong
+# Failures
 
 
-def test_a_crash_in_the_guarded_process_is_survived() -> None:
-    with pytest.raises(guarded.Crashed, match="died of SIGSEGV"):
-        guarded.call(ctypes.string_at, 0, timeout=30.0)
+def test_a_crash_in_the_isolated_process_is_an_error_here() -> None:
+    with pytest.raises(isolated.IsolatedCallError, match="was killed by SIGSEGV"):
+        isolated.call(ctypes.string_at, 0, timeout=30.0)
 
 
-def test_a_hang_in_the_guarded_process_is_survived() -> None:
+def test_a_hang_in_the_isolated_process_times_out() -> None:
     started = time.monotonic()
-    with pytest.raises(guarded.Crashed, match=r"gave no answer within 2 s"):
-        guarded.call(time.sleep, 60, timeout=2.0)
+    with pytest.raises(isolated.IsolatedCallError, match=r"timed out after 2 s"):
+        isolated.call(time.sleep, 60, timeout=2.0)
     assert time.monotonic() - started < 20.0
 
 
-def test_an_exception_or_an_exit_in_the_guarded_process_is_told() -> None:
-    with pytest.raises(guarded.Crashed, match=r"ended with status 1 \(ValueError: "):
-        guarded.call(math.sqrt, -1.0, timeout=30.0)
-    with pytest.raises(guarded.Crashed, match=r"ended with status 5"):
-        guarded.call(os._exit, 5, timeout=30.0)
-    assert guarded.call(math.hypot, 3.0, 4.0, timeout=30.0) == 5.0
+def test_an_exception_or_an_exit_in_the_isolated_process_is_reported() -> None:
+    with pytest.raises(isolated.IsolatedCallError, match=r"exited with status 1 \(ValueError: "):
+        isolated.call(math.sqrt, -1.0, timeout=30.0)
+    with pytest.raises(isolated.IsolatedCallError, match=r"exited with status 5"):
+        isolated.call(os._exit, 5, timeout=30.0)
+    assert isolated.call(math.hypot, 3.0, 4.0, timeout=30.0) == 5.0
 
 
-def test_a_flight_in_one_process_survives_an_aircraft_that_crashes(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = guarded.call
-    monkeypatch.setattr(guarded, "call", lambda *_, timeout: real(ctypes.string_at, 0, timeout=timeout))
-    scenario = find_scenario("jsbsim_c172p").vary(aircraft={"speed": 47.11})  # a condition that no other test has trimmed
-    assert simulate(scenario).outcome == "jsbsim:c172p cannot be flown: JSBSim died of SIGSEGV"
+def test_a_crash_of_jsbsim_ends_a_flight_in_one_process_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = isolated.call
+    monkeypatch.setattr(isolated, "call", lambda *_, timeout: real(ctypes.string_at, 0, timeout=timeout))
+    scenario = find_scenario("jsbsim_c172p").vary(
+        aircraft={"speed": 47.11}
+    )  # no other test has cached the trim of this condition
+    assert simulate(scenario).outcome == "jsbsim:c172p cannot be flown: JSBSim was killed by SIGSEGV"
 
 
 @pytest.mark.parametrize(
-    ("point", "sentence"),
+    ("condition", "sentence"),
     [
         (
             CESSNA._replace(speed=20.0),
@@ -239,7 +246,7 @@ def test_a_flight_in_one_process_survives_an_aircraft_that_crashes(monkeypatch: 
         (FlightCondition("pa28", 51.0, 1219.2, STEP_NS), r"^jsbsim:pa28 does not trim at .*: engine 1 cannot be started$"),
         (
             FlightCondition("SGS", 25.0, 900.0, STEP_NS),
-            r"^jsbsim:SGS has no engine, so nothing to fly V with: no fcs/throttle-cmd-norm\[0\]$",
+            r"^jsbsim:SGS has no engine to control V with: no fcs/throttle-cmd-norm\[0\]$",
         ),
         (
             FlightCondition("dr1", 41.0, 900.0, STEP_NS),
@@ -249,38 +256,38 @@ def test_a_flight_in_one_process_survives_an_aircraft_that_crashes(monkeypatch: 
     ],
     ids=["stalled", "engine", "glider", "property", "empty"],
 )
-def test_what_does_not_trim_ends_in_one_sentence(point: FlightCondition, sentence: str) -> None:
+def test_a_condition_without_trim_is_refused_in_one_sentence(condition: FlightCondition, sentence: str) -> None:
     with pytest.raises(FlightEnded, match=sentence) as ended:
-        cessna(point=point)
+        cessna(condition=condition)
     assert "\n" not in str(ended.value)
 
 
 def test_a_property_that_does_not_exist_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    cessna()  # the recipe is found with the real table
+    cessna()  # caches the trim found with the real table
     wrong = dict(INPUTS) | {"rudder": Command("fcs/ruder-cmd-norm", None, -1.0, 1.0, False, "nose left")}
-    monkeypatch.setattr(jsbsim_plant, "INPUTS", wrong)
+    monkeypatch.setattr(jsbsim_trim, "INPUTS", wrong)
     with pytest.raises(FlightEnded, match=r"^jsbsim:c172p cannot be flown: it has no property fcs/ruder-cmd-norm$"):
         cessna()
 
 
 def test_the_ground_ends_a_flight() -> None:
     with pytest.raises(FlightEnded, match=r"^jsbsim:c172p hit the ground at t = \d"):
-        flown(cessna(point=CESSNA._replace(altitude=15.0)), command(elevator=0.3), 10.0)
+        fly(cessna(condition=CESSNA._replace(altitude=15.0)), command(elevator=0.3), 10.0)
 
 
 def test_an_engine_that_stops_ends_a_flight() -> None:
-    vehicle = cessna()
+    model = cessna()
     for i in range(2):
-        vehicle._fdm[f"propulsion/tank[{i}]/contents-lbs"] = 0.0
+        model._fdm[f"propulsion/tank[{i}]/contents-lbs"] = 0.0
     with pytest.raises(FlightEnded, match=r"^jsbsim:c172p: engine 1 stopped at t = \d"):
-        flown(vehicle, command(), 1.0)
+        fly(model, command(), 1.0)
 
 
-def test_a_state_beyond_anything_counts_as_diverged() -> None:
-    vehicle = cessna()
-    assert not vehicle.diverged()
-    vehicle._x = np.array([np.nan, *np.zeros(len(STATES) - 1)])
-    assert vehicle.diverged()
+def test_a_state_that_is_not_finite_counts_as_diverged() -> None:
+    model = cessna()
+    assert not model.diverged()
+    model._x = np.array([np.nan, *np.zeros(len(STATES) - 1)])
+    assert model.diverged()
 
 
 # Parameters
@@ -305,14 +312,14 @@ def test_parameters_that_do_not_fit_are_refused(changes: dict[str, Any], sentenc
         AircraftParameters.validate_mapping(SECTION | changes, "aircraft")
 
 
-def test_channels_are_those_of_the_tables() -> None:
+def test_channels_match_the_tables() -> None:
     channels = AircraftParameters.validate_mapping(SECTION, "aircraft").channels()
     assert list(channels.outputs) == list(OUTPUTS) == ["q", "V", "p", "r"]
     assert channels.inputs == {"elevator": "1", "throttle": "1", "aileron": "1", "rudder": "1"}
     assert channels.speed == 46.3
 
 
-def test_sideslip_of_the_f15_grows_when_its_rates_are_held() -> None:
-    # Flown with p and r held (docs/experiments.md), its sideslip goes from 0.023 to 0.063 rad in 5 s: 0.20 1/s.
+def test_sideslip_of_the_f15_grows_while_its_rates_are_held() -> None:
+    # In flight with p and r held (docs/experiments.md), sideslip grows from 0.023 to 0.063 rad in 5 s: 0.20 1/s.
     assert sideslip_zero(FlightCondition("f15", 180.06, 4572.0, STEP_NS)) == pytest.approx(0.20, abs=0.05)
     assert sideslip_zero(CESSNA) < 0.0

@@ -9,11 +9,11 @@ import pytest
 
 from aircraft_sim import sensors as sensor_maths
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.sensors import Drift, Sensors, Underway, arrives, initial_drift, measure, noise, transmit, walk
-from aircraft_sim.simulator import AirframeVehicle, Simulator
+from aircraft_sim.sensors import Drift, Sensors, DelayLine, arrives, initial_drift, measure, noise, transmit, walk
+from aircraft_sim.simulator import StateSpaceModel, Simulator
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import error_figures, known_error, tracking_error, true_error
+from flight_analysis.metrics import error_metrics, best_error, tracking_error, true_error
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
@@ -98,10 +98,10 @@ def test_without_dropout_every_sample_arrives() -> None:
 
 def test_a_delay_shifts_the_arrival_by_whole_samples_and_keeps_the_stamp() -> None:
     params = sensors(NOISE, delay_ms=4)
-    underway: Underway = ()
+    delay_line: DelayLine = ()
     history = []
     for k in range(5):
-        underway, arrived = transmit(underway, 2 * k * MS, np.array([float(k)]), params)
+        delay_line, arrived = transmit(delay_line, 2 * k * MS, np.array([float(k)]), params)
         history.append([(sample.stamp_ns // MS, float(sample.value[0])) for sample in arrived])
     assert history == [[], [], [(0, 0.0)], [(2, 1.0)], [(4, 2.0)]]
 
@@ -113,27 +113,27 @@ def test_without_delay_a_sample_arrives_at_its_instant() -> None:
 
 def test_a_lost_sample_leaves_a_hole_and_holds_nothing_up() -> None:
     params = sensors(NOISE, delay_ms=2)
-    underway, _ = transmit((), 0, np.array([0.0]), params)
-    underway, arrived = transmit(underway, 2 * MS, None, params)
+    delay_line, _ = transmit((), 0, np.array([0.0]), params)
+    delay_line, arrived = transmit(delay_line, 2 * MS, None, params)
     assert [sample.stamp_ns for sample in arrived] == [0]
-    underway, arrived = transmit(underway, 4 * MS, np.array([2.0]), params)
+    delay_line, arrived = transmit(delay_line, 4 * MS, np.array([2.0]), params)
     assert arrived == ()
 
 
 def test_samples_that_fell_due_while_nobody_looked_arrive_together_oldest_first() -> None:
     # A node that missed ticks.
     params = sensors(NOISE, delay_ms=2)
-    underway, _ = transmit((), 0, np.array([0.0]), params)
-    underway, _ = transmit(underway, MS, np.array([1.0]), params)
-    underway, arrived = transmit(underway, 9 * MS, np.array([9.0]), params)
+    delay_line, _ = transmit((), 0, np.array([0.0]), params)
+    delay_line, _ = transmit(delay_line, MS, np.array([1.0]), params)
+    delay_line, arrived = transmit(delay_line, 9 * MS, np.array([9.0]), params)
     assert [sample.stamp_ns for sample in arrived] == [0, MS]
-    assert [sample.stamp_ns for sample in underway] == [9 * MS]
+    assert [sample.stamp_ns for sample in delay_line] == [9 * MS]
 
 
 def test_a_measured_sample_is_the_output_with_its_noise_or_nothing() -> None:
     values = {"airframe": "osprey", "rate": 100.0, "step": 0.01, "sensors": {"noise": NOISE, "dropout": 0.5}}
     parameters = AircraftParameters.validate_mapping(values, "aircraft")
-    simulator, flying = Simulator(parameters), AirframeVehicle(parameters)
+    simulator, flying = Simulator(parameters), StateSpaceModel(parameters)
     u = np.array([0.01, 0.1, 0.02, 0.03])
     arrivals = []
     for k in range(20):
@@ -266,7 +266,7 @@ def rms(tape: Tape) -> FloatArray:
     """Root mean square of the true error over the whole flight, q, V, p, r in mrad/s and m/s."""
     error = true_error(tape)
     assert error is not None
-    return np.array([error_figures(error[name]).rms * factor for name, factor in SHOWN.items()])
+    return np.array([error_metrics(error[name]).rms * factor for name, factor in SHOWN.items()])
 
 
 def test_truth_knows_the_noise_of_every_sample_also_of_those_that_are_lost(servo: Scenario) -> None:
@@ -298,9 +298,9 @@ def test_the_true_error_leaves_out_the_noise_that_the_measured_error_holds(servo
     assert true is not None
     for name in true.names:
         assert measured[name] - true[name] == pytest.approx(tape["truth"][f"noise.{name}"], abs=1e-15)
-    assert known_error(tape)[0] == "true error"
+    assert best_error(tape)[0] == "true error"
     seen = {topic: signal for topic, signal in tape.signals.items() if topic != "truth"}
-    assert known_error(Tape(seen))[0] == "measured error"
+    assert best_error(Tape(seen))[0] == "measured error"
     assert true_error(Tape(seen)) is None
 
 

@@ -19,7 +19,7 @@ from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import LIBRARY
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
-from aircraft_sim.plant import Plant
+from aircraft_sim.plant import PlantParams
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_figures, true_error
@@ -112,7 +112,7 @@ def fly(aircraft: Aircraft, law: LawParams, y_m: list[FloatArray], dt: float, bo
     """The errors e at 0, dt, 2 dt, ... from trim, shape (ticks, m), until one is above the bound: there the flight ends."""
     period_ns, m = nanoseconds(dt), len(law.K)
     ideal = Actuators(np.zeros(m), np.full(m, -np.inf), np.full(m, np.inf), np.full(m, np.inf))
-    hardware = Plant(aircraft, ideal, period_ns)
+    hardware = PlantParams(aircraft, ideal, period_ns)
     flying, u = plant.initial_state(hardware), np.zeros(m)
     state = rise.engage(dynamics.y(flying.x, aircraft), y_m[0])
     errors = [state.e]

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from aircraft_sim import plant, turbulence
 from aircraft_sim.disturbance import AXES
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.plant import Plant
+from aircraft_sim.plant import PlantParams
 from aircraft_sim.simulator import Simulator
 from aircraft_sim.turbulence import Dryden, Turbulence, dryden, filters
 from flight_core.parameters import ParameterError
@@ -301,7 +301,7 @@ def test_an_airframe_meets_the_axes_that_it_knows() -> None:
     )
 
 
-def parts_of(section: dict[str, Any], airframe: str = "osprey") -> Plant:
+def parts_of(section: dict[str, Any], airframe: str = "osprey") -> PlantParams:
     values = {"airframe": airframe, "rate": 100.0, "step": 0.002, "turbulence": section}
     return AircraftParameters.validate_mapping(values, "aircraft").plant()
 

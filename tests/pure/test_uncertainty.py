@@ -11,7 +11,7 @@ from scipy.stats import kstest
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.uncertainty import as_yaml, draw, uncertain
+from aircraft_sim.uncertainty import as_yaml, nominal_and_sampled, sample_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
@@ -27,7 +27,7 @@ def parts(drawn: FloatArray, published: FloatArray) -> FloatArray:
 
 def test_entries_are_spread_evenly_and_independently() -> None:
     # Of 2000 draws of A's entry q, q: uniform on +-0.3. The Kolmogorov-Smirnov test refuses one seed in a hundred.
-    A, B = uncertain(OSPREY, 0.3, 2000, seed=3)
+    A, B = nominal_and_sampled(OSPREY, 0.3, 2000, seed=3)
     q = OSPREY.index("q")
     d = A[1:, q, q] / A[0, q, q] - 1.0
     assert kstest(d, "uniform", args=(-0.3, 0.6)).pvalue > 0.01
@@ -37,7 +37,7 @@ def test_entries_are_spread_evenly_and_independently() -> None:
 
 
 def test_a_draw_keeps_zeros_angles_and_everything_but_a_and_b() -> None:
-    drawn = draw(OSPREY, 0.3, 0.2, seed=7)
+    drawn = sample_airframe(OSPREY, 0.3, 0.2, seed=7)
     A, B = OSPREY.matrix_a(), OSPREY.matrix_b()
     for angle in ("theta", "phi"):
         assert drawn.A[drawn.index(angle)] == OSPREY.A[drawn.index(angle)]
@@ -51,22 +51,22 @@ def test_a_draw_keeps_zeros_angles_and_everything_but_a_and_b() -> None:
 
 
 def test_one_uncertainty_leaves_the_other_matrix_as_published() -> None:
-    assert draw(OSPREY, 0.0, 0.2, seed=7).matrix_a() == pytest.approx(OSPREY.matrix_a(), rel=1e-15)
-    assert draw(OSPREY, 0.2, 0.0, seed=7).matrix_b() == pytest.approx(OSPREY.matrix_b(), rel=1e-15)
-    assert draw(OSPREY, 0.0, 0.0, seed=7) is OSPREY
+    assert sample_airframe(OSPREY, 0.0, 0.2, seed=7).matrix_a() == pytest.approx(OSPREY.matrix_a(), rel=1e-15)
+    assert sample_airframe(OSPREY, 0.2, 0.0, seed=7).matrix_b() == pytest.approx(OSPREY.matrix_b(), rel=1e-15)
+    assert sample_airframe(OSPREY, 0.0, 0.0, seed=7) is OSPREY
 
 
 def test_a_seed_is_an_aircraft() -> None:
-    assert draw(OSPREY, 0.3, 0.3, seed=7) == draw(OSPREY, 0.3, 0.3, seed=7) != draw(OSPREY, 0.3, 0.3, seed=8)
-    A, B = uncertain(OSPREY, 0.3, 1, seed=7)
-    drawn = draw(OSPREY, 0.3, 0.3, seed=7)
+    assert sample_airframe(OSPREY, 0.3, 0.3, seed=7) == sample_airframe(OSPREY, 0.3, 0.3, seed=7) != sample_airframe(OSPREY, 0.3, 0.3, seed=8)
+    A, B = nominal_and_sampled(OSPREY, 0.3, 1, seed=7)
+    drawn = sample_airframe(OSPREY, 0.3, 0.3, seed=7)
     assert drawn.matrix_a() == pytest.approx(A[1], rel=1e-15)  # but for the way through the file's units
     assert drawn.matrix_b() == pytest.approx(B[1], rel=1e-15)
 
 
 @pytest.mark.parametrize("name", sorted(file.stem for file in LIBRARY.glob("*.yaml")))
 def test_the_text_of_an_airframe_is_its_file_to_the_last_bit(name: str, tmp_path: Path) -> None:
-    for airframe in (load_airframe(name), draw(load_airframe(name), 0.3, 0.3, seed=1)):
+    for airframe in (load_airframe(name), sample_airframe(load_airframe(name), 0.3, 0.3, seed=1)):
         path = tmp_path / f"{name}.yaml"
         path.write_text(as_yaml(airframe), encoding="utf-8")
         again = load_airframe(str(path))

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from flight_core.vectors import Array, array_namespace
 
-SHORTEST_LAG = 1e-30  # s, stands for no lag: exp(-dt / 1e-30) is exactly 0, in float32 too, and nothing is divided by 0
+MIN_LAG = 1e-30  # s, stands for no lag: exp(-dt / 1e-30) is exactly 0, in float32 too, and nothing is divided by 0
 
 
 class Actuators(NamedTuple):
@@ -40,7 +40,7 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     if params.dead_zone is not None:
         moved = moved - xp.minimum(xp.maximum(moved, -params.dead_zone), params.dead_zone)
     if params.lag is not None:
-        moved = moved - (moved - position) * xp.exp(-dt / xp.maximum(params.lag, SHORTEST_LAG))
+        moved = moved - (moved - position) * xp.exp(-dt / xp.maximum(params.lag, MIN_LAG))
     if params.rate is not None:
         reach = params.rate * dt
         moved = xp.minimum(xp.maximum(moved, position - reach), position + reach)
@@ -49,7 +49,7 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     return moved if params.upper is None else xp.minimum(moved, params.upper)
 
 
-def fail(t: Any, position: Array, moved: Array, params: Actuators) -> Array:
+def apply_faults(t: Any, position: Array, moved: Array, params: Actuators) -> Array:
     """Positions at the end of a step that begins at t, where faults may have struck, shape (m,).
 
         t >= stuck_at    position    it stays where it is

@@ -15,7 +15,7 @@ AXES = ("longitudinal", "lateral", "vertical")
 
 REFERENCE_LENGTH = 106.68  # m, 350 ft: FAR/CS 25.341(a)(4)
 
-SHORTEST_RISE = 1e-30  # s, stands for a step: t / 1e-30 saturates for every t > 0, in float32 too, and nothing is divided by 0
+MIN_RISE = 1e-30  # s, stands for a step: t / 1e-30 saturates for every t > 0, in float32 too, and nothing is divided by 0
 
 
 class Gusts(NamedTuple):
@@ -70,7 +70,7 @@ def bias(t: Array, params: Bias) -> Array:
     value beyond it, and Assumption 2 does not hold at that instant.
     """
     xp = array_namespace(params.value)
-    s = xp.minimum(xp.maximum((t - params.start) / xp.maximum(params.rise, SHORTEST_RISE), 0.0), 1.0)
+    s = xp.minimum(xp.maximum((t - params.start) / xp.maximum(params.rise, MIN_RISE), 0.0), 1.0)
     return params.value / 2.0 * (1.0 - xp.cos(xp.pi * s))
 
 

@@ -42,20 +42,20 @@ def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Ar
 
     `turbulence` is its wind along the G axes, shape (G,), m/s, none where it is left out. Works on states in columns, (n, N).
     """  # noqa: D400, D415 - what follows is an equation
-    return of_state(x, params) + of_time(t, wind(t, params, turbulence), params)
+    return f_state(x, params) + f_time(t, wind(t, params, turbulence), params)
 
 
 def x_dot(t: Any, x: Array, u: Array, params: Aircraft, turbulence: Array | None = None) -> Array:
     """Equation (1): A x + f(x, t) + B u, shape (n,)."""
-    return rate(x, of_time(t, wind(t, params, turbulence), params) + params.B @ u, params)
+    return x_dot_forced(x, f_time(t, wind(t, params, turbulence), params) + params.B @ u, params)
 
 
-def rate(x: Array, rest: Array, params: Aircraft) -> Array:
-    """A x + of_state(x) + rest, shape (n,): equation (1) where `rest` is of_time + B u."""
-    return params.A @ x + of_state(x, params) + rest
+def x_dot_forced(x: Array, rest: Array, params: Aircraft) -> Array:
+    """A x + f_state(x) + rest, shape (n,): equation (1) where `rest` is f_time + B u."""
+    return params.A @ x + f_state(x, params) + rest
 
 
-def of_state(x: Array, params: Aircraft) -> Array:
+def f_state(x: Array, params: Aircraft) -> Array:
     """The part of f that depends on the state: gravity @ sin(x) + gain @ (x[first] x[second]), shape (n,)."""
     gravity = params.gravity @ array_namespace(x).sin(x)
     if params.coupling is None:
@@ -64,7 +64,7 @@ def of_state(x: Array, params: Aircraft) -> Array:
     return gravity + gain @ (x[first] * x[second])
 
 
-def of_time(t: Any, wind: Array, params: Aircraft) -> Array:
+def f_time(t: Any, wind: Array, params: Aircraft) -> Array:
     """The part of f that depends on time: gust_direction @ wind + bias(t) + sines(t), shape (n,); wind of shape (G,), m/s."""
     total = params.gust_direction @ wind
     if params.bias is not None:
@@ -84,18 +84,18 @@ class Forcing(NamedTuple):
     """What depends on time alone, at T instants."""
 
     wind: Array  # (T, G) of the gusts along the G axes, m/s
-    rate: Array  # (T, n) of_time in it
+    rate: Array  # (T, n) f_time in it
 
 
 def at_times(t: Array, params: Aircraft) -> Forcing:
-    """The gusts and of_time in them at T instants at once, t of shape (T,)."""
+    """The gusts and f_time in them at T instants at once, t of shape (T,)."""
 
     def column(of: Any) -> Any:
         return None if of is None else type(of)(*(one[:, None] for one in of))
 
     columns = params._replace(gusts=column(params.gusts), bias=column(params.bias), sines=column(params.sines))
     gusts = wind(t, columns)
-    return Forcing(gusts.T, of_time(t, gusts, columns).T)
+    return Forcing(gusts.T, f_time(t, gusts, columns).T)
 
 
 def y(x: Array, params: Aircraft) -> Array:

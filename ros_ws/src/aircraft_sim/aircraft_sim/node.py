@@ -54,7 +54,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         return nanoseconds(self.parameters.start_time)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        share = self.parameters.commanded_share(self._source.silence_ns(now_ns))
+        share = self.parameters.failsafe_scale(self._source.silence_ns(now_ns))
         self._publish(tick.number, now_ns - tick.number * self.period_ns(), self._u if share == 1.0 else share * self._u)
         self._take_u(now_ns)
 

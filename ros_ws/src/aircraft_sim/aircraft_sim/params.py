@@ -13,8 +13,8 @@ from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import Airframe, Unit, load_airframe
 from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines
 from aircraft_sim.dynamics import Aircraft, Coupling
-from aircraft_sim.jsbsim_plant import INPUTS, OUTPUTS, PREFIX, FlightCondition, WindModel, require_aircraft
-from aircraft_sim.plant import Plant
+from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, FlightCondition, WindModel, require_aircraft
+from aircraft_sim.plant import PlantParams
 from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
 from flight_core.failsafe import failsafe_scale
@@ -70,7 +70,7 @@ class TurbulenceParameters(Parameters):
         return self
 
     @property
-    def blows(self) -> bool:
+    def has_intensity(self) -> bool:
         """Whether it has any intensity."""
         return bool(self.wind or self.sigma)
 
@@ -243,7 +243,7 @@ class AircraftParameters(KeyedParameters):
         """The integration step in ns."""
         return nanoseconds(self.step)
 
-    def commanded_share(self, silence_ns: int) -> float:
+    def failsafe_scale(self, silence_ns: int) -> float:
         """How much of the last u is still commanded after a silence of its controller: `fade` from max_age on."""
         return failsafe_scale(silence_ns, nanoseconds(self.max_age + self.hold), nanoseconds(self.ramp))
 
@@ -258,7 +258,7 @@ class AircraftParameters(KeyedParameters):
     def sampled_airframe(self) -> Airframe:
         """The airframe that flies: the one named, or that of `uncertainty` around it."""
         around = self.uncertainty
-        return uncertainty.draw(load_airframe(self.airframe), around.A, around.B, around.seed, around.number)
+        return uncertainty.sample_airframe(load_airframe(self.airframe), around.A, around.B, around.seed, around.number)
 
     def load(self) -> tuple[Airframe, Aircraft]:
         """The airframe that flies and the arrays of equation (1) in this disturbance, all axes of the wind that it knows."""
@@ -281,10 +281,12 @@ class AircraftParameters(KeyedParameters):
             Sines(*_by_state(sines, Sines._fields, airframe)) if sines else None,
         )
 
-    def plant(self) -> Plant:
+    def plant(self) -> PlantParams:
         """What moves as arrays: equation (1), the actuators and the turbulence."""
         airframe, aircraft = self.load()
-        return Plant(aircraft, self.actuator_model(), self.step_ns, self._turbulence(airframe.speed, list(airframe.gusts)))
+        return PlantParams(
+            aircraft, self.actuator_model(), self.step_ns, self._turbulence(airframe.speed, list(airframe.gusts))
+        )
 
     def actuator_model(self) -> Actuators:
         """The actuators as arrays."""
@@ -304,7 +306,7 @@ class AircraftParameters(KeyedParameters):
 
     def _turbulence(self, speed: float, axes: Sequence[str]) -> Turbulence | None:
         air = self.turbulence
-        if air is None or not air.blows:
+        if air is None or not air.has_intensity:
             return None
         spectrum = dryden(air.altitude, air.wind or 0.0, air.sigma or 0.0)  # none is given where it does not act
         return filters(spectrum, speed, self.step, [AXES.index(axis) for axis in axes], air.seed)

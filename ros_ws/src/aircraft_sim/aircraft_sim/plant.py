@@ -16,7 +16,7 @@ DIVERGENCE_LIMIT = 1e6
 """SI. No state of an aircraft comes near it; a diverged loop passes it on its way to infinity."""
 
 
-class Plant(NamedTuple):
+class PlantParams(NamedTuple):
     """What flies."""
 
     aircraft: Aircraft
@@ -33,14 +33,14 @@ class AircraftState(NamedTuple):
     turbulence: Array | None = None  # (5,) of its filters; None in calm air
 
 
-def initial_state(plant: Plant) -> AircraftState:
+def initial_state(plant: PlantParams) -> AircraftState:
     """The state in trim: x = 0, the actuators at 0, and the turbulence, if any, drawn from its stationary distribution."""
     xp = array_namespace(plant.aircraft.A)
     z = None if plant.turbulence is None else turbulence.initial_state(plant.turbulence)
     return AircraftState(xp.zeros_like(plant.aircraft.A[0, :]), xp.zeros_like(plant.aircraft.B[0, :]), z)
 
 
-def forcing(t_ns: int, steps: int, plant: Plant) -> Forcing:
+def forcing(t_ns: int, steps: int, plant: PlantParams) -> Forcing:
     """What depends on time alone at the beginnings, middles and ends of so many steps from t on: 2 steps + 1 instants."""
     halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
     return dynamics.at_times(seconds(t_ns) + seconds(plant.step_ns) / 2.0 * halves, plant.aircraft)
@@ -51,7 +51,7 @@ def advance(
     state: AircraftState,
     u: Array,
     duration_ns: int,
-    plant: Plant,
+    plant: PlantParams,
     forced: Forcing | None = None,
     normals: Array | None = None,
 ) -> AircraftState:
@@ -77,12 +77,12 @@ def advance(
         normals = () if air is None else turbulence.normals(t_ns // plant.step_ns, steps, air.seed)
 
     def x_dot(since: float, x: Array, rest: Array, params: Aircraft) -> Array:
-        return dynamics.rate(x, rest[round(2.0 * since / dt)], params)
+        return dynamics.x_dot_forced(x, rest[round(2.0 * since / dt)], params)
 
     given = (forcing(t_ns, steps, plant) if forced is None else forced).rate
     for k in range(steps):
         moved = actuators.step(position, u, dt, plant.actuators)
-        position = actuators.fail(seconds(t_ns + k * plant.step_ns), position, moved, plant.actuators)
+        position = actuators.apply_faults(seconds(t_ns + k * plant.step_ns), position, moved, plant.actuators)
         held = aircraft.B @ position
         if air is not None:
             held = held + aircraft.gust_direction @ turbulence.wind(z, air)
@@ -97,6 +97,6 @@ def diverged(state: AircraftState) -> bool:
     return not bool(xp.all(xp.abs(state.x) < DIVERGENCE_LIMIT))  # False for NaN too
 
 
-def output(state: AircraftState, plant: Plant) -> Array:
+def output(state: AircraftState, plant: PlantParams) -> Array:
     """The outputs y = C x, before any sensor, shape (m,)."""
     return dynamics.y(state.x, plant.aircraft)

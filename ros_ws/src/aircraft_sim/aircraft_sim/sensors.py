@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim import draws
+from aircraft_sim import random_streams
 from flight_core.vectors import Array, FloatArray, StampedVector, array_namespace
 
 
@@ -37,7 +37,7 @@ class Measured(NamedTuple):
     drift: Drift
 
 
-Underway = tuple[StampedVector, ...]
+DelayLine = tuple[StampedVector, ...]
 
 
 def initial_drift(params: Sensors) -> Drift:
@@ -80,7 +80,7 @@ def noise(number: int, params: Sensors) -> FloatArray:
     """Error of sample `number` >= 0: noise_i n_i with n_i standard normal, white over channels and samples; shape (m,)."""
     if not params.noise.any():
         return np.zeros_like(params.noise)
-    return params.noise * draws.generator(number, draws.NOISE, params.seed).standard_normal(len(params.noise))
+    return params.noise * random_streams.generator(number, random_streams.NOISE, params.seed).standard_normal(len(params.noise))
 
 
 def walk(number: int, drift: Drift, params: Sensors) -> Drift:
@@ -92,21 +92,25 @@ def walk(number: int, drift: Drift, params: Sensors) -> Drift:
         return drift
     value = drift.value
     for k in range(drift.number + 1, number + 1):
-        value = value + params.drift * draws.generator(k, draws.DRIFT, params.seed).standard_normal(len(value))
+        value = value + params.drift * random_streams.generator(k, random_streams.DRIFT, params.seed).standard_normal(
+            len(value)
+        )
     return Drift(number, value)
 
 
 def arrives(number: int, params: Sensors) -> bool:
     """Whether sample `number` >= 0 is not lost: v >= dropout with v uniform in [0, 1), independent of the noise."""
-    return params.dropout == 0.0 or draws.generator(number, draws.LOSS, params.seed).random() >= params.dropout
+    return (
+        params.dropout == 0.0 or random_streams.generator(number, random_streams.LOSS, params.seed).random() >= params.dropout
+    )
 
 
-def transmit(underway: Underway, now_ns: int, y: FloatArray | None, params: Sensors) -> tuple[Underway, Underway]:
+def transmit(delay_line: DelayLine, now_ns: int, y: FloatArray | None, params: Sensors) -> tuple[DelayLine, DelayLine]:
     """One sample instant of the way from the sensors: (under way, now, y) -> (under way, arrived).
 
     The y of now, None where it is lost, sets out with the stamp now; whatever has been under way for the delay arrives, the
     oldest first. A stamp stays the instant that its sample belongs to.
     """
-    sent = underway if y is None else (*underway, StampedVector(now_ns, y))
+    sent = delay_line if y is None else (*delay_line, StampedVector(now_ns, y))
     arrived = sum(sample.stamp_ns + params.delay_ns <= now_ns for sample in sent)
     return sent[arrived:], sent[:arrived]

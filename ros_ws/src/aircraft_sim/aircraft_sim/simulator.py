@@ -11,9 +11,8 @@ import numpy as np
 
 from aircraft_sim import plant, sensors, truth
 from aircraft_sim.dynamics import Forcing
-from aircraft_sim.jsbsim_plant import JsbsimVehicle
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.sensors import Underway
+from aircraft_sim.sensors import DelayLine
 from flight_core.outcome import FlightEnded
 from flight_core.rates import divide, period_ns, seconds
 from flight_core.vectors import FloatArray
@@ -21,7 +20,7 @@ from flight_core.vectors import FloatArray
 BLOCK = 100  # steps
 
 
-class Vehicle(Protocol):
+class FlightDynamicsModel(Protocol):
     """What moves between the command and the sensors."""
 
     @property
@@ -41,7 +40,7 @@ class Vehicle(Protocol):
         """Whether the state is beyond anything that flies."""
 
 
-class AirframeVehicle:
+class StateSpaceModel:
     """Equation (1) with the matrices of an airframe, behind its actuators.
 
     What depends on time alone is worked out for BLOCK steps at once, in a tenth of the time.
@@ -56,7 +55,7 @@ class AirframeVehicle:
         self.truth_names = truth.names(airframe)
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
-        """See Vehicle."""
+        """See FlightDynamicsModel."""
         steps = divide(duration_ns, self._plant.step_ns, "step", "the duration")
         begin = (t_ns - self._block_ns) // self._plant.step_ns
         if not 0 <= begin <= begin + steps <= BLOCK:
@@ -66,25 +65,27 @@ class AirframeVehicle:
         self._state = plant.advance(t_ns, self._state, u, duration_ns, self._plant, forced)
 
     def y(self) -> FloatArray:
-        """See Vehicle."""
+        """See FlightDynamicsModel."""
         y: FloatArray = plant.output(self._state, self._plant)
         return y
 
     def truth(self, t_ns: int) -> FloatArray:
-        """See Vehicle."""
+        """See FlightDynamicsModel."""
         place = 2 * ((t_ns - self._block_ns) // self._plant.step_ns)
         return truth.values(self._state, self._block.wind[place], self._block.rate[place], self._plant)
 
     def diverged(self) -> bool:
-        """See Vehicle."""
+        """See FlightDynamicsModel."""
         return plant.diverged(self._state)
 
 
-def vehicle(parameters: AircraftParameters) -> Vehicle:
+def flight_dynamics_model(parameters: AircraftParameters) -> FlightDynamicsModel:
     """The vehicle that the parameters name, in trim at t = 0."""
     if parameters.is_jsbsim:
-        return JsbsimVehicle(parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model())
-    return AirframeVehicle(parameters)
+        from aircraft_sim.jsbsim_model import JsbsimModel  # noqa: PLC0415 - other aircraft fly without JSBSim
+
+        return JsbsimModel(parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model())
+    return StateSpaceModel(parameters)
 
 
 class Simulator:
@@ -94,15 +95,15 @@ class Simulator:
         channels = parameters.channels()
         self.outputs, self.inputs = tuple(channels.outputs), tuple(channels.inputs)
         self.period_ns = period_ns(parameters.rate, "rate")
-        self._vehicle = vehicle(parameters)
+        self._model = flight_dynamics_model(parameters)
         self._sensors = parameters.sensor_arrays()
-        self.truth_names = ("t", *self._vehicle.truth_names, *(f"noise.{name}" for name in self.outputs))
+        self.truth_names = ("t", *self._model.truth_names, *(f"noise.{name}" for name in self.outputs))
         self._drift = sensors.initial_drift(self._sensors)
-        self._underway: Underway = ()
+        self._delay_line: DelayLine = ()
         self._error = np.zeros(len(self.outputs))
         self._number = 0
 
-    def sample(self, number: int, u: FloatArray) -> Underway:
+    def sample(self, number: int, u: FloatArray) -> DelayLine:
         """Sample `number`, at number periods of flight time: moves there with u held since the one before, and measures.
 
         The y that arrive now, the oldest first; their stamps are flight time. Raises FlightEnded where the aircraft has
@@ -110,16 +111,16 @@ class Simulator:
         """
         t_ns, before_ns = number * self.period_ns, self._number * self.period_ns
         if number > self._number:
-            self._vehicle.advance(before_ns, u, t_ns - before_ns)
+            self._model.advance(before_ns, u, t_ns - before_ns)
         self._number = number
-        if self._vehicle.diverged():
+        if self._model.diverged():
             raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
-        measured, self._error, self._drift = sensors.measure(number, self._vehicle.y(), self._drift, self._sensors)
+        measured, self._error, self._drift = sensors.measure(number, self._model.y(), self._drift, self._sensors)
         y = measured if sensors.arrives(number, self._sensors) else None
-        self._underway, arrived = sensors.transmit(self._underway, t_ns, y, self._sensors)
+        self._delay_line, arrived = sensors.transmit(self._delay_line, t_ns, y, self._sensors)
         return arrived
 
     def truth(self) -> FloatArray:
         """What the aircraft really does at the instant of the last sample, in the order of `truth_names`."""
         t_ns = self._number * self.period_ns
-        return np.concatenate([[seconds(t_ns)], self._vehicle.truth(t_ns), self._error])
+        return np.concatenate([[seconds(t_ns)], self._model.truth(t_ns), self._error])

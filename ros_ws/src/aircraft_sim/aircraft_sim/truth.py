@@ -6,7 +6,7 @@ import numpy as np
 
 from aircraft_sim import dynamics, turbulence
 from aircraft_sim.airframe import Airframe
-from aircraft_sim.plant import AircraftState, Plant
+from aircraft_sim.plant import AircraftState, PlantParams
 from flight_core.vectors import FloatArray
 
 
@@ -25,12 +25,12 @@ def names(airframe: Airframe) -> tuple[str, ...]:
     return tuple(f"{group}.{name}" for group, members in groups.items() for name in members)
 
 
-def values(state: AircraftState, wind: FloatArray, rate: FloatArray, plant: Plant) -> FloatArray:
+def values(state: AircraftState, wind: FloatArray, rate: FloatArray, plant: PlantParams) -> FloatArray:
     """Values of `truth` in the order of `names`; f and the wind are those that act from now on.
 
     `wind` (G,) and `rate` (n,) are what `dynamics.Forcing` says of this instant.
     """
-    f = dynamics.of_state(state.x, plant.aircraft) + rate
+    f = dynamics.f_state(state.x, plant.aircraft) + rate
     if plant.turbulence is not None:
         air = turbulence.wind(state.turbulence, plant.turbulence)
         wind, f = wind + air, f + plant.aircraft.gust_direction @ air

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aircraft_sim import draws
+from aircraft_sim import random_streams
 from flight_core.vectors import Array, FloatArray
 
 FOOT = 0.3048  # m, exact
@@ -104,7 +104,7 @@ def filters(spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], s
 
 def initial_state(params: Turbulence) -> FloatArray:
     """State at t = 0, drawn from the stationary distribution, shape (5,)."""
-    normal = draws.generator(0, draws.TURBULENCE_START, params.seed).standard_normal(STATES)
+    normal = random_streams.generator(0, random_streams.TURBULENCE_START, params.seed).standard_normal(STATES)
     return np.asarray(params.stationary @ normal)
 
 
@@ -127,7 +127,7 @@ def wind(z: Array, params: Turbulence) -> Array:
 
 @lru_cache(maxsize=64)
 def _block(block: int, seed: int) -> FloatArray:
-    numbers = draws.generator(block, draws.TURBULENCE, seed).standard_normal((BLOCK, STATES))
+    numbers = random_streams.generator(block, random_streams.TURBULENCE, seed).standard_normal((BLOCK, STATES))
     numbers.flags.writeable = False  # it is handed out again
     return numbers
 

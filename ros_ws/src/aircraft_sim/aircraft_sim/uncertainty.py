@@ -5,7 +5,7 @@
 import numpy as np
 import yaml
 
-from aircraft_sim import draws
+from aircraft_sim import random_streams
 from aircraft_sim.airframe import Airframe
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
@@ -14,25 +14,27 @@ KINEMATIC = ("theta", "phi", "psi")
 """States whose derivatives are known exactly: their rows stay as published in uncertain airframes."""
 
 
-def uncertain(airframe: Airframe, uncertainty: float, samples: int, seed: int) -> tuple[FloatArray, FloatArray]:
+def nominal_and_sampled(airframe: Airframe, uncertainty: float, samples: int, seed: int) -> tuple[FloatArray, FloatArray]:
     """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: as published first, then numbers 0, 1, ... of the seed.
 
     Raises ParameterError for an uncertainty outside [0, 1).
     """
-    A, B = matrices(airframe, uncertainty, uncertainty, seed, 0, samples)
+    A, B = sampled_matrices(airframe, uncertainty, uncertainty, seed, 0, samples)
     return np.concatenate([airframe.matrix_a()[None], A]), np.concatenate([airframe.matrix_b()[None], B])
 
 
-def draw(airframe: Airframe, of_A: float, of_B: float, seed: int, number: int = 0) -> Airframe:
+def sample_airframe(airframe: Airframe, of_A: float, of_B: float, seed: int, number: int = 0) -> Airframe:
     """Uncertain airframe `number` of a seed, with an uncertainty of A and one of B; 0 and 0 leave it as published.
 
     Its f, the gusts in it, is the published one. Raises ParameterError for an uncertainty outside [0, 1).
     """
-    A, B = matrices(airframe, of_A, of_B, seed, number, 1)
+    A, B = sampled_matrices(airframe, of_A, of_B, seed, number, 1)
     return airframe if of_A == of_B == 0.0 else airframe.with_matrices(A[0], B[0])
 
 
-def matrices(airframe: Airframe, of_A: float, of_B: float, seed: int, first: int, count: int) -> tuple[FloatArray, FloatArray]:
+def sampled_matrices(
+    airframe: Airframe, of_A: float, of_B: float, seed: int, first: int, count: int
+) -> tuple[FloatArray, FloatArray]:
     """A and B of the aircraft first, first + 1, ... of a seed, shapes (count, n, n) and (count, n, m), SI.
 
     Every entry is multiplied by 1 + d, d uniform in +-uncertainty and independent; the rows of angles stay. An aircraft
@@ -41,7 +43,7 @@ def matrices(airframe: Airframe, of_A: float, of_B: float, seed: int, first: int
     for part in (of_A, of_B):
         require(0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1")
     A, B = airframe.matrix_a(), airframe.matrix_b()
-    uniform = draws.uniform(first, count, A.size + B.size, draws.AIRFRAME, seed)
+    uniform = random_streams.uniform(first, count, A.size + B.size, random_streams.AIRFRAME, seed)
     known = np.array([[float(state not in KINEMATIC)] for state in airframe.states])
 
     def spread(matrix: FloatArray, uncertainty: float, numbers: FloatArray) -> FloatArray:

@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Flight dynamics model of JSBSim: a six-degree-of-freedom aircraft, flown around a trim point like any other aircraft here."""
+
+import math
+
+import jsbsim
+import numpy as np
+
+from aircraft_sim import actuators, turbulence
+from aircraft_sim.actuators import Actuators
+from aircraft_sim.disturbance import AXES, one_minus_cosine
+from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
+from aircraft_sim.jsbsim_trim import (
+    CONTACT,
+    HEADING,
+    HEIGHT,
+    WIND,
+    command_paths,
+    engine_count,
+    error_text,
+    running_property,
+    settle,
+    trim_solution,
+    trimmed_fdm,
+)
+from aircraft_sim.plant import DIVERGENCE_LIMIT
+from flight_core.outcome import FlightEnded
+from flight_core.rates import divide, seconds
+from flight_core.vectors import FloatArray
+
+
+class JsbsimModel:
+    """An aircraft of JSBSim behind its actuators, in trim at t = 0: a `simulator.FlightDynamicsModel`.
+
+    A step of the integration, from t_k to t_k + dt:
+
+        position+ = actuators.apply_faults(t_k, position, actuators.step(position, u, dt))
+        wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right of it and down
+        commands  = trim + position+, then JSBSim runs
+
+    JSBSim integrates the forces of the step before, then computes those of the new commands and the new wind: both act one step
+    later. Raises FlightEnded where the aircraft does not trim, crashes or hangs. Each is tried in an isolated process first.
+    """
+
+    def __init__(self, condition: FlightCondition, actuator_model: Actuators, wind_model: WindModel) -> None:
+        self.condition = condition
+        self._fdm, self.trim = trimmed_fdm(condition, trim_solution(condition))
+        engines = engine_count(self._fdm)
+        self._commands = [[self._node(path) for path in command_paths(command, engines)] for command in INPUTS.values()]
+        self._trim_commands = [[node.get_double_value() for node in nodes] for nodes in self._commands]
+        self._wind_nodes = [self._node(path) for path in WIND]
+        self._state_nodes = [(self._node(quantity.property), quantity.si) for quantity in STATES.values()]
+        self._heading, self._height, self._contact = (self._node(path) for path in (HEADING, HEIGHT, CONTACT))
+        self._engines = [self._node(running_property(i)) for i in range(engines)]
+        self._actuator_model, self._wind_model = actuator_model, wind_model
+        self._no_wind = wind_model.turbulence is None and not wind_model.gusts.speed.any()
+        self._z = None if wind_model.turbulence is None else turbulence.initial_state(wind_model.turbulence)
+        self._position = np.zeros(len(INPUTS))
+        self._apply_wind(self._wind(0))
+        settle(self._fdm, seconds(condition.step_ns))  # one step: the wind of t = 0 acts from t = 0 on
+        self._x = self._deviations()
+        self.truth_names = (
+            *(f"x.{name}" for name in STATES),
+            *(f"gust.{name}" for name in AXES),
+            *(f"actuator.{name}" for name in INPUTS),
+        )
+
+    def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
+        """From t to t + duration with the command u held, shape (4,), deviations from trim.
+
+        Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground.
+        """
+        step_ns, model = self.condition.step_ns, self._actuator_model
+        dt, steps = seconds(step_ns), divide(duration_ns, step_ns, "step", "the duration")
+        filters = self._wind_model.turbulence
+        normals = () if filters is None else turbulence.normals(t_ns // step_ns, steps, filters.seed)
+        for k in range(steps):
+            position = actuators.step(self._position, u, dt, model)
+            self._position = actuators.apply_faults(seconds(t_ns + k * step_ns), self._position, position, model)
+            for nodes, values, deviation in zip(self._commands, self._trim_commands, self._position.tolist(), strict=True):
+                for node, value in zip(nodes, values, strict=True):
+                    node.set_double_value(value + deviation)
+            if filters is not None:
+                self._z = turbulence.step(self._z, normals[k], filters)
+            after_ns = t_ns + (k + 1) * step_ns
+            if not self._no_wind:
+                self._apply_wind(self._wind(after_ns))
+            try:
+                self._fdm.run()
+            except jsbsim.BaseError as error:
+                title, after = self.condition.title, seconds(after_ns)
+                raise FlightEnded(f"{title} failed at t = {after:.2f} s: {error_text(error)}") from None
+        self._x = self._deviations()
+        now = f"at t = {seconds(t_ns + duration_ns):.2f} s"
+        if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
+            raise FlightEnded(f"{self.condition.title} hit the ground {now}")
+        if stopped := [str(i + 1) for i, node in enumerate(self._engines) if not node.get_double_value()]:
+            raise FlightEnded(f"{self.condition.title}: engine {', '.join(stopped)} stopped {now}")
+
+    def y(self) -> FloatArray:
+        """[q, V, p, r], deviations from trim, shape (4,)."""
+        return self._x[: len(OUTPUTS)]
+
+    def truth(self, t_ns: int) -> FloatArray:
+        """Values in the order of `truth_names`."""
+        return np.concatenate([self._x, self._wind(t_ns), self._position])
+
+    def diverged(self) -> bool:
+        """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
+        return not bool(np.all(np.abs(self._x) < DIVERGENCE_LIMIT))
+
+    def _deviations(self) -> FloatArray:
+        return np.array([node.get_double_value() * si for node, si in self._state_nodes]) - self.trim.states
+
+    def _node(self, path: str) -> jsbsim.FGPropertyNode:
+        node = self._fdm.get_property_manager().get_node(path)
+        if node is None:  # the trim has checked that it exists
+            raise FlightEnded(f"{self.condition.title} cannot be flown: it has no property {path}")
+        return node
+
+    def _wind(self, t_ns: int) -> FloatArray:
+        """Wind along AXES in m/s, shape (3,), at the instant of the turbulence's state."""
+        gusts = one_minus_cosine(np.array(seconds(t_ns)), self._wind_model.gusts, np.array(self.condition.speed))
+        filters = self._wind_model.turbulence
+        return np.asarray(gusts if filters is None else gusts + turbulence.wind(self._z, filters))
+
+    def _apply_wind(self, wind: FloatArray) -> None:
+        along, right, down = (wind / FOOT).tolist()
+        heading = self._heading.get_double_value()
+        north, east = math.cos(heading), math.sin(heading)
+        for node, value in zip(
+            self._wind_nodes, (along * north - right * east, along * east + right * north, down), strict=True
+        ):
+            node.set_double_value(value)

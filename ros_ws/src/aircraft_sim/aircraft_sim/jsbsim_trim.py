@@ -1,0 +1,309 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Trim of an aircraft of JSBSim, found in an isolated process, and quantities that follow from it."""
+
+import os
+import re
+from collections.abc import Mapping
+from functools import cache
+
+import jsbsim
+import numpy as np
+
+from aircraft_sim import isolated
+from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, RESIDUALS, STATES, Command, FlightCondition, Trim
+from flight_core.outcome import FlightEnded
+from flight_core.rates import nanoseconds, seconds
+from flight_core.vectors import FloatArray
+
+HEADING, HEIGHT, CONTACT = "attitude/psi-rad", "position/h-agl-ft", "forces/fbz-gear-lbs"
+
+WIND = ("atmosphere/wind-north-fps", "atmosphere/wind-east-fps", "atmosphere/wind-down-fps")
+
+FROZEN: Mapping[str, float] = {
+    "simulation/integrator/rate/rotational": 0.0,  # the integration scheme: none
+    "simulation/integrator/rate/translational": 0.0,
+    "simulation/integrator/position/rotational": 0.0,
+    "simulation/integrator/position/translational": 0.0,
+    "propulsion/fuel_freeze": 1.0,
+}
+"""Properties that freeze position, velocity, attitude and fuel. Engines and flight control systems still run."""
+
+MIXTURE = 0.9  # of piston engines: rich
+SETTLE, SPIN_UP = 10.0, 30.0  # s of frozen flight: for running engines, and for engines that have just been started
+START = np.array([0.05, 0.7, 0.0, 0.0, 0.0, 0.0])  # alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad)
+SCALE = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.1])  # scales of these unknowns for the solver
+TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])  # m/s^2, rad/s^2: a tenth of a degree of attitude
+
+PROBE_TIME = 2.0  # s of the test flight in the isolated process
+PROBE_SIZE = 0.02  # how far the test flight moves each command
+TIMEOUT = 30.0  # s for trim and test flight; every aircraft that trims needs less than one
+
+TrimSolution = tuple[float, ...] | None
+"""The solver's unknowns of frozen flight, scaled; None where JSBSim's own trim succeeds. It gives the same bits everywhere."""
+
+
+class _Log(jsbsim.FGLogger):
+    """Keeps JSBSim's output off the console. `last` is its last error."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.last = ""
+        self._level = jsbsim.LogLevel.BULK
+        self._message = ""
+
+    def set_level(self, level: jsbsim.LogLevel) -> None:
+        self._level, self._message = level, ""
+
+    def file_location(self, filename: str, line: int) -> None:
+        pass
+
+    def message(self, message: str) -> None:
+        self._message += message
+
+    def format(self, format: jsbsim.LogFormat) -> None:  # noqa: A002 - the name is JSBSim's
+        pass
+
+    def flush(self) -> None:
+        if self._level in {jsbsim.LogLevel.ERROR, jsbsim.LogLevel.FATAL}:
+            self.last = " ".join(self._message.split())
+
+
+@cache
+def trim_solution(condition: FlightCondition) -> TrimSolution:
+    """Find the trim and make a short test flight, both in an isolated process, where JSBSim may crash or hang.
+
+    Raises FlightEnded.
+    """
+    try:
+        unknowns = isolated.call(solve_and_probe, *condition, timeout=TIMEOUT)
+    except isolated.IsolatedCallError as error:
+        raise FlightEnded(f"{condition.title} cannot be flown: JSBSim {error}") from None
+    return None if unknowns is None else tuple(unknowns)
+
+
+def solve_and_probe(name: str, speed: float, altitude: float, step_ns: int) -> TrimSolution:
+    """Find the trim, apply it, and fly with each command moved by PROBE_SIZE. Raises FlightEnded."""
+    condition = FlightCondition(name, speed, altitude, step_ns)
+    solution = _solve_trim(condition)
+    fdm, _ = trimmed_fdm(condition, solution)
+    try:
+        for command in INPUTS.values():
+            for path in command_paths(command, engine_count(fdm)):
+                fdm[path] += PROBE_SIZE if fdm[path] < command.upper - PROBE_SIZE else -PROBE_SIZE
+            for _ in range(nanoseconds(PROBE_TIME) // step_ns // len(INPUTS)):
+                fdm.run()
+    except jsbsim.BaseError as error:
+        raise FlightEnded(f"{condition.title} cannot be flown: {error_text(error)}") from None
+    return solution
+
+
+def trimmed_fdm(condition: FlightCondition, solution: TrimSolution) -> tuple[jsbsim.FGFDMExec, Trim]:
+    """The aircraft in the trim of a solution. Raises FlightEnded where it cannot be loaded."""
+    fdm = _load(condition)
+    if solution is None:
+        _jsbsim_trim(fdm)
+    else:
+        _start_engines(fdm)
+        _set_unknowns(fdm, np.array(solution))
+        settle(fdm, SPIN_UP)
+    states = np.array([fdm[quantity.property] * quantity.si for quantity in STATES.values()])
+    return fdm, Trim(*_commands_and_limits(fdm), states, _residuals(fdm))
+
+
+def sideslip_zero(condition: FlightCondition) -> float:
+    """Rate at which sideslip decays (negative) or grows while p and r are held in trim, 1/s: a zero of the aircraft.
+
+        beta_dot V = Y_beta beta + Y_u u,  0 = N_beta beta + N_u u  ->  beta_dot = (Y_beta - Y_u N_u^-1 N_beta) beta / V
+
+    Y is the side acceleration, N are the accelerations of p and r, u is aileron and rudder. Central differences in frozen
+    flight give the derivatives. Gravity is left out: it couples bank to sideslip much more slowly. Where the rate is positive,
+    Assumption 3 does not hold. Raises FlightEnded.
+    """
+    solution = trim_solution(condition)
+
+    def derivative(name: str, step: float) -> FloatArray:
+        ends = []
+        for sign in (1.0, -1.0):
+            fdm, _ = trimmed_fdm(condition, solution)
+            if name == "beta":
+                fdm[WIND[1]] -= sign * step * condition.speed / FOOT  # wind from the right
+            else:
+                fdm[INPUTS[name].property] += sign * step
+            settle(fdm, 0.5)  # long enough for flight control systems, too short for engines
+            ends.append(_residuals(fdm)[[1, 3, 5]])
+        return np.asarray((ends[0] - ends[1]) / (2.0 * step))
+
+    beta, u = derivative("beta", 0.01), np.column_stack([derivative(name, 0.05) for name in ("aileron", "rudder")])
+    return float(beta[0] - u[0] @ np.linalg.solve(u[1:], beta[1:])) / condition.speed
+
+
+def settle(fdm: jsbsim.FGFDMExec, duration: float) -> None:
+    """Run the aircraft with position, velocity, attitude and fuel frozen, for `duration` s."""
+    before = {path: fdm[path] for path in FROZEN}
+    for path, value in FROZEN.items():
+        fdm[path] = value
+    for _ in range(round(duration / fdm.get_delta_t())):
+        fdm.run()
+    for path, value in before.items():
+        fdm[path] = value
+
+
+def engine_count(fdm: jsbsim.FGFDMExec) -> int:
+    """Number of engines."""
+    return int(fdm.get_propulsion().get_num_engines())
+
+
+def running_property(engine: int) -> str:
+    """The property that is 1 while an engine runs."""
+    return f"propulsion/engine[{engine}]/set-running"
+
+
+def command_paths(command: Command, engines: int) -> list[str]:
+    """The properties of a command, one for each engine where it has one for each."""
+    return [f"{command.property}[{i}]" for i in range(engines)] if command.each_engine else [command.property]
+
+
+def error_text(error: jsbsim.BaseError) -> str:
+    """JSBSim's message on one line. Most often a property is missing that a flight simulator around JSBSim would create."""
+    text = " ".join(str(error).split())
+    missing = re.search(r"The property (\S+) does not exist", text)
+    return text if missing is None else f"its model needs the property {missing[1]}, which JSBSim alone does not have"
+
+
+def _solve_trim(condition: FlightCondition) -> TrimSolution:
+    """The trim: level, straight, sideslip 0, with the bank angle that this takes.
+
+    JSBSim's own trim comes first. It assumes that engines and flight control systems have settled, so they get time in frozen
+    flight: everything runs but position, velocity and attitude. Where it fails, or where its result does not last, a solver
+    finds the six unknowns (alpha, throttle, pitch trim, aileron, rudder, bank) in frozen flight, where everything has settled.
+    Raises FlightEnded with one sentence where there is no trim.
+    """
+    fdm = _load(condition)
+    try:
+        if _jsbsim_trim(fdm):
+            return None
+        solution = _solve_accelerations(fdm)
+        fdm, _ = trimmed_fdm(condition, solution)
+    except jsbsim.BaseError as error:
+        problem = error_text(error)
+    else:
+        if _is_trimmed(fdm):
+            return solution
+        problem = _trim_failure(fdm)
+    raise FlightEnded(f"{condition.title} does not trim at {condition.speed:g} m/s and {condition.altitude:g} m: {problem}")
+
+
+def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
+    log = _Log()
+    jsbsim.set_logger(log)  # of this thread
+    fdm = jsbsim.FGFDMExec(None)
+    fdm.set_debug_level(0)
+    fdm.set_output_path(os.devnull)  # some models write tables into the working folder while they load
+    try:
+        loaded = fdm.load_model(condition.name)
+    except jsbsim.BaseError as error:
+        raise FlightEnded(f"{condition.title} cannot be loaded: {error_text(error)}") from None
+    if not loaded:
+        raise FlightEnded(f"{condition.title} cannot be loaded: {log.last or 'JSBSim gives no reason'}")
+    fdm.disable_output()
+    fdm.set_dt(seconds(condition.step_ns))
+    manager, engines = fdm.get_property_manager(), engine_count(fdm)
+    if not engines:
+        raise FlightEnded(f"{condition.title} has no engine to control V with: no {INPUTS['throttle'].property}[0]")
+    for path in _properties(engines):  # JSBSim creates a property that it does not have
+        if not manager.hasNode(path):
+            raise FlightEnded(f"{condition.title} cannot be flown: it has no property {path}")
+    fdm["ic/h-sl-ft"], fdm["ic/vt-fps"] = condition.altitude / FOOT, condition.speed / FOOT
+    fdm["ic/gamma-deg"] = fdm["ic/psi-true-deg"] = 0.0
+    fdm["gear/gear-cmd-norm"] = fdm["gear/gear-pos-norm"] = 0.0  # up
+    for i in range(engines):
+        fdm[f"fcs/mixture-cmd-norm[{i}]"] = MIXTURE
+        fdm[f"fcs/throttle-cmd-norm[{i}]"] = START[1]
+        fdm[f"fcs/advance-cmd-norm[{i}]"] = 1.0  # propellers at fine pitch
+    return fdm
+
+
+def _properties(engines: int) -> list[str]:
+    """Every property that is read or written in flight."""
+    commands = [path for command in INPUTS.values() for path in command_paths(command, engines)]
+    trims = [command.trim_property for command in INPUTS.values() if command.trim_property is not None]
+    states = [quantity.property for quantity in STATES.values()]
+    residuals = [f"accelerations/{name}" for name in RESIDUALS]
+    running = [running_property(i) for i in range(engines)]
+    return [*commands, *trims, *states, *WIND, HEADING, HEIGHT, CONTACT, *residuals, *running, *FROZEN]
+
+
+def _jsbsim_trim(fdm: jsbsim.FGFDMExec) -> bool:
+    """Apply JSBSim's own trim; whether it succeeds and lasts."""
+    fdm.run_ic()
+    fdm["propulsion/set-running"] = -1  # all engines
+    try:
+        fdm.do_trim(jsbsim.TrimMode.FULL)
+    except jsbsim.TrimFailureError:
+        return False
+    settle(fdm, SETTLE)
+    return _is_trimmed(fdm)
+
+
+def _solve_accelerations(fdm: jsbsim.FGFDMExec) -> tuple[float, ...]:
+    """The solver's root of the accelerations of frozen flight: unknowns x = START + (scaled - 1) SCALE."""
+    from scipy.optimize import fsolve  # noqa: PLC0415 - takes a sixth of a second, which other aircraft do not need
+
+    def accelerations(scaled: FloatArray) -> FloatArray:
+        _set_unknowns(fdm, scaled)
+        settle(fdm, SETTLE)
+        return _residuals(fdm)
+
+    _start_engines(fdm)
+    # Differences over a thousandth of the scales: engines settle more accurately than that.
+    scaled, *_ = fsolve(accelerations, np.ones(len(START)), epsfcn=1e-6, xtol=1e-6, maxfev=100, full_output=True)
+    return tuple(scaled.tolist())
+
+
+def _start_engines(fdm: jsbsim.FGFDMExec) -> None:
+    _set_unknowns(fdm, np.ones(len(START)))
+    fdm["propulsion/set-running"] = -1  # all engines
+    settle(fdm, SPIN_UP)
+
+
+def _set_unknowns(fdm: jsbsim.FGFDMExec, scaled: FloatArray) -> None:
+    alpha, throttle, pitch_trim, aileron, rudder, bank = (START + (scaled - 1.0) * SCALE).tolist()
+    fdm["ic/alpha-rad"], fdm["ic/gamma-deg"], fdm["ic/phi-rad"] = alpha, 0.0, bank
+    fdm.run_ic()
+    for i in range(engine_count(fdm)):
+        fdm[f"fcs/throttle-cmd-norm[{i}]"] = throttle
+    fdm["fcs/pitch-trim-cmd-norm"], fdm["fcs/elevator-cmd-norm"] = pitch_trim, 0.0
+    fdm["fcs/aileron-cmd-norm"], fdm["fcs/rudder-cmd-norm"] = aileron, rudder
+
+
+def _residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:
+    return np.array([fdm[f"accelerations/{name}"] * si for name, si in RESIDUALS.items()])
+
+
+def _is_trimmed(fdm: jsbsim.FGFDMExec) -> bool:
+    """Whether the accelerations are within TOLERANCE and every command is inside its stops."""
+    _, lower, upper = _commands_and_limits(fdm)
+    inside = bool(np.all(lower <= 0.0) and np.all(upper >= 0.0))
+    return inside and bool(np.all(np.abs(_residuals(fdm)) <= TOLERANCE))
+
+
+def _trim_failure(fdm: jsbsim.FGFDMExec) -> str:
+    """Why the solver's result is no trim, as a sentence."""
+    stopped = [str(i + 1) for i in range(engine_count(fdm)) if not fdm[running_property(i)]]
+    if stopped:
+        return f"engine {', '.join(stopped)} cannot be started"
+    linear, angular = np.abs(_residuals(fdm)).reshape(2, 3).max(axis=1)
+    _, lower, upper = _commands_and_limits(fdm)
+    beyond = [name for name, low, high in zip(INPUTS, lower, upper, strict=True) if not low <= 0.0 <= high]
+    at_stops = f", with {' and '.join(beyond)} beyond the stops" if beyond else ""
+    return f"accelerations of {linear:.2g} m/s^2 and {angular:.2g} rad/s^2 are left at best{at_stops}"
+
+
+def _commands_and_limits(fdm: jsbsim.FGFDMExec) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Whole commands, the trim's part included, and the distances to their lower and upper stops, all (4,)."""
+    inputs = INPUTS.values()
+    own = np.array([fdm[command_paths(command, 1)[0]] for command in inputs])
+    trim = np.array([0.0 if command.trim_property is None else fdm[command.trim_property] for command in inputs])
+    lower, upper = (np.array([getattr(command, key) for command in inputs]) for key in ("lower", "upper"))
+    return own + trim, lower - np.minimum(own, own + trim), upper - np.maximum(own, own + trim)
