@@ -3,13 +3,16 @@
 """The command line: exit status, sentences, files."""
 
 import json
+import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_cli.cli import COMMANDS
 
 
 def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -93,3 +96,34 @@ def test_a_scenario_file_may_lie_anywhere(tmp_path: Path, osprey_gust: Scenario)
     (tmp_path / "mine.yaml").write_bytes(osprey_gust.path.read_bytes())
     assert rise_di("fly", "mine.yaml", "--in-process", "--duration", "1", cwd=tmp_path).returncode == 0
     assert (tmp_path / "runs" / "latest").resolve().name.endswith("-mine")
+
+
+def test_a_command_whose_python_package_is_missing_says_what_installs_it(tmp_path: Path) -> None:
+    (tmp_path / "jax.py").write_text("raise ModuleNotFoundError('No module named jax', name='jax')", encoding="utf-8")
+    shown = rise_di("campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path)  # -m puts the working folder first
+    assert shown.returncode == 2
+    sentence = "error: rise-di campaign needs the Python package jax, which `make setup-all` installs"
+    assert shown.stderr.splitlines()[-1] == sentence
+    assert "Traceback" not in shown.stderr
+
+
+def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
+    assert rise_di("--version", cwd=tmp_path).stdout == f"rise-di {version('flight_cli')}\n"
+
+
+def test_every_command_of_the_help_runs_and_has_a_help_of_its_own(tmp_path: Path) -> None:
+    for name in COMMANDS:
+        shown = rise_di(name, "--help", cwd=tmp_path)
+        assert shown.returncode == 0, name
+        assert f"Usage: rise-di {name}" in shown.stdout
+    assert all(name in rise_di("--help", cwd=tmp_path).stdout for name in COMMANDS)
+
+
+def test_the_shell_completes_commands_and_the_options_of_a_command() -> None:
+    def complete(words: str, place: int) -> list[str]:
+        environment = os.environ | {"_RISE_DI_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(place)}
+        command = [sys.executable, "-m", "flight_cli.cli"]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=False).stdout.split()
+
+    assert complete("rise-di re", 1) == ["report", "replay", "repair"]
+    assert "--parquet" in complete("rise-di report --", 2)

@@ -1,19 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di airframes`: what the theorem asks of an airframe, for every airframe of the library."""
+"""`rise-di airframes`: the assumptions of the theorem, checked on every airframe of the library."""
 
 import json
 from typing import Annotated, Any
 
 import typer
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from flight_analysis.design.airframe_properties import AirframeFacts, ComplexArray, library
-
-FOLDED = ("poles", "zeros at", "minors")
-"""Columns that take more lines where there is no room."""
+from flight_cli.output import new_table
 
 
 def airframes(
@@ -22,10 +19,10 @@ def airframes(
     """Show the airframes of the library: poles, zeros, the minors of Omega = C B, D as published and what gives D = I."""
     facts = library()
     if as_json:
-        print(json.dumps([_plain(one) for one in facts]))
+        print(json.dumps([_as_json(one) for one in facts]))
         return
     console = Console()
-    signs = _table("Signs and pairing", ("airframe", "D", "for D = I", "coupling"))
+    signs = _table("Signs and pairing", "airframe", "D", "for D = I", "coupling")
     for one in facts:
         signs.add_row(
             one.name,
@@ -34,14 +31,16 @@ def airframes(
             "-" if one.coupling is None else f"{one.coupling:.3g}",
         )
     console.print(signs)
-    asked = _table("Assumptions 1 and 3", ("airframe", "n, m", "controllable", "zeros", "integrated"))
+    assumptions = _table("Assumptions 1 and 3", "airframe", "n, m", "controllable", "zeros", "integrated")
     for one in facts:
         yes = "yes" if one.controllable else "no"
-        asked.add_row(one.name, f"{one.n}, {one.m}", yes, one.zero_dynamics, ", ".join(one.integrated) or "-")
-    console.print(asked)
-    roots = _table("Poles and zeros in 1/s, leading minors of C B in SI", ("airframe", "poles", "zeros at", "minors"))
+        assumptions.add_row(one.name, f"{one.n}, {one.m}", yes, one.zero_dynamics, ", ".join(one.integrated) or "-")
+    console.print(assumptions)
+    roots = _table("Poles and zeros in 1/s, leading minors of C B in SI", "airframe", "poles", "zeros at", "minors")
     for one in facts:
-        roots.add_row(one.name, _shown(one.poles), _shown(one.zeros), "  ".join(f"{minor:.3g}" for minor in one.minors))
+        roots.add_row(
+            one.name, _format_roots(one.poles), _format_roots(one.zeros), "  ".join(f"{minor:.3g}" for minor in one.minors)
+        )
     console.print(roots)
     outside = [one.name for one in facts if not one.in_theorem]
     console.print(f"Outside the theorem: {', '.join(outside) or 'none'}. Coupling is max abs(U - I).", soft_wrap=True)
@@ -50,15 +49,12 @@ def airframes(
         console.print(f"marginal: {integrated} integrate the outputs and need an outer loop.", soft_wrap=True)
 
 
-def _table(title: str, headings: tuple[str, ...]) -> Table:
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading in headings:
-        table.add_column(heading, no_wrap=heading not in FOLDED, overflow="fold")
-    return table
+def _table(title: str, *headings: str) -> Table:
+    return new_table(title, headings, left=headings, wrapped=("poles", "zeros at", "minors"))
 
 
-def _shown(roots: ComplexArray) -> str:
-    """Roots for people: conjugate pairs once, what is zero to rounding as 0."""
+def _format_roots(roots: ComplexArray) -> str:
+    """Roots as text: a conjugate pair once, a root that is zero to rounding as 0."""
     shown = []
     for root in roots:
         real, imaginary = (0.0 if abs(part) < 1e-6 else float(part) for part in (root.real, root.imag))
@@ -67,7 +63,7 @@ def _shown(roots: ComplexArray) -> str:
     return "  ".join(shown)
 
 
-def _plain(one: AirframeFacts) -> dict[str, Any]:
+def _as_json(one: AirframeFacts) -> dict[str, Any]:
     return {
         "name": one.name,
         "n": one.n,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di campaign`: a Monte Carlo campaign, a scenario campaign_run by thousands of uncertain aircraft."""
+"""`rise-di campaign`: a Monte Carlo campaign, a scenario flown by thousands of uncertain aircraft."""
 
 import json
 import time
@@ -61,25 +61,25 @@ def campaign(
     require((scenario is None) == (resume is not None), "SCENARIO", scenario, "one of a scenario and --resume")
     require(scheduler is None or engine is EngineName.DASK, "--scheduler", scheduler, "--engine dask with it")
     if resume is not None:
-        campaign_run = Campaign.resume(resume)
+        monte_carlo = Campaign.resume(resume)
     else:
         chosen = find_scenario(str(scenario))
         if duration is not None:
             chosen = chosen.vary(flight={"duration": duration})
         definition = define(chosen, aircraft, uncertainty, seed, chunk, None if sweep is None else _parse_sweep(sweep))
-        campaign_run = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
+        monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
-    speed = _fly_missing(campaign_run, flies, quiet=as_json)
-    figures = _write_results(campaign_run)
+    speed = _fly_missing(monte_carlo, flies, quiet=as_json)
+    figures = _write_results(monte_carlo)
     if as_json:
         print(json.dumps(figures))
         return
     console = Console()
-    for case in range(campaign_run.definition.cases):
-        _show(console, campaign_run.definition, case, campaign_run.tally(case), figures["cases"][case])
+    for case in range(monte_carlo.definition.cases):
+        _show(console, monte_carlo.definition, case, monte_carlo.tally(case), figures["cases"][case])
     if speed is not None:
         print(f"flown:   {speed:,.0f} aircraft-seconds per second")
-    print(f"folder:  {display_path(campaign_run.folder)}\nreport:  {display_path(campaign_run.folder / REPORT)}")
+    print(f"folder:  {display_path(monte_carlo.folder)}\nreport:  {display_path(monte_carlo.folder / REPORT)}")
 
 
 def _parse_sweep(text: str) -> Sweep:
@@ -91,10 +91,10 @@ def _parse_sweep(text: str) -> Sweep:
     return Sweep(parameter=name.removeprefix("controller."), factors=factors)
 
 
-def _fly_missing(campaign_run: Campaign, engine: engines.Engine, *, quiet: bool) -> float | None:
+def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) -> float | None:
     """Fly the chunks that are missing; aircraft-seconds per second, None if none is."""
-    definition = campaign_run.definition
-    total, missing = definition.aircraft * definition.cases, campaign_run.missing()
+    definition = monte_carlo.definition
+    total, missing = definition.aircraft * definition.cases, monte_carlo.missing()
     there = total - sum(definition.size(job) for job in missing)
     if not missing:
         return None
@@ -109,26 +109,27 @@ def _fly_missing(campaign_run: Campaign, engine: engines.Engine, *, quiet: bool)
     try:
         with progress_bar(*columns, quiet=quiet) as bar:
             task = bar.add_task("campaign", total=total, completed=there, shown="compiling")
-            for flights in campaign_run.fly(engine):
+            for flights in monte_carlo.fly(engine):
                 done += flights
                 speed = done * seconds / (time.monotonic() - begin)
                 bar.update(task, completed=there + done, shown=f"{speed:,.0f} aircraft-seconds per second")
     except KeyboardInterrupt:
         print(
-            f"interrupted after {there + done} of {total}; continue with: rise-di campaign --resume {display_path(campaign_run.folder)}"
+            f"interrupted after {there + done} of {total}; continue with:"
+            f" rise-di campaign --resume {display_path(monte_carlo.folder)}"
         )
         raise typer.Exit(INTERRUPTED) from None
     return done * seconds / (time.monotonic() - begin)
 
 
-def _write_results(campaign_run: Campaign) -> dict[str, Any]:
+def _write_results(monte_carlo: Campaign) -> dict[str, Any]:
     """Write the summary, the report and the scenarios of the worst aircraft; returns the summary."""
-    definition = campaign_run.definition
+    definition = monte_carlo.definition
     cases = []
     for case in range(definition.cases):
-        tally = campaign_run.tally(case)
+        tally = monte_carlo.tally(case)
         cases.append(
-            {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(campaign_run, case, tally)}
+            {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(monte_carlo, case, tally)}
         )
     figures = {
         "scenario": definition.name,
@@ -138,18 +139,18 @@ def _write_results(campaign_run: Campaign) -> dict[str, Any]:
         "sweep": None if definition.sweep is None else definition.sweep.parameter,
         "cases": cases,
     }
-    (campaign_run.folder / SUMMARY).write_text(json.dumps(figures, indent=1), encoding="utf-8")
-    write_page(campaign_run.folder / REPORT, definition, [campaign_run.tally(case) for case in range(definition.cases)], cases)
+    (monte_carlo.folder / SUMMARY).write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    write_page(monte_carlo.folder / REPORT, definition, [monte_carlo.tally(case) for case in range(definition.cases)], cases)
     return figures
 
 
-def _write_worst(campaign_run: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
+def _write_worst(monte_carlo: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
     """Write the scenarios of the worst aircraft; returns them with the command that flies each."""
     again = []
     for one in tally.worst[:RERUN]:
-        suffix = "" if campaign_run.definition.sweep is None else f"_{campaign_run.definition.factor(case):g}"
-        path = campaign_run.folder / f"{campaign_run.definition.name}{suffix}_{one.number}.yaml"
-        path.write_text(scenario_yaml(campaign_run.definition.aircraft_scenario(one.number, case)), encoding="utf-8")
+        suffix = "" if monte_carlo.definition.sweep is None else f"_{monte_carlo.definition.factor(case):g}"
+        path = monte_carlo.folder / f"{monte_carlo.definition.name}{suffix}_{one.number}.yaml"
+        path.write_text(scenario_yaml(monte_carlo.definition.aircraft_scenario(one.number, case)), encoding="utf-8")
         command = f"rise-di fly {display_path(path)} --in-process"
         again.append({"number": one.number, "score": one.score, "command": command})
     return again

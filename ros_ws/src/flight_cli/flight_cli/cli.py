@@ -78,6 +78,11 @@ def main() -> None:
         except ParameterError as error:
             print(f"error: {error}", file=sys.stderr)
             sys.exit(BAD_INPUT)
+    except ModuleNotFoundError as error:
+        print(
+            f"error: rise-di {words[0]} needs the Python package {error.name}, which `make setup-all` installs", file=sys.stderr
+        )
+        sys.exit(BAD_INPUT)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
 

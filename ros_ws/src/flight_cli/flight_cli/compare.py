@@ -18,11 +18,9 @@ from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import law_comparison
 from flight_campaign import tuning as gain_tuning
+from flight_campaign.law_comparison import LawResult
 from flight_cli.output import new_table, progress_bar
 from flight_core.parameters import ParameterError, require
-
-if TYPE_CHECKING:
-    from flight_campaign.law_comparison import LawResult
 
 SEEDS = (1, 2, 3)
 NOTES = """
@@ -30,7 +28,7 @@ NOTES = """
 sees: measurements beside y_m. y alone is gyros and airspeed; a full state is y and the other states without error;
   vanes give alpha and beta relative to the air without error. No real sensor is as good
 score: sum of rms of the true error over {unit}; mean (worst) of {aircraft} aircraft a level,
-  every entry of A and B off by up to the level, rows of angles known, seed {seed}; differences of a few % are noise of the tuning
+  every entry of A and B off by up to the level, rows of angles known, seed {seed}; a few % are noise of the tuning
 lost: loss of track, a score above 10, in % at each level; a diverged aircraft is lost and makes the mean infinite
 rms, slew: of the true error and mean abs(u_dot), nominal aircraft, in the units of the airframe and mrad/s
 delay: the largest delay of u in whole ticks at which the score stays below three times that without delay
@@ -41,9 +39,7 @@ WIDTH = 160  # characters, the least width of the table
 def compare(
     scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_servo",
     aircraft: Annotated[int, typer.Option(min=1, help="Uncertain aircraft at each level.")] = 200,
-    uncertainty: Annotated[
-        str, typer.Option(help="Largest relative deviations of each entry of A and B, as in 0.3,0.5")
-    ] = "0.3,0.5",
+    uncertainty: Annotated[str, typer.Option(help="Largest relative deviations of A and B, as in 0.3,0.5")] = "0.3,0.5",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain aircraft.")] = 1,
     laws: Annotated[str | None, typer.Option(help="Laws to compare, by name: rise,pi,l1; all by default.")] = None,
     tuning: Annotated[
@@ -88,7 +84,7 @@ def compare(
     console, units = Console(), display_units(chosen)
     console.width = max(console.width, WIDTH)
     for aim in aims:
-        console.print(_table(gain_tuning.OBJECTIVES[aim], [one for one in found if one.objective == aim], chosen))
+        console.print(_table(gain_tuning.OBJECTIVES[aim], [one for one in results if one.objective == aim], chosen))
     titles = "\n".join(f"{name}: {LAWS[name].title}; knows {LAWS[name].model_data or 'no model'}" for name in tuned)
     counted = zip(chosen.controller.outputs, benchmark.unit, strict=True)
     unit = ", ".join(f"{one * units[name].factor:g} {units[name].unit} of {name}" for name, one in counted)
@@ -111,7 +107,7 @@ def _parse_levels(text: str) -> list[float]:
     return levels
 
 
-def _table(tuned_on: str, found: Sequence["LawResult"], scenario: Scenario) -> Table:
+def _table(tuned_on: str, found: Sequence[LawResult], scenario: Scenario) -> Table:
     units, channels, of = display_units(scenario), scenario.aircraft.channels(), " / ".join
     levels = [f"+-{100.0 * level.uncertainty:g} %" for level in found[0].levels] if found else []
     inputs = "slew\n" + of(name[:4] for name in channels.inputs)
@@ -119,7 +115,7 @@ def _table(tuned_on: str, found: Sequence["LawResult"], scenario: Scenario) -> T
     table = new_table(f"{scenario.name}, each law tuned on {tuned_on}", heads, left=("law", "sees"))
     for one in found:
         rms, slew = _by_name(one, scenario)
-        table.add_as_json(
+        table.add_row(
             one.law,
             LAWS[one.law].measurements,
             f"{one.score:.2f}",
@@ -132,14 +128,14 @@ def _table(tuned_on: str, found: Sequence["LawResult"], scenario: Scenario) -> T
     return table
 
 
-def _by_name(one: "LawResult", scenario: Scenario) -> tuple[dict[str, float], dict[str, float]]:
+def _by_name(one: LawResult, scenario: Scenario) -> tuple[dict[str, float], dict[str, float]]:
     """Errors by output and slew by input, SI."""
     controller = scenario.controller
     rms = dict(zip(controller.outputs, one.rms.tolist(), strict=True))
     return rms, dict(zip(controller.inputs, one.slew.tolist(), strict=True))
 
 
-def _as_json(one: "LawResult", scenario: Scenario) -> dict[str, Any]:
+def _as_json(one: LawResult, scenario: Scenario) -> dict[str, Any]:
     """Figures of a law for JSON: SI, null for an infinite figure."""
     rms, slew = _by_name(one, scenario)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di engage`: the autopilot behind a running bridge is taken over without a jump, or given back."""
+"""`rise-di engage`: bumpless engagement of the autopilot behind a running bridge, and disengagement."""
 
 import sys
 from typing import Annotated
@@ -11,18 +11,19 @@ REFUSED = 1
 
 
 def engage(
-    off: Annotated[bool, typer.Option("--off", help="Give the autopilot its channels back.")] = False,
-    namespace: Annotated[str, typer.Option(help="Of the bridge and the controller.")] = "",
+    off: Annotated[bool, typer.Option("--off", help="Disengage: give the channels back to the autopilot.")] = False,
+    namespace: Annotated[str, typer.Option(help="Namespace of the bridge and the controller.")] = "",
 ) -> None:
-    """Deactivate the controller until u is at trim, engage the bridge, activate the controller: u then begins without a jump.
+    """Engage the autopilot behind a running bridge without a jump of u, or disengage it.
 
-    Exit status: 0 done, 1 refused, with the bridge's reason; the controller is then left as it was. 2 nobody there.
+    The controller is deactivated until u is at trim, the bridge is engaged, the controller is activated. A refusal leaves the
+    controller as it was. Exit status: 0 done, 1 refused with the bridge's reason, 2 service not available.
     """
     from flight_bringup.clients import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     with EngagementClient(namespace) as engager:
         refusal = engager.give_back() if off else engager.take_over()
     if refusal:
-        print(f"error: not {'given back' if off else 'engaged'}: {refusal}", file=sys.stderr)
+        print(f"error: not {'disengaged' if off else 'engaged'}: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)
-    print("given back" if off else "engaged, the controller flies")
+    print("disengaged" if off else "engaged, the controller flies")

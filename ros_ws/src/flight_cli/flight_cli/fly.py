@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, TextColumn
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.sign_check import require_signs
@@ -17,7 +17,7 @@ from flight_analysis.report.run_folder import conclude, conclude_unflown, new_ru
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import Autopilot, find_autopilot
 from flight_bringup.scenarios import find_scenario
-from flight_cli.output import ENDED_EARLY, INTERRUPTED, display_path, show_flight
+from flight_cli.output import ENDED_EARLY, INTERRUPTED, display_path, progress_bar, show_flight
 from flight_core import outcome as ends
 from flight_core.parameters import ParameterError, require
 
@@ -26,29 +26,29 @@ STATUS = {ends.COMPLETED: 0, ends.INTERRUPTED: INTERRUPTED}
 
 def fly(
     scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_gust",
-    duration: Annotated[float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Duration in s; by default that of the scenario.")] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Fly in one process without ROS, as fast as it goes.")
     ] = False,
     lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="Over topics as fast as the machine allows, repeatable to the byte.")
+        bool,
+        typer.Option("--lockstep", help="Fly in lockstep over topics, as fast as possible, repeatable to the byte."),
     ] = False,
-    one_process: Annotated[
-        bool, typer.Option("--one-process", help="In lockstep, with all nodes as objects in one process.")
-    ] = False,
+    one_process: Annotated[bool, typer.Option("--one-process", help="Fly in lockstep with all nodes in one process.")] = False,
     bridge: Annotated[
         str | None,
         typer.Option(
-            metavar="MAP", help="Fly an autopilot in the aircraft's place, by a channel map; a dry run without --send."
+            metavar="MAP",
+            help="Fly an autopilot in place of the aircraft, by a channel map; a dry run without --send.",
         ),
     ] = None,
-    send: Annotated[bool, typer.Option("--send", help="Send to the autopilot, once the bridge is told to engage.")] = False,
+    send: Annotated[bool, typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged.")] = False,
     runs: Annotated[Path, typer.Option(help="Folder that the run's folder is made in.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")] = False,
 ) -> None:
     """Fly a scenario: aircraft, reference model, controller and recorder as processes over ROS 2 topics, in real time.
 
-    Exit status: 0 flown to its end, 2 bad input, 3 ended early, 130 interrupted.
+    Exit status: 0 completed, 2 bad input, 3 ended early, 130 interrupted.
     """
     chosen = find_scenario(scenario)
     if duration is not None:
@@ -59,9 +59,8 @@ def fly(
     real_time = "a flight in real time over topics: an autopilot does not wait"
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     run = new_run(chosen, runs)
-    console = Console(stderr=True, quiet=as_json)
     columns = (TextColumn("{task.fields[clock]}"), BarColumn(), TextColumn("{task.fields[shown]}"))
-    with Progress(*columns, console=console) as bar:
+    with progress_bar(*columns, quiet=as_json) as bar:
         task = bar.add_task("flight", total=chosen.flight.duration, clock="", shown="")
 
         def progress(t: float, shown: str) -> None:
@@ -75,24 +74,24 @@ def fly(
             progress(chosen.flight.duration, outcome)
     status = STATUS.get(outcome, ENDED_EARLY)
     try:
-        flown = conclude(run, outcome)
+        result = conclude(run, outcome)
     except ParameterError:
         if status == 0:
             raise
         conclude_unflown(run, chosen, outcome)
-        print(f"error: {outcome}, before anything was flown; see {display_path(run)}", file=sys.stderr)
+        print(f"error: {outcome}, before the first sample; see {display_path(run)}", file=sys.stderr)
         raise typer.Exit(status) from None
-    outcome = flown.flight.summary["outcome"]
+    outcome = result.flight.summary["outcome"]
     status = STATUS.get(outcome, ENDED_EARLY)
     if as_json:
-        print(json.dumps(flown.flight.summary))
+        print(json.dumps(result.flight.summary))
     else:
-        show_flight(Console(), flown.flight)
-        print(f"outcome: {outcome}\nlog:     {display_path(flown.mcap)}\nreport:  {display_path(flown.report)}")
+        show_flight(Console(), result.flight)
+        print(f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  {display_path(result.report)}")
     raise typer.Exit(status)
 
 
 def _autopilot(scenario: Scenario, map_name: str, *, send: bool) -> Autopilot:
     found = find_autopilot(map_name, dry_run=not send)
-    require_signs(found.chart, scenario)
+    require_signs(found.channel_map, scenario)
     return found

@@ -52,7 +52,7 @@ def gains(
     write: Annotated[Path | None, typer.Option(help="File for the engineering gains, as a section of a scenario.")] = None,
     feedforward: Annotated[
         bool,
-        typer.Option("--feedforward", help="Write the airframe too, as the nominal model of the feedforward (an extension)."),
+        typer.Option("--feedforward", help="Write the airframe too, as the model of the feedforward (an extension)."),
     ] = False,
     check: Annotated[
         bool, typer.Option("--check", help="Check the gain set of the scenario instead of selecting one.")

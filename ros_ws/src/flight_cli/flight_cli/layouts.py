@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di layouts`: what Foxglove and PlotJuggler show of the runs of a scenario."""
+"""`rise-di layouts`: layouts of Foxglove and PlotJuggler for the runs of a scenario."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,9 +14,9 @@ from flight_core.parameters import ParameterError
 
 def layouts(
     scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_gust",
-    folder: Annotated[Path, typer.Option(help="Where the two files go.")] = Path(),
+    folder: Annotated[Path, typer.Option(help="Folder to write the two files to.")] = Path(),
 ) -> None:
-    """Write layouts for Foxglove and PlotJuggler that open the runs of a scenario with the plots one wants first."""
+    """Write layouts for Foxglove and PlotJuggler that plot the runs of a scenario."""
     chosen = find_scenario(scenario)
     channels = channels_of(chosen)
     for suffix, text in (("foxglove.json", foxglove(channels)), ("plotjuggler.xml", plotjuggler(channels))):

@@ -1,16 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands print and write: tables, paths, exit statuses."""
+"""What the commands share: tables, JSON, paths, exit statuses."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich import box
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from flight_analysis.metrics import PARTS
+from flight_analysis.metrics import PARTS_LEGEND
 from flight_analysis.report.recorded_flight import RecordedFlight
 from flight_analysis.report.summary import ERROR_COLUMNS, INPUT_COLUMNS, Column, display_units, limited_cell, table_rows
 
@@ -41,13 +42,28 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
                 [[*row, share] for row, share in zip(rows, limited, strict=True)],
             )
         )
-    console.print(f"{PARTS}. bound: the largest error in calm", style="dim", highlight=False)
+    console.print(f"{PARTS_LEGEND}. bound: the largest error in calm", style="dim", highlight=False)
     for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"])):
         console.print(line, highlight=False)
 
 
+def new_table(title: str, headings: Iterable[str], left: Container[str] = (), wrapped: Container[str] = ()) -> Table:
+    """An empty table. Columns are aligned right but for those in `left`, and keep to one line but for those in `wrapped`."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in headings:
+        justify: Literal["left", "right"] = "left" if heading in left else "right"
+        table.add_column(heading, justify=justify, no_wrap=heading not in wrapped, overflow="fold")
+    return table
+
+
+def progress_bar(*columns: ProgressColumn, quiet: bool = False) -> Progress:
+    """A progress bar on standard error; by default it shows a description, the count and the time that is left."""
+    default = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*(columns or default), console=Console(stderr=True, quiet=quiet))
+
+
 def grouped_table(title: str, first: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Table:
-    """A table whose neighbouring columns of one group share a head."""
+    """A table whose adjacent columns of one group share a heading."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0)
     table.add_column(f"\n{first}", no_wrap=True)
     for column, before in zip(columns, (None, *columns), strict=False):
@@ -73,5 +89,5 @@ def _timing(summary: Mapping[str, Any]) -> list[str]:
 
 
 def display_path(path: Path) -> str:
-    """A path as it is best shown: relative where it is below the working folder."""
+    """A path relative to the working folder if it is below it, else as it is."""
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

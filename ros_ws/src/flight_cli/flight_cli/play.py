@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di play`: the topics of a recorded flight again, with their timing, for any node to be tried against."""
+"""`rise-di play`: publish the topics of a recorded flight again with their timing, for a node under test."""
 
 import math
 from enum import StrEnum
@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, TextColumn
 
+from flight_cli.output import progress_bar
 from flight_core.parameters import require
 from flight_log.playback import SHARED, read_playback
 
 
 class Stamps(StrEnum):
-    """What becomes of the stamps of the messages."""
+    """Stamps of the messages."""
 
     NOW = "now"
     RECORDED = "recorded"
@@ -24,18 +24,18 @@ class Stamps(StrEnum):
 
 def play(
     run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")],
-    topics: Annotated[str, typer.Option(help="Which topics, as in y,y_m; all of the log but those that every node has.")] = "",
-    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="How many times as fast.")] = 1.0,
-    start: Annotated[float, typer.Option(min=0.0, help="Flight time to begin at, s.")] = 0.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end, until Ctrl-C.")] = False,
+    topics: Annotated[str, typer.Option(help="Topics, as in y,y_m; by default all but those of every node.")] = "",
+    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Factor to real time.")] = 1.0,
+    start: Annotated[float, typer.Option(min=0.0, help="Flight time to start at, s.")] = 0.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat until Ctrl-C.")] = False,
     stamps: Annotated[
-        Stamps, typer.Option(help="Moved to now, as a controller in real time needs them, or as they were recorded.")
+        Stamps, typer.Option(help="now: moved to the present, as a controller in real time needs them; recorded: unchanged.")
     ] = Stamps.NOW,
 ) -> None:
     """Publish the topics of a recorded flight again with their timing, and /clock with the time of the log.
 
-    Bytes are those of the log, but for the stamps, which are moved to now unless told otherwise. Refuses a domain in which
-    somebody publishes on one of the topics already. Exit status: 0 played to its end, 2 bad input, 130 interrupted.
+    The bytes are those of the log but for the stamps. A domain with another publisher on one of the topics is refused.
+    Exit status: 0 played to its end, 2 bad input, 130 interrupted.
     """
     for option, value in (("--rate", rate), ("--start", start)):
         require(math.isfinite(value), option, value, "a number")  # NaN passes the ranges above
@@ -44,10 +44,9 @@ def play(
     from flight_bringup.clients import player  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     end = playback.t(playback.messages[-1].due_ns)
-    console = Console(stderr=True)
     with (
         player(playback.types, SHARED) as sender,
-        Progress(TextColumn("{task.fields[clock]}"), BarColumn(), TextColumn("{task.fields[shown]}"), console=console) as bar,
+        progress_bar(TextColumn("{task.fields[clock]}"), BarColumn(), TextColumn("{task.fields[shown]}")) as bar,
     ):
         task = bar.add_task("play", total=end - start, clock="", shown=f"{', '.join(playback.types)}, stamps {stamps}")
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di repair`: the log of a killed recorder made one that every reader of rosbag2 takes."""
+"""`rise-di repair`: rebuild a log whose recorder was killed, so that every rosbag2 reader accepts it."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,22 +18,22 @@ from flight_log.tape_reader import read_run
 
 
 def repair(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> None:
-    """Rebuild the log of a run whose recorder was killed, or that is damaged; leave an intact one alone.
+    """Rebuild the log of a run whose recorder was killed, or that is damaged. An intact log stays as it is.
 
-    What could be read is kept, with an index and metadata.yaml; the damaged file stays beside it as *.damaged.
+    The new log holds every message that could be read, an index and metadata.yaml. The damaged file stays as *.damaged.
     """
     repaired = repair_bag(run)
     for file in repaired.files:
         if file.damaged is not None:
-            print(f"{file.path.name} had {file.faults}: {file.kept} messages kept; as it was: {file.damaged.name}")
+            print(f"{file.path.name} had {file.faults}: {file.kept} messages kept; the damaged file is {file.damaged.name}")
     if repaired.wrote_metadata:
-        print(f"{METADATA} written; {_end(run, repaired.files[-1])}")
+        print(f"{METADATA} written; {_missing_at_end(run, repaired.files[-1])}")
     else:
         print(f"{run} is intact: nothing to repair")
 
 
-def _end(run: Path, last: Repaired) -> str:
-    """How much is missing, compared with what is known of the end: what the files say, else how long the flight was to be."""
+def _missing_at_end(run: Path, last: Repaired) -> str:
+    """Time missing at the end of the log: by what the files say of their end, else by the duration of the scenario."""
     if (missing := seconds(last.known_end_ns - last.last_ns)) > 0:
         return f"{missing:.3f} s are missing at its end"
     if not last.faults:
@@ -41,7 +41,7 @@ def _end(run: Path, last: Repaired) -> str:
     try:
         recorded = read_run(run)
     except ParameterError:
-        return "nothing says how much is missing at its end"
+        return "it is unknown how much is missing at its end"
     end = max(float(recorded.tape.time(name)[-1]) for name in recorded.tape.signals)
     for stored in recorded.attachments:
         if stored.name == PARAMETERS:
@@ -49,6 +49,6 @@ def _end(run: Path, last: Repaired) -> str:
                 parameters = parse_yaml(stored.content, PARAMETERS, "a scenario file")
                 duration = float(parameters["/**/flight"]["ros__parameters"]["duration"])
             except (ParameterError, LookupError, OverflowError, TypeError, ValueError):
-                continue  # a file of any content may have this name
-            return f"the log ends at t = {end:.3f} s of the {duration:g} s that were to be flown"
-    return f"the log ends at t = {end:.3f} s; nothing says how much is missing"
+                continue  # an attachment of this name may hold anything
+            return f"the log ends at t = {end:.3f} s of the {duration:g} s of the scenario"
+    return f"the log ends at t = {end:.3f} s; it is unknown how much is missing"

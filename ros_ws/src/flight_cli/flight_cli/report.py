@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di report`: the figures of recorded runs, as tables, pages, pictures and data."""
+"""`rise-di report`: tables, report page, figures and data of recorded runs."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from flight_analysis.report import comparison
 from flight_analysis.report.export import write_csv, write_parquet, write_png
@@ -18,27 +16,27 @@ from flight_analysis.report.page import write_page
 from flight_analysis.report.recorded_flight import RecordedFlight
 from flight_analysis.report.run_folder import conclude, read_flight
 from flight_analysis.report.summary import ERROR_COLUMNS
-from flight_cli.output import display_path, show_flight
+from flight_cli.output import display_path, new_table, show_flight
 from flight_core.parameters import ParameterError
 
 
 def report(
-    runs: Annotated[list[Path], typer.Argument(help="Folder of a run; several are compared, each with the first.")],
-    html: Annotated[Path | None, typer.Option(help="Page of a comparison; comparison.html beside the first run.")] = None,
-    png: Annotated[Path | None, typer.Option(help="Write y over y_m, e and u as one picture.")] = None,
+    runs: Annotated[list[Path], typer.Argument(help="Folder of a run; several runs are compared with the first.")],
+    html: Annotated[Path | None, typer.Option(help="Page of a comparison; by default comparison.html beside run 1.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Write y over y_m, e and u as one PNG figure.")] = None,
     csv: Annotated[
-        Path | None, typer.Option(help="Write all signals as a table: a row an instant, a column a channel.")
+        Path | None, typer.Option(help="Write all signals as CSV, one row an instant, one column a channel.")
     ] = None,
     parquet: Annotated[Path | None, typer.Option(help="Write the same table as Parquet.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, of several runs a list of them.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, a list for several runs.")] = False,
 ) -> None:
     """Write the report page of a recorded run again, or one that compares several, and print its tables.
 
     Exit status: 0, or 2 bad input.
     """
     if len(runs) == 1 and html is None:
-        concluded = conclude(runs[0])
-        flights, page = [concluded.flight], concluded.report
+        result = conclude(runs[0])
+        flights, page = [result.flight], result.report
     else:
         flights, page = [read_flight(run) for run in runs], html or runs[0].absolute().parent / "comparison.html"
         _write("--html", page, write_page, flights)
@@ -69,14 +67,11 @@ def _write(
 
 
 def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None:
-    """Print the errors of several flights beside each other, with ratios to the first."""
+    """Print the errors of several flights with their ratios to the first."""
     for k, (label, flight) in enumerate(zip(comparison.labels(flights), flights, strict=True), start=1):
         console.print(f"{k}: {label}, {flight.summary['outcome']}", highlight=False, soft_wrap=True)
-    table = Table(title="Tracking error, and its ratio to the first", title_justify="left", box=box.SIMPLE_HEAD)
-    table.add_column("channel", no_wrap=True)
-    table.add_column("", no_wrap=True)
-    for k in range(len(flights)):
-        table.add_column(f"{k + 1}", justify="right", no_wrap=True)
+    headings = ("channel", "", *(str(k + 1) for k in range(len(flights))))
+    table = new_table("Tracking error, and its ratio to the first", headings, left=("channel", ""))
     for block in comparison.blocks(flights, "errors", ERROR_COLUMNS, judged=True):
         for k, row in enumerate(block.rows):
             ratios = ("" if j == 0 or ratio is None else f" x{ratio:.3g}" for j, ratio in enumerate(row.ratios))
