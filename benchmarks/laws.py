@@ -17,7 +17,7 @@ from rich.progress import track
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
 from flight_campaign.law_comparison import LawResult, compare
-from flight_campaign.tuning import Benchmark, TuningResult, benchmark, load, tuned_file
+from flight_campaign.tuning import Benchmark, TuningResult, build_benchmark, load, tuned_file
 
 LAWS = ("rise", "rise_ff", "rise_observer", "lqg", "pi", "pi_ff", "l1", "indi", "lqi_vanes")
 OBSERVER = "rise_observer"
@@ -44,13 +44,13 @@ def courses(scenario: Scenario) -> dict[str, Scenario]:
     }
 
 
-def wrong_wind(here: Benchmark) -> Iterator[tuple[str, Benchmark]]:
+def wrong_wind(benchmark: Benchmark) -> Iterator[tuple[str, Benchmark]]:
     """The benchmark with an observer that knows the wind's columns wrongly; the aircraft stay."""
     generator = np.random.default_rng(5)
     for part in WRONG:
-        factor = 1.0 + part * generator.uniform(-1.0, 1.0, here.known.wind.shape) if part < 1.0 else 0.0
+        factor = 1.0 + part * generator.uniform(-1.0, 1.0, benchmark.model.wind.shape) if part < 1.0 else 0.0
         name = f"wind wrong by up to {100.0 * part:g} %" if part < 1.0 else "no wind known"
-        yield name, here._replace(known=here.known._replace(wind=here.known.wind * factor))
+        yield name, benchmark._replace(model=benchmark.model._replace(wind=benchmark.model.wind * factor))
 
 
 def main(
@@ -63,12 +63,12 @@ def main(
     chosen: dict[str, dict[str, TuningResult]] = {name: {"uncertain": tuned[name]["uncertain"]} for name in LAWS}
     chosen[OBSERVER] |= {"late": tuned[OBSERVER]["late"]}
     flown: list[tuple[str, Benchmark, dict[str, dict[str, TuningResult]]]] = [
-        (name, benchmark(one), chosen) for name, one in courses(scenario).items()
+        (name, build_benchmark(one), chosen) for name, one in courses(scenario).items()
     ]
-    flown += [(name, one, {OBSERVER: chosen[OBSERVER]}) for name, one in wrong_wind(benchmark(scenario))]
+    flown += [(name, one, {OBSERVER: chosen[OBSERVER]}) for name, one in wrong_wind(build_benchmark(scenario))]
     rows: list[tuple[str, LawResult]] = []
-    for name, here, laws in track(flown, "courses", console=Console(stderr=True)):
-        rows += [(name, one) for one in compare(here, laws, aircraft, LEVELS, seed)]
+    for name, benchmark, laws in track(flown, "courses", console=Console(stderr=True)):
+        rows += [(name, one) for one in compare(benchmark, laws, aircraft, LEVELS, seed)]
     levels = tuple(f"+-{100.0 * level:g} %" for level in LEVELS)
     title = f"Scores, mean (worst) of {aircraft} aircraft a level, seed {seed}"
     table = new_table(title, ("course", "law", "tuned on", "nominal", *levels), texts=3)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
 from control_laws import adaptive, indi, inversion, lqi, mackunis, riccati, rise_di, rise_observer, super_twisting
-from control_laws.catalogue import LAWS, start
+from control_laws.catalogue import LAWS, initial_gains
 from control_laws.nominal_model import NominalModel, conditional_integration
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import tuning
@@ -51,15 +51,15 @@ def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) ->
 def osprey() -> NominalModel:
     """The osprey without actuators or limits."""
     scenario = find_scenario("osprey_gust").vary(flight={"duration": 0.1})
-    return tuning.benchmark(scenario).known
+    return tuning.benchmark(scenario).model
 
 
 def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:
     """What a law sees of one aircraft; what is not named is 0, and x is y."""
     y = np.atleast_1d(np.asarray(y, dtype=float))[:, None]
     zero = np.zeros_like(y)
-    seen = Measurements(y, zero + y_m, zero, zero, zero, zero, y, y, zero)
-    return seen._replace(**{key: np.asarray(value) for key, value in others.items()})
+    measured = Measurements(y, zero + y_m, zero, zero, zero, zero, y, y, zero)
+    return measured._replace(**{key: np.asarray(value) for key, value in others.items()})
 
 
 class Flight(NamedTuple):
@@ -71,18 +71,18 @@ class Flight(NamedTuple):
 
 
 def fly(
-    control_law: ControlLaw, params: Any, ticks: int, y: float, d: Any, known: NominalModel, Omega: float | None = None
+    control_law: ControlLaw, params: Any, ticks: int, y: float, d: Any, model: NominalModel, Omega: float | None = None
 ) -> Flight:
     """The exact flight of y_dot = Omega u + d with u held over a tick and d its mean over one, y_m = 0, actuators ideal."""
-    response = known.Omega[0, 0] if Omega is None else Omega
-    seen, ys, us = at(y), [], []
-    state = control_law.start(seen, params)
+    response = model.Omega[0, 0] if Omega is None else Omega
+    measured, ys, us = at(y), [], []
+    state = control_law.start(measured, params)
     u = np.zeros(COLUMN)
     for k in range(ticks):
-        state, u = control_law.step(state, at(y, u_before=u, position=u), np.array(known.period), params)
+        state, u = control_law.step(state, at(y, u_before=u, position=u), np.array(model.period), params)
         ys.append(y)
         us.append(u.item())
-        y += known.period * (response * u.item() + (d(k) if callable(d) else d))
+        y += model.period * (response * u.item() + (d(k) if callable(d) else d))
     return Flight(np.array(ys), np.array(us), state)
 
 
@@ -102,8 +102,8 @@ def test_inversion_cancels_the_model_and_leaves_the_error_its_own_dynamics(
     control_law = inversion.control_law(osprey, vanes=False)
     params = inversion.inversion_params({"K": K}, osprey)
     y = osprey.C @ x
-    seen = Measurements(y, y - 0.1, y_m_dot, 0.0 * y, 0.0 * y, 0.0 * y, x, x, 0.0 * y)
-    _, u = control_law.step(control_law.start(seen, params), seen, np.array(DT), params)
+    measured = Measurements(y, y - 0.1, y_m_dot, 0.0 * y, 0.0 * y, 0.0 * y, x, x, 0.0 * y)
+    _, u = control_law.step(control_law.start(measured, params), measured, np.array(DT), params)
     y_dot = osprey.C @ (osprey.A @ x + osprey.gravity @ np.sin(x) + osprey.B @ u)
     # e = 0.1, so e_dot = -0.1 K exactly; what is left is rounding of terms of size 10
     np.testing.assert_allclose(y_dot - y_m_dot, -0.1 * K, atol=1e-12)
@@ -114,20 +114,20 @@ def test_inversion_with_vanes_looks_at_the_air_and_without_at_the_ground(osprey:
     air[1] = 0.05
     params = inversion.inversion_params({"K": np.ones((4, 1))}, osprey)
     y = osprey.C @ x
-    seen = Measurements(y, y, 0.0 * y, 0.0 * y, 0.0 * y, 0.0 * y, x, air, 0.0 * y)
+    measured = Measurements(y, y, 0.0 * y, 0.0 * y, 0.0 * y, 0.0 * y, x, air, 0.0 * y)
     u = {}
     for vanes in (False, True):
         control_law = inversion.control_law(osprey, vanes=vanes)
-        u[vanes] = control_law.step(control_law.start(seen, params), seen, np.array(DT), params)[1]
+        u[vanes] = control_law.step(control_law.start(measured, params), measured, np.array(DT), params)[1]
     assert not u[False].any()
     np.testing.assert_allclose(osprey.Omega @ u[True], -osprey.C @ osprey.A @ air, atol=1e-12)
 
 
 def test_the_integral_of_the_inversion_takes_a_constant_disturbance_away() -> None:
-    known = integrator()
-    control_law = inversion.control_law(known, vanes=False)
-    kept = fly(control_law, inversion.inversion_params(gains(K=8.0), known), 2000, 0.0, 1.0, known)
-    gone = fly(control_law, inversion.inversion_params(gains(K=8.0, Lambda=2.0), known), 2000, 0.0, 1.0, known)
+    model = integrator()
+    control_law = inversion.control_law(model, vanes=False)
+    kept = fly(control_law, inversion.inversion_params(gains(K=8.0), model), 2000, 0.0, 1.0, model)
+    gone = fly(control_law, inversion.inversion_params(gains(K=8.0, Lambda=2.0), model), 2000, 0.0, 1.0, model)
     # without the integral e rests where K e = d; sampled and held exactly as well, for y_dot is then 0
     assert kept.y[-1] == pytest.approx(1.0 / 8.0, rel=1e-9)
     assert abs(gone.y[-1]) < 1e-9
@@ -137,12 +137,12 @@ def test_the_integral_of_the_inversion_takes_a_constant_disturbance_away() -> No
 
 
 def test_doubling_solves_the_riccati_equation(osprey: NominalModel) -> None:
-    model, generator = rise_observer.observer(osprey), np.random.default_rng(1)
-    Q = np.tile(model.H.T @ model.H, (5, 1, 1))
+    estimator, generator = rise_observer.observer(osprey), np.random.default_rng(1)
+    Q = np.tile(estimator.H.T @ estimator.H, (5, 1, 1))
     R = riccati.diagonals(np.exp(generator.normal(-3.0, 1.0, (4, 5))))
-    found = riccati.riccati(model.F, model.G, Q, R)
+    found = riccati.riccati(estimator.F, estimator.G, Q, R)
     for k in range(5):  # scipy's own residuals are of that size: modes that decay with 0.01 1/s lie 1e-4 from the unit circle
-        expected = solve_discrete_are(model.F, model.G, Q[k], R[k])
+        expected = solve_discrete_are(estimator.F, estimator.G, Q[k], R[k])
         np.testing.assert_allclose(found[k], expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
 
 
@@ -171,19 +171,19 @@ def test_lqi_is_what_a_long_finite_horizon_comes_to(osprey: NominalModel) -> Non
 
 
 def test_lqi_leaves_no_error_under_a_constant_disturbance() -> None:
-    known = integrator()
-    params = lqi.lqi_params(gains(integral=2.0, effort=0.1, fade=4.0), known)
-    assert abs(fly(lqi.control_law(vanes=False), params, 3000, 0.0, 1.0, known).y[-1]) < 1e-6
+    model = integrator()
+    params = lqi.lqi_params(gains(integral=2.0, effort=0.1, fade=4.0), model)
+    assert abs(fly(lqi.control_law(vanes=False), params, 3000, 0.0, 1.0, model).y[-1]) < 1e-6
 
 
 # MacKunis
 
 
 def test_the_acceleration_based_law_by_hand() -> None:
-    known = integrator(Omega=2.0, period=0.1)
-    control_law = mackunis.control_law(known, ideal=True)
+    model = integrator(Omega=2.0, period=0.1)
+    control_law = mackunis.control_law(model, ideal=True)
     K, Lambda, beta, eps, none = (np.full(COLUMN, value) for value in (3.0, 2.0, 5.0, 0.4, 0.0))
-    params = mackunis.MacKunisParams(K, Lambda, beta, eps, none, known.limits)
+    params = mackunis.MacKunisParams(K, Lambda, beta, eps, none, model.limits)
     state = control_law.start(at(0.0), params)
     state, u = control_law.step(state, at(0.2, y_dot=np.full(COLUMN, -0.3)), np.array(0.1), params)
     # r = -0.3 + 2 0.2 = 0.1, Pi = 0.1 5 0.1 / 0.4 = 0.125, integral = 0.1 0.2 / 2 = 0.01: -(3 (0.2 + 0.02) + 0.125) / 2
@@ -194,9 +194,9 @@ def test_the_acceleration_based_law_by_hand() -> None:
 
 
 def test_the_filtered_difference_of_a_ramp_comes_to_its_slope() -> None:
-    known = integrator()
-    control_law = mackunis.control_law(known, ideal=False)
-    params = mackunis.mackunis_params(gains(K=1.0, Lambda=1.0, beta=1.0, softening=1.0, filter=12.6), known)
+    model = integrator()
+    control_law = mackunis.control_law(model, ideal=False)
+    params = mackunis.mackunis_params(gains(K=1.0, Lambda=1.0, beta=1.0, softening=1.0, filter=12.6), model)
     state = control_law.start(at(0.0), params)
     for k in range(1, 301):
         state, _ = control_law.step(state, at(0.3 * k * DT), np.array(DT), params)
@@ -208,33 +208,33 @@ def test_the_filtered_difference_of_a_ramp_comes_to_its_slope() -> None:
 
 
 def test_the_predictor_of_l1_knows_a_constant_disturbance_after_one_tick() -> None:
-    known = integrator()
-    control_law, params = adaptive.l1(known, feedforward=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
-    flight = fly(control_law, params, 3, 0.1, 0.7, known)
+    model = integrator()
+    control_law, params = adaptive.l1(model, feedforward=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), model)
+    flight = fly(control_law, params, 3, 0.1, 0.7, model)
     x = adaptive.ADAPTATION_POLE * DT
     assert flight.state.sigma_hat.item() == pytest.approx(0.7 * x / (np.exp(x) - 1.0), rel=1e-9)
 
 
 def test_l1_rejects_what_its_filter_lets_through_with_a_wrong_input_gain() -> None:
-    known = integrator()
-    control_law, params = adaptive.l1(known, feedforward=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
-    flight = fly(control_law, params, 1500, 0.0, 0.7, known, Omega=1.4 * known.Omega[0, 0])
+    model = integrator()
+    control_law, params = adaptive.l1(model, feedforward=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), model)
+    flight = fly(control_law, params, 1500, 0.0, 0.7, model, Omega=1.4 * model.Omega[0, 0])
     # at rest y_hat - y is constant: K e = d (1 - k) where k = 0.995 is what the pole leaves of the estimate
     assert abs(flight.y[-1]) < 0.7 * 0.006 / 3.0
-    assert flight.u[-1] == pytest.approx(-0.7 / (1.4 * known.Omega[0, 0]), rel=1e-6)
+    assert flight.u[-1] == pytest.approx(-0.7 / (1.4 * model.Omega[0, 0]), rel=1e-6)
 
 
 def test_l1_with_feedforward_does_not_cancel_what_the_feedforward_cancels() -> None:
-    known = integrator()
-    control_law, params = adaptive.l1(known, feedforward=True), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), known)
+    model = integrator()
+    control_law, params = adaptive.l1(model, feedforward=True), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), model)
     y, state, u = 0.0, None, np.zeros(COLUMN)
     d, y_m_dot = 0.7, 0.5
-    u_ff = np.full(COLUMN, (y_m_dot - d) / known.Omega[0, 0])  # a model that knows d
+    u_ff = np.full(COLUMN, (y_m_dot - d) / model.Omega[0, 0])  # a model that knows d
     for k in range(500):
-        seen = at(y, y_m_dot * k * DT, y_m_dot=np.full(COLUMN, y_m_dot), u_ff=u_ff, u_before=u)
-        state = control_law.start(seen, params) if state is None else state
-        state, u = control_law.step(state, seen, np.array(DT), params)
-        y += DT * (known.Omega[0, 0] * u.item() + d)
+        measured = at(y, y_m_dot * k * DT, y_m_dot=np.full(COLUMN, y_m_dot), u_ff=u_ff, u_before=u)
+        state = control_law.start(measured, params) if state is None else state
+        state, u = control_law.step(state, measured, np.array(DT), params)
+        y += DT * (model.Omega[0, 0] * u.item() + d)
     assert u.item() == pytest.approx(u_ff.item(), rel=1e-2)
     assert abs(y - y_m_dot * 500 * DT) < 0.01 * 0.7 / 3.0
 
@@ -243,25 +243,25 @@ def test_l1_with_feedforward_does_not_cancel_what_the_feedforward_cancels() -> N
 
 
 def test_mrac_learns_what_the_model_is_short_of() -> None:
-    known = integrator()
-    control_law = adaptive.mrac(known, vanes=False)
-    params = adaptive.mrac_params(gains(K=2.0, adaptation=20.0, bias=20.0, leak=0.0), known)
-    flight = fly(control_law, params, 4000, 0.3, 0.7, known)
+    model = integrator()
+    control_law = adaptive.mrac(model, vanes=False)
+    params = adaptive.mrac_params(gains(K=2.0, adaptation=20.0, bias=20.0, leak=0.0), model)
+    flight = fly(control_law, params, 4000, 0.3, 0.7, model)
     assert abs(flight.y[-1]) < 1e-6
     assert flight.state[0, 1, 0] == pytest.approx(0.7, rel=1e-4)  # the weight of 1 is the disturbance
 
 
 def test_the_lyapunov_function_of_mrac_falls_by_what_the_theory_says() -> None:
-    known = integrator(period=1e-4)
-    control_law, K, gamma, d = adaptive.mrac(known, vanes=False), 2.0, 20.0, 0.7
-    params = adaptive.mrac_params(gains(K=K, adaptation=gamma, bias=gamma, leak=0.0), known)
+    model = integrator(period=1e-4)
+    control_law, K, gamma, d = adaptive.mrac(model, vanes=False), 2.0, 20.0, 0.7
+    params = adaptive.mrac_params(gains(K=K, adaptation=gamma, bias=gamma, leak=0.0), model)
     W, y, u, values, decay = control_law.start(at(0.3), params), 0.3, np.zeros(COLUMN), [], 0.0
     for _ in range(10_000):
         # what is to be learned: nothing of x, d of the constant
         values.append(y**2 / 2.0 + (W[0, 0, 0] ** 2 + (W[0, 1, 0] - d) ** 2) / (2.0 * gamma) + decay)
-        decay += K * y**2 * known.period
-        W, u = control_law.step(W, at(y, u_before=u), np.array(known.period), params)
-        y += known.period * (2.0 * u.item() + d)
+        decay += K * y**2 * model.period
+        W, u = control_law.step(W, at(y, u_before=u), np.array(model.period), params)
+        y += model.period * (2.0 * u.item() + d)
     # V + integral of K e^2 is constant in continuous time; Euler steps of 0.1 ms keep it within 1 in 1000
     np.testing.assert_allclose(values, values[0], rtol=1e-3)
 
@@ -270,11 +270,11 @@ def test_the_lyapunov_function_of_mrac_falls_by_what_the_theory_says() -> None:
 
 
 def test_indi_needs_no_model_beside_the_input_gain() -> None:
-    known = integrator()
-    control_law = indi.control_law(known)
-    params = indi.indi_params(gains(K=2.0, bandwidth=60.0, share=1.0), known)
+    model = integrator()
+    control_law = indi.control_law(model)
+    params = indi.indi_params(gains(K=2.0, bandwidth=60.0, share=1.0), model)
     for Omega in (2.0, 1.4, 2.6):
-        flight = fly(control_law, params, 1500, 0.2, 0.7, known, Omega=Omega)
+        flight = fly(control_law, params, 1500, 0.2, 0.7, model, Omega=Omega)
         assert abs(flight.y[-1]) < 1e-6, Omega  # exp(-2 15) of the start and the disturbance, were it first order
         assert flight.u[-1] == pytest.approx(-0.7 / Omega, rel=1e-5)
 
@@ -284,10 +284,10 @@ def test_indi_needs_no_model_beside_the_input_gain() -> None:
 
 def reaching(e_0: float) -> float:
     """When abs(e) is first below a ten-thousandth of its start for good, s."""
-    known = integrator(period=2e-4)
-    control_law, params = super_twisting.control_law(known), super_twisting.twisting_params(gains(root=3.0, beta=2.0), known)
-    flight = fly(control_law, params, 15_000, e_0, 0.0, known)
-    return float((np.flatnonzero(np.abs(flight.y) > 1e-4 * e_0)[-1] + 1) * known.period)
+    model = integrator(period=2e-4)
+    control_law, params = super_twisting.control_law(model), super_twisting.twisting_params(gains(root=3.0, beta=2.0), model)
+    flight = fly(control_law, params, 15_000, e_0, 0.0, model)
+    return float((np.flatnonzero(np.abs(flight.y) > 1e-4 * e_0)[-1] + 1) * model.period)
 
 
 def test_super_twisting_arrives_in_a_time_that_goes_with_the_root_of_the_start() -> None:
@@ -297,12 +297,12 @@ def test_super_twisting_arrives_in_a_time_that_goes_with_the_root_of_the_start()
 
 
 def test_super_twisting_holds_against_a_disturbance_that_grows() -> None:
-    known = integrator(period=2e-4)
-    control_law, params = super_twisting.control_law(known), super_twisting.twisting_params(gains(root=4.0, beta=3.0), known)
-    flight = fly(control_law, params, 20_000, 0.5, lambda k: 2.0 * k * 2e-4, known)  # d_dot = 2 < beta = 3
+    model = integrator(period=2e-4)
+    control_law, params = super_twisting.control_law(model), super_twisting.twisting_params(gains(root=4.0, beta=3.0), model)
+    flight = fly(control_law, params, 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model)  # d_dot = 2 < beta = 3
     assert np.abs(flight.y[15_000:]).max() < 3e-6  # the sliding of an explicit scheme: of the order of beta dt^2 = 1.2e-7
-    linear = fly(inversion.control_law(known, vanes=False), inversion.inversion_params(gains(K=8.0, Lambda=2.0), known),
-                 20_000, 0.5, lambda k: 2.0 * k * 2e-4, known)  # fmt: skip
+    linear = fly(inversion.control_law(model, vanes=False), inversion.inversion_params(gains(K=8.0, Lambda=2.0), model),
+                 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model)  # fmt: skip
     assert np.abs(linear.y[15_000:]).min() > 0.1  # d_dot / (K Lambda) = 0.125: an integral alone follows late
 
 
@@ -314,10 +314,10 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
     params = rise_di.of_gains({"K": K, "Lambda": Lambda}, osprey)
     control_law, e = rise_di.control_law(Sign.SOFT), np.array([[0.1], [0.2], [0.0], [-0.3]])
     zero = np.zeros((4, 1))
-    seen = Measurements(zero, zero, zero, zero, zero, zero, zero, zero, zero)
-    state = control_law.start(seen, params)
+    measured = Measurements(zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    state = control_law.start(measured, params)
     for k in range(1, 6):
-        state, u = control_law.step(state, seen._replace(y=k * e), np.array(DT), params)
+        state, u = control_law.step(state, measured._replace(y=k * e), np.array(DT), params)
     # e rises by one step a tick from 0: its trapezoid up to tick 5 is 12.5 steps of dt
     np.testing.assert_allclose(u, -osprey.input_scale[:, None] * K * (5.0 + Lambda * 12.5 * DT) * e, rtol=1e-12)
 
@@ -326,29 +326,29 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
 
 
 def test_the_observer_finds_the_states_the_wind_and_the_disturbance_of_the_aircraft_that_it_knows(osprey: NominalModel) -> None:
-    model = rise_observer.observer(osprey)
-    _, corrections = rise_observer.observer_gains(model, osprey, start(LAWS["lqg"], osprey))
+    estimator = rise_observer.observer(osprey)
+    _, corrections = rise_observer.observer_gains(estimator, osprey, initial_gains(LAWS["lqg"], osprey))
     correction = corrections[..., 0]
     generator = np.random.default_rng(1)
-    z, z_hat = 0.01 * generator.standard_normal(len(model.F)), np.zeros(len(model.F))
+    z, z_hat = 0.01 * generator.standard_normal(len(estimator.F)), np.zeros(len(estimator.F))
     for _ in range(3000):
         u = 0.01 * generator.standard_normal(4)
-        z_hat = z_hat + correction @ (model.H @ (z - z_hat))
-        z, z_hat = model.F @ z + model.G @ u, model.F @ z_hat + model.G @ u
+        z_hat = z_hat + correction @ (estimator.H @ (z - z_hat))
+        z, z_hat = estimator.F @ z + estimator.G @ u, estimator.F @ z_hat + estimator.G @ u
     # angles and disturbances that only together move V end within 1 / LEAK = 100 s, so exp(-0.3) of them is left after 30 s;
     # what moves the outputs is known: the prediction of e a second ahead
-    ahead = np.linalg.matrix_power(model.F, 100)
-    assert np.abs(model.H @ ahead @ (z - z_hat)).max() < 1e-4
-    assert np.abs(np.linalg.eigvals(model.F - model.F @ correction @ model.H)).max() < 1.0
+    ahead = np.linalg.matrix_power(estimator.F, 100)
+    assert np.abs(estimator.H @ ahead @ (z - z_hat)).max() < 1e-4
+    assert np.abs(np.linalg.eigvals(estimator.F - estimator.F @ correction @ estimator.H)).max() < 1.0
 
 
 def test_what_the_observer_adds_is_bounded_whatever_it_sees() -> None:
-    known = integrator(limit=0.5)
+    model = integrator(limit=0.5)
     law = LAWS["rise_observer"]
-    gains_ = start(law, known) | {"K": np.full(COLUMN, 1e-6), "beta": np.full(COLUMN, 1e-6)}
-    control_law, params = law.control_law(known), law.params(gains_, known)
-    seen = at(0.0)
-    state = control_law.start(seen, params)
+    gains_ = initial_gains(law, model) | {"K": np.full(COLUMN, 1e-6), "beta": np.full(COLUMN, 1e-6)}
+    control_law, params = law.control_law(model), law.params(gains_, model)
+    measured = at(0.0)
+    state = control_law.start(measured, params)
     added = []
     for k in range(200):
         state, _ = control_law.step(state, at(100.0 * (-1.0) ** (k // 40)), np.array(DT), params)
@@ -361,7 +361,7 @@ def test_what_the_observer_adds_is_bounded_whatever_it_sees() -> None:
 
 def test_without_an_observer_s_gain_it_is_the_law_with_feedforward(osprey: NominalModel) -> None:
     law, plain = LAWS["rise_observer"], LAWS["rise_ff"]
-    gains_ = start(law, osprey)
+    gains_ = initial_gains(law, osprey)
     params = law.params(gains_, osprey)
     params = params._replace(gain=0.0 * params.gain)
     generator, pilots = np.random.default_rng(1), (law.control_law(osprey), plain.control_law(osprey))
@@ -369,9 +369,9 @@ def test_without_an_observer_s_gain_it_is_the_law_with_feedforward(osprey: Nomin
         Measurements(*(0.01 * generator.standard_normal((8 if k in {6, 7} else 4, 1)) for k in range(9))) for _ in range(5)
     ]
     states = [control_law.start(looks[0], given_) for control_law, given_ in zip(pilots, (params, params.rise), strict=True)]
-    for seen in looks:
-        states[0], u = pilots[0].step(states[0], seen, np.array(DT), params)
-        states[1], without = pilots[1].step(states[1], seen, np.array(DT), params.rise)
+    for measured in looks:
+        states[0], u = pilots[0].step(states[0], measured, np.array(DT), params)
+        states[1], without = pilots[1].step(states[1], measured, np.array(DT), params.rise)
         assert np.array_equal(u, without)  # to the last bit
 
 
@@ -385,10 +385,10 @@ def test_integrals_stop_where_they_push_on_and_go_where_they_come_back() -> None
 
 @pytest.mark.parametrize("name", list(LAWS))
 def test_every_law_keeps_its_limits_and_recovers_from_them(name: str) -> None:
-    known = integrator(limit=0.5)
+    model = integrator(limit=0.5)
     law = LAWS[name]
-    params = law.params(start(law, known), known)
-    flight = fly(law.control_law(known), params, 3000, 0.0, lambda k: 2.0 if k < 1000 else 0.0, known)
+    params = law.params(initial_gains(law, model), model)
+    flight = fly(law.control_law(model), params, 3000, 0.0, lambda k: 2.0 if k < 1000 else 0.0, model)
     assert np.abs(flight.u).max() <= 0.5  # 0.5 of 2.0 / Omega = 1.0 that the disturbance would take
     # pushed 10 away in 10 s, it comes back at Omega 0.5 = 1 /s for 10 s; a wound-up integral would not stop there
     assert np.abs(flight.y[2800:]).max() < 0.2
@@ -397,7 +397,7 @@ def test_every_law_keeps_its_limits_and_recovers_from_them(name: str) -> None:
 @pytest.mark.parametrize("name", list(LAWS))
 def test_every_law_is_the_same_under_numpy_and_jax_and_over_a_fleet(name: str, osprey: NominalModel) -> None:
     law, generator = LAWS[name], np.random.default_rng(1)
-    control_law, params = law.control_law(osprey), law.params(start(law, osprey), osprey)
+    control_law, params = law.control_law(osprey), law.params(initial_gains(law, osprey), osprey)
 
     def look() -> Measurements:
         shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))
@@ -407,10 +407,10 @@ def test_every_law_is_the_same_under_numpy_and_jax_and_over_a_fleet(name: str, o
     state, one = control_law.start(looks[0], params), [one[..., :1] for one in looks[0]]
     compiled, alone = jax.tree.map(jax.numpy.asarray, state), control_law.start(Measurements(*one), params)
     step = jax.jit(control_law.step)
-    for seen in looks:
-        state, u = control_law.step(state, seen, np.array(DT), params)
-        compiled, by_jax = step(compiled, seen, DT, params)
-        alone, first = control_law.step(alone, Measurements(*(one[..., :1] for one in seen)), np.array(DT), params)
+    for measured in looks:
+        state, u = control_law.step(state, measured, np.array(DT), params)
+        compiled, by_jax = step(compiled, measured, DT, params)
+        alone, first = control_law.step(alone, Measurements(*(one[..., :1] for one in measured)), np.array(DT), params)
         # nothing but the order of additions differs
         np.testing.assert_allclose(by_jax, u, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(first, u[:, :1], rtol=1e-9, atol=1e-12)

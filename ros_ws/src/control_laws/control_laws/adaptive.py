@@ -29,7 +29,7 @@ class L1State(NamedTuple):
     sigma_f: Array  # filtered
 
 
-def l1(known: NominalModel, *, feedforward: bool) -> ControlLaw:
+def l1(model: NominalModel, *, feedforward: bool) -> ControlLaw:
     """L1 adaptive output control with piecewise-constant adaptation. Sees y, y_m and the nominal Omega.
 
         sigma_hat = -Phi^-1 exp(-a dt) (y_hat - y),  Phi = (1 - exp(-a dt)) / a          a = ADAPTATION_POLE
@@ -42,33 +42,33 @@ def l1(known: NominalModel, *, feedforward: bool) -> ControlLaw:
     sigma_r = y_m_dot - Omega u_ff, so that it is not cancelled twice. The predictor takes the u that was commanded after its
     limits: nothing winds up. Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
     """
-    Omega, inverse = known.Omega, known.inverse
+    Omega, inverse = model.Omega, model.inverse
 
-    def start(seen: Measurements, params: L1Params) -> L1State:
+    def start(measured: Measurements, params: L1Params) -> L1State:
         del params
-        zero = array_namespace(seen.y).zeros_like(seen.y)
-        return L1State(seen.y, zero, zero)
+        zero = array_namespace(measured.y).zeros_like(measured.y)
+        return L1State(measured.y, zero, zero)
 
-    def step(state: L1State, seen: Measurements, dt: Array, params: L1Params) -> tuple[L1State, Array]:
-        xp = array_namespace(seen.y)
-        off = state.y_hat - seen.y
+    def step(state: L1State, measured: Measurements, dt: Array, params: L1Params) -> tuple[L1State, Array]:
+        xp = array_namespace(measured.y)
+        off = state.y_hat - measured.y
         a = ADAPTATION_POLE + xp.zeros_like(params.K)
         Phi, left = filter_gain(a, dt) / a, xp.exp(-a * dt)
         sigma_hat = -left / Phi * off
-        u_r = seen.u_ff if feedforward else inverse @ seen.y_m_dot
-        sigma_r = seen.y_m_dot - Omega @ u_r
+        u_r = measured.u_ff if feedforward else inverse @ measured.y_m_dot
+        sigma_r = measured.y_m_dot - Omega @ u_r
         sigma_f = state.sigma_f + filter_gain(params.bandwidth, dt) * (sigma_hat - sigma_r - state.sigma_f)
-        wanted = -params.K * (seen.y - seen.y_m) - sigma_f
-        u, _ = saturate(u_r + inverse @ wanted, seen, dt, params.limits)
-        y_hat = seen.y + left * off + dt * (Omega @ u) + Phi * sigma_hat
+        wanted = -params.K * (measured.y - measured.y_m) - sigma_f
+        u, _ = saturate(u_r + inverse @ wanted, measured, dt, params.limits)
+        y_hat = measured.y + left * off + dt * (Omega @ u) + Phi * sigma_hat
         return L1State(y_hat, sigma_hat, sigma_f), u
 
     return ControlLaw(start, step)
 
 
-def l1_params(gains: dict[str, FloatArray], known: NominalModel) -> L1Params:
+def l1_params(gains: dict[str, FloatArray], model: NominalModel) -> L1Params:
     """Parameters from gains K and bandwidth, shapes (m, N)."""
-    return L1Params(gains["K"], gains["bandwidth"], known.limits)
+    return L1Params(gains["K"], gains["bandwidth"], model.limits)
 
 
 class MracParams(NamedTuple):
@@ -81,7 +81,7 @@ class MracParams(NamedTuple):
     limits: Limits
 
 
-def mrac(known: NominalModel, *, vanes: bool) -> ControlLaw:
+def mrac(model: NominalModel, *, vanes: bool) -> ControlLaw:
     """Model-reference adaptive inversion. Sees x, with `vanes` relative to the air, y_m and the nominal model.
 
         phi = [x / size, 1],  W (m, n + 1) per aircraft, W(0) = 0
@@ -93,21 +93,21 @@ def mrac(known: NominalModel, *, vanes: bool) -> ControlLaw:
     A channel whose u is beyond a limit learns nothing. Source: E. Lavretsky, K. A. Wise, "Robust and Adaptive Control",
     ch. 9 to 11; P. A. Ioannou, P. V. Kokotovic, Automatica 20(5), 1984, for the leak.
     """
-    drift, gravity = known.C @ known.A, known.C @ known.gravity
-    inverse, size = known.inverse, known.size[:, None]
+    drift, gravity = model.C @ model.A, model.C @ model.gravity
+    inverse, size = model.inverse, model.size[:, None]
 
-    def start(seen: Measurements, params: MracParams) -> Array:
+    def start(measured: Measurements, params: MracParams) -> Array:
         del params
-        xp = array_namespace(seen.y)
-        return xp.zeros_like(seen.y[:, None, :] * xp.concat([seen.x, seen.x[:1]])[None, :, :])
+        xp = array_namespace(measured.y)
+        return xp.zeros_like(measured.y[:, None, :] * xp.concat([measured.x, measured.x[:1]])[None, :, :])
 
-    def step(state: Array, seen: Measurements, dt: Array, params: MracParams) -> tuple[Array, Array]:
-        xp = array_namespace(seen.y)
-        x = seen.x_air if vanes else seen.x
-        e = seen.y - seen.y_m
+    def step(state: Array, measured: Measurements, dt: Array, params: MracParams) -> tuple[Array, Array]:
+        xp = array_namespace(measured.y)
+        x = measured.x_air if vanes else measured.x
+        e = measured.y - measured.y_m
         phi = xp.concat([x / size, xp.ones_like(x[:1])])
-        wanted = seen.y_m_dot - drift @ x - gravity @ xp.sin(x) - params.K * e - xp.sum(state * phi[None, :, :], axis=1)
-        u, beyond = saturate(inverse @ wanted, seen, dt, params.limits)
+        wanted = measured.y_m_dot - drift @ x - gravity @ xp.sin(x) - params.K * e - xp.sum(state * phi[None, :, :], axis=1)
+        u, beyond = saturate(inverse @ wanted, measured, dt, params.limits)
         free = xp.where(beyond == 0.0, xp.ones_like(e), xp.zeros_like(e))
         states = (params.adaptation * e * free)[:, None, :] * phi[None, :-1, :]
         learned = xp.concat([states, (params.bias * e * free)[:, None, :]], axis=1)
@@ -116,6 +116,6 @@ def mrac(known: NominalModel, *, vanes: bool) -> ControlLaw:
     return ControlLaw(start, step)
 
 
-def mrac_params(gains: dict[str, FloatArray], known: NominalModel) -> MracParams:
+def mrac_params(gains: dict[str, FloatArray], model: NominalModel) -> MracParams:
     """Parameters from gains K, adaptation and bias (m, N), leak (1, N)."""
-    return MracParams(gains["K"], gains["adaptation"], gains["bias"], gains["leak"], known.limits)
+    return MracParams(gains["K"], gains["adaptation"], gains["bias"], gains["leak"], model.limits)

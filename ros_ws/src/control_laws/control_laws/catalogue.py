@@ -52,18 +52,18 @@ class Law(NamedTuple):
     feedforward: bool = False  # whether it flies with the feedforward
 
 
-def start(law: Law, known: NominalModel) -> Gains:
+def initial_gains(law: Law, model: NominalModel) -> Gains:
     """The gains where the search starts, shapes (m, 1) and (1, 1)."""
-    K = INITIAL_CROSSOVER_LAG_PRODUCT / known.total_lag[:, None]
+    K = INITIAL_CROSSOVER_LAG_PRODUCT / model.total_lag[:, None]
     gains = {"K": K, "Lambda": K / 4.0}
     gains |= {name: np.full(K.shape, value) for name, value in INITIAL_CHANNEL_GAINS.items()}
     gains |= {name: np.full((1, 1), value) for name, value in INITIAL_COMMON_GAINS.items()}
-    gains["gust"] = np.full((known.wind.shape[1], 1), INITIAL_GUST_INTENSITY)
+    gains["gust"] = np.full((model.wind.shape[1], 1), INITIAL_GUST_INTENSITY)
     return {name: gains[name] for name in law.tuned}
 
 
 def _rise(sign: Sign) -> Callable[[NominalModel], ControlLaw]:
-    return lambda known: rise_di.control_law(sign)
+    return lambda model: rise_di.control_law(sign)
 
 
 _soft, _soft_gains = _rise(Sign.SOFT), ("K", "Lambda", "beta", "softening")
@@ -154,9 +154,9 @@ LAWS: dict[str, Law] = {
         "MRAC", _air, "A, B, f", partial(adaptive.mrac, vanes=True), adaptive.mrac_params, ("K", "adaptation", "bias", "leak")
     ),
     "lqi": Law(
-        "LQI", _full, "A, B, f", lambda known: lqi.control_law(vanes=False), lqi.lqi_params, ("integral", "effort", "fade")
+        "LQI", _full, "A, B, f", lambda model: lqi.control_law(vanes=False), lqi.lqi_params, ("integral", "effort", "fade")
     ),
     "lqi_vanes": Law(
-        "LQI", _air, "A, B, f", lambda known: lqi.control_law(vanes=True), lqi.lqi_params, ("integral", "effort", "fade")
+        "LQI", _air, "A, B, f", lambda model: lqi.control_law(vanes=True), lqi.lqi_params, ("integral", "effort", "fade")
     ),
 }

@@ -27,7 +27,7 @@ class IndiState(NamedTuple):
     position: Array  # filtered
 
 
-def control_law(known: NominalModel) -> ControlLaw:
+def control_law(model: NominalModel) -> ControlLaw:
     """Each tick inverts the increment of y_dot alone: what the model is wrong about is in the measured y_dot already.
 
         y_dot_f    += a ((y - y_p) / dt - y_dot_f),  position_f += a (position - position_f),  a = 1 - exp(-bandwidth dt)
@@ -37,23 +37,23 @@ def control_law(known: NominalModel) -> ControlLaw:
     Source: S. Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E. J. J. Smeur, Q. P. Chu, G. C. H. E. de Croon,
     JGCD 39(3), 2016, for the filters.
     """
-    inverse = known.inverse
+    inverse = model.inverse
 
-    def start(seen: Measurements, params: IndiParams) -> IndiState:
+    def start(measured: Measurements, params: IndiParams) -> IndiState:
         del params
-        return IndiState(seen.y, array_namespace(seen.y).zeros_like(seen.y), seen.position)
+        return IndiState(measured.y, array_namespace(measured.y).zeros_like(measured.y), measured.position)
 
-    def step(state: IndiState, seen: Measurements, dt: Array, params: IndiParams) -> tuple[IndiState, Array]:
+    def step(state: IndiState, measured: Measurements, dt: Array, params: IndiParams) -> tuple[IndiState, Array]:
         a = filter_gain(params.bandwidth, dt)
-        y_dot = state.y_dot + a * ((seen.y - state.y) / dt - state.y_dot)
-        position = state.position + a * (seen.position - state.position)
-        wanted = seen.y_m_dot - params.K * (seen.y - seen.y_m) - y_dot
-        u, _ = saturate(position + params.share * (inverse @ wanted), seen, dt, params.limits)
-        return IndiState(seen.y, y_dot, position), u
+        y_dot = state.y_dot + a * ((measured.y - state.y) / dt - state.y_dot)
+        position = state.position + a * (measured.position - state.position)
+        wanted = measured.y_m_dot - params.K * (measured.y - measured.y_m) - y_dot
+        u, _ = saturate(position + params.share * (inverse @ wanted), measured, dt, params.limits)
+        return IndiState(measured.y, y_dot, position), u
 
     return ControlLaw(start, step)
 
 
-def indi_params(gains: dict[str, FloatArray], known: NominalModel) -> IndiParams:
+def indi_params(gains: dict[str, FloatArray], model: NominalModel) -> IndiParams:
     """Parameters from gains K, bandwidth and share, shapes (m, N)."""
-    return IndiParams(gains["K"], gains["bandwidth"], gains["share"], known.limits)
+    return IndiParams(gains["K"], gains["bandwidth"], gains["share"], model.limits)

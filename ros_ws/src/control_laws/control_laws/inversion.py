@@ -25,7 +25,7 @@ class InversionState(NamedTuple):
     integral_e: Array
 
 
-def control_law(known: NominalModel, *, vanes: bool) -> ControlLaw:
+def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
     """Inversion of the nominal model, with `vanes` about the state relative to the air.
 
         u = Omega^-1 (y_m_dot - C (A x + f(x)) - K (e + Lambda integral of e))
@@ -33,28 +33,28 @@ def control_law(known: NominalModel, *, vanes: bool) -> ControlLaw:
     so that on the nominal aircraft without actuators e_dot = -K (e + Lambda integral of e) - C (what f is short of). The
     integral is a trapezoid. Source: B. L. Stevens, F. L. Lewis, E. N. Johnson, "Aircraft Control and Simulation", 5.8.
     """
-    drift, gravity = known.C @ known.A, known.C @ known.gravity
-    Omega, inverse = known.Omega, known.inverse
+    drift, gravity = model.C @ model.A, model.C @ model.gravity
+    Omega, inverse = model.Omega, model.inverse
 
-    def start(seen: Measurements, params: InversionParams) -> InversionState:
+    def start(measured: Measurements, params: InversionParams) -> InversionState:
         del params
-        e = seen.y - seen.y_m
+        e = measured.y - measured.y_m
         return InversionState(e, array_namespace(e).zeros_like(e))
 
-    def step(state: InversionState, seen: Measurements, dt: Array, params: InversionParams) -> tuple[InversionState, Array]:
-        x = seen.x_air if vanes else seen.x
-        e = seen.y - seen.y_m
+    def step(state: InversionState, measured: Measurements, dt: Array, params: InversionParams) -> tuple[InversionState, Array]:
+        x = measured.x_air if vanes else measured.x
+        e = measured.y - measured.y_m
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
         known_part = drift @ x + gravity @ array_namespace(e).sin(x)
-        wanted = seen.y_m_dot - known_part - params.K * (e + params.Lambda * integral_e)
-        u, beyond = saturate(inverse @ wanted, seen, dt, params.limits)
+        wanted = measured.y_m_dot - known_part - params.K * (e + params.Lambda * integral_e)
+        u, beyond = saturate(inverse @ wanted, measured, dt, params.limits)
         effect = -params.K * params.Lambda * increment
         return InversionState(e, conditional_integration(state.integral_e, integral_e, effect, Omega @ beyond)), u
 
     return ControlLaw(start, step)
 
 
-def inversion_params(gains: dict[str, FloatArray], known: NominalModel) -> InversionParams:
+def inversion_params(gains: dict[str, FloatArray], model: NominalModel) -> InversionParams:
     """Parameters from gains K and, for DI with an integral, Lambda, shapes (m, N)."""
-    return InversionParams(gains["K"], gains.get("Lambda", 0.0 * gains["K"]), known.limits)
+    return InversionParams(gains["K"], gains.get("Lambda", 0.0 * gains["K"]), model.limits)

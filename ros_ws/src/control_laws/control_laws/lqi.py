@@ -37,19 +37,19 @@ def control_law(*, vanes: bool) -> ControlLaw:
     The integral is a trapezoid; that of channel i waits where u_i is beyond a limit and it would push on.
     """
 
-    def start(seen: Measurements, params: LqiParams) -> LqiState:
+    def start(measured: Measurements, params: LqiParams) -> LqiState:
         del params
-        e = seen.y - seen.y_m
+        e = measured.y - measured.y_m
         return LqiState(e, array_namespace(e).zeros_like(e))
 
-    def step(state: LqiState, seen: Measurements, dt: Array, params: LqiParams) -> tuple[LqiState, Array]:
-        xp = array_namespace(seen.y)
-        e = seen.y - seen.y_m
+    def step(state: LqiState, measured: Measurements, dt: Array, params: LqiParams) -> tuple[LqiState, Array]:
+        xp = array_namespace(measured.y)
+        e = measured.y - measured.y_m
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
         none = xp.zeros_like(e)
-        z = xp.concat([seen.x_air if vanes else seen.x, seen.y_m + none, seen.y_m_dot + none, integral_e])
-        u, beyond = saturate(-xp.sum(params.gain * z[None, :, :], axis=1), seen, dt, params.limits)
+        z = xp.concat([measured.x_air if vanes else measured.x, measured.y_m + none, measured.y_m_dot + none, integral_e])
+        u, beyond = saturate(-xp.sum(params.gain * z[None, :, :], axis=1), measured, dt, params.limits)
         m = e.shape[0]
         own = xp.stack([params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)])
         return LqiState(e, conditional_integration(state.integral_e, integral_e, -own * increment, beyond)), u
@@ -65,30 +65,30 @@ class Design(NamedTuple):
     E: FloatArray  # (2 m, n + 3 m)
 
 
-def design(known: NominalModel, fade: float) -> Design:
+def design(model: NominalModel, fade: float) -> Design:
     """The nominal aircraft with the reference and the integral of e, sampled with u held over a period.
 
-        x_dot   = (A + gravity) x + B u      rows of angles: -LEAK angle, a disturbance that is seen
+        x_dot   = (A + gravity) x + B u      rows of angles: -LEAK angle, a disturbance that is measured
         y_m_dot = w - LEAK y_m,  w_dot = -fade w,  integral of e: C x - y_m
 
     Angles integrate the very rates that are to follow: with their true rows the integral of e would not be controllable.
     """
-    n, m = known.B.shape
-    free = 1.0 - known.kinematic[:, None]
+    n, m = model.B.shape
+    free = 1.0 - model.kinematic[:, None]
     motion = np.zeros((n + 3 * m, n + 3 * m))
     x, y_m, w, integral = np.split(np.arange(n + 3 * m), [n, n + m, n + 2 * m])
-    motion[np.ix_(x, x)] = free * (known.A + known.gravity) - LEAK * np.diag(known.kinematic)
+    motion[np.ix_(x, x)] = free * (model.A + model.gravity) - LEAK * np.diag(model.kinematic)
     motion[y_m, y_m], motion[y_m, w], motion[w, w] = -LEAK, 1.0, -fade
-    motion[np.ix_(integral, x)] = known.C
+    motion[np.ix_(integral, x)] = model.C
     motion[integral, y_m] = -1.0
-    drive = np.vstack([free * known.B, np.zeros((3 * m, m))])
-    whole = expm(np.block([[motion, drive], [np.zeros((m, n + 4 * m))]]) * known.period)
+    drive = np.vstack([free * model.B, np.zeros((3 * m, m))])
+    whole = expm(np.block([[motion, drive], [np.zeros((m, n + 4 * m))]]) * model.period)
     E = np.zeros((2 * m, n + 3 * m))
-    E[:m, x], E[np.arange(m), y_m], E[np.arange(m, 2 * m), integral] = known.C, -1.0, 1.0
+    E[:m, x], E[np.arange(m), y_m], E[np.arange(m, 2 * m), integral] = model.C, -1.0, 1.0
     return Design(whole[: n + 3 * m, : n + 3 * m], whole[: n + 3 * m, n + 3 * m :], E)
 
 
-def lqi_gain(known: NominalModel, gains: dict[str, FloatArray]) -> FloatArray:
+def lqi_gain(model: NominalModel, gains: dict[str, FloatArray]) -> FloatArray:
     """The gain that is least in the sum of e'Q e + q'Q_i q + u'R u over z+ = F z + G u, of N sets of weights: (m, n + 3 m, N).
 
         Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,  q the integral of e
@@ -97,16 +97,16 @@ def lqi_gain(known: NominalModel, gains: dict[str, FloatArray]) -> FloatArray:
     E. Kreindler, D. Rothschild, AIAA J. 14(7), 1976, for the model followed; B. D. O. Anderson, J. B. Moore,
     "Optimal Control", ch. 9.
     """
-    size = (known.C @ known.size)[:, None]
+    size = (model.C @ model.size)[:, None]
     found = []
     for k, fade in enumerate(gains["fade"][0]):
-        F, G, E = design(known, float(fade))
+        F, G, E = design(model, float(fade))
         weights = np.concatenate([np.ones(len(size)), gains["integral"][:, k] ** 2]) / np.tile(size[:, 0] ** 2, 2)
-        R = np.diag((gains["effort"][:, k] / known.input_scale / size[:, 0]) ** 2)
+        R = np.diag((gains["effort"][:, k] / model.input_scale / size[:, 0]) ** 2)
         found.append(gain_of(F, G, E.T @ np.diag(weights) @ E, R))
     return np.stack(found, axis=-1)
 
 
-def lqi_params(gains: dict[str, FloatArray], known: NominalModel) -> LqiParams:
+def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
     """Parameters from weights integral and effort (m, N) and fade (1, N)."""
-    return LqiParams(lqi_gain(known, gains), known.limits)
+    return LqiParams(lqi_gain(model, gains), model.limits)

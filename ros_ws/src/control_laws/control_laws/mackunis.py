@@ -31,7 +31,7 @@ class MacKunisState(NamedTuple):
     Pi: Array
 
 
-def control_law(known: NominalModel, *, ideal: bool) -> ControlLaw:
+def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
     """The law that needs e_dot under its sign.
 
         r          = e_dot + Lambda e
@@ -43,25 +43,25 @@ def control_law(known: NominalModel, *, ideal: bool) -> ControlLaw:
     a filtered difference, e_dot += (1 - exp(-bandwidth dt)) ((e - e_p) / dt - e_dot).
     Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010, its matrices replaced by those here.
     """
-    Omega, inverse = known.Omega, known.inverse
+    Omega, inverse = model.Omega, model.inverse
 
-    def start(seen: Measurements, params: MacKunisParams) -> MacKunisState:
+    def start(measured: Measurements, params: MacKunisParams) -> MacKunisState:
         del params
-        e = seen.y - seen.y_m
+        e = measured.y - measured.y_m
         zero = array_namespace(e).zeros_like(e)
         return MacKunisState(e, e, zero, zero, zero)
 
-    def step(state: MacKunisState, seen: Measurements, dt: Array, params: MacKunisParams) -> tuple[MacKunisState, Array]:
-        xp = array_namespace(seen.y)
-        e = seen.y - seen.y_m
+    def step(state: MacKunisState, measured: Measurements, dt: Array, params: MacKunisParams) -> tuple[MacKunisState, Array]:
+        xp = array_namespace(measured.y)
+        e = measured.y - measured.y_m
         e_dot = state.e_dot + filter_gain(params.bandwidth, dt) * ((e - state.e) / dt - state.e_dot)
-        r = (seen.y_dot - seen.y_m_dot if ideal else e_dot) + params.Lambda * e
+        r = (measured.y_dot - measured.y_m_dot if ideal else e_dot) + params.Lambda * e
         one = xp.ones_like(e)
         move = dt * params.beta * xp.minimum(xp.maximum(r / params.eps, -one), one)
         increment = dt * (e + state.e) / 2.0
         integral_e, Pi = state.integral_e + increment, state.Pi + move
         wanted = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
-        u, beyond = saturate(inverse @ wanted, seen, dt, params.limits)
+        u, beyond = saturate(inverse @ wanted, measured, dt, params.limits)
         past = Omega @ beyond
         integral_e = conditional_integration(state.integral_e, integral_e, -increment, past)
         return MacKunisState(state.e_0, e, e_dot, integral_e, conditional_integration(state.Pi, Pi, -move, past)), u
@@ -69,11 +69,11 @@ def control_law(known: NominalModel, *, ideal: bool) -> ControlLaw:
     return ControlLaw(start, step)
 
 
-def mackunis_params(gains: dict[str, FloatArray], known: NominalModel) -> MacKunisParams:
+def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKunisParams:
     """Parameters from gains K, Lambda, beta (m, N), softening (1, N) and, without ideal y_dot, filter (1, N), rad/s.
 
     eps = beta / K softening: inside it the sign adds K / softening to K.
     """
     K, beta = gains["K"], gains["beta"]
     eps = beta / K * gains["softening"]
-    return MacKunisParams(K, gains["Lambda"], beta, eps, gains.get("filter", 0.0) + 0.0 * K, known.limits)
+    return MacKunisParams(K, gains["Lambda"], beta, eps, gains.get("filter", 0.0) + 0.0 * K, model.limits)

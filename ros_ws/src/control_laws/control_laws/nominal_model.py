@@ -52,9 +52,9 @@ class NominalModel(NamedTuple):
         return Limits(self.lower[:, None], self.upper[:, None], self.rate[:, None])
 
 
-def saturate(u: Array, seen: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:
+def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:
     """The u that is commanded and what of the u asked for lies beyond it, both shape (m, N)."""
-    commanded = guard.limit(u, seen.u_before, dt, limits)
+    commanded = guard.saturate(u, measured.u_before, dt, limits)
     return commanded, u - commanded
 
 

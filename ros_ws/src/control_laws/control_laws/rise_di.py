@@ -10,7 +10,7 @@ from control_laws.nominal_model import NominalModel
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller import law
 from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.guard import Limits, guarded_step
+from rise_di_controller.guard import Limits, step_with_anti_windup
 from rise_di_controller.law import LawParams, LawState, Sign
 from rise_di_controller.params import ControllerParameters
 
@@ -29,7 +29,7 @@ class RiseParams(NamedTuple):
 
 
 def control_law(sign: Sign) -> ControlLaw:
-    """The law with its sign sampled in one way: u = u_ff + what `guarded_step` commands inside the limits."""
+    """The law with its sign sampled in one way: u = u_ff + what `step_with_anti_windup` commands inside the limits."""
     return LAWS_BY_SIGN[sign]
 
 
@@ -44,26 +44,26 @@ def params(controller: ControllerParameters) -> RiseParams:
     return RiseParams(limits=limits, **{key: column(named[key]) for key in RiseParams._fields[:-1]})
 
 
-def of_gains(gains: dict[str, FloatArray], known: NominalModel) -> RiseParams:
+def of_gains(gains: dict[str, FloatArray], model: NominalModel) -> RiseParams:
     """Those of gains K, Lambda, beta (m, N) and softening or omega (1, N), the paper's in scaled inputs.
 
     eps = beta / K softening total_lag. Without beta, a PI controller: u = -input_scale D K (e - e_0 + Lambda integral_e).
     """
     K = gains["K"]
     beta = gains.get("beta", 0.0 * K)
-    eps = beta / K * gains["softening"] * known.total_lag[:, None] if "softening" in gains else 1.0 + 0.0 * K
+    eps = beta / K * gains["softening"] * model.total_lag[:, None] if "softening" in gains else 1.0 + 0.0 * K
     omega = gains.get("omega", 1.0) + 0.0 * K
-    return RiseParams(K, gains["Lambda"], beta, known.D[:, None], known.input_scale[:, None], omega, eps, known.limits)
+    return RiseParams(K, gains["Lambda"], beta, model.D[:, None], model.input_scale[:, None], omega, eps, model.limits)
 
 
-def _start(seen: Measurements, params: RiseParams) -> LawState:
-    return law.engage(seen.y, seen.y_m)
+def _start(measured: Measurements, params: RiseParams) -> LawState:
+    return law.engage(measured.y, measured.y_m)
 
 
 def _control_law(sign: Sign) -> ControlLaw:
-    def step(state: LawState, seen: Measurements, dt: Array, params: RiseParams) -> tuple[LawState, Array]:
+    def step(state: LawState, measured: Measurements, dt: Array, params: RiseParams) -> tuple[LawState, Array]:
         of_law = LawParams(*params[:-1], sign)
-        after, _, u = guarded_step(state, seen.y, seen.y_m, dt, seen.u_ff, seen.u_before, of_law, params.limits)
+        after, _, u = step_with_anti_windup(state, measured.y, measured.y_m, dt, measured.u_ff, measured.u_before, of_law, params.limits)
         return after, u
 
     return ControlLaw(_start, step)

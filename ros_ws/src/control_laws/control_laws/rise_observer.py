@@ -22,7 +22,7 @@ from rise_di_controller.guard import Limits
 from rise_di_controller.law import LawParams, LawState, Sign
 
 LEAK = 0.01
-"""1/s. Angles and disturbances decay this slowly in the observer's model, so that each of its modes can be seen or ends."""
+"""1/s. Angles and disturbances decay this slowly in the observer's model, so that each of its modes can be measured or ends."""
 
 GUST_TIME_CONSTANT = 0.6
 """s, within which a wind is taken to change: the time to the peak of the 1-cosine gust, H / V0."""
@@ -61,7 +61,7 @@ class ObserverModel(NamedTuple):
     H: FloatArray  # (m, s)
 
 
-def observer(known: NominalModel) -> ObserverModel:
+def observer(model: NominalModel) -> ObserverModel:
     """The nominal aircraft around its reference, its actuators, wind and a disturbance of each output.
 
         dx_dot       = (A + gravity) dx + B position + wind_direction w + C' d
@@ -69,22 +69,22 @@ def observer(known: NominalModel) -> ObserverModel:
 
     Angles decay with LEAK besides. The reference's own motion is u_ff's: the model is that of small deviations from it.
     """
-    (n, m), G = known.B.shape, known.wind.shape[1]
+    (n, m), G = model.B.shape, model.wind.shape[1]
     s = n + m + G + m
     x, p, w, d = np.split(np.arange(s), [n, n + m, n + m + G])
-    lag = np.maximum(known.lag, 1e-4)
+    lag = np.maximum(model.lag, 1e-4)
     motion, drive = np.zeros((s, s)), np.zeros((s, m))
-    motion[np.ix_(x, x)] = known.A + known.gravity - LEAK * np.diag(known.kinematic)
-    motion[np.ix_(x, p)], motion[np.ix_(x, w)], motion[np.ix_(x, d)] = known.B, known.wind, known.C.T
+    motion[np.ix_(x, x)] = model.A + model.gravity - LEAK * np.diag(model.kinematic)
+    motion[np.ix_(x, p)], motion[np.ix_(x, w)], motion[np.ix_(x, d)] = model.B, model.wind, model.C.T
     motion[p, p], motion[w, w], motion[d, d] = -1.0 / lag, -1.0 / GUST_TIME_CONSTANT, -LEAK
     drive[p, np.arange(m)] = 1.0 / lag
-    whole = expm(np.block([[motion, drive], [np.zeros((m, s + m))]]) * known.period)
+    whole = expm(np.block([[motion, drive], [np.zeros((m, s + m))]]) * model.period)
     H = np.zeros((m, s))
-    H[:, x] = known.C
+    H[:, x] = model.C
     return ObserverModel(whole[:s, :s], whole[:s, s:], H)
 
 
-def observer_gains(model: ObserverModel, known: NominalModel, gains: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
+def observer_gains(estimator: ObserverModel, model: NominalModel, gains: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Gain (m, s, N) and correction (s, m, N), the linear-quadratic ones of N sets of weights.
 
     Control: sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2 with `effort` (m, N), s. Estimate: the wind driven
@@ -92,52 +92,52 @@ def observer_gains(model: ObserverModel, known: NominalModel, gains: dict[str, F
     `loose` (1, N), sizes per root s, for the model is not the aircraft; the noise of e as measured. Source: H. Kwakernaak,
     R. Sivan, "Linear Optimal Control Systems", ch. 5 and 6.
     """
-    size, count = (known.C @ known.size)[:, None], gains["effort"].shape[1]
-    Q = np.tile(model.H.T @ np.diag(1.0 / size[:, 0] ** 2) @ model.H, (count, 1, 1))
-    R = diagonals((gains["effort"] / known.input_scale[:, None] / size) ** 2)
-    gain = gain_of(model.F, model.G, Q, R)
-    states, positions = gains["loose"] * known.size[:, None], np.full((len(size), count), ACTUATOR_NOISE)
-    process = np.concatenate([states, positions, gains["gust"], gains["drift"] * size]) ** 2 * known.period
-    noise = np.tile(np.diag(known.noise**2), (count, 1, 1))
-    S = riccati(model.F.T, model.H.T, diagonals(process), noise)
-    correction = np.swapaxes(np.linalg.solve(model.H @ S @ model.H.T + noise, model.H @ S), 1, 2)
+    size, count = (model.C @ model.size)[:, None], gains["effort"].shape[1]
+    Q = np.tile(estimator.H.T @ np.diag(1.0 / size[:, 0] ** 2) @ estimator.H, (count, 1, 1))
+    R = diagonals((gains["effort"] / model.input_scale[:, None] / size) ** 2)
+    gain = gain_of(estimator.F, estimator.G, Q, R)
+    states, positions = gains["loose"] * model.size[:, None], np.full((len(size), count), ACTUATOR_NOISE)
+    process = np.concatenate([states, positions, gains["gust"], gains["drift"] * size]) ** 2 * model.period
+    noise = np.tile(np.diag(model.noise**2), (count, 1, 1))
+    S = riccati(estimator.F.T, estimator.H.T, diagonals(process), noise)
+    correction = np.swapaxes(np.linalg.solve(estimator.H @ S @ estimator.H.T + noise, estimator.H @ S), 1, 2)
     return np.moveaxis(gain, 0, -1), np.moveaxis(correction, 0, -1)
 
 
-def control_law(known: NominalModel, *, authority: float) -> ControlLaw:
+def control_law(model: NominalModel, *, authority: float) -> ControlLaw:
     """The law's step from a trim that the observer moves within a part of the limits.
 
         z_hat = z + correction (e - H z)
         u_o   = -gain z_hat, held inside `authority` of the limits and of their upper ones / RAMP_TIME in rate
-        u     = `guarded_step` from the trim u_ff + u_o
+        u     = `step_with_anti_windup` from the trim u_ff + u_o
         z+    = F z_hat + G (u - u_ff)
 
     with the u that was commanded, after its limits: nothing winds up. The law gets e as ever, not what is estimated.
     """
-    model = observer(known)
+    estimator = observer(model)
 
-    def start(seen: Measurements, params: ObserverParams) -> ObserverState:
-        xp = array_namespace(seen.y)
-        e = seen.y - seen.y_m
-        return ObserverState(feedback.engage(seen.y, seen.y_m), model.H.T @ e, xp.zeros_like(e))
+    def start(measured: Measurements, params: ObserverParams) -> ObserverState:
+        xp = array_namespace(measured.y)
+        e = measured.y - measured.y_m
+        return ObserverState(feedback.engage(measured.y, measured.y_m), estimator.H.T @ e, xp.zeros_like(e))
 
-    def step(state: ObserverState, seen: Measurements, dt: Array, params: ObserverParams) -> tuple[ObserverState, Array]:
-        xp = array_namespace(seen.y)
+    def step(state: ObserverState, measured: Measurements, dt: Array, params: ObserverParams) -> tuple[ObserverState, Array]:
+        xp = array_namespace(measured.y)
         limits = params.rise.limits
-        off = seen.y - seen.y_m - model.H @ state.z
+        off = measured.y - measured.y_m - estimator.H @ state.z
         z = state.z + xp.sum(params.correction * off[None, :, :], axis=1)
         inside = Limits(authority * limits.lower, authority * limits.upper, authority / RAMP_TIME * limits.upper)
-        u_o = guard.limit(-xp.sum(params.gain * z[None, :, :], axis=1), state.u_o, dt, inside)
+        u_o = guard.saturate(-xp.sum(params.gain * z[None, :, :], axis=1), state.u_o, dt, inside)
         law = LawParams(*params.rise[:-1], Sign.SOFT)
-        after, _, u = guard.guarded_step(state.law, seen.y, seen.y_m, dt, seen.u_ff + u_o, seen.u_before, law, limits)
-        return ObserverState(after, model.F @ z + model.G @ (u - seen.u_ff), u_o), u
+        after, _, u = guard.step_with_anti_windup(state.law, measured.y, measured.y_m, dt, measured.u_ff + u_o, measured.u_before, law, limits)
+        return ObserverState(after, estimator.F @ z + estimator.G @ (u - measured.u_ff), u_o), u
 
     return ControlLaw(start, step)
 
 
-def observer_params(gains: dict[str, FloatArray], known: NominalModel) -> ObserverParams:
+def observer_params(gains: dict[str, FloatArray], model: NominalModel) -> ObserverParams:
     """Parameters from the gains of RISE-DI, where it has any, and from effort and drift (m, N), gust (G, N), loose (1, N)."""
     none = 0.0 * gains["effort"]
     return ObserverParams(
-        rise_di.of_gains({"K": none, "Lambda": none} | gains, known), *observer_gains(observer(known), known, gains)
+        rise_di.of_gains({"K": none, "Lambda": none} | gains, model), *observer_gains(observer(model), model, gains)
     )

@@ -18,7 +18,7 @@ class TwistingParams(NamedTuple):
     limits: Limits
 
 
-def control_law(known: NominalModel) -> ControlLaw:
+def control_law(model: NominalModel) -> ControlLaw:
     """Second-order sliding on e, by forward Euler.
 
         z += -dt beta sgn(e)
@@ -28,24 +28,24 @@ def control_law(known: NominalModel) -> ControlLaw:
     beta > L and root^2 > 2 (beta + L)^2 / (beta - L). Source: A. Levant, Int. J. Control 58(6), 1993; J. A. Moreno,
     M. Osorio, IEEE TAC 57(4), 2012; Y. Shtessel et al., "Sliding Mode Control and Observation", 4.3.
     """
-    Omega, inverse = known.Omega, known.inverse
+    Omega, inverse = model.Omega, model.inverse
 
-    def start(seen: Measurements, params: TwistingParams) -> Array:
+    def start(measured: Measurements, params: TwistingParams) -> Array:
         del params
-        return array_namespace(seen.y).zeros_like(seen.y)
+        return array_namespace(measured.y).zeros_like(measured.y)
 
-    def step(state: Array, seen: Measurements, dt: Array, params: TwistingParams) -> tuple[Array, Array]:
-        xp = array_namespace(seen.y)
-        e = seen.y - seen.y_m
+    def step(state: Array, measured: Measurements, dt: Array, params: TwistingParams) -> tuple[Array, Array]:
+        xp = array_namespace(measured.y)
+        e = measured.y - measured.y_m
         move = -dt * params.beta * xp.sign(e)
         z = state + move
-        wanted = seen.y_m_dot - params.root * xp.sign(e) * xp.sqrt(xp.abs(e)) + z
-        u, beyond = saturate(inverse @ wanted, seen, dt, params.limits)
+        wanted = measured.y_m_dot - params.root * xp.sign(e) * xp.sqrt(xp.abs(e)) + z
+        u, beyond = saturate(inverse @ wanted, measured, dt, params.limits)
         return conditional_integration(state, z, move, Omega @ beyond), u
 
     return ControlLaw(start, step)
 
 
-def twisting_params(gains: dict[str, FloatArray], known: NominalModel) -> TwistingParams:
+def twisting_params(gains: dict[str, FloatArray], model: NominalModel) -> TwistingParams:
     """Parameters from gains root and beta, shapes (m, N)."""
-    return TwistingParams(gains["root"], gains["beta"], known.limits)
+    return TwistingParams(gains["root"], gains["beta"], model.limits)

@@ -22,6 +22,7 @@ from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, check_togeth
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
 from flight_campaign.statistics import Tally, score, score_units
+from flight_core.files import writing
 from flight_core.parameters import ParameterError, Parameters, require
 from flight_core.vectors import FloatArray
 
@@ -221,8 +222,6 @@ class _Work:
 def _write(path: Path, text: str) -> None:
     """Write a file that is there as a whole or not at all."""
     part = path.with_suffix(".part")
-    try:
+    with writing("", path, "a folder and a disk that can"):
         part.write_text(text, encoding="utf-8")
         os.replace(part, path)  # noqa: PTH105 - atomic, over what may be there
-    except OSError as error:
-        raise ParameterError(f"{path} cannot be written ({error.strerror}), expected a folder and a disk that can") from None

@@ -45,28 +45,28 @@ class LawResult(NamedTuple):
 
 
 def compare(
-    here: Benchmark, tuned: Mapping[str, Mapping[str, TuningResult]], aircraft: int, levels: Sequence[float], seed: int
+    benchmark: Benchmark, tuned: Mapping[str, Mapping[str, TuningResult]], aircraft: int, levels: Sequence[float], seed: int
 ) -> Iterator[LawResult]:
     """Fly each law with each of its gain sets through the same flights, all of one gain set at once.
 
     The flights: the nominal aircraft with u late by 0 to MAX_DELAY_TICKS ticks, and `aircraft` uncertain ones at each level, those
     of `seed`. Raises ParameterError for an uncertainty outside [0, 1).
     """
-    airframe, _ = here.scenario.aircraft.load()
+    airframe, _ = benchmark.scenario.aircraft.load()
     drawn = [nominal_and_sampled(airframe, level, aircraft, seed) for level in levels]
     nominal = [np.repeat(matrix[None], MAX_DELAY_TICKS + 1, axis=0) for matrix in (airframe.matrix_a(), airframe.matrix_b())]
     A = np.concatenate([nominal[0], *(one[0][1:] for one in drawn)])
     B = np.concatenate([nominal[1], *(one[1][1:] for one in drawn)])
     late = np.concatenate([np.arange(MAX_DELAY_TICKS + 1), np.zeros(aircraft * len(levels), dtype=int)])
-    flights = benchmark_fleet(A, B, np.ones(len(A)), late, here)
+    flights = benchmark_fleet(A, B, np.ones(len(A)), late, benchmark)
     parts = np.split(np.arange(MAX_DELAY_TICKS + 1, len(A)), len(levels))
     for name, by_aim in tuned.items():
         law = LAWS[name]
-        control_law = law.control_law(here.known)  # one for both gain sets: it is compiled once
+        control_law = law.control_law(benchmark.model)  # one for both gain sets: it is compiled once
         for objective, gains in by_aim.items():
-            params = law.params(as_gains(gains), here.known)
-            flown = fleet.fly(flights, here.vehicle, here.courses[law.feedforward], control_law, params)
-            scores, diverged = score(flown, here.unit), np.asarray(flown.diverged)
+            params = law.params(as_gains(gains), benchmark.model)
+            flown = fleet.fly(flights, benchmark.vehicle, benchmark.courses[law.feedforward], control_law, params)
+            scores, diverged = score(flown, benchmark.unit), np.asarray(flown.diverged)
             yield LawResult(
                 name,
                 objective,
@@ -74,7 +74,7 @@ def compare(
                 tuple(_level(level, scores[part], diverged[part]) for level, part in zip(levels, parts, strict=True)),
                 np.asarray(flown.rms)[:, 0],
                 np.asarray(flown.slew)[:, 0],
-                _borne(scores[: MAX_DELAY_TICKS + 1]) * here.known.period,
+                _borne(scores[: MAX_DELAY_TICKS + 1]) * benchmark.model.period,
             )
 
 
