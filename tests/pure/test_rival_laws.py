@@ -51,7 +51,7 @@ def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) ->
 def osprey() -> NominalModel:
     """The osprey without actuators or limits."""
     scenario = find_scenario("osprey_gust").vary(flight={"duration": 0.1})
-    return tuning.benchmark(scenario).model
+    return tuning.build_benchmark(scenario).model
 
 
 def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:

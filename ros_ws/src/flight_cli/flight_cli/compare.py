@@ -20,7 +20,8 @@ from flight_campaign import law_comparison
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.law_comparison import LawResult
 from flight_cli.output import new_table, progress_bar
-from flight_core.parameters import ParameterError, require
+from flight_core.files import writing
+from flight_core.parameters import require
 
 SEEDS = (1, 2, 3)
 NOTES = """
@@ -62,7 +63,7 @@ def compare(
     for aim in aims:
         require(aim in gain_tuning.OBJECTIVES, "--tuning", repr(aim), ", ".join(gain_tuning.OBJECTIVES))
     levels, chosen = _parse_levels(uncertainty), find_scenario(scenario)
-    benchmark, path = gain_tuning.benchmark(chosen), gains or gain_tuning.tuned_file(chosen)
+    benchmark, path = gain_tuning.build_benchmark(chosen), gains or gain_tuning.tuned_file(chosen)
     known = gain_tuning.load(path)
     results = []
     with progress_bar() as bar:
@@ -152,9 +153,5 @@ def _as_json(one: LawResult, scenario: Scenario) -> dict[str, Any]:
 
 
 def _write(path: Path, text: str) -> None:
-    try:
+    with writing("--json", path, "the path of a file"):
         path.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ParameterError(
-            f"--json: {path} cannot be written ({error.strerror or error}), expected the path of a file"
-        ) from None
