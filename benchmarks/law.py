@@ -51,7 +51,7 @@ def measure() -> dict[str, tuple[float, float, float]]:
     engaged, _ = guard.tick(guard.initial_state(4), 0, StampedVector(0, y[0]), [StampedVector(0, y_m)], limits, law)
 
     def guarded(k: int) -> object:
-        return guard.guarded_step(law_state, y[k], y_m, dt, zero, zero, law, limits.limits)
+        return guard.step_with_anti_windup(law_state, y[k], y_m, dt, zero, zero, law, limits.limits)
 
     def whole_tick(k: int) -> object:
         stamp_ns = limits.period_ns
@@ -62,7 +62,7 @@ def measure() -> dict[str, tuple[float, float, float]]:
     return {
         FLOOR: percentiles(lambda k: law.K * y[k] + y_m),
         "law.step": percentiles(lambda k: step(law_state, y[k], y_m, dt, law)),
-        "guard.guarded_step": percentiles(guarded),
+        "guard.step_with_anti_windup": percentiles(guarded),
         "guard.tick": percentiles(whole_tick),
     }
 

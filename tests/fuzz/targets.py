@@ -113,7 +113,7 @@ def channel_map(data: bytes, folder: Path) -> None:
 
     def bridge() -> None:
         made = Bridge(load_map(str(path)), dry_run=False)
-        made.engage(0), made.raw(), made.flown()
+        made.engage(0), made.raw(), made.raw_u()
 
     refused(bridge)
 

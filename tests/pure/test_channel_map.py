@@ -67,8 +67,8 @@ def test_each_output_comes_in_si_and_frd(name: str, channel: str) -> None:
 
 @pytest.mark.parametrize("name", MAPS)
 def test_each_input_is_sent_in_the_autopilots_unit_and_sign(name: str) -> None:
-    chart = load_map(name)
-    for (path, expected), row in zip(SENT[name].items(), chart.inputs.values(), strict=True):
+    channel_map = load_map(name)
+    for (path, expected), row in zip(SENT[name].items(), channel_map.inputs.values(), strict=True):
         assert path in (row.field, f"{row.message}.{row.field}")
         assert to_raw(row.trim + 0.1, row.line) == pytest.approx(expected, abs=1e-3)  # us are whole ones anyway
 
@@ -76,18 +76,18 @@ def test_each_input_is_sent_in_the_autopilots_unit_and_sign(name: str) -> None:
 @pytest.mark.parametrize("name", FOREIGN_MAPS)
 def test_each_field_of_a_map_is_published_and_takes_what_the_map_puts_into_it(name: str) -> None:
     """float32 has 24 bits: what is put in comes back to 1e-7 of itself; what is a whole number comes back to half a unit."""
-    chart = load_map(name)
-    foreign = {key: kind_ for key, _, kind_ in chart.used_topics() if kind_ in PUBLISHED}
+    channel_map = load_map(name)
+    foreign = {key: kind_ for key, _, kind_ in channel_map.used_topics() if kind_ in PUBLISHED}
     messages = {key: blank(kind_) for key, kind_ in foreign.items()}
     assert {kind_.split("/")[0] for kind_ in foreign.values()} <= {"px4_msgs", "mavros_msgs", "rosflight_msgs", "rosplane_msgs"}
-    for key, row in chart.messages.items():
+    for key, row in channel_map.messages.items():
         message = messages[f"messages.{key}"]
         for path, value in row.values.items():
             set_field(message, path, list(value) if isinstance(value, tuple) else value)
             assert path in PUBLISHED[row.type]
         assert not row.stamped or "header" in PUBLISHED[row.type]
-    for channel, input_row in chart.inputs.items():
-        message, kind_ = messages[f"messages.{input_row.message}"], chart.messages[input_row.message].type
+    for channel, input_row in channel_map.inputs.items():
+        message, kind_ = messages[f"messages.{input_row.message}"], channel_map.messages[input_row.message].type
         ((field, place), *_) = STEP.findall(input_row.field)
         element, length, is_array = kind(PUBLISHED[kind_][field])
         assert is_array, channel
@@ -96,8 +96,8 @@ def test_each_field_of_a_map_is_published_and_takes_what_the_map_puts_into_it(na
             set_field(message, input_row.field, raw)
             error = 1e-7 * abs(raw) if element == "float32" else 0.5
             assert get_field(message, input_row.field) == pytest.approx(raw, rel=0.0, abs=error, nan_ok=True)
-    for key, reader in [("outputs." + one, row) for one, row in chart.outputs.items()] + [
-        ("overrides." + one, row) for one, row in chart.overrides.items()
+    for key, reader in [("outputs." + one, row) for one, row in channel_map.outputs.items()] + [
+        ("overrides." + one, row) for one, row in channel_map.overrides.items()
     ]:
         if key in messages:
             assert read_raw(messages[key], reader.field, "value") == 0.0
@@ -107,13 +107,13 @@ def test_each_field_of_a_map_is_published_and_takes_what_the_map_puts_into_it(na
 
 @pytest.mark.parametrize("name", MAPS)
 def test_each_map_sends_nothing_by_default_and_says_where_each_row_is_from(name: str) -> None:
-    chart = load_map(name)
-    assert chart.dry_run
-    assert list(chart.outputs) == ["q", "V", "p", "r"]
-    assert list(chart.inputs) == ["elevator", "thrust", "aileron", "rudder"]
-    rows: list[Any] = [*chart.outputs.values(), *chart.inputs.values(), *chart.overrides.values()]
+    channel_map = load_map(name)
+    assert channel_map.dry_run
+    assert list(channel_map.outputs) == ["q", "V", "p", "r"]
+    assert list(channel_map.inputs) == ["elevator", "thrust", "aileron", "rudder"]
+    rows: list[Any] = [*channel_map.outputs.values(), *channel_map.inputs.values(), *channel_map.overrides.values()]
     assert all(len(row.source) > 10 for row in rows)
-    for row in chart.inputs.values():
+    for row in channel_map.inputs.values():
         assert row.release == pytest.approx(RELEASED[name], nan_ok=True)
         assert to_channel(row.neutral, row.line) == pytest.approx(row.trim, abs=1e-6)
 

@@ -48,9 +48,9 @@ def listed(value: Any) -> Any:
     return [listed(one) for one in value] if isinstance(value, tuple) else value
 
 
-def written(chart: ChannelMap, folder: Path) -> str:
-    path = folder / f"{chart.name}.yaml"
-    path.write_text(yaml.safe_dump(listed(chart.model_dump(exclude_none=True)), sort_keys=False), encoding="utf-8")
+def written(channel_map: ChannelMap, folder: Path) -> str:
+    path = folder / f"{channel_map.name}.yaml"
+    path.write_text(yaml.safe_dump(listed(channel_map.model_dump(exclude_none=True)), sort_keys=False), encoding="utf-8")
     return str(path)
 
 

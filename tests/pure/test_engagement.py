@@ -117,7 +117,7 @@ def assert_no_jumps(flown: list[Tick]) -> None:
         if tick.after.mode is Mode.ENGAGED:
             allowed = step_of_the_law(tick) if tick.before.mode is Mode.ENGAGED else np.zeros(4)
         else:
-            allowed = np.abs(tick.after.u_lost) * seconds(PERIOD_NS) / SERVO.controller.ramp
+            allowed = np.abs(tick.after.u_failsafe) * seconds(PERIOD_NS) / SERVO.controller.ramp
         assert (np.abs(tick.after.u - tick.before.u) <= allowed + ROUNDING).all(), tick
 
 

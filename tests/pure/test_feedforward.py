@@ -185,7 +185,7 @@ def recomputed(params: ControllerParameters, tape: Tape) -> tuple[FloatArray, Fl
         if ahead is not None and limits.nominal is not None:
             ahead, u_ff = feedforward.step(ahead, y_m[k], dt, limits.nominal)
             start = u_trim + u_ff
-        state, _, u = guard.guarded_step(state, y[k], y_m[k], dt, start, u, law, limits.limits)
+        state, _, u = guard.step_with_anti_windup(state, y[k], y_m[k], dt, start, u, law, limits.limits)
         us.append(u)
         added.append(u_ff)
     return np.array(us), np.array(added)

@@ -12,7 +12,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard, internals
 from rise_di_controller.guard import ControllerState, Limits, Mode, align
-from rise_di_controller.internals import Limited
+from rise_di_controller.internals import Saturation
 from rise_di_controller.law import LawParams, LawState, Sign, control, engage, retune, step
 from rise_di_controller.params import ControllerParameters
 
@@ -212,7 +212,7 @@ def test_inside_its_limits_the_guarded_law_is_the_law_to_the_last_bit(sign: Sign
     law = TWO._replace(sign=sign)
     zero, dt = np.zeros(2), np.array(0.01)
     after, u = step(state, y, zero, dt, law)
-    guarded, u_free, limited = guard.guarded_step(state, y, zero, dt, zero, u, law, NO_LIMITS)
+    guarded, u_free, limited = guard.step_with_anti_windup(state, y, zero, dt, zero, u, law, NO_LIMITS)
     assert limited.tobytes() == u_free.tobytes() == (zero + u).tobytes()
     assert [part.tobytes() for part in guarded] == [part.tobytes() for part in after]
 
@@ -223,7 +223,7 @@ def test_limits_are_kept_and_nothing_inside_them_is_touched(
 ) -> None:
     limits = Limits(np.full(2, -bound), np.full(2, bound), np.full(2, rate))
     before = np.clip(before, -bound, bound)
-    limited = guard.limit(u, before, np.array(0.01), limits)
+    limited = guard.saturate(u, before, np.array(0.01), limits)
     assert (np.abs(limited) <= bound).all()
     assert (np.abs(limited - before) <= rate * 0.01 + 1e-12).all()
     inside = (np.abs(u) <= bound) & (np.abs(u - before) <= rate * 0.01)
@@ -232,7 +232,7 @@ def test_limits_are_kept_and_nothing_inside_them_is_touched(
 
 def test_an_input_outside_its_limits_comes_back_inside_them() -> None:
     limits = Limits(np.full(2, -1.0), np.full(2, 1.0), np.full(2, 10.0))
-    assert guard.limit(np.array([5.0, -5.0]), np.array([3.0, -3.0]), np.array(0.01), limits).tolist() == [1.0, -1.0]
+    assert guard.saturate(np.array([5.0, -5.0]), np.array([3.0, -3.0]), np.array(0.01), limits).tolist() == [1.0, -1.0]
 
 
 @given(state=STATES, y=PAIRS, trim=PAIRS)
@@ -244,8 +244,8 @@ def test_integrals_stop_only_in_the_direction_that_worsens_saturation(
     limits = Limits(np.full(2, -bound), np.full(2, bound), np.full(2, rate))
     zero, dt = np.zeros(2), np.array(0.01)
     free, u = step(state, y, zero, dt, TWO)
-    guarded, _, _ = guard.guarded_step(state, y, zero, dt, trim, zero, TWO, limits)
-    beyond = trim + u - guard.limit(trim + u, zero, dt, limits)
+    guarded, _, _ = guard.step_with_anti_windup(state, y, zero, dt, trim, zero, TWO, limits)
+    beyond = trim + u - guard.saturate(trim + u, zero, dt, limits)
     outward = -TWO.D * (free.integral_e - state.integral_e) * beyond > 0
     assert (guarded.integral_e == np.where(outward, state.integral_e, free.integral_e)).all()
     outward = -TWO.D * (free.Pi - state.Pi) * beyond > 0
@@ -260,7 +260,7 @@ def test_an_input_reaches_its_limit_however_large_a_tick_of_the_integrals_is() -
     zero, e = np.zeros(2), np.array([-0.2, 0.2])
     state, u = engage(e, zero), zero
     for _ in range(20):
-        state, _, u = guard.guarded_step(state, e, zero, np.array(0.01), zero, u, TWO, limits)
+        state, _, u = guard.step_with_anti_windup(state, e, zero, np.array(0.01), zero, u, TWO, limits)
     assert u == pytest.approx([0.01, 0.01], rel=1e-12)
 
 
@@ -290,7 +290,7 @@ def test_internals_hold_the_integrals_and_what_limited_each_input(params: Contro
     assert (shown["e.q"], shown["e_0.q"], shown["integral_e.q"], shown["Pi.q"]) == (1.0, 0.0, 2.0, 3.0)
     assert (shown["u_free.aileron"], shown["u.aileron"], shown["u_trim.aileron"]) == (5.0, 1.0, 0.1)
     limited = [shown[f"limited.{name}"] for name in params.inputs]
-    assert limited == [Limited.NO, Limited.MAGNITUDE, Limited.MAGNITUDE, Limited.RATE]
+    assert limited == [Saturation.NO, Saturation.MAGNITUDE, Saturation.MAGNITUDE, Saturation.RATE]
 
 
 def test_internals_are_named_after_the_outputs(params: ControllerParameters) -> None:

@@ -30,7 +30,7 @@ from flight_analysis.metrics import (
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from rise_di_controller.guard import Mode
-from rise_di_controller.internals import Limited
+from rise_di_controller.internals import Saturation
 
 MS = 1_000_000
 EPOCH = 1_795_000_000_000_000_000  # a stamp of today, where float64 seconds resolve no better than 0.2 us
@@ -181,7 +181,7 @@ def test_effort_is_the_rms_about_trim_and_the_rate_the_way_over_the_time() -> No
 
 
 def test_limited_ticks_are_shared_out_by_what_limited_them() -> None:
-    kinds = [Limited.NO, Limited.MAGNITUDE, Limited.RATE, Limited.RATE]
+    kinds = [Saturation.NO, Saturation.MAGNITUDE, Saturation.RATE, Saturation.RATE]
     internals = signal([0, 10, 20, 30], **{"limited.thrust": [float(one) for one in kinds]})
     assert limited_shares(Tape({"internals": internals}, EPOCH)) == {"thrust": {"magnitude": 0.25, "rate": 0.5}}
     assert limited_shares(Tape({}, EPOCH)) == {}

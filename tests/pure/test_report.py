@@ -25,7 +25,7 @@ from flight_core.outcome import COMPLETED
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.guard import Mode
-from rise_di_controller.internals import Limited
+from rise_di_controller.internals import Saturation
 
 MS = 1_000_000
 EPOCH = 1_795_000_000_000_000_000  # a stamp of today
@@ -46,7 +46,7 @@ def signal(stamps_ms: list[float], **channels: list[float]) -> Signal:
 def ticks(count: int, **channels: list[float]) -> Signal:
     """Internals of a controller at 100 Hz that flew on time and inside its limits, but for the channels given."""
     quiet = {"mode": [float(Mode.ENGAGED)] * count, "dt": [0.01] * count, "late": [0.0] * count, "age": [0.0] * count}
-    limited = {f"limited.{name}": [float(Limited.NO)] * count for name in INPUTS}
+    limited = {f"limited.{name}": [float(Saturation.NO)] * count for name in INPUTS}
     integrals = {f"{group}.{name}": [0.0] * count for group in ("integral_e", "Pi") for name in OUTPUTS}
     return signal([10.0 * k for k in range(count)], **(quiet | limited | integrals | channels))
 
@@ -180,7 +180,7 @@ def test_events_are_told_once_each_in_the_order_of_their_first_instant() -> None
     mode = (
         [Mode.ENGAGED] * 20 + [Mode.HOLD] * 10 + [Mode.ENGAGED] * 20 + [Mode.HOLD] * 5 + [Mode.RAMP] * 5 + [Mode.ENGAGED] * 41
     )
-    rate = [Limited.NO] * 2 + [Limited.RATE] * 3 + [Limited.NO] * 90 + [Limited.RATE] + [Limited.NO] * 5
+    rate = [Saturation.NO] * 2 + [Saturation.RATE] * 3 + [Saturation.NO] * 90 + [Saturation.RATE] + [Saturation.NO] * 5
     tape = flight(internals=ticks(101, mode=[float(one) for one in mode], **{"limited.thrust": [float(one) for one in rate]}))
     told = events(tape, {"lateral": (0.9, 2.0), "vertical": (5.0, 6.0)})
     assert [(event.what, round(event.start, 3), round(event.stop, 3), event.how_much) for event in told] == [
@@ -207,7 +207,7 @@ def test_spans_closer_than_can_be_seen_are_one_and_none_is_too_short_to_see() ->
 
 def test_every_mode_but_engaged_is_a_band_under_its_name() -> None:
     assert set(figures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
-    assert set(figures.LIMITED_COLOURS) == set(Limited) - {Limited.NO}
+    assert set(figures.LIMITED_COLOURS) == set(Saturation) - {Saturation.NO}
     modes = [float(one) for one in Mode for _ in range(10)]
     bands = figures.mode_bands(flight(60, internals=ticks(60, mode=modes)))
     assert {band.label: (round(band.start, 3), round(band.stop, 3)) for band in bands} == {
@@ -265,9 +265,9 @@ def test_an_input_without_limits_has_no_lines(osprey_gust: Scenario) -> None:
 
 
 def test_when_an_input_was_limited_is_marked_in_its_row_alone() -> None:
-    limited = [float(Limited.NO)] * 101
-    limited[50:60] = [float(Limited.MAGNITUDE)] * 10
-    limited[80] = float(Limited.RATE)
+    limited = [float(Saturation.NO)] * 101
+    limited[50:60] = [float(Saturation.MAGNITUDE)] * 10
+    limited[80] = float(Saturation.RATE)
     tape = input_flight(**{"limited.aileron": limited})
     figure = figures.input_figure(scene(tape), {})
     (magnitude,), (rate,) = traces(figure, "limited: magnitude"), traces(figure, "limited: rate")

@@ -22,7 +22,7 @@ from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.plant import PlantParams
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import error_figures, true_error
+from flight_analysis.metrics import error_metrics, true_error
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
 from flight_core.tape import Tape
@@ -71,7 +71,7 @@ def first(t: FloatArray, values: FloatArray, bound: float) -> float:
 def test_with_the_textbooks_elevator_the_right_d_tracks(scenario: Scenario, tmp_path: Path) -> None:
     # D = (-1, 1, 1, 1). Measured rms of q: 1.97 mrad/s through servos, 1.95 without them; the prototype: 2.0 and 2.2.
     right = trailing_edge_down(scenario, tmp_path).vary(controller={"D": [-1, 1, 1, 1]}, flight={"duration": 30.0})
-    sixty_seconds = error_figures(q_error(simulate(right))).rms * math.sqrt(30.0 / 60.0)  # nothing happens to q after 30 s
+    sixty_seconds = error_metrics(q_error(simulate(right))).rms * math.sqrt(30.0 / 60.0)  # nothing happens to q after 30 s
     assert sixty_seconds <= 0.0022
 
 

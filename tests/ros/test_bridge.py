@@ -429,11 +429,11 @@ def test_a_real_pressure_gives_the_speed() -> None:
 
 
 def test_inputs_are_put_into_a_real_joy() -> None:
-    chart = load_map("ardupilot")
+    channel_map = load_map("ardupilot")
     message = Joy()
-    for path, value in chart.messages["joy"].values.items():
+    for path, value in channel_map.messages["joy"].values.items():
         set_field(message, path, value)
-    for row, u in zip(chart.inputs.values(), (0.1, 0.1, -0.1, 0.2), strict=True):
+    for row, u in zip(channel_map.inputs.values(), (0.1, 0.1, -0.1, 0.2), strict=True):
         set_field(message, row.field, to_raw(row.trim + u, row.line))
     assert list(through_the_wire(message).axes) == pytest.approx(
         [-0.1 / FULL, 0.1 / FULL, 0.2, 0.2 / FULL], rel=1e-5

@@ -86,8 +86,8 @@ def test_any_payload_is_a_sample_or_refused_and_spoils_no_other(raw: bytes) -> N
 @many
 @given(st.data())
 def test_any_payload_of_an_autopilots_topic_is_a_value_or_refused(data: st.DataObject) -> None:
-    chart = load_map("ardupilot")  # its message types are installed with the others
-    row = data.draw(st.sampled_from([*chart.outputs.values()]))
+    channel_map = load_map("ardupilot")  # its message types are installed with the others
+    row = data.draw(st.sampled_from([*channel_map.outputs.values()]))
     kind: Any = message_type(row.type)
     raw = data.draw(payloads() | st.binary(max_size=200))
     try:

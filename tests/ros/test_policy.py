@@ -115,7 +115,7 @@ def test_the_policy_names_what_the_monitor_of_a_flight_has(osprey_gust: Scenario
 
 def test_the_policy_names_what_the_bridge_has_with_every_map(start: Start) -> None:
     maps = [load_map(path.stem) for path in sorted(LIBRARY.glob("*.yaml"))]
-    used = [row for chart in maps for row in chart.used_topics()]
+    used = [row for channel_map in maps for row in channel_map.used_topics()]
     sent = {topic for key, topic, _ in used if key.startswith("messages.")}
     heard = {topic for key, topic, _ in used if not key.startswith("messages.")}
     policy = allowed()["bridge"]

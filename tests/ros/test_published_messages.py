@@ -38,8 +38,8 @@ def needs(*packages: str) -> None:
             pytest.skip(f"{package} is not installed and not on PyPI; its fields are checked as {PACKAGES[package]} has them")
 
 
-def needs_packages_of(chart: ChannelMap) -> None:
-    needs(*sorted({kind_.split("/")[0] for _, _, kind_ in chart.used_topics()} & PACKAGES.keys()))
+def needs_packages_of(channel_map: ChannelMap) -> None:
+    needs(*sorted({kind_.split("/")[0] for _, _, kind_ in channel_map.used_topics()} & PACKAGES.keys()))
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -86,10 +86,10 @@ ROWS: tuple[tuple[str, str, Callable[[Any], None]], ...] = (
 
 @pytest.mark.parametrize(("name", "channels", "fill"), ROWS, ids=[f"{name}-{channels}" for name, channels, _ in ROWS])
 def test_outputs_are_read_from_real_messages(name: str, channels: str, fill: Callable[[Any], None]) -> None:
-    chart = load_map(name)
-    needs_packages_of(chart)
+    channel_map = load_map(name)
+    needs_packages_of(channel_map)
     for channel in channels:
-        row = chart.outputs[channel]
+        row = channel_map.outputs[channel]
         message = message_type(row.type)()
         fill(message)
         message = deserialize_message(serialize_message(message), type(message))
@@ -99,11 +99,11 @@ def test_outputs_are_read_from_real_messages(name: str, channels: str, fill: Cal
 
 @pytest.mark.parametrize("name", FOREIGN_MAPS)
 def test_inputs_are_put_into_real_messages(name: str) -> None:
-    chart = load_map(name)
-    needs_packages_of(chart)
-    for (path, expected), row in zip(SENT[name].items(), chart.inputs.values(), strict=True):
-        message = message_type(chart.messages[row.message].type)()
-        for field, value in chart.messages[row.message].values.items():
+    channel_map = load_map(name)
+    needs_packages_of(channel_map)
+    for (path, expected), row in zip(SENT[name].items(), channel_map.inputs.values(), strict=True):
+        message = message_type(channel_map.messages[row.message].type)()
+        for field, value in channel_map.messages[row.message].values.items():
             set_field(message, field, value)
         set_field(message, row.field, to_raw(row.trim + 0.1, row.line))
         message = deserialize_message(serialize_message(message), type(message))

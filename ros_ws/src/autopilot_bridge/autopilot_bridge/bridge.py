@@ -13,7 +13,7 @@ import numpy as np
 from autopilot_bridge.channel_map import to_channel, to_raw
 from autopilot_bridge.params import ChannelMap
 from flight_core.rates import nanoseconds, seconds
-from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer
 
 
 class Phase(IntEnum):
@@ -35,10 +35,10 @@ class Reading(NamedTuple):
 class Bridge:
     """What has come, what goes out. Engaged by `engage` alone: what has ended an engagement never begins another one."""
 
-    def __init__(self, chart: ChannelMap, *, dry_run: bool) -> None:
-        self.chart = chart
+    def __init__(self, channel_map: ChannelMap, *, dry_run: bool) -> None:
+        self.channel_map = channel_map
         self.dry_run = dry_run
-        self.outputs, self.inputs = tuple(chart.outputs), tuple(chart.inputs)
+        self.outputs, self.inputs = tuple(channel_map.outputs), tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
         self.reason = "not engaged yet"  # why it is not engaged
         self._readings: dict[str, Reading] = {}
@@ -48,9 +48,9 @@ class Bridge:
         self._u_ns = 0  # when it came
         self._pilot = ""  # the override with which the pilot has taken over
         self._phase_ns = 0  # when the phase began
-        rows = chart.inputs.values()
+        rows = channel_map.inputs.values()
         self._lower, self._upper = (np.array([getattr(row, key) for row in rows]) for key in ("lower", "upper"))
-        self._max_age_ns = nanoseconds(chart.silence.max_age)
+        self._max_age_ns = nanoseconds(channel_map.silence.max_age)
 
     # What comes
 
@@ -60,24 +60,24 @@ class Bridge:
         Raises ChannelError, reason "stamp" where its instant is further from now than its age limit, "order" where it is not
         newer than the last one.
         """
-        row = self.chart.outputs[name]
+        row = self.channel_map.outputs[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
             hint = "" if row.stamp == "arrival" else "; where the autopilot keeps another time, say stamp: arrival in the map"
             raise ChannelError("stamp", f"{name} is stamped {seconds(now_ns - stamp_ns):.3f} s before now{hint}")
         last = self._readings.get(name)
-        if last is not None and stamp_ns <= last.stamp_ns:
-            raise ChannelError("order", f"{name} is not newer than the sample before it")
+        if last is not None:
+            require_newer(stamp_ns, last.stamp_ns, name)
         self._readings[name] = Reading(stamp_ns, to_channel(raw, row.line))
 
     def take_u(self, u: FloatArray, sender: str, now_ns: int) -> None:
         """A new u, shape (m,) in the map's order. Raises ChannelError, reason "sender", while another one flies."""
-        if sender != self._u_from and not self.u_is_silent(now_ns):
-            raise ChannelError("sender", f"{sender} commands too, beside {self._u_from}")
+        if sender != self._u_from and not self.u_timed_out(now_ns):
+            raise ChannelError("sender", f"conflicting publisher {sender} ignored: already receiving from {self._u_from}")
         self._u, self._u_from, self._u_ns = u, sender, now_ns
 
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
         """The pilot's field: beyond its threshold the pilot has the aircraft, at once."""
-        if self.chart.overrides[name].takes_over(raw):
+        if self.channel_map.overrides[name].is_active(raw):
             self._pilot = name
             if self.phase in {Phase.ENGAGED, Phase.NEUTRAL}:
                 self.disengage(f"the pilot has taken over by {name}", now_ns)
@@ -89,7 +89,7 @@ class Bridge:
     def stale(self, now_ns: int) -> dict[str, str]:
         """Channels of y that are missing or older than their limit, each with what is wrong with it."""
         found = {}
-        for name, row in self.chart.outputs.items():
+        for name, row in self.channel_map.outputs.items():
             reading = self._readings.get(name)
             if reading is None:
                 found[name] = f"{name} has not come yet ({row.topic})"
@@ -97,7 +97,7 @@ class Bridge:
                 found[name] = f"{name} is {seconds(now_ns - reading.stamp_ns):.2f} s old ({row.topic})"
         return found
 
-    def u_is_silent(self, now_ns: int) -> bool:
+    def u_timed_out(self, now_ns: int) -> bool:
         """Whether there is no u, or none for longer than its limit."""
         return self._u_from is None or now_ns - self._u_ns > self._max_age_ns
 
@@ -105,11 +105,11 @@ class Bridge:
         """What is wrong with u, nothing where it is fresh."""
         if self._u_from is None:
             return ("u has not come yet",)
-        return (f"u is {seconds(now_ns - self._u_ns):.2f} s old",) if self.u_is_silent(now_ns) else ()
+        return (f"u is {seconds(now_ns - self._u_ns):.2f} s old",) if self.u_timed_out(now_ns) else ()
 
     def ready(self, now_ns: int) -> bool:
         """Whether y and u are fresh."""
-        return not self.stale(now_ns) and not self.u_is_silent(now_ns)
+        return not self.stale(now_ns) and not self.u_timed_out(now_ns)
 
     def refusal(self, now_ns: int) -> str:
         """Why it would not engage now, empty where it would."""
@@ -119,7 +119,7 @@ class Bridge:
             return f"the pilot has the aircraft by {self._pilot}"
         if missing := (*self.stale(now_ns).values(), *self._silence(now_ns)):
             return "; ".join(missing)
-        room = self.chart.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
+        room = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
         for name, u, most in zip(self.inputs, self._u, room, strict=True):
             if abs(u) > most:
                 return f"u.{name} is {u:.3g} from trim, more than {most:.3g}: deactivate the controller until u is at trim"
@@ -149,7 +149,7 @@ class Bridge:
             elif silence := self._silence(now_ns):
                 self.reason = silence[0]
                 self._enter(Phase.NEUTRAL, now_ns)
-        times = self.chart.silence
+        times = self.channel_map.silence
         if self.phase is Phase.NEUTRAL and now_ns - self._phase_ns >= nanoseconds(times.neutral):
             self._enter(Phase.RELEASE, now_ns)
         if self.phase is Phase.RELEASE and now_ns - self._phase_ns >= nanoseconds(times.release):
@@ -160,30 +160,30 @@ class Bridge:
 
     def y(self, now_ns: int) -> StampedVector | None:
         """The newest value of each output, at the instant of the map's `instant`; None where it was given, or one is stale."""
-        newest = self._readings.get(self.chart.instant)
+        newest = self._readings.get(self.channel_map.instant)
         if newest is None or newest.stamp_ns <= self._given_ns or self.stale(now_ns):
             return None
         self._given_ns = newest.stamp_ns
         return StampedVector(newest.stamp_ns, np.array([self._readings[name].value for name in self.outputs]))
 
-    def flown(self) -> FloatArray:
+    def raw_u(self) -> FloatArray:
         """The raw values for the newest u inside its limits, shape (m,): raw of trim + min(max(u, lower), upper)."""
         u = np.minimum(np.maximum(self._u, self._lower), self._upper)
-        rows = self.chart.inputs.values()
+        rows = self.channel_map.inputs.values()
         return np.array([to_raw(row.trim + one, row.line) for row, one in zip(rows, u.tolist(), strict=True)])
 
     def raw(self) -> FloatArray:
         """The raw values that this phase sends, shape (m,)."""
         if self.phase is Phase.ENGAGED:
-            return self.flown()
+            return self.raw_u()
         key = "neutral" if self.phase is Phase.NEUTRAL else "release"
-        return np.array([getattr(row, key) for row in self.chart.inputs.values()])
+        return np.array([getattr(row, key) for row in self.channel_map.inputs.values()])
 
     def sends(self, name: str, now_ns: int) -> bool:
         """Whether a message of the map is sent in this phase; in a dry run none is."""
         if self.dry_run:
             return False
-        if self.chart.messages[name].when == "ready":
+        if self.channel_map.messages[name].when == "ready":
             return self.ready(now_ns)
         return self.phase is not Phase.DISENGAGED
 

@@ -86,7 +86,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
         if sample is not None:
             self._publish_y(self._y_encoder.encode(sample.stamp_ns, sample.value))
         if self._take_u(now_ns):
-            self._publish_would_send(self._would_send_encoder.encode(now_ns, self._bridge.flown()))
+            self._publish_would_send(self._would_send_encoder.encode(now_ns, self._bridge.raw_u()))
         self._bridge.step(now_ns)
         self._say_phase()
         self._send(now_ns, self.period_ns() // 2)
@@ -165,7 +165,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
         for subscription, rows in self._readers:
             if any(name in stale for name, row in rows if isinstance(row, OutputRow)):
                 self.warn_no_publisher(subscription)
-        if self._bridge.u_is_silent(now_ns):
+        if self._bridge.u_timed_out(now_ns):
             self.warn_no_publisher(self._u_subscription)
 
     def check_graph(self) -> None:

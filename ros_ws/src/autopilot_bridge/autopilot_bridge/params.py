@@ -126,7 +126,7 @@ class OverrideRow(Parameters):
     )
     source: str = Field(min_length=1, description="where the row is from")
 
-    def takes_over(self, raw: float) -> bool:
+    def is_active(self, raw: float) -> bool:
         """Whether the pilot takes over."""
         if self.bits is not None:
             raw = float(int(raw) & self.bits)

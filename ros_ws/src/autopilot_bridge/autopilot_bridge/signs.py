@@ -17,34 +17,34 @@ SURE = 5.0  # times its standard error: residuals that hang together make that e
 FEWEST = 3  # intervals a regressor, else the fit says nothing
 
 
-def output_signs(chart: ChannelMap) -> FloatArray:
+def output_signs(channel_map: ChannelMap) -> FloatArray:
     """+1 for each output that comes with the stack's sign (q nose up, p roll right, r nose right, V faster), -1 for others.
 
     Shape (m,) in the map's order. Raises ParameterError where a row is of another motion than its channel's.
     """
     signs = []
-    for name, row in chart.outputs.items():
+    for name, row in channel_map.outputs.items():
         output, sign = row.motion
         channels = sorted({channel for channel, _ in MOTIONS.values()})
-        require(name in channels, f"map {chart.name}: outputs.{name}", "a channel", f"one of {', '.join(channels)}")
+        require(name in channels, f"map {channel_map.name}: outputs.{name}", "a channel", f"one of {', '.join(channels)}")
         require(
-            output == name, f"map {chart.name}: outputs.{name}.positive", f"{row.positive!r}", f"a motion that {name} shows"
+            output == name, f"map {channel_map.name}: outputs.{name}.positive", f"{row.positive!r}", f"a motion that {name} shows"
         )
         signs.append(sign)
     return np.array(signs, dtype=np.float64)
 
 
-def input_signs(chart: ChannelMap, Omega: FloatArray) -> FloatArray:
+def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
     """+1 for each input that moves the aircraft the way Omega = C B says, -1 for one that moves it the other way; shape (m,).
 
     Arguments: Omega (m, m), rows and columns in the map's order. Raises ParameterError where an input does not move its output.
     """
     signs = []
-    for j, (name, row) in enumerate(chart.inputs.items()):
+    for j, (name, row) in enumerate(channel_map.inputs.items()):
         output, sign = row.motion
-        key = f"map {chart.name}: inputs.{name}.positive"
-        require(output in chart.outputs, key, f"{row.positive!r}", f"a motion that one of {', '.join(chart.outputs)} shows")
-        effect = Omega[list(chart.outputs).index(output), j]
+        key = f"map {channel_map.name}: inputs.{name}.positive"
+        require(output in channel_map.outputs, key, f"{row.positive!r}", f"a motion that one of {', '.join(channel_map.outputs)} shows")
+        effect = Omega[list(channel_map.outputs).index(output), j]
         require(
             effect != 0.0, key, f"{row.positive!r}", f"a motion that {name} makes: in the airframe {output} does not answer"
         )
@@ -52,9 +52,9 @@ def input_signs(chart: ChannelMap, Omega: FloatArray) -> FloatArray:
     return np.array(signs)
 
 
-def through(chart: ChannelMap, Omega: FloatArray) -> FloatArray:
+def through(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
     """Omega as the controller sees it through the map: diag(output signs) Omega diag(input signs), shape (m, m)."""
-    return output_signs(chart)[:, None] * Omega * input_signs(chart, Omega)
+    return output_signs(channel_map)[:, None] * Omega * input_signs(channel_map, Omega)
 
 
 class Estimate(NamedTuple):

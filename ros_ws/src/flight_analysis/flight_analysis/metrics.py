@@ -12,7 +12,7 @@ from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.guard import Mode
-from rise_di_controller.internals import Limited
+from rise_di_controller.internals import Saturation
 
 Windows = Mapping[str, tuple[float, float]]
 
@@ -298,7 +298,7 @@ def limited_shares(tape: Tape) -> dict[str, dict[str, float]]:
     limited = tape["internals"].group("limited") if "internals" in tape else None
     if limited is None or len(limited.stamp_ns) == 0:
         return {}
-    kinds = (Limited.MAGNITUDE, Limited.RATE)
+    kinds = (Saturation.MAGNITUDE, Saturation.RATE)
     return {name: {kind.name.lower(): float(np.mean(limited[name] == kind)) for kind in kinds} for name in limited.names}
 
 

@@ -60,14 +60,14 @@ FLOWN = "]: flown to its end"  # what the aircraft says at the end of a lockstep
 class Autopilot(NamedTuple):
     """What flies in the aircraft's place."""
 
-    chart: ChannelMap
+    channel_map: ChannelMap
     path: Path  # of the map
     dry_run: bool  # say what would be sent, and send nothing
 
     @property
     def topics(self) -> list[str]:
         """What is recorded of it: the autopilot's own topics, and what the bridge makes of u for them."""
-        return [*self.chart.topics, WOULD_SEND]
+        return [*self.channel_map.topics, WOULD_SEND]
 
 
 def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
@@ -118,7 +118,7 @@ def to_play(
     within = f"/{namespace.strip('/')}/".replace("//", "/")
     said = {within + name for node in nodes for name in PUBLISHED_TOPICS[node]}
     if BRIDGE in nodes and autopilot is not None:
-        sent = (message.topic for message in autopilot.chart.messages.values())
+        sent = (message.topic for message in autopilot.channel_map.messages.values())
         said |= {topic if topic.startswith("/") else within + topic for topic in sent}
     return sorted(set(known) - said)
 

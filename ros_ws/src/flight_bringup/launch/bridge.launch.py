@@ -61,7 +61,7 @@ def _fly(context: LaunchContext) -> list[Action]:
     if duration := text(context, "duration"):
         scenario = scenario.vary(flight={"duration": yaml.safe_load(duration)})
     autopilot = find_autopilot(text(context, "map"), dry_run=text(context, "dry_run") == "true")
-    require_signs(autopilot.chart, scenario)
+    require_signs(autopilot.channel_map, scenario)
     recorded = text(context, "recorder") == "true"
     run = new_run(scenario, Path(text(context, "runs"))) if recorded else Path()
     end_with_launch(context)

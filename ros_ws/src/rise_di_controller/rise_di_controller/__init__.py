@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""RISE dynamic inversion: the control law from the measured output alone, and its fixed-rate ROS 2 node."""
+"""RISE dynamic inversion: a control law that uses the measured output only, its guard, and a ROS 2 node with a fixed rate."""

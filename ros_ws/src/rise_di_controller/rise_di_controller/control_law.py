@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a control law is to a fleet: a start, a step, and what it may look at. Arrays hold N aircraft in their last axis."""
+"""Protocol of a control law, for Monte Carlo campaigns: a function for engagement, a function for a step, and their inputs.
+
+Each law of `control_laws` returns a `ControlLaw`. Every array holds N aircraft in its last axis, so that one call steps all of
+them. The functions are pure: they keep no state of their own, and work with NumPy and JAX arrays.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -9,21 +13,29 @@ from flight_core.vectors import Array
 
 
 class Measurements(NamedTuple):
-    """What a law may look at, at a tick. Channels in the law's order, states in the airframe's; SI, deviations from trim."""
+    """Inputs of a law at a tick: SI units, deviations from trim.
+
+    Channels are in the law's order, states in the airframe's order. RISE-DI uses y, y_m, u_ff and u_before only; the other
+    fields serve laws that need more sensors.
+    """
 
     y: Array  # (m, N) measured outputs
     y_m: Array  # (m, 1) reference
-    y_m_dot: Array  # (m, 1) its derivative
+    y_m_dot: Array  # (m, 1) derivative of y_m
     u_ff: Array  # (m, 1) feedforward along the reference, 0 where it is off
-    u_before: Array  # (m, N) the last command, after limits
-    position: Array  # (m, N) of the actuators
-    x: Array  # (n, N) state: the outputs as measured, the others as they are
-    x_air: Array  # (n, N) the same with alpha and beta relative to the air
-    y_dot: Array  # (m, N) derivative of C x, as no sensor has it
+    u_before: Array  # (m, N) the last command, after saturation
+    position: Array  # (m, N) positions of the actuators
+    x: Array  # (n, N) state: measured values of the outputs, true values of the other states
+    x_air: Array  # (n, N) x with alpha and beta relative to the air
+    y_dot: Array  # (m, N) true derivative of C x, free of noise and delay
 
 
 class ControlLaw(NamedTuple):
-    """A law. Its parameters are arrays of (m, 1), or of (m, N) where each aircraft has its own."""
+    """A control law as two pure functions.
 
-    start: Callable[[Measurements, Any], Any]  # (seen, params) -> state, at engagement
-    step: Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]  # (state, seen, dt, params) -> (state, u after limits)
+    `start` makes the state of the law at engagement. `step` takes one tick of dt seconds and returns the new state and u after
+    saturation, shape (m, N). The parameters are arrays of (m, 1), or of (m, N) where each aircraft has its own.
+    """
+
+    start: Callable[[Measurements, Any], Any]  # (measurements, params) -> state
+    step: Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]  # (state, measurements, dt, params) -> (state, u)

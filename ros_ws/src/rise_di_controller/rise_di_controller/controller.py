@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller from sample to sample: what has come, one tick, what is to be published. Flown by the node and in process."""
+"""The controller without ROS: buffers y and y_m, steps the guarded law, returns u and its log. For node and simulation."""
 
 from collections import deque
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 from flight_core.rates import seconds
-from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
 from rise_di_controller import guard, internals
 from rise_di_controller.guard import Mode
 from rise_di_controller.law import Sign, retune
@@ -16,20 +16,20 @@ from rise_di_controller.params import ControllerParameters
 
 
 class ControlOutput(NamedTuple):
-    """What a tick has to say."""
+    """Output of one tick."""
 
-    stamp_ns: int  # that of the y it answers
+    stamp_ns: int  # of the y from which u was computed
     u: FloatArray  # (m,) in the order of the parameters' inputs
     log: Callable[[], FloatArray]
 
     @property
     def internals(self) -> FloatArray:
-        """For the log, in the order of `Controller.names`; made when asked for, so that u need not wait."""
+        """Values for the log in the order of `Controller.names`. They are computed on access, so that u is published first."""
         return self.log()
 
 
 class Controller:
-    """`guard.tick` with its memory: the state, the last y and y_m."""
+    """`guard.tick` with its state and the last samples of y and y_m."""
 
     def __init__(self, parameters: ControllerParameters) -> None:
         self._law, self._guard = parameters.law(), parameters.guard()
@@ -43,20 +43,20 @@ class Controller:
 
     @property
     def mode(self) -> Mode:
-        """What it is doing."""
+        """Mode of the guard."""
         return self._state.mode
 
     @property
     def sign(self) -> Sign:
-        """How the sign is sampled."""
+        """How the sign of e is sampled."""
         return self._law.sign
 
     def restart(self) -> None:
-        """Begin anew, but with u as it is: it does not jump."""
+        """Reset the state and keep u (bumpless transfer)."""
         self._state = guard.initial_state(len(self._state.u))._replace(u=self._state.u)
 
     def retune(self, parameters: ControllerParameters) -> None:
-        """Take new parameters between two ticks, all at once and without a jump of u; the same ones change nothing."""
+        """Replace all parameters between two ticks without a jump of u (bumpless transfer). Equal parameters change nothing."""
         law, digest = parameters.law(), parameters.digest()
         if digest == self._digest:
             return
@@ -65,49 +65,49 @@ class Controller:
         self._law, self._guard, self._digest = law, parameters.guard(), digest
 
     def take_y(self, sample: StampedVector, now_ns: int) -> None:
-        """A sample of y, shape (m,), in the law's order.
+        """Buffer a sample of y, shape (m,), in the law's order.
 
-        Raises ChannelError, "future" or "order", for a stamp ahead of the clock by more than the age limit, or not after the
-        last one.
+        Raises ChannelError: reason "future" for a stamp more than the age limit ahead of the clock, reason "order" for a stamp
+        that is not later than the previous one.
         """
         self._take(self._y, sample, now_ns)
 
     def take_y_m(self, sample: StampedVector, now_ns: int) -> None:
-        """A sample of y_m, likewise."""
+        """Buffer a sample of y_m, as `take_y` does."""
         self._take(self._y_m, sample, now_ns)
 
     def _take(self, samples: deque[StampedVector], sample: StampedVector, now_ns: int) -> None:
-        if sample.stamp_ns > now_ns + self._guard.max_age_ns:
-            raise ChannelError("future", f"stamp {seconds(sample.stamp_ns - now_ns):g} s ahead of the clock")
-        if samples and sample.stamp_ns <= samples[-1].stamp_ns:
-            raise ChannelError("order", f"stamp {seconds(sample.stamp_ns - samples[-1].stamp_ns):g} s after the last one")
+        require_not_future(sample.stamp_ns, now_ns, self._guard.max_age_ns)
+        if samples:
+            require_newer(sample.stamp_ns, samples[-1].stamp_ns)
         samples.append(sample)
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
-        """One tick at `now_ns`, `late_ns` after its deadline; None where nothing is to be published."""
-        y = self._newest_pair()
-        self._state, used = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, active)
-        if used is None:
+        """One tick at `now_ns`, `late_ns` after its deadline. Returns None where nothing is to be published."""
+        y = self._newest_paired_y()
+        self._state, inputs = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, active)
+        if inputs is None:
             return None
         self._number += 1
-        age = seconds(now_ns - used.stamp_ns)
+        age = seconds(now_ns - inputs.stamp_ns)
         limits, digest = self._guard.limits, self._digest
-        log = partial(internals.values, self._state, used, limits, seconds(late_ns), age, self._number, digest)
-        return ControlOutput(used.stamp_ns, self._state.u, log)
+        log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest)
+        return ControlOutput(inputs.stamp_ns, self._state.u, log)
 
-    def _newest_pair(self) -> StampedVector | None:
-        """The newest y that y_m reaches; where y_m comes late, a tick takes the y before instead of letting go of u."""
+    def _newest_paired_y(self) -> StampedVector | None:
+        """The newest y at whose stamp y_m is known. Where y_m is late, an earlier y is used, so that no failsafe starts."""
+        newest = self._y[-1] if self._y else None
         if not self._y_m:
-            return self._y[-1] if self._y else None
-        reached_ns = self._y_m[-1].stamp_ns + self._guard.period_ns
-        return next((sample for sample in reversed(self._y) if sample.stamp_ns <= reached_ns), self._y[-1] if self._y else None)
+            return newest
+        known_ns = self._y_m[-1].stamp_ns + self._guard.period_ns
+        return next((sample for sample in reversed(self._y) if sample.stamp_ns <= known_ns), newest)
 
     def ages(self, now_ns: int) -> dict[str, float]:
-        """How old the newest y and y_m are, s; those that have come."""
+        """Ages of the newest y and y_m, s, of those that were received."""
         newest = {"y": self._y, "y_m": self._y_m}
         return {name: seconds(now_ns - samples[-1].stamp_ns) for name, samples in newest.items() if samples}
 
     def stale(self, now_ns: int) -> tuple[str, ...]:
-        """Which of y and y_m has not come, or is too old."""
+        """Names of the stale inputs: y or y_m that was never received or is older than the age limit."""
         ages, limit = self.ages(now_ns), seconds(self._guard.max_age_ns)
         return tuple(name for name in ("y", "y_m") if ages.get(name, limit + 1.0) > limit)

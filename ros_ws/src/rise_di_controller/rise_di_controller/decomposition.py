@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Omega = C B = S D U, equations (10)-(11): what the law has to know of the aircraft is D, and this finds it.
+"""SDU decomposition Omega = C B = S D U, equations (10)-(11). D is all that the law has to know of the aircraft.
 
-D depends on the order of the channels, on which input drives which output and on the sign of each input, so it is
-validated together with them. U says how good the pairing is: beta and K of channel i grow with abs(U_ij), j > i.
+D depends on the order of the channels, on the pairing of inputs with outputs and on the sign of each input, so it is validated
+together with them. U measures the quality of the pairing: beta and K of channel i grow with abs(U_ij), j > i.
 """
 
 import math
@@ -16,15 +16,15 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
 NEARLY_ZERO = 1e-9
-"""Minor k is nearly zero if changing every entry of Omega by this part of its size could turn the sign of
-Delta_k / Delta_(k-1), to first order. Rounding alone is 2e-16 times the growth of the elimination, so this leaves room
-for a growth of 1e6; published and identified figures are six orders of magnitude coarser still."""
+"""Minor k is nearly zero if a change of every entry of Omega by this fraction of its size could turn the sign of
+Delta_k / Delta_(k-1), to first order. Rounding is 2e-16 times the growth of the elimination, so a growth of 1e6 is allowed.
+Published and identified values are six orders of magnitude coarser."""
 
-_EQUILIBRATIONS = 10  # each halves the spread of the exponents: 10 bring a spread of 1e300 below a factor of 2
+_EQUILIBRATIONS = 10  # each one halves the spread of the exponents: 10 reduce a spread of 1e300 to less than a factor of 2
 
 
 class DecompositionError(ParameterError):
-    """A matrix without S D U, with the number of the first minor that is zero or nearly zero (None: not even square)."""
+    """A matrix without S D U. `minor` is the number of its first minor that is zero or nearly so, None if not square."""
 
     def __init__(self, sentence: str, minor: int | None = None) -> None:
         super().__init__(sentence)
@@ -44,8 +44,8 @@ class Pairing(NamedTuple):
 
     outputs: tuple[int, ...]  # row of Omega for each channel
     inputs: tuple[int, ...]  # column of Omega for each channel
-    signs: tuple[int, ...]  # +1, or -1 where the input is to be flipped, for each channel
-    U: FloatArray  # (m, m) of the rearranged matrix in inputs of unit response
+    signs: tuple[int, ...]  # for each channel +1, or -1 where the sign of its input changes
+    U: FloatArray  # (m, m) of the reordered matrix in inputs of unit response
 
 
 class _Elimination(NamedTuple):
@@ -79,7 +79,7 @@ def signs(Omega: FloatArray) -> FloatArray:
 
 
 def leading_minors(Omega: FloatArray) -> FloatArray:
-    """Determinants Delta_k of the first k rows and columns, k = 1 .. m, shape (m,); zeros are answered, not refused.
+    """Determinants Delta_k of the first k rows and columns, k = 1 .. m, shape (m,). Minors of zero are allowed.
 
     Raises DecompositionError if Omega is not square or not finite.
     """
@@ -101,24 +101,24 @@ def unit_diagonal(Omega: FloatArray) -> FloatArray:
 
 
 def coupling(Omega: FloatArray) -> float:
-    """How far U is from I in inputs of unit response: max abs(U - I) of `unit_diagonal(Omega)`; large is a bad pairing.
+    """Coupling max abs(U - I) of `unit_diagonal(Omega)`, in inputs of unit response; a large value is a bad pairing.
 
-    Infinite where an output does not respond to its own input. It depends on the units of y, not on those of u, nor on
-    their signs. Raises DecompositionError as `decompose` does.
+    It is infinite where an output does not respond to its own input. It depends on the units of y, not on the units or signs
+    of u. Raises DecompositionError as `decompose` does.
     """
     signs(Omega)
     return _excess(decompose(unit_diagonal(Omega)).U) if np.diag(Omega).all() else math.inf
 
 
 def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
-    """Find the smallest change of the channels that gives D = I, or None where there is none.
+    """The smallest change of the channels that gives D = I, or None where there is none.
 
-    Tried are all orders of the outputs with all orders of the inputs; each admits one choice of input signs, namely D,
-    for flipping input k flips D_k alone. Preferred are, in this order: outputs that keep their inputs, outputs that
-    keep their places, inputs that keep their signs, the smallest max abs(U - I) in inputs of unit response. Orders with
-    a zero on the diagonal, or with max abs(U - I) above `largest_U`, do not count: so a bad pairing can be refused.
+    All orders of the outputs are combined with all orders of the inputs. Each has one choice of input signs, namely D, because
+    a change of the sign of input k changes D_k only. Preferred are, in this order: outputs that keep their inputs, outputs that
+    keep their places, inputs that keep their signs, the smallest max abs(U - I) in inputs of unit response. Orders with a zero
+    on the diagonal, or with max abs(U - I) above `largest_U`, are excluded. There are (m!)^2 orders: 576 for four channels,
+    518 400 for six.
 
-    The number of orders is (m!)^2: 576 for four channels, 518 400 for six.
     Raises DecompositionError if Omega is not square or not finite.
     """
     matrix = _square(Omega)
@@ -126,20 +126,20 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
 
     def change(order: tuple[tuple[int, ...], tuple[int, ...]]) -> tuple[int, int]:
         outputs, inputs = order
-        repaired = sum(i != j for i, j in zip(outputs, inputs, strict=True))
-        moved = sum(i != k for i, k in zip(outputs, places, strict=True))
-        return repaired, moved
+        re_paired = sum(i != j for i, j in zip(outputs, inputs, strict=True))
+        reordered = sum(i != k for i, k in zip(outputs, places, strict=True))
+        return re_paired, reordered
 
     orders = sorted(product(permutations(places), permutations(places)), key=change)
-    for _, alike in groupby(orders, key=change):
-        found = [pairing for order in alike if (pairing := _paired(matrix, *order)) is not None]
-        within = [pairing for pairing in found if _excess(pairing.U) <= largest_U]
-        if within:
-            return min(within, key=lambda pairing: (pairing.signs.count(-1), _excess(pairing.U)))
+    for _, group in groupby(orders, key=change):
+        pairings = (_pairing(matrix, *order) for order in group)
+        accepted = [pairing for pairing in pairings if pairing is not None and _excess(pairing.U) <= largest_U]
+        if accepted:
+            return min(accepted, key=lambda pairing: (pairing.signs.count(-1), _excess(pairing.U)))
     return None
 
 
-def _paired(matrix: FloatArray, outputs: tuple[int, ...], inputs: tuple[int, ...]) -> Pairing | None:
+def _pairing(matrix: FloatArray, outputs: tuple[int, ...], inputs: tuple[int, ...]) -> Pairing | None:
     try:
         factors = decompose(unit_diagonal(matrix[np.ix_(outputs, inputs)]))
     except DecompositionError:
@@ -162,10 +162,10 @@ def _square(Omega: FloatArray) -> FloatArray:
 
 
 def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Sizes (m,) and (m,) of rows and columns: the largest abs(Omega_ij) / (rows_i columns_j) is 1 in each row and column.
+    """Scales (m,) and (m,) of rows and columns: the largest abs(Omega_ij) / (rows_i columns_j) is 1 in each row and column.
 
-    They follow a change of the units of any channel, so what is small beside them is small in whatever units. A row or
-    column of zeros keeps the size 1. Source: D. Ruiz, "A Scaling Algorithm to Equilibrate Both Rows and Columns Norms in
+    They scale with the units of each channel, so a comparison with them does not depend on units. A row or column of zeros
+    keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to Equilibrate Both Rows and Columns Norms in
     Matrices", RAL-TR-2001-034.
     """
     rows = np.ones(len(matrix))
@@ -179,7 +179,7 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _eliminate(Omega: FloatArray) -> _Elimination:
-    """Omega = L diag(p) W without pivoting; p_k = (L^-1)_k Omega (W^-1)_k, which is what tells how sure its sign is."""
+    """Omega = L diag(p) W without pivoting; p_k = (L^-1)_k Omega (W^-1)_k, from which the certainty of its sign follows."""
     rest = _square(Omega)
     m = len(rest)
     rows, columns = _sizes(rest)

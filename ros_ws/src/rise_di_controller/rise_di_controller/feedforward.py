@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An extension of the paper, off by default: the input that a nominal model needs along the reference, beside the law.
+"""Feedforward by model inversion, an extension of the paper, off by default: the input of a nominal model along y_m.
 
-It takes y_m alone, no state of the aircraft, and leaves the law as it is: see docs/theory.md.
+It uses y_m only, no state of the aircraft, and does not change the law. See docs/theory.md.
 """
 
 from typing import NamedTuple
@@ -13,36 +13,36 @@ from numpy.typing import NDArray
 from flight_core.integrators import rk4
 from flight_core.vectors import Array, array_namespace
 
-ORIGIN = 1e-6
-"""1/s. Real parts below it are zero: rounding leaves 1e-14, and a mode this slow takes 11 days."""
+ZERO_REAL_PART = 1e-6
+"""1/s. A smaller real part counts as zero: rounding leaves 1e-14, and a mode of 1e-6 1/s takes 11 days."""
 
 
 class Nominal(NamedTuple):
-    """What is believed of the aircraft: x_dot = A x + f(x) + B u, y = C x, in deviations from trim, SI and radians."""
+    """Nominal model of the aircraft: x_dot = A x + f(x) + B u, y = C x, in deviations from trim, SI and radians."""
 
     A: Array  # (n, n)
     B: Array  # (n, m)
-    C: Array  # (m, n), picks the outputs
+    C: Array  # (m, n), selects the outputs
     gravity: Array  # (n, n), f(x) = gravity @ sin(x)
-    inverse: Array  # (m, m), that of Omega = C B
-    lead: Array  # (m,) from a tick to the instant its input acts at: half a period of hold, delay, lag of the actuator; s
+    inverse: Array  # (m, m), inverse of Omega = C B
+    lead: Array  # (m,) time from a tick until its input acts: half a period of hold, delay, actuator lag; s
 
 
 class FeedforwardState(NamedTuple):
-    """What the feedforward carries from tick to tick."""
+    """State of the feedforward between two ticks."""
 
     x: Array  # (n,) state of the nominal model, C x = y_m
-    u: Array  # (m,) input of the last tick, in its middle
-    dt: Array  # () length of that tick, s
-    ticks: Array  # () how many there were since engagement
+    u: Array  # (m,) input in the middle of the last tick
+    dt: Array  # () length of the last tick, s
+    ticks: Array  # () number of ticks since engagement
     u_0: Array  # (m,) u_ff at engagement
 
 
 def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
-    """State at engagement: the outputs on y_m, shape (m,), the other states at 0, where the aircraft is trimmed."""
+    """State at engagement: the outputs at y_m, shape (m,), the other states at 0, their trim."""
     xp = array_namespace(y_m)
-    none, zero = xp.zeros_like(y_m), xp.zeros_like(y_m[0])
-    return FeedforwardState(nominal.C.T @ y_m, none, zero, zero, none)
+    zeros, zero = xp.zeros_like(y_m), xp.zeros_like(y_m[0])
+    return FeedforwardState(nominal.C.T @ y_m, zeros, zero, zero, zeros)
 
 
 def ideal(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
@@ -61,19 +61,19 @@ def _drift(x: Array, nominal: Nominal) -> Array:
 
 
 def step(state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal) -> tuple[FeedforwardState, Array]:
-    """One tick: (state, y_m, dt) -> (state, what is added to the law's u).
+    """One tick: (state, y_m, dt) -> (state, u_ff - u_0), which is added to u of the law.
 
-    Over the last tick y_m is taken for a straight line; the nominal model is led along it, its other states (the zero
-    dynamics) integrated with the input that this takes:
+    y_m is linear over the last tick. The outputs of the nominal model follow it, and its other states (the zero dynamics) are
+    integrated with the input that this takes:
 
         y_m_dot = (y_m - C x_p) / dt                       C x_p = y_m one tick ago
         x       = Runge-Kutta step of x_dot from x_p       C x = y_m
         u       = ideal((x + x_p) / 2, y_m_dot)            in the middle of the tick, dt / 2 ago
         u_ff    = u + (dt / 2 + lead) (u - u_p) / ((dt + dt_p) / 2)
 
-    the straight line through the last two u, at the instant when this tick's input acts: behind an actuator of first order
-    u + lag u_dot is what makes it move by u. The two first ticks after engagement make the line known and add nothing;
-    u_ff of the second is u_0 and u_ff - u_0 is added from then on, so that nothing jumps. dt > 0.
+    u_ff extrapolates the last two u linearly to the instant at which the input of this tick acts: an actuator of first order
+    moves by u if it is commanded u + lag u_dot. The first two ticks after engagement only determine the slope and add
+    nothing. u_0 is u_ff of the second one, so that u does not jump (bumpless transfer). dt > 0.
 
     Shapes: y_m, u_ff (m,), dt (). Units: SI and radians; u in the units of B. Source: this project, after the feedforward
     of model inversion; see docs/theory.md.
@@ -88,11 +88,12 @@ def step(state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal) -> tu
 
 
 def zero_dynamics(nominal: Nominal) -> NDArray[np.complex128]:
-    """Eigenvalues of the states behind the outputs held at 0, shape (n - m,), 1/s: those of the nominal model's zeros.
+    """Eigenvalues of the zero dynamics, shape (n - m,), 1/s: the zeros of the nominal model.
 
-    H' (I - B Omega^-1 C) (A + gravity) H, H the columns of I that are not outputs; sin(x) by x. Takes NumPy arrays.
+    They are those of H' (I - B Omega^-1 C) (A + gravity) H, with H the columns of I that are not outputs and sin(x)
+    linearised to x. NumPy arrays only.
     """
     hidden = ~np.asarray(nominal.C).any(axis=0)
-    led = nominal.A + nominal.gravity
-    matrix = led - nominal.B @ nominal.inverse @ nominal.C @ led
+    linear = nominal.A + nominal.gravity
+    matrix = linear - nominal.B @ nominal.inverse @ nominal.C @ linear
     return np.linalg.eigvals(matrix[np.ix_(hidden, hidden)]).astype(np.complex128)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's log: one named vector a tick, enough to recompute u without anything else but the parameters."""
+"""The controller's log: one named vector a tick. With the parameters it is enough to recompute u."""
 
 from collections.abc import Sequence
 from enum import IntEnum
@@ -15,8 +15,8 @@ OUTPUT_GROUPS = ("y", "y_m", "e", "e_0", "integral_e", "Pi")
 INPUT_GROUPS = ("u_free", "u", "u_trim", "limited", "u_ff")
 
 
-class Limited(IntEnum):
-    """What held an input back in a tick; published as a number in `internals`."""
+class Saturation(IntEnum):
+    """Which limit saturated an input in a tick; published as a number in `internals`."""
 
     NO = 0
     MAGNITUDE = 1
@@ -26,10 +26,10 @@ class Limited(IntEnum):
 def names(outputs: Sequence[str], inputs: Sequence[str]) -> tuple[str, ...]:
     """Channel names of `internals`: the scalars, then "group.output" and "group.input".
 
-    mode (guard.Mode), dt (s), y_m_offset (s), late (s, the tick after its deadline), age (s, of y at the tick), number (of
-    this sample since the controller's start, from 1: a gap is a loss), parameters (ControllerParameters.digest); y and y_m as
-    used, e = y - y_m, e_0 (e at engagement), integral_e (units s), Pi (scaled input); u before (u_free) and after limits,
-    u_trim, limited (Limited), u_ff (what the feedforward adds to u_trim + the law's u).
+    Scalars: mode (guard.Mode), dt (s), y_m_offset (s), late (s, delay of the tick after its deadline), age (s, of y at the
+    tick), number (counts the samples from 1 since the start: a gap is a lost sample), parameters (ControllerParameters.digest).
+    By output: y, y_m, e = y - y_m, e_0 (e at engagement), integral_e (units of y times s), Pi (scaled input).
+    By input: u before (u_free) and after saturation (u), u_trim, limited (Saturation), u_ff (feedforward).
     """
     by_output = (f"{group}.{name}" for group in OUTPUT_GROUPS for name in outputs)
     by_input = (f"{group}.{name}" for group in INPUT_GROUPS for name in inputs)
@@ -37,13 +37,13 @@ def names(outputs: Sequence[str], inputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def values(
-    state: ControllerState, used: TickInputs, limits: Limits, late: float, age: float, number: int, parameters: int
+    state: ControllerState, inputs: TickInputs, limits: Limits, late: float, age: float, number: int, parameters: int
 ) -> FloatArray:
     """Values of `internals` in the order of `names`. Raises ValueError for a state that was never engaged."""
     if state.law is None:
-        raise ValueError("internals of a controller that was never engaged")
-    scalars = np.array([float(state.mode), used.dt, used.y_m_offset, late, age, float(number), float(parameters)])
+        raise ValueError("internals: found a controller that was never engaged, expected an engaged one")
+    scalars = np.array([float(state.mode), inputs.dt, inputs.y_m_offset, late, age, float(number), float(parameters)])
     inside = (state.u_free >= limits.lower) & (state.u_free <= limits.upper)
-    limited = np.where(state.u == state.u_free, Limited.NO, np.where(inside, Limited.RATE, Limited.MAGNITUDE))
-    by_output = (used.y, used.y_m, state.law.e, state.law.e_0, state.law.integral_e, state.law.Pi)
+    limited = np.where(state.u == state.u_free, Saturation.NO, np.where(inside, Saturation.RATE, Saturation.MAGNITUDE))
+    by_output = (inputs.y, inputs.y_m, state.law.e, state.law.e_0, state.law.integral_e, state.law.Pi)
     return np.concatenate([scalars, *by_output, state.u_free, state.u, state.u_trim, limited, state.u_ff])

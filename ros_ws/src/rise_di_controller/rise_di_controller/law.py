@@ -9,7 +9,7 @@ from flight_core.vectors import Array, array_namespace
 
 
 class Sign(IntEnum):
-    """How Sgn(e) of equation (21) is sampled."""
+    """How Sgn(e) of equation (21) is evaluated at the samples."""
 
     LITERAL = 0
     IMPLICIT = 1
@@ -19,8 +19,8 @@ class Sign(IntEnum):
 class LawParams(NamedTuple):
     """Parameters of the law over m channels.
 
-    The law works in inputs scaled to unit response, v_i = u_i / input_scale_i with abs(Omega_ii) about 1, so that K is a
-    bandwidth in rad/s and beta an acceleration rate in units of y / s^2; the theorem holds for v as it does for u.
+    The law works in inputs scaled to unit response, v_i = u_i / input_scale_i with abs(Omega_ii) about 1. So K is a bandwidth
+    in rad/s, and beta has units of y / s^2. The theorem holds for v as it does for u.
     """
 
     K: Array  # (m,) diagonal of equation (22), 1/s
@@ -28,13 +28,13 @@ class LawParams(NamedTuple):
     beta: Array  # (m,) diagonal of beta, units of y / s^2
     D: Array  # (m,) diagonal of D, +1 or -1
     input_scale: Array  # (m,) u per scaled input: units of u s / units of y
-    omega: Array  # (m,) abs(Omega_ii) in scaled inputs, or an over-estimate; used by Sign.IMPLICIT alone
-    eps: Array  # (m,) half-width of the softened sign, units of y, > 0; used by Sign.SOFT alone
+    omega: Array  # (m,) abs(Omega_ii) in scaled inputs, or an over-estimate; for Sign.IMPLICIT only
+    eps: Array  # (m,) half-width of the softened sign, units of y, > 0; for Sign.SOFT only
     sign: Sign
 
 
 class LawState(NamedTuple):
-    """What the law carries from tick to tick, each of shape (m,)."""
+    """State of the law between two ticks, each field of shape (m,)."""
 
     e_0: Array  # e at engagement
     e: Array  # e at the previous tick
@@ -49,12 +49,12 @@ def gain(k_g: Array, k_d: Array) -> Array:
 
 
 def total_lag(lag: Array, delay: float, period: float) -> Array:
-    """Lag from y to what the actuators do: actuator + 1.5 period (sampling and hold) + delay, shape of `lag`, s."""
+    """Lag from y to the actuator positions: actuator + 1.5 period (sampling and hold) + delay, shape of `lag`, s."""
     return lag + 1.5 * period + delay
 
 
 def engage(y: Array, y_m: Array) -> LawState:
-    """State at the instant of engagement: e_0 = y - y_m, integral_e = 0, Pi = 0, so that u = 0 there."""
+    """State at engagement: e_0 = y - y_m, integral_e = 0, Pi = 0. So u = 0 at that instant (bumpless transfer)."""
     xp = array_namespace(y)
     e = y - y_m
     return LawState(e, e, xp.zeros_like(e), xp.zeros_like(e))
@@ -72,9 +72,9 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
         SOFT:      Pi += dt beta s first, s = clip(e / eps, -1, 1)
         u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi)         (20)
 
-    e_hat is e one tick ahead if Pi stays, and s the element of Sgn(e one tick ahead) that makes the prediction consistent:
-    backward Euler of (21), whose error falls with dt^2 and which does not chatter. SOFT is for loops with lag. u is the
-    deviation from the input at engagement. sgn(0) = 0. dt > 0.
+    e_hat predicts e one tick ahead with an unchanged Pi, and s is the element of Sgn(e one tick ahead) that is consistent
+    with the prediction. That is backward Euler of (21): its error falls with dt^2, and it does not chatter. SOFT is for loops
+    with lag. u is the deviation from the input at engagement. sgn(0) = 0. dt > 0.
 
     Shapes: y, y_m, u (m,), dt (). Units: SI and radians; u in the units that input_scale gives it.
     Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see docs/theory.md.
@@ -102,18 +102,18 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
 def control(before: LawState, after: LawState, params: LawParams) -> Array:
     """Equation (20), shape (m,): u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi).
 
-    e and the integral are those after the tick; Pi is that before it with the literal sign (used, then updated), else that
-    after it. Units of u.
+    e and integral_e are the values after the tick. Pi is the value before the tick with the literal sign, which is used and
+    then updated, and the value after the tick with the other signs. Units of u.
     """
     Pi = before.Pi if params.sign is Sign.LITERAL else after.Pi
     return params.input_scale * (-params.D * (params.K * (after.e - after.e_0 + params.Lambda * after.integral_e) + Pi))
 
 
 def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
-    """Take new parameters without a jump of u: Pi absorbs what the linear term would jump by.
+    """State for new parameters, without a jump of u (bumpless transfer): Pi absorbs the change of the linear term.
 
-    Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e), D, input_scale, K, Lambda the new ones, u from the old ones.
-    The other states stay. Equation (23) then goes on from the same u with the new gains.
+    Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e), with the new D, input_scale, K, Lambda and u of the old ones.
+    The other states stay. Equation (23) continues from the same u with the new gains.
     """
     u = control(state, state, old)
     Pi = -new.D * u / new.input_scale - new.K * (state.e - state.e_0 + new.Lambda * state.integral_e)

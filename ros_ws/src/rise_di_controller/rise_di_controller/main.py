@@ -6,7 +6,7 @@ from flight_ros.startup import start_nodes
 
 
 def main() -> None:
-    """Its entry point."""
+    """Start the controller node."""
     start_nodes("rise_di_controller.node:ControllerNode")
 
 

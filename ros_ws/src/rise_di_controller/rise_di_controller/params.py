@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the controller, validated once, and the arrays that the law takes."""
+"""Parameters of the controller: validation, and conversion to the arrays of law, guard and feedforward."""
 
 import json
 from collections.abc import Sequence
@@ -27,25 +27,25 @@ from flight_core.parameters import (
 )
 from flight_core.rates import divide, nanoseconds, period_ns
 from rise_di_controller.decomposition import DecompositionError, signs
-from rise_di_controller.feedforward import ORIGIN, Nominal, zero_dynamics
+from rise_di_controller.feedforward import ZERO_REAL_PART, Nominal, zero_dynamics
 from rise_di_controller.guard import DT_RANGE, GuardParams, Limits
 from rise_di_controller.law import LawParams, Sign, gain, total_lag
 
 MAX_STABLE_STEP = 2.5
-"""A tick of Runge-Kutta times the fastest zero: up to 2.78 it is stable, here with the longest dt that the law is given."""
+"""Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78; dt is the longest that the law takes."""
 
 
 class FeedforwardParameters(Parameters):
-    """The nominal model of the feedforward, an extension of the paper; SI, matrices row by row."""
+    """The nominal model of the feedforward, an extension of the paper. SI units, matrices row by row."""
 
     states: Names = Field(description="the states of the nominal model, the outputs among them")
     A: Numbers = Field(description="A, a row a state")
     B: Numbers = Field(description="B, a row a state, the columns in the order of controller.inputs")
     gravity: Numbers | None = Field(default=None, description="sine terms, x_dot += gravity sin(x), a row a state")
-    lead: NonNegatives = Field(description="from a tick to the instant its input acts at, s: half a period, delay and lag")
+    lead: NonNegatives = Field(description="time from a tick until its input acts, s: half a period, delay and lag")
 
     def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
-        """The arrays of the feedforward. Raises ParameterError for sizes that do not fit, and for a C B with another D."""
+        """The arrays of the feedforward. Raises ParameterError for sizes that do not match and for a C B whose D differs."""
         n, m = len(self.states), len(outputs)
         for name in outputs:
             require(self.states.count(name) == 1, "feedforward.states", ", ".join(self.states), f"the output {name} once")
@@ -58,47 +58,47 @@ class FeedforwardParameters(Parameters):
         gravity = np.zeros((n, n)) if self.gravity is None else np.reshape(self.gravity, (n, n))
         C = np.array([[float(state == name) for state in self.states] for name in outputs])
         try:
-            found = [int(sign) for sign in signs(C @ B)]
+            nominal_D = [int(sign) for sign in signs(C @ B)]
         except DecompositionError as error:
             raise ParameterError(f"feedforward.B: found a C B without a D ({error}), expected D = {list(D)}") from None
-        require(found == list(D), "feedforward.B", f"a C B with D = {found}", f"D = {list(D)}, that of the controller")
+        require(nominal_D == list(D), "feedforward.B", f"a C B with D = {nominal_D}", f"D = {list(D)}, that of the controller")
         return Nominal(A, B, C, gravity, np.linalg.inv(C @ B), np.array(self.lead))
 
 
 class ControllerParameters(KeyedParameters):
-    """All parameters of the controller's node."""
+    """All parameters of the controller node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of the law, Hz")
     y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=0.0, description="in lockstep: the rate of y, so that counting them tells the time, Hz"
+        default=0.0, description="in lockstep: the rate of y, Hz; the node derives the time from the number of samples"
     )
-    outputs: Names = Field(description="the channels of y in the order of the law; the last has the smallest gain (22)")
+    outputs: Names = Field(description="the channels of y in the order of the law; the last one has the smallest gain (22)")
     inputs: Names = Field(description="the channels of u, paired with the outputs")
     k_g: Positive = Field(description="k_g of equation (22), 1/s")
     k_d: Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(as_tuple)] = Field(
-        description="k_d of equation (22), one a channel but the last, 1/s"
+        description="k_d of equation (22), one per channel except the last, 1/s"
     )
     Lambda: Positives = Field(description="the diagonal of Lambda (4), 1/s")
     beta: Positives = Field(description="the diagonal of beta (21) in scaled inputs, units of y / s^2")
     D: Signs = Field(description="the diagonal of D (11), +1 or -1")
-    input_scale: Positives = Field(description="how much u changes y_dot by one, diagonal: 1 / abs(Omega_ii)")
+    input_scale: Positives = Field(description="the change of u that changes y_dot by one, diagonal: 1 / abs(Omega_ii)")
     omega: Positives = Field(description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign)")
     sign: Literal["auto", "literal", "implicit", "soft"] = Field(
         description="how the sign of (21) is sampled; auto: implicit where lag and delay are below half a period, else soft"
     )
-    lag: NonNegatives = Field(description="time constants of the actuators, s, one a channel; 0 where there is none")
-    delay: Annotated[float, Field(ge=0)] = Field(description="pure delay from y to the actuators, beyond sampling, s")
-    softening: Positive = Field(description="width of the softened sign in total lags; above 1 the loop is stable, 3 is usual")
-    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(description="the age beyond which y or y_m is stale, s")
-    hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="how long u is held when y or y_m is stale, s")
-    ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(description="how long u then takes to trim, s")
+    lag: NonNegatives = Field(description="time constants of the actuators, s, one per channel; 0 for an actuator without lag")
+    delay: Annotated[float, Field(ge=0)] = Field(description="pure delay from y to the actuators in addition to sampling, s")
+    softening: Positive = Field(description="width of the softened sign in total lags; stable above 1, 3 is usual")
+    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(description="the age above which y or y_m is stale, s")
+    hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u is held when y or y_m is stale, s")
+    ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u then takes to ramp to trim, s")
     lower: Numbers | None = Field(default=None, description="lower limits of u from trim, units of u; none where absent")
     upper: Numbers | None = Field(default=None, description="upper limits of u from trim, units of u; none where absent")
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s; none where absent")
-    on_deactivate: Literal["trim", "hold"] = Field(default="trim", description="where u goes when deactivated")
-    autostart: bool = Field(default=True, description="configure and activate at start, without waiting to be told")
+    on_deactivate: Literal["trim", "hold"] = Field(default="trim", description="u after deactivation: ramped to trim or held")
+    autostart: bool = Field(default=True, description="whether the node configures and activates itself at start")
     feedforward: FeedforwardParameters | None = Field(
-        default=None, description="an extension of the paper: the input of a nominal model along y_m is added; off where absent"
+        default=None, description="an extension of the paper: adds the input of a nominal model along y_m; off where absent"
     )
 
     @model_validator(mode="after")
@@ -129,8 +129,9 @@ class ControllerParameters(KeyedParameters):
     def _check_nominal(self, nominal: Nominal) -> None:
         zeros = zero_dynamics(nominal)
         rightmost, fastest = float(np.max(zeros.real, initial=-np.inf)), float(np.max(np.abs(zeros), initial=0.0))
-        stable = "none in the right half plane: along them u_ff grows without bound"
-        require(rightmost <= ORIGIN, "feedforward.A", f"zero dynamics with an eigenvalue at {rightmost:.3g} 1/s", stable)
+        stable = "none in the right half plane: u_ff would grow without bound"
+        eigenvalue = f"zero dynamics with an eigenvalue at {rightmost:.3g} 1/s"
+        require(rightmost <= ZERO_REAL_PART, "feedforward.A", eigenvalue, stable)
         limit = MAX_STABLE_STEP / DT_RANGE[1] * self.rate
         slow = f"at most {limit:.3g} 1/s, which ticks of {self.rate:g} Hz can follow"
         require(fastest <= limit, "feedforward.A", f"zero dynamics as fast as {fastest:.3g} 1/s", slow)
@@ -140,12 +141,12 @@ class ControllerParameters(KeyedParameters):
         return None if self.feedforward is None else self.feedforward.nominal(self.outputs, self.inputs, self.D)
 
     def digest(self) -> int:
-        """A number that stands for what flies, 0 to 2^48 - 1, exact as a float64: it changes with any bit of any gain.
+        """Hash of the parameters of the law and its guard, 0 to 2^48 - 1, exact as a float64.
 
-        BLAKE2b of the names and values, without what says how the node is run.
+        BLAKE2b of names and values. It changes with any bit of any gain. Parameters of the node alone are left out.
         """
-        flown = self.model_dump(exclude={"lockstep", "y_rate", "autostart", "key_file"})
-        return int.from_bytes(blake2b(json.dumps(sorted(flatten(flown))).encode(), digest_size=6).digest(), "big")
+        content = self.model_dump(exclude={"lockstep", "y_rate", "autostart", "key_file"})
+        return int.from_bytes(blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big")
 
     def law(self) -> LawParams:
         """The arrays of the law."""
@@ -162,17 +163,17 @@ class ControllerParameters(KeyedParameters):
         )
 
     def sampled_sign(self) -> tuple[Sign, str]:
-        """How the sign is sampled, and why, as a sentence."""
+        """How the sign is sampled, and the reason as a sentence."""
         if self.sign != "auto":
-            return Sign[self.sign.upper()], f"{self.sign} sign, as asked for"
+            return Sign[self.sign.upper()], f"{self.sign} sign, as configured"
         lag, half = max(self.lag) + self.delay, 0.5 / self.rate
         if lag < half:
             return Sign.IMPLICIT, f"implicit sign, because lag and delay of {lag:g} s are below half a period ({half:g} s)"
         return Sign.SOFT, f"softened sign, because lag and delay of {lag:g} s reach half a period ({half:g} s)"
 
     def guard(self) -> GuardParams:
-        """Period, freshness, limits and the nominal model."""
-        none = (np.inf,) * len(self.inputs)
+        """Times, limits and nominal model of the guard."""
+        unlimited = (np.inf,) * len(self.inputs)
         return GuardParams(
             period_ns=period_ns(self.rate, "rate"),
             max_age_ns=nanoseconds(self.max_age),
@@ -180,9 +181,9 @@ class ControllerParameters(KeyedParameters):
             ramp_ns=nanoseconds(self.ramp),
             deactivation_holds=self.on_deactivate == "hold",
             limits=Limits(
-                -np.array(none) if self.lower is None else np.array(self.lower),
-                np.array(self.upper or none),
-                np.array(self.slew or none),
+                -np.array(unlimited) if self.lower is None else np.array(self.lower),
+                np.array(self.upper or unlimited),
+                np.array(self.slew or unlimited),
             ),
             nominal=self.nominal(),
         )

@@ -23,7 +23,7 @@ from rise_di_controller.decomposition import (
     search,
     signs,
 )
-from rise_di_controller.feedforward import ORIGIN
+from rise_di_controller.feedforward import ZERO_REAL_PART
 
 ComplexArray = NDArray[np.complex128]
 
@@ -134,11 +134,11 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Where the zeros lie, 1/s, shape (n - m,): right half plane, imaginary axis (within ORIGIN) or left half plane."""
+    """Where the zeros lie, 1/s, shape (n - m,): right half plane, imaginary axis (within ZERO_REAL_PART) or left half plane."""
     rightmost = float(np.max(zeros.real, initial=-np.inf))
-    if rightmost > ORIGIN:
+    if rightmost > ZERO_REAL_PART:
         return ZeroDynamics.UNSTABLE
-    return ZeroDynamics.MARGINAL if rightmost >= -ORIGIN else ZeroDynamics.STABLE
+    return ZeroDynamics.MARGINAL if rightmost >= -ZERO_REAL_PART else ZeroDynamics.STABLE
 
 
 def controllable(A: FloatArray, B: FloatArray) -> bool:

@@ -32,7 +32,7 @@ from reference_model import model
 from reference_model.command import command
 from reference_model.params import ReferenceModelParameters, zero_state
 from rise_di_controller.decomposition import DecompositionError, coupling, search, signs
-from rise_di_controller.feedforward import ORIGIN
+from rise_di_controller.feedforward import ZERO_REAL_PART
 from rise_di_controller.law import LawParams, Sign
 from rise_di_controller.params import ControllerParameters, FeedforwardParameters
 
@@ -176,7 +176,7 @@ def study_airframe(airframe: Airframe, flown: Manoeuvre, uncertainty: float = 0.
     """
     A, B = nominal_and_sampled(airframe, uncertainty, samples, seed)
     zeros = [invariant_zeros(*pair, airframe.matrix_c()).real.max(initial=-math.inf) for pair in zip(A, B, strict=True)]
-    stable = np.array(zeros) <= ORIGIN
+    stable = np.array(zeros) <= ZERO_REAL_PART
     require(bool(stable[0]), f"airframe {airframe.name}", f"a zero at {zeros[0]:.3g} 1/s", "none in the right half plane")
     # The last column is the nominal airframe in still air: the gusts have the speed 0 there.
     A, B = np.concatenate([A, A[:1]]), np.concatenate([B, B[:1]])

@@ -37,26 +37,26 @@ class SignCheck(NamedTuple):
     intervals: int  # of the recorded flight
 
 
-def require_signs(chart: ChannelMap, scenario: Scenario) -> None:
+def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
     """Raise ParameterError where a map contradicts the D of a scenario's controller, by the scenario's airframe."""
-    checked = check_scenario(chart, scenario, load_airframe(scenario.aircraft.airframe), None)
+    checked = check_scenario(channel_map, scenario, load_airframe(scenario.aircraft.airframe), None)
     if checked.contradictions:
         raise ParameterError("; ".join(checked.contradictions))
 
 
-def check_scenario(chart: ChannelMap, scenario: Scenario, frame: Airframe, bag: Path | None) -> SignCheck:
+def check_scenario(channel_map: ChannelMap, scenario: Scenario, frame: Airframe, bag: Path | None) -> SignCheck:
     """Check a channel map against a scenario's controller, by an airframe and, where there is one, a recorded flight."""
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     for key, found, expected in (
-        (f"map {chart.name}: outputs", tuple(chart.outputs), outputs),
-        (f"map {chart.name}: inputs", tuple(chart.inputs), inputs),
+        (f"map {channel_map.name}: outputs", tuple(channel_map.outputs), outputs),
+        (f"map {channel_map.name}: inputs", tuple(channel_map.inputs), inputs),
         (f"airframe {frame.name}: outputs", frame.outputs, outputs),
         (f"airframe {frame.name}: inputs", tuple(frame.inputs), inputs),
     ):
         require(sorted(found) == sorted(expected), key, ", ".join(found), f"the controller's: {', '.join(expected)}")
     Omega = frame.matrix_c() @ frame.matrix_b()
     in_map = Omega[
-        np.ix_([frame.outputs.index(one) for one in chart.outputs], [list(frame.inputs).index(one) for one in chart.inputs])
+        np.ix_([frame.outputs.index(one) for one in channel_map.outputs], [list(frame.inputs).index(one) for one in channel_map.inputs])
     ]
     measured = None
     if bag is not None:
@@ -64,11 +64,11 @@ def check_scenario(chart: ChannelMap, scenario: Scenario, frame: Airframe, bag: 
         for topic in ("y", "u"):
             require(topic in tape, str(bag), f"no {topic}", "a log with y and u")
         measured = estimate(tape["y"], tape["u"], outputs, inputs)
-    return check(chart, in_map, outputs, inputs, scenario.controller.D, measured)
+    return check(channel_map, in_map, outputs, inputs, scenario.controller.D, measured)
 
 
 def check(
-    chart: ChannelMap,
+    channel_map: ChannelMap,
     Omega: FloatArray,
     outputs: tuple[str, ...],
     inputs: tuple[str, ...],
@@ -81,14 +81,14 @@ def check(
     ParameterError where the map does not fit the airframe, or Omega has no D.
     """
     rows, columns = (
-        [list(part).index(one) for one in names] for part, names in ((chart.outputs, outputs), (chart.inputs, inputs))
+        [list(part).index(one) for one in names] for part, names in ((channel_map.outputs, outputs), (channel_map.inputs, inputs))
     )
-    seen = through(chart, Omega)[np.ix_(rows, columns)]
+    seen = through(channel_map, Omega)[np.ix_(rows, columns)]
     follows = [int(sign) for sign in signs(seen)]
     sentences = [
-        f"outputs.{name} of the map {chart.name} comes with the wrong sign:"
-        f" {motion_as_channel_grows(chart.outputs[name])} as it grows"
-        for name, sign in zip(chart.outputs, output_signs(chart), strict=True)
+        f"outputs.{name} of the map {channel_map.name} comes with the wrong sign:"
+        f" {motion_as_channel_grows(channel_map.outputs[name])} as it grows"
+        for name, sign in zip(channel_map.outputs, output_signs(channel_map), strict=True)
         if sign < 0
     ]
     channels = []
@@ -98,13 +98,13 @@ def check(
         channels.append(Channel(output, name, float(seen[i, i]), follows[i], D[i], found, ratio))
         if follows[i] != D[i]:
             sentences.append(
-                f"with the map {chart.name} D of {output} and {name} is {follows[i]:+d}, the controller has {D[i]:+d}:"
-                f" a positive {name} makes the aircraft {motion_as_channel_grows(chart.inputs[name])}"
+                f"with the map {channel_map.name} D of {output} and {name} is {follows[i]:+d}, the controller has {D[i]:+d}:"
+                f" a positive {name} makes the aircraft {motion_as_channel_grows(channel_map.inputs[name])}"
             )
         if found is not None and ratio is not None and ratio >= SURE and found * seen[i, i] < 0.0:
             sentences.append(
                 f"the recorded flight has {output}_dot {'rise' if found > 0.0 else 'fall'} with {name}"
-                f" ({found:.3g}, {ratio:.0f} standard errors), the map {chart.name} says the opposite"
+                f" ({found:.3g}, {ratio:.0f} standard errors), the map {channel_map.name} says the opposite"
             )
     return SignCheck(tuple(channels), tuple(sentences), 0 if measured is None else measured.intervals)
 

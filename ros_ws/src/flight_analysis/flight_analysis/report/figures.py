@@ -18,7 +18,7 @@ from flight_analysis.report.summary import PLAIN, DisplayUnit
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.guard import Mode
-from rise_di_controller.internals import Limited
+from rise_di_controller.internals import Saturation
 
 PLANT, REFERENCE, ERROR, MEASURED, WIND, GUST = "#123c52", "#f6a85f", "#8b1f4f", "#e3b6c9", "#2a7f62", "#7f7f7f"
 END_STOP, LIMIT = "#bbbbbb", "#444444"
@@ -39,7 +39,7 @@ MODE_COLOURS = {
     Mode.TRIM: "#8a63b8",
     Mode.INACTIVE: "#5f6b73",
 }
-LIMITED_COLOURS = {Limited.MAGNITUDE: "#d62728", Limited.RATE: "#8a63b8"}
+LIMITED_COLOURS = {Saturation.MAGNITUDE: "#d62728", Saturation.RATE: "#8a63b8"}
 LIMIT_LINES = ({"color": END_STOP, "width": 4}, {"color": LIMIT, "width": 1.2, "dash": "dash"})
 FLOOR_LINE = {"color": LIMIT, "width": 1.0, "dash": "dot"}
 INTEGRALS = {"integral_e": "∫e", "Pi": "Pi"}  # groups of `internals`, and what their rows are called
@@ -278,7 +278,7 @@ def _moving(tape: Tape, group: str) -> Signal:
     return Signal(signal.stamp_ns, tuple(signal.names[i] for i in moving), signal.values[:, moving])
 
 
-def _limited(tape: Tape, name: str, what: Limited) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _limited(tape: Tape, name: str, what: Saturation) -> tuple[FloatArray, NDArray[np.bool_]]:
     """The instants of `internals`, and at which of them an input was limited so."""
     channel = f"limited.{name}"
     if "internals" not in tape or channel not in tape["internals"].names:

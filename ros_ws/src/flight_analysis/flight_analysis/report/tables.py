@@ -22,7 +22,7 @@ from flight_analysis.report.summary import (
     table_rows,
 )
 from flight_core.tape import Tape
-from rise_di_controller.internals import Limited
+from rise_di_controller.internals import Saturation
 
 READING = (
     f"{PARTS}. bound: the largest error in calm. switches: of the sign term's direction. settling: until the error stays for"
@@ -53,7 +53,7 @@ def events(tape: Tape, gusts: Windows) -> list[Event]:
         found.append(Event(label, bands[0].start, bands[-1].stop, f"{sum(b.stop - b.start for b in bands):.2f} s{times}"))
     if "internals" in tape:
         limited, t = tape["internals"].group("limited"), tape.time("internals")
-        for name, what in product(limited.names, (Limited.MAGNITUDE, Limited.RATE)):
+        for name, what in product(limited.names, (Saturation.MAGNITUDE, Saturation.RATE)):
             hit = limited[name] == what
             if hit.any():
                 first, last = t[hit][[0, -1]]
