@@ -120,5 +120,5 @@ def test_short_writes_are_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_a_flight_in_one_process_that_finds_no_space_is_one_sentence(disk: Path, osprey_gust: Scenario) -> None:
     fill(disk / "other")
-    with pytest.raises(ParameterError, match=r"disk/run: cannot be written \(No space left on device\)"):
+    with pytest.raises(ParameterError, match=r"disk/run cannot be written \(No space left on device\)"):
         write_run(simulate(osprey_gust.vary(flight={"duration": 0.1})), disk / "run", Enclosed(osprey_gust.path))

@@ -27,7 +27,6 @@ EXECUTABLES = {
 KEYS = {name: f"python3-{name}" for name in ("matplotlib", "numpy", "psutil", "pydantic", "rich", "scipy", "typer", "yaml")}
 # Those that have none, or (rosbags) one that calls pip alone, which Ubuntu 24.04 refuses for its own Python.
 WITHOUT_KEY = {
-    "array_api_compat",
     "cma",
     "distributed",
     "jax",

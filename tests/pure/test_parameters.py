@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bad parameters: one sentence that names the key, what was found and what is expected."""
+"""Invalid parameters: one sentence that names the key, what was found and what is expected."""
 
 from pathlib import Path
 
@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from aircraft_sim.airframe import LIBRARY, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_bringup.scenarios import find_scenario
-from flight_core.files import read_yaml
+from flight_core.files import read_yaml, writing
 from flight_core.parameters import ParameterError, flatten, nest
 from flight_core.rates import divide, period_ns
 
-# What is changed in the default scenario's text -> the sentence that must come of it.
+# Replacement in the text of the default scenario -> the sentence of the error.
 BAD = {
     ("k_g: 1.0", "k_g: -1.0"): "controller.k_g: found -1.0, expected greater than 0",
     ("k_g: 1.0", "k_g: true"): "controller.k_g: found True, expected a number",
@@ -85,35 +85,37 @@ BAD = {
 
 
 @pytest.mark.parametrize(("change", "sentence"), BAD.items(), ids=[change[1].strip()[:40] for change in BAD])
-def test_bad_scenario_is_one_sentence(change: tuple[str, str], sentence: str, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_an_invalid_scenario_is_one_sentence(
+    change: tuple[str, str], sentence: str, osprey_gust: Scenario, tmp_path: Path
+) -> None:
     text = osprey_gust.path.read_text(encoding="utf-8")
     assert text.count(change[0]) >= 1, f"the scenario no longer holds {change[0]!r}"
     bad = tmp_path / "bad.yaml"
     bad.write_text(text.replace(*change, 1), encoding="utf-8")
-    with pytest.raises(ParameterError) as refused:
+    with pytest.raises(ParameterError) as rejected:
         load_scenario(bad)
-    said = str(refused.value)
-    assert sentence in said
-    assert "\n" not in said
+    message = str(rejected.value)
+    assert sentence in message
+    assert "\n" not in message
 
 
-def test_an_integer_may_stand_for_a_number(osprey_gust: Scenario) -> None:
+def test_an_integer_is_accepted_as_a_number(osprey_gust: Scenario) -> None:
     assert osprey_gust.vary(controller={"k_g": 1, "Lambda": [5, 5, 3, 1]}).controller.Lambda == (5.0, 5.0, 3.0, 1.0)
 
 
-def test_an_unknown_scenario_is_told_which_there_are() -> None:
+def test_the_error_for_an_unknown_scenario_lists_the_scenarios() -> None:
     with pytest.raises(ParameterError, match=r"scenario: found 'osprey', expected one of .*osprey_gust.*, or the path"):
         find_scenario("osprey")
 
 
 @pytest.mark.parametrize("name", [5000 * "a", 5000 * "a" + ".yaml"])
-def test_a_name_too_long_for_a_file_is_none_that_there_is(name: str) -> None:
+def test_a_name_too_long_for_a_file_is_an_unknown_name(name: str) -> None:
     for find in (find_scenario, load_airframe):
         with pytest.raises(ParameterError, match=r": found 'aaaa.*, expected one of .*osprey"):
             find(name)
 
 
-def test_an_airframe_file_that_is_no_yaml_or_has_a_key_twice_is_one_sentence(tmp_path: Path) -> None:
+def test_an_airframe_file_with_invalid_yaml_or_a_duplicate_key_is_one_sentence(tmp_path: Path) -> None:
     bad = tmp_path / "bad.yaml"
     whole = (LIBRARY / "osprey.yaml").read_text(encoding="utf-8")
     for text, what in (
@@ -127,13 +129,13 @@ def test_an_airframe_file_that_is_no_yaml_or_has_a_key_twice_is_one_sentence(tmp
             load_airframe(str(bad))
 
 
-def test_a_key_may_stand_in_the_mapping_that_is_merged_and_in_the_one_it_is_merged_into(tmp_path: Path) -> None:
+def test_a_key_may_override_the_same_key_of_a_merged_mapping(tmp_path: Path) -> None:
     file = tmp_path / "merged.yaml"
     file.write_text("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\n", encoding="utf-8")
     assert read_yaml(file, "file", "anything")["b"] == {"x": 1, "y": 3}
 
 
-def test_every_scenario_that_ships_is_valid() -> None:
+def test_every_installed_scenario_is_valid() -> None:
     directory = find_scenario("osprey_gust").path.parent
     assert [load_scenario(path).name for path in sorted(directory.glob("*.yaml"))]
 
@@ -143,7 +145,7 @@ TREES = st.recursive(st.integers(), lambda children: st.dictionaries(NAMES, chil
 
 
 @given(tree=st.dictionaries(NAMES, TREES, min_size=1, max_size=3))
-def test_nesting_undoes_flattening(tree: dict[str, object]) -> None:
+def test_nest_is_the_inverse_of_flatten(tree: dict[str, object]) -> None:
     assert nest(dict(flatten(tree))) == tree
 
 
@@ -153,7 +155,7 @@ def test_a_name_cannot_be_a_value_and_a_group() -> None:
             nest(flat)
 
 
-def test_periods_are_whole_nanoseconds() -> None:
+def test_a_period_is_a_whole_number_of_nanoseconds() -> None:
     assert [period_ns(rate, "rate") for rate in (1.0, 100.0, 500.0, 1000.0, 62.5)] == [
         10**9,
         10**7,
@@ -166,7 +168,15 @@ def test_periods_are_whole_nanoseconds() -> None:
             period_ns(rate, "rate")
 
 
-def test_dividing_counts_the_parts() -> None:
+def test_divide_returns_the_number_of_parts() -> None:
     assert divide(10, 2, "step", "it") == 5
     with pytest.raises(ParameterError, match="step"):
         divide(10, 0, "step", "it")
+
+
+def test_an_output_that_cannot_be_written_is_one_sentence() -> None:
+    path = "/proc/none/file"
+    for key, place in (("--csv", f"--csv: {path}"), ("", path)):
+        with pytest.raises(ParameterError) as rejected, writing(key, path, "the path of a file"):
+            Path(path).write_text("")
+        assert str(rejected.value) == f"{place} cannot be written (No such file or directory), expected the path of a file"

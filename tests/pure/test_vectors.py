@@ -1,22 +1,24 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors are matched by name; what cannot be used is refused with a reason."""
+"""Named vectors are matched by name; an invalid sample is rejected with a reason."""
 
 import math
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight_core.vectors import ChannelError, select
+from flight_core.vectors import ChannelError, _NumPy1, array_namespace, require_newer, require_not_future, select
 
 
-def test_values_are_matched_by_name_not_by_place() -> None:
+def test_values_are_matched_by_name_not_by_position() -> None:
     assert select(["q", "V"], ["V", "r", "q"], [1.0, 2.0, 3.0]).tolist() == [3.0, 1.0]
 
 
 @given(values=st.permutations([("q", 1.0), ("V", 2.0), ("p", 3.0), ("r", 4.0)]))
-def test_order_of_the_sender_does_not_matter(values: list[tuple[str, float]]) -> None:
+def test_the_order_of_the_publisher_does_not_matter(values: list[tuple[str, float]]) -> None:
     names, numbers = zip(*values, strict=True)
     assert select(["q", "V", "p", "r"], names, numbers).tolist() == [1.0, 2.0, 3.0, 4.0]
 
@@ -33,11 +35,33 @@ def test_order_of_the_sender_does_not_matter(values: list[tuple[str, float]]) ->
         (["q", "V"], [-math.inf, 1.0], "finite"),
     ],
 )
-def test_a_sample_that_cannot_be_used_is_refused_with_its_reason(names: list[str], values: list[float], reason: str) -> None:
-    with pytest.raises(ChannelError) as refused:
+def test_an_invalid_sample_is_rejected_with_its_reason(names: list[str], values: list[float], reason: str) -> None:
+    with pytest.raises(ChannelError) as rejected:
         select(["q", "V"], names, values)
-    assert refused.value.reason == reason
+    assert rejected.value.reason == reason
 
 
-def test_a_channel_nobody_asked_for_may_hold_anything() -> None:
+def test_a_channel_that_is_not_wanted_may_have_any_value() -> None:
     assert select(["q"], ["q", "T"], [1.0, math.nan]).tolist() == [1.0]
+
+
+def test_the_array_namespace_is_that_of_the_library_of_the_array() -> None:
+    assert array_namespace(np.zeros(2)) is array_namespace(np.float64(0.0)) is np
+    assert array_namespace(jnp.zeros(2)) is jnp
+
+
+def test_the_namespace_of_numpy_1_has_concat() -> None:
+    xp = _NumPy1()
+    assert xp.concat((np.zeros(1), np.ones(2))).tolist() == [0.0, 1.0, 1.0]
+    assert xp.sin is np.sin
+
+
+def test_stamps_out_of_order_or_ahead_of_the_clock_are_rejected() -> None:
+    require_newer(1, 0)
+    require_not_future(12, 10, 2)
+    with pytest.raises(ChannelError, match="V: stamp 1 s before the last one") as rejected:
+        require_newer(10**9, 2 * 10**9, "V")
+    assert rejected.value.reason == "order"
+    with pytest.raises(ChannelError, match="stamp 2 s ahead of the clock") as rejected:
+        require_not_future(2 * 10**9, 0, 10**9)
+    assert rejected.value.reason == "future"

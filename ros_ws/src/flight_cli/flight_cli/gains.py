@@ -24,6 +24,7 @@ from flight_analysis.design.gain_selection import (
 )
 from flight_bringup.scenarios import find_scenario
 from flight_cli.output import new_table
+from flight_core.files import writing
 from flight_core.parameters import ParameterError, require
 
 CONDITION_FAILS = 1
@@ -116,10 +117,8 @@ def _parse_lags(text: str, airframe: Airframe) -> dict[str, float]:
 
 def _write(path: Path, text: str) -> None:
     header = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
-    try:
+    with writing("--write", path, "the path of a file"):
         path.write_text(header + text, encoding="utf-8")
-    except OSError as error:
-        raise ParameterError(f"--write: found {path}, expected a file that can be written ({error.strerror})") from None
 
 
 def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) -> None:

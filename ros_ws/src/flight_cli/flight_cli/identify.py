@@ -16,8 +16,9 @@ from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, RESIDUALS, STA
 from flight_analysis.design.identification import IdentifiedAircraft
 from flight_analysis.design.identification import identify as identify_aircraft
 from flight_cli.output import new_table
+from flight_core.files import writing
 from flight_core.outcome import FlightEnded
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import require
 from flight_core.units import SI_PER_UNIT
 
 CANNOT_FLY = 3
@@ -55,10 +56,8 @@ def identify(
     except FlightEnded as error:
         print(f"error: {error}", file=sys.stderr)
         raise typer.Exit(CANNOT_FLY) from None
-    try:
+    with writing("--output", path, "the path of a file"):
         path.write_text(found.text, encoding="utf-8")
-    except OSError as error:
-        raise ParameterError(f"--output: found {path}, expected a file that can be written ({error.strerror})") from None
     if as_json:
         print(json.dumps(_as_json(found, path)))
     else:

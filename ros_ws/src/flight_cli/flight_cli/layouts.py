@@ -9,7 +9,7 @@ import typer
 
 from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler
 from flight_bringup.scenarios import find_scenario
-from flight_core.parameters import ParameterError
+from flight_core.files import writing
 
 
 def layouts(
@@ -21,9 +21,7 @@ def layouts(
     channels = channels_of(chosen)
     for suffix, text in (("foxglove.json", foxglove(channels)), ("plotjuggler.xml", plotjuggler(channels))):
         path = folder / f"{chosen.name}.{suffix}"
-        try:
+        with writing("folder", folder, "a folder that can"):
             folder.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ParameterError(f"folder: {folder} cannot be written ({error.strerror}), expected a folder that can") from None
         print(path)

@@ -16,7 +16,7 @@ from flight_analysis.closed_loop.replay import OPEN_LOOP, Difference, Replayed, 
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
 from flight_cli.output import new_table
-from flight_core.files import parse_yaml
+from flight_core.files import parse_yaml, writing
 from flight_core.parameters import ParameterError, require
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
@@ -157,13 +157,10 @@ def _first_as_json(first: Difference) -> dict[str, Any]:
 def _write_csv(path: Path, result: Replayed, inputs: tuple[str, ...]) -> None:
     """One row a tick: number, t, then each input as recorded and as computed, in digits that restore every bit."""
     columns = [result.names.index(f"u.{name}") for name in inputs]
-    try:
-        with path.open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(["number", "t", *(f"u.{name}.{what}" for name in inputs for what in ("recorded", "computed"))])
-            for row in range(len(result.number)):
-                pairs = ((result.recorded[row, column], result.computed[row, column]) for column in columns)
-                values = [float(value) for pair in pairs for value in pair]
-                writer.writerow([int(result.number[row]), float(result.t[row]), *values])
-    except OSError as error:
-        raise ParameterError(f"--csv: {path} cannot be written ({error.strerror}), expected the path of a file") from None
+    with writing("--csv", path, "the path of a file"), path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["number", "t", *(f"u.{name}.{what}" for name in inputs for what in ("recorded", "computed"))])
+        for row in range(len(result.number)):
+            pairs = ((result.recorded[row, column], result.computed[row, column]) for column in columns)
+            values = [float(value) for pair in pairs for value in pair]
+            writer.writerow([int(result.number[row]), float(result.t[row]), *values])

@@ -17,7 +17,7 @@ from flight_analysis.report.recorded_flight import RecordedFlight
 from flight_analysis.report.run_folder import conclude, read_flight
 from flight_analysis.report.summary import ERROR_COLUMNS
 from flight_cli.output import display_path, new_table, show_flight
-from flight_core.parameters import ParameterError
+from flight_core.files import writing
 
 
 def report(
@@ -58,12 +58,8 @@ def report(
 def _write(
     option: str, path: Path, write: Callable[[Path, Sequence[RecordedFlight]], None], flights: Sequence[RecordedFlight]
 ) -> None:
-    try:
+    with writing(option, path, "the path of a file"):
         write(path, flights)
-    except OSError as error:
-        raise ParameterError(
-            f"{option}: {path} cannot be written ({error.strerror or error}), expected the path of a file"
-        ) from None
 
 
 def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None:

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Shared words of the RISE-DI flight stack: validated parameters, named vectors, integrators, rates, scenario files, tapes."""
+"""Basics of the RISE-DI flight stack without ROS: parameters, named vectors, rates, integrators, scenario files, the tape."""

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is done with an input whose source has gone silent: hold it for a while, then let it go to trim."""
+"""Failsafe for an input that times out: hold the last value, then ramp it to trim."""
 
 
 def failsafe_scale(silence_ns: int, hold_ns: int, ramp_ns: int) -> float:
-    """Share of the last input that is still commanded after a silence: 1 up to hold, then linear to 0 over ramp.
+    """Factor s of the failsafe input u = s u_last, where u is the deviation from trim.
 
-    u = u_last fade, u being the deviation from trim. With ramp 0 it drops at once.
+    `silence_ns` is the time since the last input. s is 1 up to hold, then falls linearly to 0 over ramp. Ramp 0 is a step.
     """
     if silence_ns <= hold_ns:
         return 1.0

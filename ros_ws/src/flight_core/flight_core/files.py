@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files that people write: found without an exception, read as YAML, refused with one sentence."""
+"""Input files and output files: existence checks, YAML, and one-sentence errors for files that cannot be read or written."""
 
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -12,50 +14,50 @@ import yaml
 
 from flight_core.parameters import ParameterError, require
 
-# What PyYAML raises: its own errors where the text is no YAML, the others where a value is not what it looks like ("0b_",
-# "2001-99-99", "!!bool 2") or nests too deeply.
+# Exceptions of PyYAML. It raises its own for invalid syntax, the others for an invalid scalar ("0b_", "2001-99-99", "!!bool 2")
+# or for nesting that is too deep.
 NOT_YAML = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 MAX_FILE_BYTES = 1 << 19
-"""Bytes: a scenario has 4 kB, metadata.yaml of 500 topics less than this. PyYAML takes up to 0.7 kB and 30 us a byte."""
+"""Bytes. A scenario has 4 kB, metadata.yaml of 500 topics less than this. PyYAML needs up to 0.7 kB and 30 us a byte."""
 
 MAX_YAML_NODES = 100_000
-"""Values of a file with its aliases written out: a few lines of them may stand for billions."""
+"""Values of a file after expansion of its aliases. A few lines of nested aliases can expand to billions of values."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Refuses a key that is given twice, of which YAML otherwise keeps the last, and aliases that stand for too much."""
+    """Rejects duplicate keys, of which PyYAML keeps the last, and aliases that expand to more than MAX_YAML_NODES values."""
 
     def get_single_node(self) -> Any:
         node = super().get_single_node()
-        if node is not None and _size(node, {}) > MAX_YAML_NODES:
+        if node is not None and _expanded_size(node, {}) > MAX_YAML_NODES:
             raise yaml.composer.ComposerError(None, None, f"found more than {MAX_YAML_NODES} values", node.start_mark)
         return node
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         node = super().compose_mapping_node(anchor)
-        seen = set()
+        keys = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
-                if (key.tag, key.value) in seen:
+                if (key.tag, key.value) in keys:
                     raise yaml.composer.ComposerError(None, None, f"found the key {key.value} twice", key.start_mark)
-                seen.add((key.tag, key.value))
+                keys.add((key.tag, key.value))
         return node
 
 
-def _size(node: yaml.Node, known: dict[int, float]) -> float:
-    """How many nodes there are with all aliases written out; infinite for a node inside itself."""
+def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
+    """Number of nodes after expansion of all aliases; infinite for a node that contains itself. `sizes` caches by identity."""
     if isinstance(node, yaml.ScalarNode):
         return 1
-    if id(node) not in known:
-        known[id(node)] = math.inf
+    if id(node) not in sizes:
+        sizes[id(node)] = math.inf
         children = chain.from_iterable(node.value) if isinstance(node, yaml.MappingNode) else node.value
-        known[id(node)] = 1 + sum(_size(child, known) for child in children)
-    return known[id(node)]
+        sizes[id(node)] = 1 + sum(_expanded_size(child, sizes) for child in children)
+    return sizes[id(node)]
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file; a path that no file can have, such as one too long, is none."""
+    """Whether the path is a file; False also for an invalid path, such as one that is too long."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -63,7 +65,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder, likewise."""
+    """Whether the path is a folder; False also for an invalid path."""
     try:
         return path.is_dir()
     except (OSError, ValueError):
@@ -71,12 +73,25 @@ def is_folder(path: Path) -> bool:
 
 
 def open_nonblocking(path: str | Path) -> BinaryIO:
-    """A file for reading; a pipe to which nobody writes is an empty one, and not waited for. Raises OSError, ValueError."""
+    """Open a file for reading. A pipe without a writer reads as empty and does not block. Raises OSError, ValueError."""
     return open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
 
 
+@contextmanager
+def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
+    """Turn an OSError inside the block into a ParameterError: `key`, the `path` that cannot be written, and `expected`.
+
+    `key` may be empty.
+    """
+    try:
+        yield
+    except OSError as error:
+        place = f"{key}: {path}" if key else f"{path}"
+        raise ParameterError(f"{place} cannot be written ({error.strerror or error}), expected {expected}") from None
+
+
 def read_yaml(path: Path, key: str, expected: str) -> Any:
-    """Content of a YAML file. Raises ParameterError for a file that cannot be read, is no YAML or has a key twice.
+    """Content of a YAML file. Raises ParameterError for a file that cannot be read, is not YAML or has a duplicate key.
 
     `key` names the file in the sentence, `expected` what it should be.
     """
@@ -90,7 +105,7 @@ def read_yaml(path: Path, key: str, expected: str) -> Any:
 
 
 def parse_yaml(content: bytes | str, key: str, expected: str) -> Any:
-    """YAML that came from elsewhere than a file; `read_yaml` otherwise."""
+    """Content of YAML text. Raises ParameterError as `read_yaml` does."""
     try:
         text = content if isinstance(content, str) else content.decode("utf-8")
     except UnicodeDecodeError as error:

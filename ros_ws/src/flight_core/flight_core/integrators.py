@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixed-step integrators, so that no step-size control can jump over a gust."""
+"""Fixed-step integrators: step-size control could step over a gust."""
 
 from collections.abc import Callable
 from typing import Any

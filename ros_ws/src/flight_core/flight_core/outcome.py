@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How a flight ends: every way has a name."""
+"""Outcomes of a flight."""
 
 COMPLETED = "completed"
 INTERRUPTED = "interrupted"
 
 
-class FlightEnded(RuntimeError):  # noqa: N818 - how a flight ends is no error of the program
-    """A flight that cannot go on. The message is one sentence for the user."""
+class FlightEnded(RuntimeError):  # noqa: N818 - the end of a flight is not a program error
+    """A flight cannot continue. The message is one sentence for the user."""

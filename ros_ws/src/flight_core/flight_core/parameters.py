@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Validated parameter sets: one declaration a set, one sentence an error.
+"""Validated parameter sets: one declaration for each set, one sentence for each error.
 
 A set is a frozen pydantic model. `validate_mapping` builds it from the nested mapping that a scenario file or a ROS node
-holds, and turns whatever does not fit into a `ParameterError` of one sentence: the key, what was found, what is expected.
+holds. The first value that does not fit becomes a `ParameterError` of one sentence: the key, what was found, what is expected.
 """
 
 import difflib
@@ -14,18 +14,18 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 MAX_SENTENCE_LENGTH = 1000
-"""Characters: what is said of bad input does not grow with it."""
+"""Characters of an error sentence, however long the bad input is."""
 
 
 def printable(text: str) -> str:
-    """A text with what does not print, such as a line's end or a terminal's commands, as escapes."""
+    """A text with unprintable characters, such as line ends and terminal control codes, written as escapes."""
     return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
 
 
 class ParameterError(ValueError):
-    """A parameter, or a set of them, that cannot be flown. The message is one sentence for the user, whatever it quotes.
+    """An invalid parameter or parameter set. The message is one sentence for the user.
 
-    What does not print is shown by its escape; the middle of a long one is left out.
+    Unprintable characters are written as escapes; the middle of a long sentence is left out.
     """
 
     def __init__(self, sentence: str) -> None:
@@ -34,8 +34,8 @@ class ParameterError(ValueError):
         super().__init__(printable(sentence))
 
 
-class _Shown(reprlib.Repr):
-    """Values as they are shown in a sentence: without end they are not."""
+class _ShortRepr(reprlib.Repr):
+    """repr of a value for an error sentence, of limited length."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -44,21 +44,21 @@ class _Shown(reprlib.Repr):
     def repr_int(self, value: int, level: int) -> str:
         try:
             return super().repr_int(value, level)
-        except ValueError:  # Python writes no more than 4300 digits
+        except ValueError:  # Python converts at most 4300 digits
             return f"a number of {value.bit_length()} bits"
 
 
-_shown = _Shown().repr
+_short_repr = _ShortRepr().repr
 
 
 class Parameters(BaseModel):
-    """Base of every parameter set: frozen, finite, strictly typed (an int may stand for a float), no unknown keys."""
+    """Base of every parameter set: frozen, finite, strictly typed (an int is accepted as a float), without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
-        """Build the set from a nested mapping; `where` names it in errors, e.g. "controller".
+        """Build the set from a nested mapping; `where` is its name in errors, e.g. "controller".
 
         Raises ParameterError with one sentence for the first key that does not fit.
         """
@@ -74,20 +74,20 @@ class Parameters(BaseModel):
 class NodeParameters(Parameters):
     """Base of the parameters of a node of a flight."""
 
-    lockstep: bool = Field(default=False, description="move when all others have, as fast as the machine allows; no real time")
+    lockstep: bool = Field(default=False, description="run in lockstep with the other nodes, as fast as possible")
 
 
 class KeyedParameters(NodeParameters):
-    """Base of the parameters of a node whose samples can be signed."""
+    """Base of the parameters of a node whose messages can carry a message authentication code."""
 
     key_file: str = Field(
         default="",
-        description="file of the key that named vectors are signed and checked with (flight_core.authentication); empty: none",
+        description="file of the key of the message authentication codes (flight_core.authentication); empty: none",
     )
 
 
 def as_tuple(value: object) -> object:
-    """A sequence other than a string as a tuple; anything else as it is, for the validator behind to refuse."""
+    """A sequence other than a string as a tuple; any other value unchanged, for the next validator to reject."""
     return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
 
 
@@ -108,12 +108,12 @@ def require(condition: bool, key: str, found: object, expected: str) -> None:
 
 
 def require_length(key: str, values: Sequence[object], names: Sequence[str]) -> None:
-    """Raise ParameterError unless there is one value for each of the named channels."""
+    """Raise ParameterError unless there is one value for each named channel."""
     require(len(values) == len(names), key, f"{len(values)} values", f"{len(names)}, one for each of {', '.join(names)}")
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Nested mapping -> (dotted name, value) pairs, as ROS 2 names its parameters; absent (None) values are left out."""
+    """Nested mapping -> (dotted name, value) pairs, the parameter names of ROS 2; None values are left out."""
     for key, value in mapping.items():
         if isinstance(value, Mapping):
             yield from flatten(value, f"{prefix}{key}.")
@@ -122,7 +122,7 @@ def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted names -> nested mapping: the inverse of `flatten`. Raises ParameterError where a name is value and group."""
+    """Dotted names -> nested mapping, the inverse of `flatten`. Raises ParameterError for a name with both value and group."""
     tree: dict[str, Any] = {}
     for name, value in flat.items():
         *groups, leaf = name.split(".")
@@ -139,7 +139,7 @@ def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
     location, kind, found = error["loc"], error["type"], error["input"]
     if kind == "invalid_key" or location[-1:] == ("[key]",):
         key = ".".join([where, *map(str, location[: -1 if kind == "invalid_key" else -2])])
-        return f"{key}: found the key {_shown(found)}, expected a name"
+        return f"{key}: found the key {_short_repr(found)}, expected a name"
     key = where + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
     if kind == "extra_forbidden":
         known = sorted(_fields_at(cls, location[:-1]))
@@ -150,14 +150,14 @@ def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
         meaning = field.description if field is not None and field.description else "a value"
         return f"{key}: missing, expected {meaning}"
     if kind == "value_error":
-        return f"{key}.{error['ctx']['error']}"  # raised by `require`: the rest of the key and the sentence
+        return f"{key}.{error['ctx']['error']}"  # `require` raised it, with the rest of the key and the sentence
     if kind == "too_short":
         least = error["ctx"]["min_length"]
         return f"{key}: found {error['ctx']['actual_length']} values, expected at least {least} value{'s' * (least > 1)}"
     expected = (
         "a list of values" if kind == "tuple_type" else error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
     )
-    return f"{key}: found {_shown(found)}, expected {expected}"
+    return f"{key}: found {_short_repr(found)}, expected {expected}"
 
 
 def _fields_at(cls: type[BaseModel], location: Sequence[str | int]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ NANOSECONDS = 1_000_000_000
 
 
 def seconds(time_ns: int) -> float:
-    """Nanoseconds as float seconds, by one rounding only: t = time_ns / 1e9."""
+    """Nanoseconds as float seconds, rounded once: t = time_ns / 1e9."""
     return time_ns / NANOSECONDS
 
 
@@ -27,7 +27,7 @@ def period_ns(rate: float, key: str) -> int:
 
 
 def divide(whole_ns: int, part_ns: int, key: str, whole: str) -> int:
-    """How many parts make the whole. Raises ParameterError naming `key` where they do not divide."""
+    """Number of parts in the whole. Raises ParameterError naming `key` unless it is an integer."""
     require(
         part_ns > 0 and whole_ns % part_ns == 0,
         key,

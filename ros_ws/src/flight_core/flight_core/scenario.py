@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario files: one ROS parameter file, a section for each node, read without ROS.
+"""Scenario files: one ROS parameter file with a section for each node, read without ROS.
 
 /**/controller:
   ros__parameters:
@@ -19,7 +19,7 @@ Sections = dict[str, dict[str, Any]]
 def read_sections(path: Path, expected: tuple[str, ...]) -> Sections:
     """Sections of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
 
-    Raises ParameterError where the file cannot be read, is not such a file, has a key twice, or lacks or adds a section.
+    Raises ParameterError for a file that cannot be read, is no scenario file, has a duplicate key, or lacks or adds a section.
     """
     tree = read_yaml(path, str(path), "a scenario file")
     require(isinstance(tree, dict), str(path), f"{type(tree).__name__}", f"a mapping with {', '.join(expected)}")

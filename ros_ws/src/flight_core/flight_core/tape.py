@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The tape: the one in-memory log of a flight, whatever flew it (in one process, over topics, read from a bag)."""
+"""The tape: the in-memory log of a flight, in one process, over topics or read from a bag."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from flight_core.vectors import FloatArray
 class Signal:
     """One topic: N samples of k named channels, SI units and radians.
 
-    stamp_ns: shape (N,), int64, the instant each sample belongs to. values: shape (N, k).
+    stamp_ns: shape (N,), int64, the instant of each sample. values: shape (N, k).
     """
 
     stamp_ns: NDArray[np.int64]
@@ -26,7 +26,7 @@ class Signal:
     values: FloatArray
 
     def __getitem__(self, name: str) -> FloatArray:
-        """Samples of one channel, shape (N,). Raises ParameterError naming the channels there are."""
+        """Samples of one channel, shape (N,). Raises ParameterError that lists the channels."""
         if name not in self.names:
             raise ParameterError(f"the log: found no channel {name} among {', '.join(self.names)}, expected one")
         return self.values[:, self.names.index(name)]
@@ -37,7 +37,7 @@ class Signal:
         return Signal(self.stamp_ns[keep], self.names, self.values[keep])
 
     def group(self, prefix: str) -> "Signal":
-        """The channels called "prefix.name", as a signal with channels "name"."""
+        """The channels "prefix.name", as a signal with channels "name"."""
         columns = [i for i, name in enumerate(self.names) if name.startswith(prefix + ".")]
         names = tuple(self.names[i].removeprefix(prefix + ".") for i in columns)
         return Signal(self.stamp_ns, names, self.values[:, columns])
@@ -45,7 +45,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Tape:
-    """A flight: signals by topic name. `start_ns` is the stamp of flight time t = 0, `outcome` how it ended."""
+    """A flight: signals by topic name. `start_ns` is the stamp of flight time t = 0, `outcome` one of flight_core.outcome."""
 
     signals: Mapping[str, Signal]
     start_ns: int = 0
@@ -53,7 +53,7 @@ class Tape:
     outcome: str = COMPLETED
 
     def __getitem__(self, topic: str) -> Signal:
-        """The signal of a topic. Raises ParameterError naming the topics there are."""
+        """The signal of a topic. Raises ParameterError that lists the topics."""
         if topic not in self.signals:
             raise ParameterError(f"the log: found no topic {topic} among {', '.join(self.signals) or 'none'}, expected one")
         return self.signals[topic]

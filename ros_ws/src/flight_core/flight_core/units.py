@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Units of airframe files, converted to SI once, at load. Everything past that point is SI and radians."""
+"""Units of airframe files. Values are converted to SI once, at load; all other code uses SI and radians."""
 
 import math
 from collections.abc import Mapping
@@ -23,4 +23,4 @@ SI_PER_UNIT: Mapping[str, float] = MappingProxyType(
         "%": 0.01,
     }
 )
-"""How much of the SI unit (rad, rad/s, m/s, 1) one of each unit is: value_SI = value * SI_PER_UNIT[unit]."""
+"""SI value (rad, rad/s, m/s, 1) of one of each unit: value_SI = value * SI_PER_UNIT[unit]."""

@@ -1,30 +1,34 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors: values travel with their channel names and are matched by name, never by place."""
+"""Named vectors: values with their channel names. Channels are matched by name, never by position."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import array_api_compat
 import numpy as np
 from numpy.typing import NDArray
 
-NUMPY: Any = np  # NumPy 2 has the array API itself
-if not hasattr(np, "concat"):
-    import array_api_compat.numpy  # loads all of NumPy, 0.1 s
-
-    NUMPY = array_api_compat.numpy
+from flight_core.rates import seconds
 
 FloatArray = NDArray[np.float64]
-Array = Any  # an array of whichever array namespace the caller flies with: NumPy, JAX
+Array = Any  # an array of NumPy or of JAX
+
+
+class _NumPy1:
+    """NumPy 1 with the one function of the array API standard that this stack uses and NumPy 1 lacks."""
+
+    concat = staticmethod(np.concatenate)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(np, name)
+
+
+_NUMPY: Any = np if hasattr(np, "concat") else _NumPy1()
 
 
 def array_namespace(array: Array) -> Any:
-    """The array namespace of an array.
-
-    NumPy's at once, for most of the time of a step of a few small arrays would go into looking what else it could be.
-    """
-    return NUMPY if isinstance(array, (np.ndarray, np.generic)) else array_api_compat.array_namespace(array)
+    """The array namespace of an array, as the array API standard defines it. NumPy 1 arrays lack `__array_namespace__`."""
+    return _NUMPY if isinstance(array, (np.ndarray, np.generic)) else array.__array_namespace__()
 
 
 class StampedVector(NamedTuple):
@@ -36,18 +40,30 @@ class StampedVector(NamedTuple):
 
 
 class ChannelError(ValueError):
-    """A sample that cannot be used: `reason` is a short word for counters, the message a sentence."""
+    """An invalid sample. `reason` is a short word for counters; the message is a sentence."""
 
     def __init__(self, reason: str, sentence: str) -> None:
         super().__init__(sentence)
         self.reason = reason
 
 
+def require_newer(stamp_ns: int, last_ns: int, what: str = "sample") -> None:
+    """Raise ChannelError, reason "order", unless a stamp is newer than the last one; `what` names the sample."""
+    if stamp_ns <= last_ns:
+        raise ChannelError("order", f"{what}: stamp {seconds(last_ns - stamp_ns):g} s before the last one")
+
+
+def require_not_future(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
+    """Raise ChannelError, reason "future", for a stamp ahead of the clock by more than the age limit."""
+    if stamp_ns > now_ns + max_age_ns:
+        raise ChannelError("future", f"stamp {seconds(stamp_ns - now_ns):g} s ahead of the clock")
+
+
 def select(wanted: Sequence[str], names: Sequence[str], values: Sequence[float] | FloatArray) -> FloatArray:
     """Values of the wanted channels, in the wanted order: v_i = values[names.index(wanted_i)], shape (len(wanted),).
 
     Raises ChannelError with reason "length" (names and values differ in number), "name" (a wanted channel is missing or
-    stands twice) or "finite" (a wanted value is NaN or infinite).
+    duplicated) or "finite" (a wanted value is NaN or infinite).
     """
     if len(names) != len(values):
         raise ChannelError("length", f"{len(names)} names for {len(values)} values")

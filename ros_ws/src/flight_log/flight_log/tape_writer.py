@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from flight_core.parameters import ParameterError
+from flight_core.files import writing
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_log.bag import BagWriter, Enclosed
@@ -30,18 +30,13 @@ def write_run(tape: Tape, directory: Path, enclosed: Enclosed) -> Path:
         for index, stamp_ns in enumerate(signal.stamp_ns)
     )
     signals = list(tape.signals.items())
-    try:
-        with BagWriter(directory) as bag:
-            bag.enclose(enclosed, tape.start_ns)
-            channels = [bag.add_topic(f"/{name}", JOINT_STATE, "") for name, _ in signals]
-            none = np.zeros(0)
-            for stamp_ns, place, index in rows:
-                _, signal = signals[place]
-                stamp = time(sec=stamp_ns // NANOSECONDS, nanosec=stamp_ns % NANOSECONDS)
-                message = vector(header(stamp, "in_process"), list(signal.names), signal.values[index], none, none)
-                bag.write(channels[place], stamp_ns, stamp_ns, index + 1, bytes(store.serialize_cdr(message, JOINT_STATE)))
-    except OSError as error:
-        raise ParameterError(
-            f"{directory}: cannot be written ({error.strerror}), expected a folder and a disk that can"
-        ) from None
+    with writing("", directory, "a folder and a disk that can"), BagWriter(directory) as bag:
+        bag.enclose(enclosed, tape.start_ns)
+        channels = [bag.add_topic(f"/{name}", JOINT_STATE, "") for name, _ in signals]
+        none = np.zeros(0)
+        for stamp_ns, place, index in rows:
+            _, signal = signals[place]
+            stamp = time(sec=stamp_ns // NANOSECONDS, nanosec=stamp_ns % NANOSECONDS)
+            message = vector(header(stamp, "in_process"), list(signal.names), signal.values[index], none, none)
+            bag.write(channels[place], stamp_ns, stamp_ns, index + 1, bytes(store.serialize_cdr(message, JOINT_STATE)))
     return bag.path

@@ -19,7 +19,7 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.validate_topic_name import validate_topic_name
 
-from flight_core.files import is_file
+from flight_core.files import is_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_log.bag import LOST, BagWriter, Channel, Enclosed
@@ -100,15 +100,13 @@ class RecorderNode(FlightNode[RecorderParameters]):
         )
         default = f"runs/{datetime.now(UTC):%Y%m%dT%H%M%SZ}-recording"
         directory = Path(parameters.directory or default).absolute()
-        try:
+        with writing("recorder.directory", directory, "a folder that can"):
             directory.mkdir(parents=True, exist_ok=True)
             if sentence := self._short_of_space(directory):
                 raise ParameterError(f"recorder.min_free: {sentence}")
             bag = BagWriter(directory)
             bag.enclose(enclosed, time.time_ns())
             bag.flush()
-        except OSError as error:
-            raise ParameterError(f"recorder.directory: {directory} cannot be written ({error.strerror})") from None
         return bag
 
     def _short_of_space(self, directory: Path) -> str:

@@ -4,8 +4,8 @@
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,6 +17,7 @@ from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, load_scenario, scenario_yaml
 from flight_analysis.report.recorded_flight import RecordedFlight
 from flight_analysis.report.summary import summarise, summarise_unflown
+from flight_core.files import writing
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError, printable
 from flight_core.tape import Tape
@@ -46,13 +47,9 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}{scenario.name}"
     for name in (stem, *(f"{stem}-{k}" for k in range(2, 100))):
         run = (runs / name).absolute()
-        try:
+        with writing("runs", runs, "a folder that can"), suppress(FileExistsError):
             run.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise ParameterError(f"runs: {runs} cannot be written ({error.strerror}), expected a folder that can") from None
-        return run
+            return run
     raise ParameterError(f"runs: found a hundred runs of this second in {runs}, expected fewer")
 
 
@@ -73,10 +70,8 @@ def enclosed(
 
 
 def _write(path: Path, text: str) -> Path:
-    try:
+    with writing("", path, "a folder and a disk that can"):
         path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ParameterError(f"{path} cannot be written ({error.strerror}), expected a folder and a disk that can") from None
     return path
 
 
@@ -110,7 +105,7 @@ def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
 
 def _written(stored: StoredFile, folder: Path) -> Scenario:
     path = folder / stored.name
-    with _writing(folder):
+    with writing("", folder, "a folder that can"):
         path.write_bytes(stored.content)
     return load_scenario(path)
 
@@ -123,7 +118,7 @@ def conclude(run: Path, outcome: str | None = None) -> FlightResult:
     from flight_analysis.report.page import write_page  # noqa: PLC0415 - loads plotly, which a flight does without
 
     flight, folder = read_flight(run, outcome), _folder(run)
-    with _writing(folder):
+    with writing("", folder, "a folder that can"):
         (folder / SUMMARY).write_text(json.dumps(flight.summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         write_page(folder / REPORT, [flight])
         if outcome is not None:
@@ -142,14 +137,6 @@ def conclude_unflown(run: Path, scenario: Scenario, outcome: str) -> Path:
 def _folder(run: Path) -> Path:
     """The folder of a run, which may be named by its log; runs/latest is a link."""
     return run.resolve() if run.is_dir() else run.resolve().parent
-
-
-@contextmanager
-def _writing(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise ParameterError(f"{folder}: cannot be written ({error.strerror}), expected a folder that can") from None
 
 
 def _outcome_before(summary: Path) -> str:
