@@ -116,7 +116,7 @@ def refuses(topic: str, why: str) -> Noticed:
 
 def intrudes(topic: str, other: str) -> Noticed:
     """By the refusal of the samples of a second publisher."""
-    return refuses(topic, rf"/{other}(#\d+)? publishes too, beside")
+    return refuses(topic, rf"conflicting publisher /{other}(#\d+)? ignored")
 
 
 def unsaid(flight: Flight, role: str, pattern: str, repeated: float) -> None:
@@ -212,7 +212,7 @@ def storm(topic: str) -> Callable[[Flight, Generator], None]:
     def inject(flight: Flight, random: Generator) -> None:
         seed = int(random.integers(2**31))
         words = ("tests.ros.faults.foreign", "storm", topic, str(STORM_RATE), str(STORM), str(seed))
-        unrefused(flight, topic, "publishes too")
+        unrefused(flight, topic, "conflicting publisher")
         process = Process(*words, cwd=REPOSITORY, within=APART)
         try:
             process.wait_for("begins at")
@@ -326,7 +326,7 @@ def second(role: str, topic: str) -> Callable[[Flight, Generator], None]:
     """A second node of the same kind, that publishes for two seconds."""
 
     def inject(flight: Flight, random: Generator) -> None:
-        unrefused(flight, topic, "publishes too")
+        unrefused(flight, topic, "conflicting publisher")
         started = flight.fault()
         process = flight.node(role)
         first = partial(flight.first_of, topic, f"/{role}#{process.popen.pid}", started)
@@ -493,17 +493,17 @@ def bad_change(random: Generator) -> Parameter:
 
 # The table
 
-HELD = SILENCE + 0.005  # s, and a tick, until the aircraft says that its controller is silent
+HELD = SILENCE + 0.005  # s, and a tick, until the aircraft logs the timeout of u
 STALE = MAX_AGE + 0.01  # s, and a tick, until the controller holds u
 
 CASES = (
     Case("aircraft killed", kill("aircraft"), enters(Mode.HOLD), STALE, Does.LETS_GO, BACK),
     Case("reference model killed", kill("reference_model"), enters(Mode.HOLD), STALE, Does.LETS_GO, BACK),
-    Case("controller killed", kill("controller"), says("aircraft", "is silent"), HELD, Does.IS_LET_GO, BACK),
+    Case("controller killed", kill("controller"), says("aircraft", "failsafe: u from"), HELD, Does.IS_LET_GO, BACK),
     Case("recorder killed", kill("recorder"), None, 0.0, Does.FLIES, 0.0),
     Case("aircraft stopped", stop("aircraft"), enters(Mode.HOLD), STALE, Does.LETS_GO, 0.0),
     Case("reference model stopped", stop("reference_model"), enters(Mode.HOLD), STALE, Does.LETS_GO, 0.0),
-    Case("controller stopped", stop("controller"), says("aircraft", "is silent"), HELD, Does.IS_LET_GO, 0.0),
+    Case("controller stopped", stop("controller"), says("aircraft", "failsafe: u from"), HELD, Does.IS_LET_GO, 0.0),
     Case("recorder stopped", stop("recorder"), None, 0.0, Does.FLIES, 0.0),
     *(Case(f"storm on {topic}", storm(topic), intrudes(topic, "foreign"), 0.0, Does.FLIES, 0.0) for topic in NAMES),
     *(

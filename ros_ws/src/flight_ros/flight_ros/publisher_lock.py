@@ -1,42 +1,45 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whom a node listens to on a topic that is to have one publisher. A message names its sender in `frame_id` alone."""
+"""Publisher lock of a topic that must have one publisher: samples of a conflicting publisher are ignored.
+
+A message names its publisher in `frame_id`.
+"""
 
 from flight_core.vectors import ChannelError
 
-SENDER = "sender"  # the reason for which a sample of another one is refused
+SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting publisher
 
 
 class PublisherLock:
-    """The first one that is heard, until nothing was heard of it for longer than an age limit; then the next one.
+    """Locks to the first publisher of a topic, until its samples time out; then to the next one.
 
-    Not every next one is as good: a node that is started again comes under its name, a stranger may be made to wait longer.
+    A restarted node, which has the same name, may take over earlier than another node.
     """
 
     def __init__(self) -> None:
-        self.name: str | None = None
-        self._heard_ns = 0
+        self.publisher: str | None = None
+        self._received_ns = 0
 
-    def silence_ns(self, now_ns: int) -> int:
-        """For how long nothing was heard of it."""
-        return now_ns - self._heard_ns
+    def age_ns(self, now_ns: int) -> int:
+        """Time since the last sample of the locked publisher."""
+        return now_ns - self._received_ns
 
-    def silent(self, now_ns: int, max_age_ns: int) -> bool:
-        """Whether there is nobody to listen to."""
-        return self.name is None or self.silence_ns(now_ns) > max_age_ns
+    def timed_out(self, now_ns: int, max_age_ns: int) -> bool:
+        """Whether there is no publisher, or its last sample is older than the age limit."""
+        return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
-    def require(self, sender: str, now_ns: int, max_age_ns: int, strange_ns: int) -> None:
-        """Raise ChannelError, "sender", for a sample of another one while the first is heard.
+    def check(self, sender: str, now_ns: int, max_age_ns: int, takeover_ns: int) -> None:
+        """Raise ChannelError, reason "sender", for a sample of another publisher while the locked one has not timed out.
 
-        Its silence has to be longer than `max_age_ns` for the same node in another process, `strange_ns` for another node.
+        The timeout is `max_age_ns` for the same node in another process, `takeover_ns` for another node.
         """
-        if sender == self.name:
+        if sender == self.publisher:
             return
-        same = self.name is not None and sender.partition("#")[0] == self.name.partition("#")[0]
-        if not self.silent(now_ns, max_age_ns if same else strange_ns):
-            raise ChannelError(SENDER, f"{sender} publishes too, beside {self.name}")
+        restarted = self.publisher is not None and sender.partition("#")[0] == self.publisher.partition("#")[0]
+        if not self.timed_out(now_ns, max_age_ns if restarted else takeover_ns):
+            raise ChannelError(SENDER, f"conflicting publisher {sender} ignored: already receiving from {self.publisher}")
 
-    def hear(self, sender: str, now_ns: int) -> bool:
-        """Called with each good sample; whether it comes from another one than before."""
-        changes, self.name, self._heard_ns = sender != self.name, sender, now_ns
-        return changes
+    def refresh(self, sender: str, now_ns: int) -> bool:
+        """Lock to the publisher of a valid sample. Returns whether it is another one than before."""
+        changed, self.publisher, self._received_ns = sender != self.publisher, sender, now_ns
+        return changed

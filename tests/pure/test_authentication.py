@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The key of signed samples, and their code against HMAC as RFC 2104 writes it."""
+"""Message authentication codes against HMAC as RFC 2104 defines it, and key files."""
 
 import hashlib
 import os
@@ -28,11 +28,11 @@ def hmac_sha256(key: bytes, text: bytes) -> bytes:
     return hashlib.sha256(bytes(byte ^ 0x5C for byte in padded) + inner).digest()
 
 
-def signed(stamp_ns: int, values: tuple[float, ...], seal: MessageAuthenticator) -> bytes:
-    """A sample of another publisher: blank, signed, put together."""
-    blank = vector(stamp_ns, ("q", "V"), values, "/someone" + BLANK)
+def signed(stamp_ns: int, values: tuple[float, ...], authenticator: MessageAuthenticator) -> bytes:
+    """A signed sample of an independent publisher."""
+    blank = vector(stamp_ns, ("q", "V"), values, "/publisher" + BLANK)
     place = mac_slice(blank)
-    return blank[: place.start] + seal.mac(blank) + blank[place.stop :]
+    return blank[: place.start] + authenticator.mac(blank) + blank[place.stop :]
 
 
 @given(st.binary(min_size=KEY_BYTES, max_size=KEY_BYTES), st.text(max_size=30), st.binary(max_size=300))
@@ -42,30 +42,30 @@ def test_the_code_is_half_of_hmac_sha256_over_topic_and_message(key: bytes, topi
     assert len(expected) == DIGITS
 
 
-def test_a_message_of_another_publisher_passes_with_its_code_and_no_other() -> None:
-    seal = MessageAuthenticator(KEY, "/y", None)
-    message = signed(7, (0.5, -1.0), seal)
-    seal.check(message)
+def test_a_message_passes_with_the_code_of_its_key_and_topic_alone() -> None:
+    authenticator = MessageAuthenticator(KEY, "/y", None)
+    message = signed(7, (0.5, -1.0), authenticator)
+    authenticator.check(message)
     for other in (MessageAuthenticator(KEY, "/u", None), MessageAuthenticator(bytes(KEY_BYTES), "/y", None)):
-        with pytest.raises(ChannelError) as refused:
+        with pytest.raises(ChannelError) as rejected:
             other.check(message)
-        assert refused.value.reason == "mac"
+        assert rejected.value.reason == "mac"
 
 
 @given(st.binary(max_size=100))
-def test_a_place_is_found_in_bytes_of_any_kind(message: bytes) -> None:
+def test_the_slice_of_the_code_is_empty_or_whole_for_any_bytes(message: bytes) -> None:
     place = mac_slice(message)
     assert place.stop - place.start in (0, DIGITS)
 
 
-def test_signed_samples_of_a_log_are_read_as_others_are_and_at_once() -> None:
-    seal = MessageAuthenticator(KEY, "/y", None)
+def test_signed_samples_of_a_log_are_decoded_as_one_group() -> None:
+    authenticator = MessageAuthenticator(KEY, "/y", None)
     decode = decoder("/y", JOINT_STATE)
     assert decode is not None
-    found = decode([signed(k, (0.1 * k, -k), seal) for k in range(5)])
-    assert len(found.samples) == 1  # all of one layout, though each has its own code
-    assert found.samples[0].stamp_ns.tolist() == list(range(5))
-    assert np.array_equal(found.samples[0].values, [[0.1 * k, -k] for k in range(5)])
+    decoded = decode([signed(k, (0.1 * k, -k), authenticator) for k in range(5)])
+    assert len(decoded.samples) == 1  # one layout, although the codes differ
+    assert decoded.samples[0].stamp_ns.tolist() == list(range(5))
+    assert np.array_equal(decoded.samples[0].values, [[0.1 * k, -k] for k in range(5)])
 
 
 def key_file(folder: Path, content: bytes, mode: int) -> str:
@@ -90,27 +90,27 @@ def test_a_key_is_the_32_bytes_of_its_file(mode: int, tmp_path: Path) -> None:
         (b"", 0o600, "of 0 bytes"),
     ],
 )
-def test_a_key_that_others_can_read_or_of_another_size_is_refused(
+def test_a_key_file_with_open_permissions_or_another_size_is_rejected(
     content: bytes, mode: int, found: str, tmp_path: Path
 ) -> None:
     path = key_file(tmp_path, content, mode)
-    with pytest.raises(ParameterError) as refused:
+    with pytest.raises(ParameterError) as rejected:
         read_key(path, "controller.key_file")
     expected = "expected a file of 32 bytes that its owner alone can read (chmod 600)"
-    assert str(refused.value) == f"controller.key_file: found {path} {found}, {expected}"
+    assert str(rejected.value) == f"controller.key_file: found {path} {found}, {expected}"
 
 
-def test_a_key_file_that_is_none_is_refused_and_no_pipe_is_waited_for(tmp_path: Path) -> None:
+def test_a_key_file_that_is_no_regular_file_is_rejected_without_blocking(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe", 0o600)
     for path, found in (
         (tmp_path, "cannot be read"),
         (tmp_path / "absent", "cannot be read"),
-        (tmp_path / "pipe", "is no file"),
+        (tmp_path / "pipe", "is not a regular file"),
     ):
         with pytest.raises(ParameterError, match=found):
             read_key(str(path), "controller.key_file")
 
 
-def test_the_key_changes_nothing_of_what_is_said_to_fly(osprey_gust: Scenario) -> None:
+def test_the_key_file_does_not_change_the_parameter_digest(osprey_gust: Scenario) -> None:
     keyed = osprey_gust.vary(controller={"key_file": "/etc/key"})
     assert keyed.controller.digest() == osprey_gust.controller.digest()

@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The publisher lock of a topic, and the samples that a controller uses while y_m is delayed."""
+
+import numpy as np
+import pytest
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.rates import nanoseconds
+from flight_core.vectors import ChannelError, StampedVector
+from flight_ros.publisher_lock import PublisherLock
+from rise_di_controller.controller import Controller
+from rise_di_controller.guard import Mode
+
+MAX_AGE, TAKEOVER = 100, 1000
+
+
+def locked(*senders: tuple[str, int]) -> PublisherLock:
+    """A lock after samples of these publishers at these instants."""
+    lock = PublisherLock()
+    for sender, now_ns in senders:
+        lock.check(sender, now_ns, MAX_AGE, TAKEOVER)
+        lock.refresh(sender, now_ns)
+    return lock
+
+
+def test_samples_of_a_conflicting_publisher_are_ignored_until_the_first_one_times_out() -> None:
+    lock = locked(("/aircraft#1", 0), ("/aircraft#1", 90))
+    for other in ("/aircraft#2", "/foreign", ""):
+        with pytest.raises(
+            ChannelError, match=f"conflicting publisher {other} ignored: already receiving from /aircraft#1"
+        ) as ignored:
+            lock.check(other, 190, MAX_AGE, TAKEOVER)
+        assert ignored.value.reason == "sender"
+    lock.check("/aircraft#1", 10_000, MAX_AGE, TAKEOVER)  # the locked publisher itself, after any time
+
+
+def test_a_restarted_node_takes_over_after_the_age_limit_and_another_node_later() -> None:
+    lock = locked(("/aircraft#1", 0))
+    lock.check("/aircraft#2", MAX_AGE + 1, MAX_AGE, TAKEOVER)
+    with pytest.raises(ChannelError):
+        lock.check("/foreign", TAKEOVER, MAX_AGE, TAKEOVER)
+    lock.check("/foreign", TAKEOVER + 1, MAX_AGE, TAKEOVER)
+    assert lock.timed_out(MAX_AGE + 1, MAX_AGE)
+    assert not lock.timed_out(MAX_AGE, MAX_AGE)
+
+
+def test_a_change_of_publisher_is_returned_once() -> None:
+    lock = PublisherLock()
+    assert lock.timed_out(0, MAX_AGE)
+    assert lock.refresh("/aircraft#1", 0)
+    assert not lock.refresh("/aircraft#1", 1)
+    assert lock.refresh("/aircraft#2", 2)
+
+
+@pytest.mark.parametrize(("late", "modes"), [(0.05, {Mode.ENGAGED}), (0.15, {Mode.ENGAGED, Mode.HOLD, Mode.RAMP})])
+def test_a_delayed_reference_is_awaited_up_to_the_age_limit(late: float, modes: set[Mode], osprey_gust: Scenario) -> None:
+    """Y and y_m at 100 Hz. From 1 s on y_m has a delay, once below the age limit of 0.1 s and once above it."""
+    controller, period_ns = Controller(osprey_gust.controller), 10_000_000
+    visited, stamps = set(), []
+    for k in range(200):
+        now_ns = k * period_ns
+        controller.take_y(StampedVector(now_ns, np.zeros(4)), now_ns)
+        delay_ns = nanoseconds(late) if k >= 100 else 0
+        if k < 100 or now_ns - delay_ns >= 100 * period_ns:
+            controller.take_y_m(StampedVector(now_ns - delay_ns, np.zeros(4)), now_ns)
+        output = controller.tick(now_ns)
+        visited.add(controller.mode)
+        if output is not None and controller.mode is Mode.ENGAGED:
+            stamps.append(output.stamp_ns)
+    assert visited == modes
+    assert stamps == sorted(set(stamps))
+    if late < 0.1:  # each y is used in order, as late as its y_m, which may be extrapolated by one period
+        assert 199 * period_ns - stamps[-1] == nanoseconds(late) - period_ns
