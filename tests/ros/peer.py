@@ -26,14 +26,14 @@ OUTPUTS = ("q", "V", "p", "r")
 class Peer:
     """Event-driven: `until` spins until a condition holds."""
 
-    def __init__(self, context: Context, topics: tuple[str, ...]) -> None:
+    def __init__(self, context: Context, topics: tuple[str, ...], qos: QoSProfile) -> None:
         self.node = Node("peer", context=context)
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.node)
         self.received: dict[str, list[Any]] = {topic: [] for topic in topics}
         for topic, messages in self.received.items():
             kind = DiagnosticArray if topic == "/diagnostics" else JointState
-            self.node.create_subscription(kind, topic, messages.append, QoSProfile(depth=100))
+            self.node.create_subscription(kind, topic, messages.append, qos)
         self._publishers: dict[str, Any] = {}
 
     def until(self, condition: Callable[[], object], timeout: float = 20.0, each: Callable[[], None] | None = None) -> None:
@@ -57,12 +57,12 @@ class Peer:
             self._publishers[topic] = self.node.create_publisher(JointState, topic, PUBLISH)
         self._publishers[topic].publish(message)
 
-    def call(self, kind: Any, name: str, request: Any) -> Any:
-        """Call a service and wait for its answer."""
+    def call(self, kind: Any, name: str, request: Any, each: Callable[[], None] | None = None) -> Any:
+        """Call a service and wait for its answer; `each` is called every 5 ms meanwhile."""
         client = self.node.create_client(kind, name)
-        self.until(client.service_is_ready)
+        self.until(client.service_is_ready, each=each)
         future = client.call_async(request)
-        self.until(future.done)
+        self.until(future.done, each=each)
         return future.result()
 
     def modes(self) -> list[int]:
@@ -76,12 +76,12 @@ class Peer:
 
 
 @contextmanager
-def peer(topics: tuple[str, ...] = ("u", "internals", "/diagnostics")) -> Iterator[Peer]:
+def peer(topics: tuple[str, ...] = ("u", "internals", "/diagnostics"), qos: QoSProfile | None = None) -> Iterator[Peer]:
     """A peer in a context of its own, that listens to these topics."""
     transport.prepare()
     context = Context()
     rclpy.init(context=context)
-    made = Peer(context, topics)
+    made = Peer(context, topics, qos or QoSProfile(depth=100))
     try:
         yield made
     finally:

@@ -3,9 +3,13 @@
 """The controller's node among peers that fail: engagement, stale and bad samples, parameters and transitions in flight."""
 
 import math
+import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -20,14 +24,88 @@ from tests.ros.conftest import Process, Start
 from tests.ros.peer import OUTPUTS, Peer, peer
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.vectors import FloatArray
 from flight_ros.messages import to_message
+from flight_ros.topics import RECORD
 from rise_di_controller.guard import Mode
+
+Instants = np.ndarray[Any, np.dtype[np.int64]]
+
+PERIOD_NS = NANOSECONDS // 100  # of the ticks, as in the default scenario
+MAX_AGE_NS = NANOSECONDS // 10  # of y and y_m, as in the default scenario
+PATIENT = ("-p", "max_age:=2.0")  # where nothing is to grow stale, on a busy machine either
+
+STOPS = 4  # each moves what would drift by up to a period
+
+CHANGED: dict[str, Any] = {"k_g": 3.0, "Lambda": [1, 1, 1, 1], "beta": [10.0, 10.0, 10.0, 5.0]}
+
+KERNEL_TICK_NS = NANOSECONDS // os.sysconf("SC_CLK_TCK")
+
+EXACT = 1e-12  # of what is multiplied once
 
 
 @pytest.fixture
 def peer_node() -> Iterator[Peer]:
-    with peer() as made:
+    """Receives all from the first sample on, as a recorder does, also where it is matched late or held back."""
+    with peer(qos=RECORD) as made:
         yield made
+
+
+class Ticks(NamedTuple):
+    """What the ticks say of themselves in `internals`, N of them; instants in ns of the system clock."""
+
+    number: Instants  # (N,) of the sample
+    mode: Instants  # (N,)
+    stamp: Instants  # (N,) of the y used; of the tick where none is
+    at: Instants  # (N,) the tick's own instant
+    late: Instants  # (N,) how long after its deadline that is
+    dt: FloatArray  # (N,) s, given to the law
+    offset: FloatArray  # (N,) s, of the newest y_m from the y used
+    u: FloatArray  # (N, m)
+
+
+def ticks(peer_node: Peer) -> Ticks:
+    """All that were heard. None may be lost: the numbers count up by one."""
+    heard = peer_node.received["internals"]
+    names = heard[0].name
+    values = np.array([message.position for message in heard])
+    stamp = np.array([stamp_ns(message) for message in heard])
+    at = stamp + np.array([nanoseconds(age) for age in values[:, names.index("age")]])
+    late = np.array([nanoseconds(late) for late in values[:, names.index("late")]])
+    number, mode = (values[:, names.index(name)].astype(np.int64) for name in ("number", "mode"))
+    dt, offset = (values[:, names.index(name)] for name in ("dt", "y_m_offset"))
+    u = values[:, [k for k, name in enumerate(names) if name.startswith("u.")]]
+    assert number.tolist() == list(range(1, len(number) + 1))
+    return Ticks(number, mode, stamp, at, late, dt, offset, u)
+
+
+def channel(message: JointState, name: str) -> float:
+    return float(message.position[message.name.index(name)])
+
+
+def stamp_ns(message: Any) -> int:
+    return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
+
+
+class HeldBack:
+    """How long the machine has held up the ticks of a process: their thread was ready, and had to wait for a processor."""
+
+    def __init__(self, process: Process) -> None:
+        self._process = process
+        self._before_ns = self._counted_ns()
+
+    def _counted_ns(self) -> int:
+        """Waited for those of Linux, and these for those of a virtual machine's host.
+
+        Source: proc_pid_schedstat(5), second figure; proc_stat(5), eighth figure.
+        """
+        waited = int(Path(f"/proc/{self._process.popen.pid}/schedstat").read_text(encoding="ascii").split()[1])
+        return waited + int(Path("/proc/stat").read_text(encoding="ascii").split()[8]) * KERNEL_TICK_NS
+
+    def most_ns(self) -> int:
+        """Since this was made; the host's share is counted in whole ticks of the kernel, so one more may have begun."""
+        return self._counted_ns() - self._before_ns + KERNEL_TICK_NS
 
 
 def controller(start: Start, scenario: Scenario, *arguments: str) -> Process:
@@ -40,7 +118,7 @@ def engage(peer_node: Peer, y: float = 0.01) -> None:
     )
 
 
-def set_parameters(peer_node: Peer, **values: object) -> tuple[bool, str]:
+def set_parameters(peer_node: Peer, each: Callable[[], None] | None = None, **values: object) -> tuple[bool, str]:
     kinds = {float: ("double_value", ParameterType.PARAMETER_DOUBLE), str: ("string_value", ParameterType.PARAMETER_STRING)}
     request = SetParametersAtomically.Request()
     for name, value in values.items():
@@ -54,7 +132,7 @@ def set_parameters(peer_node: Peer, **values: object) -> tuple[bool, str]:
         else:
             field, kind = kinds[type(value)]
         request.parameters.append(Parameter(name=name, value=ParameterValue(type=kind, **{field: value})))
-    result = peer_node.call(SetParametersAtomically, "controller/set_parameters_atomically", request).result
+    result = peer_node.call(SetParametersAtomically, "controller/set_parameters_atomically", request, each).result
     return result.successful, result.reason
 
 
@@ -67,19 +145,53 @@ def test_engages_without_a_jump_from_zero(start: Start, osprey_gust: Scenario, p
 
 
 def test_stale_inputs_are_held_ramped_to_trim_and_engaged_again(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
-    controller(start, osprey_gust, "-p", "hold:=0.1", "-p", "ramp:=0.2")
+    """Judged at each tick's own instant, so that ticks may come late or be missed, but not do another thing."""
+    hold_ns, ramp_ns, y = NANOSECONDS // 10, NANOSECONDS, 0.05
+    process = controller(start, osprey_gust, "-p", "hold:=0.1", "-p", "ramp:=1.0")
     engage(peer_node)
-    peer_node.until(lambda: peer_node.modes()[-1] == Mode.TRIM)  # nothing is sent any more
-    assert [Mode(mode) for mode in peer_node.modes()] == [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.TRIM]
-    u = peer_node.u()
-    assert (u[-1] == 0).all()
-    # on the ramp no step is larger than that of a 10 ms tick, twice as much where the machine was late
-    biggest = np.abs(u).max(axis=0)
-    ramp = np.abs(np.diff(u[-25:], axis=0)).max(axis=0)
-    assert (ramp <= biggest * 0.01 / 0.2 * 4).all()
-    peer_node.until(lambda: peer_node.modes()[-1] == Mode.ENGAGED, each=lambda: peer_node.send(0.05))
-    engaged = next(m for m in reversed(peer_node.received["internals"]) if m.position[m.name.index("dt")] == 0.0)
-    assert engaged.position[engaged.name.index("u.elevator")] == 0.0
+    held_back = HeldBack(process)
+    peer_node.until(lambda: peer_node.modes()[-1] == Mode.HOLD)  # nothing is sent any more
+    held_back_ns = held_back.most_ns()
+    peer_node.until(lambda: peer_node.modes()[-1] == Mode.TRIM)
+    silent = len(ticks(peer_node).number)
+    heard = peer_node.received["internals"]
+    peer_node.until(lambda: sum(channel(one, "dt") > 0.0 for one in heard[silent:]) >= 3, each=lambda: peer_node.send(y))
+    flown = ticks(peer_node)
+
+    # lost with the first tick at which the last y or y_m is too old
+    lost = int(np.flatnonzero(flown.mode[:silent] == Mode.ENGAGED)[-1]) + 1
+    oldest = flown.stamp[lost - 1] + min(nanoseconds(flown.offset[lost - 1]), 0)
+    assert flown.at[lost] - oldest > MAX_AGE_NS
+    assert flown.at[lost] - flown.late[lost] - oldest <= MAX_AGE_NS + PERIOD_NS + held_back_ns
+
+    # then held, and on a straight line to trim: mode and u are those of the instant
+    alone = slice(lost, silent)
+    at, mode, u, u_lost = flown.at[alone], flown.mode[alone], flown.u[alone], flown.u[lost - 1]
+    assert (np.diff(at) >= 0).all()
+    share = np.clip(1.0 - (at - at[0] - hold_ns) / ramp_ns, 0.0, 1.0)
+    expected = np.select([share == 1.0, share > 0.0], [Mode.HOLD, Mode.RAMP], Mode.TRIM)
+    assert mode.tolist() == expected.tolist()
+    assert set(mode) == {Mode.HOLD, Mode.RAMP, Mode.TRIM}
+    assert np.abs(u_lost).min() > 0.0
+    assert np.abs(u - np.outer(share, u_lost)).max() <= EXACT
+    assert (u[share == 1.0] == u_lost).all()
+    assert (u[share == 0.0] == 0.0).all()
+
+    # what is published is what is logged
+    logged = dict(zip(at.tolist(), u.tolist(), strict=True))
+    published = [message for message in peer_node.received["u"] if stamp_ns(message) in logged]
+    assert len(published) > len(logged) / 2  # a tick that is held up for too long does not publish
+    assert all(message.position.tolist() == logged[stamp_ns(message)] for message in published)
+
+    # engaged from where u was, and from there on with no more than the steps of the law, e being constant
+    law = osprey_gust.controller.law()
+    again = silent + int(np.flatnonzero(flown.mode[silent:] == Mode.ENGAGED)[0])
+    assert flown.dt[again] == 0.0
+    assert (flown.u[again] == flown.u[again - 1]).all()
+    flies = again + np.flatnonzero(flown.dt[again:] > 0.0)
+    moved, dt = np.abs(flown.u[flies] - flown.u[flies - 1]), flown.dt[flies]
+    assert (moved > 0.0).all()
+    assert (moved <= np.outer(dt, law.input_scale * (law.K * law.Lambda * y + law.beta)) + EXACT).all()
 
 
 def test_one_that_was_stopped_says_nothing_of_before_and_engages_from_where_u_was_let_go(
@@ -113,7 +225,7 @@ def test_one_that_was_stopped_says_nothing_of_before_and_engages_from_where_u_wa
 def test_a_bad_sample_is_refused_counted_and_never_used(
     name: str, message: JointState, reason: str, start: Start, osprey_gust: Scenario, peer_node: Peer
 ) -> None:
-    controller(start, osprey_gust)
+    controller(start, osprey_gust, *PATIENT)
     engage(peer_node)
 
     def send_both() -> None:
@@ -125,28 +237,33 @@ def test_a_bad_sample_is_refused_counted_and_never_used(
         return any(value.key == f"refused {reason}" and int(value.value) > 0 for value in values)
 
     peer_node.until(counted, each=send_both)
-    assert peer_node.modes()[-1] == Mode.ENGAGED
+    assert peer_node.modes() == [Mode.ENGAGED]
     used = [m.position[m.name.index("y.q")] for m in peer_node.received["internals"]]
     assert set(used) == {0.01}
 
 
 def test_gains_change_in_flight_without_a_jump(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
-    process = controller(start, osprey_gust, "-p", "sign:=soft")
-    engage(peer_node)
-    for _ in range(20):  # between y samples u stands still, so a jump at the change would stand out
-        peer_node.send(0.011)
-    count = len(peer_node.received["u"])
-    peer_node.until(lambda: len(peer_node.received["u"]) > count, each=lambda: peer_node.send(0.011))
-    accepted = set_parameters(peer_node, k_g=3.0, Lambda=[1, 1, 1, 1], beta=[10.0, 10.0, 10.0, 5.0])
+    process = controller(start, osprey_gust, "-p", "sign:=soft", *PATIENT)
+    engage(peer_node, 0.0)
+    y, heard = 0.2, peer_node.received["internals"]
+
+    def send() -> None:
+        peer_node.send(y)
+
+    peer_node.until(lambda: channel(heard[-1], "y.q") == y, each=send)
+    since = len(heard) - 1
+    accepted = set_parameters(peer_node, send, **CHANGED)
     assert accepted == (True, "")
     process.wait_for("k_g: 1.0 -> 3.0")
-    count = len(peer_node.received["u"])
-    peer_node.until(lambda: len(peer_node.received["u"]) > count + 5, each=lambda: peer_node.send(0.011))
-    # With e = 0.01 the law moves u by K Lambda e dt + beta dt in a tick; the old gains would have jumped by K e.
-    u = peer_node.u()
-    law = osprey_gust.vary(controller={"k_g": 3.0}).controller.law()
-    step = law.input_scale * (law.K * law.Lambda * 0.011 + law.beta) * 0.03 + law.input_scale * law.K * 0.001
-    assert (np.abs(np.diff(u, axis=0)) <= step + 1e-9).all()
+    count = len(heard)
+    peer_node.until(lambda: len(heard) > count + 5, each=send)
+    # With e = y the law moves u by K Lambda e dt + beta dt in a tick; the new gains alone would have moved it by more than 2 e.
+    flown = ticks(peer_node)
+    assert len({channel(one, "parameters") for one in heard[since:]}) == 2  # those before and after
+    laws = [one.controller.law() for one in (osprey_gust, osprey_gust.vary(controller=CHANGED))]
+    rate = np.max([law.input_scale * (law.K * law.Lambda * y + law.beta) for law in laws], axis=0)
+    moved = np.abs(np.diff(flown.u[since:], axis=0))
+    assert (moved <= np.outer(flown.dt[since + 1 :], rate) + EXACT).all()
 
 
 def test_limits_that_were_not_given_can_be_set_in_flight(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
@@ -172,7 +289,7 @@ def test_limits_that_were_not_given_can_be_set_in_flight(start: Start, osprey_gu
     ],
 )
 def test_a_bad_change_is_refused_with_its_reason_and_leaves_all_as_it_was(
-    changes: dict[str, object], sentence: str, start: Start, osprey_gust: Scenario, peer_node: Peer
+    changes: dict[str, Any], sentence: str, start: Start, osprey_gust: Scenario, peer_node: Peer
 ) -> None:
     controller(start, osprey_gust)
     engage(peer_node)
@@ -231,9 +348,64 @@ def _check_that_unfitting_peers_are_named(start: Start, osprey_gust: Scenario, p
 
 
 def test_the_rate_is_kept_over_seconds(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
-    controller(start, osprey_gust)
+    """Deadlines are absolute: a tick that was held up comes late, or is skipped and counted; none after it is moved."""
+    process = controller(start, osprey_gust, "-p", "max_age:=1.0")
     engage(peer_node)
-    begin, count = time.monotonic(), len(peer_node.received["u"])
-    peer_node.until(lambda: time.monotonic() - begin > 3.0, each=lambda: peer_node.send(0.01))
-    # absolute deadlines: 100 Hz on the mean; the margin is for what is under way at both ends and a tick that found no new y
-    assert 285 <= len(peer_node.received["u"]) - count <= 305
+    held_back, begin_ns, stopped_ns = HeldBack(process), time.time_ns(), 0
+    peer_node.until(lambda: time.time_ns() - begin_ns > NANOSECONDS, each=lambda: peer_node.send(0.01))
+    peer_node.until(lambda: peer_node.modes()[-1] == Mode.HOLD)  # nothing is sent any more: from here on each tick publishes
+    silent_ns = stamp_ns(peer_node.received["internals"][-1])
+    peer_node.until(lambda: len(missed(peer_node, silent_ns)) >= 1)
+    for _ in range(STOPS):
+        stopped_ns += stop_for(process, peer_node, 5 * PERIOD_NS)
+        count = len(peer_node.received["internals"])
+        peer_node.until(lambda: len(peer_node.received["internals"]) > count + 1)  # noqa: B023
+    counted_ns = max(missed(peer_node, silent_ns))
+    peer_node.until(lambda: max(missed(peer_node, silent_ns)) > counted_ns)
+    counted = missed(peer_node, silent_ns)
+    peer_node.until(lambda: stamp_ns(peer_node.received["internals"][-1]) > max(counted))
+    again_ns = time.time_ns()
+    peer_node.until(lambda: time.time_ns() - again_ns > NANOSECONDS, each=lambda: peer_node.send(0.01))
+    held_back_ns = held_back.most_ns() + stopped_ns
+
+    flown = ticks(peer_node)
+    assert ((flown.late >= 0) & (flown.late < PERIOD_NS)).all()
+    steps, rest = np.divmod(np.diff(flown.at - flown.late), PERIOD_NS)
+    assert (rest == 0).all()
+    assert (steps > 0).all()
+    # what is skipped, where each tick publishes, is what is counted
+    for (earlier_ns, before), (later_ns, after) in pairwise(counted.items()):
+        skipped = (steps - 1)[(flown.at[1:] > earlier_ns) & (flown.at[1:] <= later_ns)]
+        assert skipped.sum() == after - before
+    total = list(counted.values())
+    assert total[-1] - total[0] >= 4 * STOPS
+    # no more is missed than the machine made it miss
+    total = list(missed(peer_node, begin_ns).values())
+    assert (total[-1] - total[0]) * PERIOD_NS <= held_back_ns
+    # After all that the ticks still have the clock of the sender: most y are flown after they were sent, some soon after. One
+    # that comes while its tick is held up is flown by a tick that was due before.
+    age = (flown.at - flown.stamp)[(flown.mode == Mode.ENGAGED) & (flown.stamp > again_ns)]
+    assert len(age) > 0
+    assert np.median(age) >= 0
+    assert age.min() < PERIOD_NS
+
+
+def stop_for(process: Process, peer_node: Peer, pause_ns: int) -> int:
+    """SIGSTOP, then SIGCONT; how long it was at most, ns."""
+    begin_ns = time.monotonic_ns()
+    process.popen.send_signal(signal.SIGSTOP)
+    try:
+        stopped_ns = time.monotonic_ns()
+        peer_node.until(lambda: time.monotonic_ns() - stopped_ns > pause_ns)
+    finally:
+        process.popen.send_signal(signal.SIGCONT)
+    return time.monotonic_ns() - begin_ns
+
+
+def missed(peer_node: Peer, since_ns: int) -> dict[int, int]:
+    """How many ticks the diagnostics count as missed, by the instant of the report, ns."""
+    heard = [message for message in peer_node.received["/diagnostics"] if stamp_ns(message) > since_ns]
+    return {
+        stamp_ns(message): int(next(value.value for value in message.status[0].values if value.key == "missed ticks"))
+        for message in heard
+    }

@@ -28,7 +28,6 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tests.ros.conftest import Process
 
-from flight_bringup.graph import READY
 from flight_bringup.processes import end_with_parent
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.vectors import FloatArray
@@ -66,6 +65,12 @@ TRACKING = 0.05
 """rad/s, m/s. An idle machine keeps the loop within 0.001 of trim, one with five times as much to do as it can within 0.04; a
 restarted node comes back with 0.1."""
 
+# s. What a reader's socket has dropped is asked for again after the publisher's next heartbeat, every 0.05 s
+# (flight_ros/loopback.xml), and comes again after the pauses that Fast DDS makes before a question and before its answer, 5 ms
+# each (heartbeatResponseDelay, nackResponseDelay). Nobody has to repeat what a killed publisher has sent since.
+UNREPEATED = 0.05 + 2 * 0.005
+BEFORE = 0.5  # s, well beyond
+
 # The probe must not change what it watches: best effort, and deep enough for what a busy machine lets it miss.
 WATCH = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 WATCH_LOGS = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -74,8 +79,9 @@ KEPT = 120_000  # messages a topic: ten seconds of a storm
 
 
 class Heard(NamedTuple):
-    """A message, when the middleware had it (s of the system clock) and its number of its publisher."""
+    """A message, when it was sent and when the middleware had it (s of the system clock), its number of its publisher."""
 
+    sent: float
     at: float
     message: Any
     sequence: int
@@ -114,13 +120,14 @@ class Probe:
             with self._changed:
                 for name, subscription in self._polled_subscriptions.items():
                     self.heard[name].extend(
-                        Heard(seconds(one.received_ns), one.message, one.sequence) for one in subscription.take()
+                        Heard(seconds(one.sent_ns), seconds(one.received_ns), one.message, one.sequence)
+                        for one in subscription.take()
                     )
                 self._changed.notify_all()
 
     def _look_who_waits(self) -> None:
         before = self._waited_ns
-        ready = [one.popen.pid for one in list(self.watched) if READY in one.output]
+        ready = [one.popen.pid for one in list(self.watched) if "]: ready" in one.output]
         self._waited_ns = {process: _waited_ns(process) for process in (os.getpid(), *ready)}
         longest = max(waited - before.get(process, waited) for process, waited in self._waited_ns.items())
         self.waited.append((time.time(), longest / NANOSECONDS))
@@ -243,10 +250,20 @@ def scenario(source: Path, folder: Path) -> Path:
 
 
 class Witnessed(NamedTuple):
-    """What was heard during a fault."""
+    """What was heard during a fault, but for what killed nodes said right before their end."""
 
     internals: set[bytes]  # of the flight's own controllers
     said: set[tuple[str, str]]  # by whom, and what
+    last: list[list[bytes]]  # the `internals` right before the end, a list a killed node, in their order
+
+
+class Killed(NamedTuple):
+    """A node that was killed: it still lived at an instant, and no longer at another one, s."""
+
+    role: str
+    instance: str
+    alive: float
+    dead: float
 
 
 class Flight:
@@ -265,6 +282,7 @@ class Flight:
         self.measured: dict[str, Any] = {}  # what a case adds to its row
         self.witnessed: dict[str, Witnessed] = {}  # what the log has to hold, by case
         self._all: list[Process] = []
+        self._killed: list[Killed] = []
         self._ours: set[str] = set()  # instances of the four, of all that there were
         for role in PACKAGES:  # the aircraft is never without its controller, and all is in the log
             self.start(role)
@@ -306,8 +324,10 @@ class Flight:
 
     def kill(self, role: str) -> None:
         """SIGKILL."""
+        alive = time.time()
         self.processes[role].popen.kill()
         assert self.processes[role].end() == -signal.SIGKILL
+        self._killed.append(Killed(role, self.instance(role), alive, time.time()))
 
     @contextmanager
     def stopped(self, role: str) -> Iterator[None]:
@@ -402,12 +422,23 @@ class Flight:
         return None
 
     def witness(self, case: str, begin: float) -> None:
-        """Keep what was heard since, to be looked for in the log."""
+        """Keep what was heard since, and from BEFORE the end of a killed node on, to be looked for in the log."""
         decoder = Decoder(())
-        heard = [one.message for one in self.probe.since("internals", begin)]
-        ours = {raw for raw in heard if (sample := decoder.decode(raw)) is not None and sample.sender in self._ours}
-        lines = [one.message for one in self.probe.since("/rosout", begin)]
-        self.witnessed[case] = Witnessed(ours, {(line.name, line.msg) for line in lines if line.name in SPEAKERS})
+        ended = [one for one in self._killed if one.dead >= begin and one.role in SPEAKERS]
+        begin = min([begin, *(one.alive - BEFORE for one in ended)])
+        internals = self.probe.since("internals", begin)
+        by = [sample.sender if (sample := decoder.decode(one.message)) is not None else "" for one in internals]
+        lines = [one for one in self.probe.since("/rosout", begin) if one.message.name in SPEAKERS]
+        last = []
+        for killed in ended:
+            # that of two processes one after the other, of the node and of the recorder
+            since = killed.alive - UNREPEATED - 2.0 * self.held_back(killed.alive - MAX_AGE, killed.dead)
+            mine = [one for one, sender in zip(internals, by, strict=True) if sender == killed.instance]
+            last.append([one.message for one in mine if one.sent > since])
+            lines = [one for one in lines if one.message.name != killed.role or not since < one.sent <= killed.dead]
+        ours = {one.message for one, sender in zip(internals, by, strict=True) if sender in self._ours}
+        said = {(one.message.name, one.message.msg) for one in lines}
+        self.witnessed[case] = Witnessed(ours.difference(*last), said, last)
 
     def reports(self, role: str, begin: float) -> list[tuple[float, DiagnosticStatus]]:
         """The 1 Hz diagnostics of a node, with when they came."""
