@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators against closed forms, and the law flown through them."""
+"""Actuators and their faults against closed forms, and flights with dead zones, lags, rate and position saturation."""
 
 import math
 
@@ -25,7 +25,7 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.law import Sign
 
 MS = 1_000_000
-SHOWN = {"q": 1e3, "V": 1.0, "p": 1e3, "r": 1e3}  # mrad/s, m/s
+FACTORS = {"q": 1e3, "V": 1.0, "p": 1e3, "r": 1e3}  # mrad/s, m/s
 SIX = Actuators(  # ideal, lag, rate limit, lag and rate limit, end stops, all
     lag=np.array([0.0, 0.1, 0.0, 0.1, 0.0, 0.1]),
     lower=np.array([-np.inf, -np.inf, -np.inf, -np.inf, -0.5, -0.05]),
@@ -34,7 +34,7 @@ SIX = Actuators(  # ideal, lag, rate limit, lag and rate limit, end stops, all
 )
 
 
-def one(lag: float = 0.0, lower: float = -math.inf, upper: float = math.inf, rate: float = math.inf) -> Actuators:
+def actuator(lag: float = 0.0, lower: float = -math.inf, upper: float = math.inf, rate: float = math.inf) -> Actuators:
     return Actuators(*(np.array([value]) for value in (lag, lower, upper, rate)))
 
 
@@ -48,11 +48,11 @@ def positions(commands: list[float], dt: float, params: Actuators, start: float 
 
 @given(position=st.floats(-1e3, 1e3), command=st.floats(-1e3, 1e3), dt=st.floats(1e-4, 0.1))
 def test_an_ideal_actuator_passes_the_command_on_to_the_last_bit(position: float, command: float, dt: float) -> None:
-    assert positions([command], dt, one(), start=position) == [command]
+    assert positions([command], dt, actuator(), start=position) == [command]
 
 
 def test_no_lag_is_exact_in_float32_too() -> None:
-    params = Actuators(*(None if value is None else value.astype(np.float32) for value in one()))
+    params = Actuators(*(None if value is None else value.astype(np.float32) for value in actuator()))
     command = np.array([0.1], dtype=np.float32)
     moved = step(np.zeros(1, dtype=np.float32), command, np.array(0.001, dtype=np.float32), params)
     assert moved.dtype == np.float32
@@ -60,48 +60,48 @@ def test_no_lag_is_exact_in_float32_too() -> None:
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.01, 0.05])
-def test_a_step_is_answered_by_the_exact_first_order_response_whatever_dt(dt: float) -> None:
+def test_the_step_response_is_the_exact_first_order_response_for_any_dt(dt: float) -> None:
     # p(t) = c (1 - exp(-t / lag)): no error of integration, only rounding
-    history = positions([0.3] * 20, dt, one(lag=0.02))
+    history = positions([0.3] * 20, dt, actuator(lag=0.02))
     assert history == pytest.approx([0.3 * (1.0 - math.exp(-dt * (k + 1) / 0.02)) for k in range(20)], rel=1e-13)
 
 
 def test_a_rate_limit_gives_a_straight_ramp_that_ends_on_the_command() -> None:
     # 2 /s over 0.1 s: 0.2 a step, the last one only as far as the command
-    assert positions([0.7] * 5, 0.1, one(rate=2.0)) == pytest.approx([0.2, 0.4, 0.6, 0.7, 0.7], abs=1e-15)
-    assert positions([-0.7] * 5, 0.1, one(rate=2.0)) == pytest.approx([-0.2, -0.4, -0.6, -0.7, -0.7], abs=1e-15)
+    assert positions([0.7] * 5, 0.1, actuator(rate=2.0)) == pytest.approx([0.2, 0.4, 0.6, 0.7, 0.7], abs=1e-15)
+    assert positions([-0.7] * 5, 0.1, actuator(rate=2.0)) == pytest.approx([-0.2, -0.4, -0.6, -0.7, -0.7], abs=1e-15)
 
 
-def test_an_end_stop_holds_and_lets_go_at_once() -> None:
-    # Nothing winds up behind the stop: the position, not the command, is the state.
-    assert positions([9.0, 9.0, -0.1, -9.0], 0.1, one(lower=-0.3, upper=0.5)) == [0.5, 0.5, -0.1, -0.3]
+def test_position_saturation_does_not_wind_up() -> None:
+    # The position leaves the stop at once: the position, not the command, is the state.
+    assert positions([9.0, 9.0, -0.1, -9.0], 0.1, actuator(lower=-0.3, upper=0.5)) == [0.5, 0.5, -0.1, -0.3]
 
 
 def test_lag_comes_before_the_rate_limit_and_the_end_stop_last() -> None:
     # Command 1 from 0 over 0.1 s: the lag alone would reach 1 - 1/e = 0.632, the rate allows 0.2, the stop 0.05.
     moved = step(np.zeros(6), np.ones(6), np.array(0.1), SIX)
     assert moved == pytest.approx([1.0, 1.0 - math.exp(-1.0), 0.2, 0.2, 0.5, 0.05], abs=1e-15)
-    # Close to the command the lag is slower than the limit: 0.1 (1 - 1/e) = 0.063 < 0.2.
+    # Close to the command the lag is slower than the rate limit: 0.1 (1 - 1/e) = 0.063 < 0.2.
     assert step(np.zeros(6), np.full(6, 0.1), np.array(0.1), SIX)[3] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)), abs=1e-15)
 
 
 # Dead zone and faults
 
 
-def test_a_dead_zone_feels_nothing_inside_and_the_rest_beyond() -> None:
-    # felt = c - clip(c, -w, w), w = 0.1
+def test_a_dead_zone_gives_zero_inside_and_the_excess_outside() -> None:
+    # input = c - clip(c, -w, w), w = 0.1
     params = Actuators(dead_zone=np.array([0.1]))
     commands = [0.0, 0.05, 0.1, 0.3, -0.1, -0.25]
     assert positions(commands, 0.01, params) == pytest.approx([0.0, 0.0, 0.0, 0.2, 0.0, -0.15], abs=1e-16)
 
 
 @given(command=st.floats(-1.0, 1.0), further=st.floats(0.0, 1e-3), width=st.floats(0.0, 0.5))
-def test_a_dead_zone_has_no_jump_and_never_turns_a_command_round(command: float, further: float, width: float) -> None:
+def test_a_dead_zone_has_no_jump_and_never_reverses_a_command(command: float, further: float, width: float) -> None:
     params = Actuators(dead_zone=np.array([width]))
-    felt, more = positions([command, command + further], 0.01, params)
-    assert -1e-15 <= more - felt <= further + 1e-15
-    assert felt * command >= 0.0
-    assert abs(felt) <= abs(command)
+    first, second = positions([command, command + further], 0.01, params)
+    assert -1e-15 <= second - first <= further + 1e-15
+    assert first * command >= 0.0
+    assert abs(first) <= abs(command)
 
 
 def test_the_dead_zone_comes_before_the_lag() -> None:
@@ -109,51 +109,50 @@ def test_the_dead_zone_comes_before_the_lag() -> None:
     assert positions([0.4], 0.1, params) == pytest.approx([0.3 * (1.0 - math.exp(-1.0))])
 
 
-def flown_positions(times_ms: range, command: float, **actuators: list[float]) -> FloatArray:
-    """Positions of the four actuators at the end of each 10 ms from the given instants on, all four commanded alike."""
-    parts = osprey(10.0, **actuators)
-    state, history = plant.initial_state(parts), []
+def position_history(times_ms: range, command: float, **actuators: list[float]) -> FloatArray:
+    """Positions of the four actuators 10 ms after each of the given instants, with one command for all four."""
+    params = osprey(10.0, **actuators)
+    state, history = plant.initial_state(params), []
     for t in times_ms:
-        state = advance(t * MS, state, np.full(4, command), 10 * MS, parts)
+        state = advance(t * MS, state, np.full(4, command), 10 * MS, params)
         history.append(state.position)
     return np.array(history)
 
 
 def test_a_stuck_surface_stays_where_it_is_from_its_instant_on() -> None:
-    # Lag 20 ms, elevator stuck at 50 ms: it moves as ever up to there, and stays.
+    # Lag 20 ms, elevator stuck at 50 ms: it moves normally until then and keeps its position.
     lag, never = [0.02] * 4, math.inf
-    sound = flown_positions(range(0, 100, 10), 0.2, lag=lag)
-    stuck = flown_positions(range(0, 100, 10), 0.2, lag=lag, stuck_at=[0.05, never, never, never])
-    assert (stuck[:, 1:] == sound[:, 1:]).all()
-    assert (stuck[:5, 0] == sound[:5, 0]).all()
-    assert (stuck[5:, 0] == sound[4, 0]).all()
+    healthy = position_history(range(0, 100, 10), 0.2, lag=lag)
+    stuck = position_history(range(0, 100, 10), 0.2, lag=lag, stuck_at=[0.05, never, never, never])
+    assert (stuck[:, 1:] == healthy[:, 1:]).all()
+    assert (stuck[:5, 0] == healthy[:5, 0]).all()
+    assert (stuck[5:, 0] == healthy[4, 0]).all()
     assert stuck[-1, 0] == pytest.approx(0.2 * (1.0 - math.exp(-2.5)))
 
 
 def test_a_surface_stuck_from_the_start_is_in_trim() -> None:
-    assert (flown_positions(range(0, 30, 10), 0.2, stuck_at=[0.0] * 4) == 0.0).all()
+    assert (position_history(range(0, 30, 10), 0.2, stuck_at=[0.0] * 4) == 0.0).all()
 
 
-def test_a_lost_surface_is_in_trim_from_its_instant_on_also_where_it_was_stuck() -> None:
+def test_a_lost_surface_is_in_trim_from_its_instant_on_even_if_it_was_stuck() -> None:
     never = math.inf
-    lost = flown_positions(range(0, 80, 10), 0.2, lost_at=[0.05, 0.06, never, never], stuck_at=[never, 0.03, 0.03, never])
+    lost = position_history(range(0, 80, 10), 0.2, lost_at=[0.05, 0.06, never, never], stuck_at=[never, 0.03, 0.03, never])
     assert lost[:, 0].tolist() == [0.2] * 5 + [0.0] * 3
     assert lost[:, 1].tolist() == [0.2] * 6 + [0.0] * 2
-    assert lost[:, 2:].tolist() == [[0.2, 0.2]] * 8  # stuck where it was commanded, and sound
+    assert lost[:, 2:].tolist() == [[0.2, 0.2]] * 8  # one stuck where it was commanded, one healthy
 
 
-def test_a_fault_within_a_step_strikes_at_the_next_one() -> None:
-    lost = flown_positions(range(0, 40, 10), 0.2, lost_at=[0.015] * 4)
+def test_a_fault_within_a_step_acts_from_the_next_step_on() -> None:
+    lost = position_history(range(0, 40, 10), 0.2, lost_at=[0.015] * 4)
     assert lost[:, 0].tolist() == [0.2, 0.2, 0.0, 0.0]
 
 
-def test_a_lost_aileron_leaves_the_aircraft_as_without_it() -> None:
-    # Against matrices without that column: what the actuator shows is what the aircraft feels.
-    parts, u = osprey(lost_at=[math.inf, math.inf, 0.0, math.inf]), np.array([0.01, 0.1, -0.02, 0.03])
+def test_a_lost_aileron_acts_like_a_zero_column_of_b() -> None:
+    params, u = osprey(lost_at=[math.inf, math.inf, 0.0, math.inf]), np.array([0.01, 0.1, -0.02, 0.03])
     without = osprey()
     without = without._replace(aircraft=without.aircraft._replace(B=without.aircraft.B * [1.0, 1.0, 0.0, 1.0]))
-    found, expected = (advance(0, plant.initial_state(one_of), u, 500 * MS, one_of).x for one_of in (parts, without))
-    assert (found == expected).all()
+    actual, expected = (advance(0, plant.initial_state(each), u, 500 * MS, each).x for each in (params, without))
+    assert (actual == expected).all()
 
 
 @given(
@@ -165,7 +164,7 @@ def test_a_lost_aileron_leaves_the_aircraft_as_without_it() -> None:
 def test_no_command_moves_it_faster_than_its_rate_or_past_its_stops(
     commands: list[float], lag: float, rate: float, stop: float
 ) -> None:
-    history = np.array([0.0, *positions(commands, 0.01, one(lag, -stop, stop, rate))])
+    history = np.array([0.0, *positions(commands, 0.01, actuator(lag, -stop, stop, rate))])
     assert np.abs(history).max() <= stop
     assert np.abs(np.diff(history)).max() <= rate * 0.01 * (1.0 + 1e-9) + 1e-15
 
@@ -176,23 +175,23 @@ def osprey(step_ms: float = 2.0, **actuators: list[float]) -> PlantParams:
 
 
 def test_a_scenario_without_actuators_integrates_the_command_to_the_last_bit() -> None:
-    parts, u = osprey(), np.array([0.01, 0.1, -0.02, 0.03])
+    params, u = osprey(), np.array([0.01, 0.1, -0.02, 0.03])
     x: FloatArray = np.linspace(-0.1, 0.1, 8)
-    state = advance(0, AircraftState(x, np.zeros(4)), u, 10 * MS, parts)
+    state = advance(0, AircraftState(x, np.zeros(4)), u, 10 * MS, params)
     for k in range(5):
-        x = rk4(x_dot, k * 2 * MS / NANOSECONDS, x, u, parts.aircraft, 0.002)
+        x = rk4(x_dot, k * 2 * MS / NANOSECONDS, x, u, params.aircraft, 0.002)
     assert (state.x == x).all()
     assert (state.position == u).all()
 
 
 def test_the_plant_behind_a_lag_leads_its_continuous_model_by_half_a_step() -> None:
-    # The position at the end of a step acts during all of it. Of the exact answer of lag and plant together (a fine step)
-    # that is an error of first order: half the step, half the error.
+    # The position at the end of a step acts during the whole step. Against the exact response of lag and plant (a fine step)
+    # this is an error of first order: half the step, half the error.
     u, lag = np.array([0.02, 0.0, 0.03, 0.01]), [0.02, 0.1, 0.02, 0.02]
     runs = {ms: advance(0, plant.initial_state(osprey()), u, 100 * MS, osprey(ms, lag=lag)) for ms in (5.0, 2.5, 0.05)}
     errors = [np.abs(runs[ms].x - runs[0.05].x).max() for ms in (5.0, 2.5)]
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.05)
-    # Early by dt / 2: x(t) behind 2.5 ms steps is x(t + 1.25 ms) of the fine one.
+    # It leads by dt / 2: x(t) with 2.5 ms steps is x(t + 1.25 ms) with the fine step.
     ahead = advance(0, plant.initial_state(osprey()), u, 101 * MS + MS // 4, osprey(0.05, lag=lag))
     assert runs[2.5].x == pytest.approx(ahead.x, abs=0.05 * np.abs(ahead.x - runs[0.05].x).max())
 
@@ -221,13 +220,13 @@ def test_actuators_that_do_not_fit_are_refused_by_name(section: dict[str, list[f
         AircraftParameters.validate_mapping(values, "aircraft")
 
 
-def test_one_channel_may_have_no_limit() -> None:
+def test_a_limit_may_be_infinite_on_one_channel() -> None:
     upper = osprey(upper=[0.5, math.inf, 0.5, 0.5]).actuators.upper
     assert upper is not None
     assert upper.tolist() == [0.5, math.inf, 0.5, 0.5]
 
 
-# The law flown through servos: scenario osprey_servo, of which noise is left out here.
+# Flights through servos: scenario osprey_servo without its noise.
 
 
 @pytest.fixture(scope="module")
@@ -239,42 +238,42 @@ def rms(scenario: Scenario) -> FloatArray:
     """Root mean square of the true error over the whole flight, q, V, p, r in mrad/s and m/s."""
     error = true_error(simulate(scenario))
     assert error is not None
-    return np.array([error_metrics(error[name]).rms * factor for name, factor in SHOWN.items()])
+    return np.array([error_metrics(error[name]).rms * factor for name, factor in FACTORS.items()])
 
 
-def test_the_servo_scenario_softens_the_sign_of_its_own_accord(servo: Scenario) -> None:
+def test_the_servo_scenario_uses_the_softened_sign(servo: Scenario) -> None:
     assert servo.controller.sampled_sign()[0] is Sign.SOFT
 
 
-def test_error_through_servos_in_the_gusts(servo: Scenario) -> None:
+def test_error_through_servos_in_gusts(servo: Scenario) -> None:
     # Measured 7.59, 0.0871, 9.74, 6.38. The prototype that these gains come from: 7.6, 0.088, 9.9, 6.4.
     assert (rms(servo) <= [7.6, 0.088, 9.9, 6.4]).all()
 
 
-def test_error_through_servos_in_calm_air(servo: Scenario) -> None:
+def test_error_through_servos_without_gusts(servo: Scenario) -> None:
     # Measured 1.97, 0.0552, 9.74, 2.19. The prototype: 2.0, 0.058, 9.9, 2.2.
     assert (rms(servo.vary(aircraft={"gusts": {}})) <= [2.0, 0.058, 9.9, 2.2]).all()
 
 
 def test_error_through_servos_with_sensor_noise() -> None:
-    # Measured 7.60, 0.0882, 9.75, 6.44 with the noise of the shipped scenario: the prototype's 7.6, 0.088, 9.9, 6.4 to the
-    # digits that are known of it.
+    # Measured 7.60, 0.0882, 9.75, 6.44 with the noise of the shipped scenario. The prototype: 7.6, 0.088, 9.9, 6.4, to the
+    # digits that are known.
     assert (np.round(rms(find_scenario("osprey_servo")) * [10, 1000, 10, 10]) <= [76, 88, 99, 64]).all()
 
 
 def test_the_softened_sign_leaves_no_limit_cycle_behind_servos(servo: Scenario) -> None:
     tape = simulate(servo)
-    rest = tape.time("u") > 55.0  # gusts and commands are over by 50 s
+    rest = tape.time("u") > 55.0  # gusts and commands end before 50 s
     error = true_error(tape)
     assert error is not None
-    # The literal sign would go on moving every input by beta: 15 deg/s, 60 %/s. What is left here is the spiral's slow end.
+    # The literal sign would keep moving every input by beta: 15 deg/s, 60 %/s. Here the slow spiral mode is left.
     slew = np.abs(np.diff(tape["u"].values[rest], axis=0)).mean(axis=0) / 0.01
     beta = np.array(servo.controller.beta) * np.array(servo.controller.input_scale)
     assert (slew < 0.01 * beta).all()
     assert np.abs(error.values[(error.stamp_ns - tape.start_ns) > 55 * 10**9]).max() < 5e-4
 
 
-def test_without_the_sign_term_the_same_gains_leave_twice_the_error(servo: Scenario) -> None:
+def test_without_the_sign_term_the_same_gains_have_twice_the_error(servo: Scenario) -> None:
     # beta -> 0 leaves a PI controller. Measured 13.5, 0.178, 22.0, 14.2; the prototype: 13.7, 0.178, 22.2, 14.0.
     pi = rms(servo.vary(controller={"beta": [1e-9] * 4}))
     assert pi == pytest.approx([13.7, 0.178, 22.2, 14.0], rel=0.05)
@@ -282,9 +281,9 @@ def test_without_the_sign_term_the_same_gains_leave_twice_the_error(servo: Scena
 
 def test_the_actuators_stay_inside_their_limits_in_flight(servo: Scenario) -> None:
     truth = simulate(servo.vary(flight={"duration": 14.0}))["truth"]
-    moved = truth.group("actuator").values
+    positions = truth.group("actuator").values
     limits = servo.aircraft.actuators
-    assert (moved >= limits.lower).all()
-    assert (moved <= limits.upper).all()
-    assert (np.abs(np.diff(moved, axis=0)) <= np.array(limits.rate) * 0.002 * (1 + 1e-9)).all()
-    assert np.abs(moved).max() > 0.1  # thrust for 1.5 m/s: the limits were asked about something
+    assert (positions >= limits.lower).all()
+    assert (positions <= limits.upper).all()
+    assert (np.abs(np.diff(positions, axis=0)) <= np.array(limits.rate) * 0.002 * (1 + 1e-9)).all()
+    assert np.abs(positions).max() > 0.1  # thrust for 1.5 m/s: the flight uses the actuators

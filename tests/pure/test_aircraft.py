@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated aircraft against exact solutions."""
+"""The simulated aircraft against exact solutions, independent integrators and its own definition."""
 
 import math
 from functools import partial
@@ -35,10 +35,10 @@ def plant(**gusts: dict[str, float]) -> PlantParams:
     return AircraftParameters.validate_mapping(values, "aircraft").plant()
 
 
-def flown(x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, aircraft: Aircraft) -> FloatArray:
-    """State x after a time under a held u, with ideal actuators."""
-    parts = plant()._replace(aircraft=aircraft, step_ns=step_ns)
-    end = advance(0, AircraftState(x, np.zeros_like(u)), u, duration_ns, parts)
+def final_state(x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, aircraft: Aircraft) -> FloatArray:
+    """State x after `duration_ns` with u held and ideal actuators."""
+    params = plant()._replace(aircraft=aircraft, step_ns=step_ns)
+    end = advance(0, AircraftState(x, np.zeros_like(u)), u, duration_ns, params)
     return np.asarray(end.x)
 
 
@@ -53,14 +53,14 @@ def test_without_f_the_plant_follows_the_matrix_exponential() -> None:
     x_0, u = np.linspace(-0.1, 0.1, 8), np.array([0.02, 0.1, -0.01, 0.03])
     block = np.block([[aircraft.A, aircraft.B], [np.zeros((4, 12))]])
     exact = (expm(block * 1.0) @ np.concatenate([x_0, u]))[:8]
-    assert flown(x_0, u, NANOSECONDS, 2 * MS, aircraft) == pytest.approx(exact, abs=1e-8)
+    assert final_state(x_0, u, NANOSECONDS, 2 * MS, aircraft) == pytest.approx(exact, abs=1e-8)
 
 
 def test_halving_the_step_divides_the_integration_error_by_sixteen() -> None:
     aircraft = osprey()
     x_0, u = np.linspace(-0.2, 0.2, 8), np.zeros(4)
-    finest = flown(x_0, u, NANOSECONDS, MS // 4, aircraft)
-    errors = [np.abs(flown(x_0, u, NANOSECONDS, step, aircraft) - finest).max() for step in (20 * MS, 10 * MS)]
+    finest = final_state(x_0, u, NANOSECONDS, MS // 4, aircraft)
+    errors = [np.abs(final_state(x_0, u, NANOSECONDS, step, aircraft) - finest).max() for step in (20 * MS, 10 * MS)]
     assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.15)  # fourth order
 
 
@@ -76,8 +76,8 @@ def test_the_plant_agrees_with_an_adaptive_integrator_through_a_gust() -> None:
         atol=1e-12,
         max_step=0.01,
     )
-    end = flown(np.zeros(8), u, 2 * NANOSECONDS, 2 * MS, aircraft)
-    # The gust's second derivative jumps at its ends, which costs Runge-Kutta an order there.
+    end = final_state(np.zeros(8), u, 2 * NANOSECONDS, 2 * MS, aircraft)
+    # The gust's second derivative jumps at its ends: Runge-Kutta loses an order there.
     assert end == pytest.approx(reference.y[:, -1], abs=1e-6)
 
 
@@ -99,9 +99,9 @@ def test_gust_stays_between_zero_and_its_speed_with_bounded_derivative(speed: fl
 
 
 def test_a_gust_of_speed_zero_is_exactly_no_gust() -> None:
-    calm, zero = osprey(), osprey(vertical={"start": 0.0, "speed": 0.0, "length": 15.24})
+    undisturbed, zero = osprey(), osprey(vertical={"start": 0.0, "speed": 0.0, "length": 15.24})
     x = np.linspace(-0.1, 0.1, 8)
-    assert (dynamics.f(0.5, x, zero) == dynamics.f(0.5, x, calm)).all()
+    assert (dynamics.f(0.5, x, zero) == dynamics.f(0.5, x, undisturbed)).all()
 
 
 def test_gravity_and_lateral_coupling_enter_as_published() -> None:
@@ -131,12 +131,12 @@ def test_truth_holds_the_state_the_disturbance_and_the_actuators() -> None:
     names = truth.names(parameters.load()[0])
     state = AircraftState(np.arange(8.0) / 100, np.array([0.1, 0.2, 0.3, 0.4]))
     now = dynamics.at_times(np.array([0.4]), parameters.plant().aircraft)
-    shown = dict(zip(names, truth.values(state, now.wind[0], now.rate[0], parameters.plant()), strict=True))
-    assert shown["x.phi"] == 0.07
-    assert shown["gust.vertical"] == pytest.approx(2.0)  # s = 25 0.4 = H
-    assert shown["gust.lateral"] == shown["gust.longitudinal"] == 0.0  # every axis that the airframe knows
-    assert shown["actuator.thrust"] == 0.2
-    assert shown["f.V"] == pytest.approx(-9.81 * math.sin(0.03) - 11.1 * 2.0 / 25)
+    true = dict(zip(names, truth.values(state, now.wind[0], now.rate[0], parameters.plant()), strict=True))
+    assert true["x.phi"] == 0.07
+    assert true["gust.vertical"] == pytest.approx(2.0)  # s = 25 0.4 = H
+    assert true["gust.lateral"] == true["gust.longitudinal"] == 0.0  # every axis of the airframe's gusts
+    assert true["actuator.thrust"] == 0.2
+    assert true["f.V"] == pytest.approx(-9.81 * math.sin(0.03) - 11.1 * 2.0 / 25)
 
 
 EVERYTHING = {
@@ -153,24 +153,24 @@ EVERYTHING = {
 }
 
 
-def test_steps_taken_together_are_runge_kutta_steps_of_equation_1() -> None:
-    # x_dot is the definition; advance takes what depends on time at all instants together. Measured 1e-16 over 20 steps.
+def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() -> None:
+    # x_dot is the definition; advance computes f_time at all instants together. Measured difference 1e-16 over 20 steps.
     values = {"airframe": "osprey", "rate": 25.0, "step": 0.002} | EVERYTHING
-    parts = AircraftParameters.validate_mapping(values, "aircraft").plant()
-    air = parts.turbulence
-    assert air is not None
+    params = AircraftParameters.validate_mapping(values, "aircraft").plant()
+    filters = params.turbulence
+    assert filters is not None
     u, T = np.array([0.05, 0.1, -0.04, 0.03]), 20
-    state = initial_state(parts)._replace(x=np.linspace(-0.5, 0.5, 8))
-    end = advance(7 * 40 * MS, state, u, 40 * MS, parts)
+    state = initial_state(params)._replace(x=np.linspace(-0.5, 0.5, 8))
+    end = advance(7 * 40 * MS, state, u, 40 * MS, params)
 
     x, position, z = state
-    for k, normal in enumerate(turbulence.normals(7 * T, T, air.seed)):
+    for k, normal in enumerate(turbulence.normals(7 * T, T, filters.seed)):
         t = 0.28 + 0.002 * k
-        moved = actuators.step(position, u, 0.002, parts.actuators)
-        position = actuators.apply_faults(t, position, moved, parts.actuators)
-        x_dot = partial(dynamics.x_dot, turbulence=turbulence.wind(z, air))
-        x = rk4(x_dot, t, x, position, parts.aircraft, 0.002)
-        z = turbulence.step(z, normal, air)
+        moved = actuators.step(position, u, 0.002, params.actuators)
+        position = actuators.apply_faults(t, position, moved, params.actuators)
+        x_dot = partial(dynamics.x_dot, turbulence=turbulence.wind(z, filters))
+        x = rk4(x_dot, t, x, position, params.aircraft, 0.002)
+        z = turbulence.step(z, normal, filters)
     assert end.x == pytest.approx(x, rel=1e-13, abs=1e-15)
     assert (end.position == position).all()
     assert np.asarray(end.turbulence).tobytes() == np.asarray(z).tobytes()
@@ -183,23 +183,27 @@ def test_equation_1_is_the_sum_of_its_parts() -> None:
     x, u, turbulent = np.linspace(-0.3, 0.3, 8), np.array([0.01, 0.1, 0.02, 0.03]), np.array([0.5, -1.0, 2.0])
     x_dot = dynamics.x_dot(0.3, x, u, aircraft, turbulent)
     assert x_dot == pytest.approx(aircraft.A @ x + dynamics.f(0.3, x, aircraft, turbulent) + aircraft.B @ u, abs=1e-14)
-    calm = dynamics.f(0.3, x, aircraft)
-    assert dynamics.f(0.3, x, aircraft, turbulent) - calm == pytest.approx(aircraft.gust_direction @ turbulent, abs=1e-14)
+    undisturbed = dynamics.f(0.3, x, aircraft)
+    assert dynamics.f(0.3, x, aircraft, turbulent) - undisturbed == pytest.approx(
+        aircraft.gust_direction @ turbulent, abs=1e-14
+    )
 
 
-def test_states_in_columns_have_the_f_of_each() -> None:
+def test_f_of_states_in_columns_is_f_of_each_state() -> None:
     aircraft = plant(vertical={"start": 0.0, "speed": 10.0, "length": 15.0}).aircraft
     coupling = AircraftParameters.validate_mapping(
         {"airframe": "osprey", "rate": 25.0, "step": 0.002, "inertial_coupling": 1.0}, "aircraft"
     )
-    together = aircraft._replace(coupling=coupling.load()[1].coupling, gusts=Gusts(*(one[:, None] for one in aircraft.gusts)))
-    alone = together._replace(gusts=aircraft.gusts)
+    batched = aircraft._replace(
+        coupling=coupling.load()[1].coupling, gusts=Gusts(*(values[:, None] for values in aircraft.gusts))
+    )
+    single = batched._replace(gusts=aircraft.gusts)
     columns = np.random.default_rng(1).uniform(-1.0, 1.0, (8, 5))
-    f = dynamics.f(0.3, columns, together)
+    f = dynamics.f(0.3, columns, batched)
     for k in range(5):
-        assert f[:, k] == pytest.approx(dynamics.f(0.3, columns[:, k], alone), abs=1e-14)
+        assert f[:, k] == pytest.approx(dynamics.f(0.3, columns[:, k], single), abs=1e-14)
 
 
 def test_a_step_that_does_not_divide_the_time_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"step: found 0\.003 s, expected a whole fraction of the duration \(0\.01 s\)"):
-        flown(np.zeros(8), np.zeros(4), 10 * MS, 3 * MS, osprey())
+        final_state(np.zeros(8), np.zeros(4), 10 * MS, 3 * MS, osprey())

@@ -35,7 +35,7 @@ D_AS_PUBLISHED: Mapping[str, tuple[float, ...]] = {
     "navion_longitudinal": (-1, 1),
     "osprey": (1, 1, 1, 1),
 }
-"""By the sign convention of each source: + on an input is not + on its rate. Outputs p, r or q, V (osprey q, V, p, r)."""
+"""D by the signs of each source: a positive input may give a negative rate. Outputs p, r or q, V (osprey q, V, p, r)."""
 
 COUPLING_IN_PUBLISHED_UNITS = {
     "aerosonde_first_edition_lateral": 13.6,  # C_n_da = 0.06: the aileron yaws four times as strongly as the rudder
@@ -71,7 +71,7 @@ def test_the_library_is_the_nine_airframes_of_the_table() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_airframe_says_where_it_is_from_and_what_plus_does(name: str) -> None:
+def test_every_airframe_states_its_source_and_its_signs(name: str) -> None:
     airframe = load_airframe(name)
     assert "memory" in airframe.source or "computed" in airframe.source
     directions = {"nose up", "nose down", "nose left", "nose right", "roll left", "roll right"}
@@ -83,21 +83,21 @@ def test_every_airframe_says_where_it_is_from_and_what_plus_does(name: str) -> N
 def test_the_sign_in_words_is_the_sign_of_the_diagonal_of_omega(name: str) -> None:
     airframe = load_airframe(name)
     facts = airframe_facts(airframe)
-    words = [i.positive for i in airframe.inputs.values()]
-    expected = [-1.0 if text in ("nose down", "nose left", "roll left") else 1.0 for text in words]
+    signs = [i.positive for i in airframe.inputs.values()]
+    expected = [-1.0 if text in ("nose down", "nose left", "roll left") else 1.0 for text in signs]
     np.testing.assert_array_equal(np.sign(np.diag(facts.Omega)), expected)
 
 
 @pytest.mark.parametrize("name", PUBLISHED_POLES)
 def test_poles_are_the_published_ones(name: str) -> None:
-    # The sources print two to four digits, of matrices that they print to two or three: 2 % of the pole, or the last digit.
+    # Sources print poles to two to four digits, matrices to two or three. Tolerance: 2 % of the pole, or the last digit.
     expected = np.sort_complex(np.array(PUBLISHED_POLES[name], dtype=np.complex128))
     found = np.sort_complex(airframe_facts(load_airframe(name)).poles)
     assert np.all(np.abs(found - expected) <= np.maximum(0.02 * np.abs(expected), 1e-3))
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_d_of_the_published_signs_is_the_table(name: str) -> None:
+def test_d_of_the_published_signs_matches_the_table(name: str) -> None:
     np.testing.assert_array_equal(airframe_facts(load_airframe(name)).D, D_AS_PUBLISHED[name])
 
 
@@ -111,7 +111,7 @@ def test_flipping_inputs_alone_gives_every_airframe_d_equal_to_one(name: str) ->
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_coupling_in_published_units_is_the_table(name: str) -> None:
+def test_coupling_in_published_units_matches_the_table(name: str) -> None:
     airframe = load_airframe(name)
     found = coupling(airframe.matrix_c() @ np.array(airframe.B))
     assert found == pytest.approx(COUPLING_IN_PUBLISHED_UNITS[name], abs=0.05 if name.startswith("aerosonde_first") else 0.006)
@@ -127,7 +127,7 @@ def test_coupling_depends_on_the_unit_of_speed(name: str, published: float, si: 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_airframe_is_in_the_theorem_with_zero_dynamics_that_only_an_outer_loop_bounds(name: str) -> None:
-    # theta (longitudinal) and phi (lateral) integrate the rates: a zero at the origin each, never strictly stable.
+    # theta (longitudinal) and phi (lateral) integrate the rates. Each gives a zero at the origin: never strictly stable.
     facts = airframe_facts(load_airframe(name))
     angles = [state for state in load_airframe(name).states if state in ("theta", "phi")]
     assert facts.controllable
@@ -139,9 +139,9 @@ def test_every_airframe_is_in_the_theorem_with_zero_dynamics_that_only_an_outer_
 
 
 def test_zeros_of_the_osprey() -> None:
-    found = airframe_facts(load_airframe("osprey")).zeros
+    zeros = airframe_facts(load_airframe("osprey")).zeros
     # -0.69 is Y_beta; -7.19 is Z_alpha with the elevator that holds q.
-    np.testing.assert_allclose(found, [-7.188, -0.69, 0.0, 0.0], atol=5e-4)
+    np.testing.assert_allclose(zeros, [-7.188, -0.69, 0.0, 0.0], atol=5e-4)
 
 
 def test_minors_are_of_omega_in_si() -> None:
@@ -150,7 +150,7 @@ def test_minors_are_of_omega_in_si() -> None:
     np.testing.assert_allclose(facts.minors, per_degree / np.deg2rad(1.0) ** np.array([1, 2]), rtol=1e-12)
 
 
-def test_remedies_in_words() -> None:
+def test_remedies() -> None:
     remedies = {facts.name: facts.remedy for facts in library()}
     assert remedies["osprey"] == "none needed"
     assert remedies["f16_lateral"] == "flip aileron, rudder"
@@ -158,7 +158,7 @@ def test_remedies_in_words() -> None:
 
 
 def test_the_foot_is_exact() -> None:
-    # 1 ft = 0.3048 m by the agreement of 1959, not to a tolerance.
+    # 1 ft = 0.3048 m by definition (1959).
     assert SI_PER_UNIT["ft/s"] == 0.3048
 
 
@@ -232,14 +232,14 @@ def toy(k: float) -> Airframe:
     ("k", "zero", "kind"),
     [(3.0, -2.0, ZeroDynamics.STABLE), (1.0, 0.0, ZeroDynamics.MARGINAL), (0.5, 0.5, ZeroDynamics.UNSTABLE)],
 )
-def test_zero_dynamics_are_told_apart(k: float, zero: float, kind: ZeroDynamics) -> None:
+def test_zero_dynamics_are_classified_by_their_zeros(k: float, zero: float, kind: ZeroDynamics) -> None:
     facts = airframe_facts(toy(k))
     np.testing.assert_allclose(facts.zeros, [zero], atol=1e-12)
     assert facts.zero_dynamics is kind
     assert facts.in_theorem is (kind is not ZeroDynamics.UNSTABLE)
 
 
-def test_zeros_on_the_imaginary_axis_are_marginal_and_none_at_all_is_stable() -> None:
+def test_zeros_on_the_imaginary_axis_are_marginal_and_no_zeros_are_stable() -> None:
     pair: ComplexArray = np.array([-1j, 1j])
     assert zero_dynamics(pair) is ZeroDynamics.MARGINAL
     assert zero_dynamics(pair[:0]) is ZeroDynamics.STABLE
@@ -261,10 +261,10 @@ def test_an_airframe_without_s_d_u_has_no_d_and_no_remedy() -> None:
     assert not facts.in_theorem
 
 
-def test_an_input_that_drives_another_output_is_paired_anew_in_words() -> None:
+def test_an_input_that_drives_another_output_gets_a_new_pairing() -> None:
     osprey = load_airframe("osprey")
     swapped = [[row[0], row[1], row[3], row[2]] for row in osprey.B]
-    swapped[osprey.index("p")][2] = 0.0  # what is called aileron does nothing but yaw
+    swapped[osprey.index("p")][2] = 0.0  # the input named aileron only yaws
     facts = airframe_facts(osprey.model_copy(update={"B": swapped}))
     assert facts.D is None
     assert facts.remedy == "pair q-elevator, V-thrust, p-rudder, r-aileron"
@@ -278,8 +278,8 @@ def test_zeros_do_not_depend_on_the_coordinates_of_the_state() -> None:
     for _ in range(50):
         T = generator.standard_normal((8, 8))
         if np.linalg.cond(T) > 100.0:
-            continue  # beyond that the rounding of T itself, not the zeros, is what is measured
+            continue  # beyond that the result measures the rounding of T, not the zeros
         found = invariant_zeros(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T))
-        assert len(found) == 4  # dense coordinates let rounding bring infinite zeros in: none may pass for a finite one
+        assert len(found) == 4  # rounding in dense coordinates must not turn infinite zeros into finite ones
         np.testing.assert_allclose(np.sort(found.real), np.sort(expected.real), atol=1e-6)
         assert controllable(T @ A @ np.linalg.inv(T), T @ B)

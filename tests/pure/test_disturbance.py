@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Gusts, biases, sines and inertial coupling: their formulas, what Assumption 2 says of them, and that off is off."""
+"""Gusts, biases, sines and inertial coupling: formulas, Assumption 2, and exactly no effect with amplitude 0."""
 
 import math
 from collections.abc import Callable
@@ -28,8 +28,8 @@ MS = 1_000_000
 V0 = 25.0
 
 
-def one(kind: Any, *values: float) -> Any:
-    """A set of arrays of one element each."""
+def single(kind: Any, *values: float) -> Any:
+    """Arrays of one element each."""
     return kind(*(np.array([value]) for value in values))
 
 
@@ -50,26 +50,28 @@ def aircraft(**section: Any) -> Aircraft:
         (107.0 / 0.3048, 56.0, 1.0, 56.028),  # the longest, in the figures of CS-25
     ],
 )
-def test_the_design_gust_is_that_of_25_341(feet: float, reference_fps: float, alleviation: float, expected_fps: float) -> None:
-    found = design_gust_speed(feet * 0.3048, reference_fps * 0.3048, alleviation)
-    assert found / 0.3048 == pytest.approx(expected_fps, rel=1e-4)
+def test_the_design_gust_speed_is_that_of_25_341(
+    feet: float, reference_fps: float, alleviation: float, expected_fps: float
+) -> None:
+    speed = design_gust_speed(feet * 0.3048, reference_fps * 0.3048, alleviation)
+    assert speed / 0.3048 == pytest.approx(expected_fps, rel=1e-4)
 
 
 @given(H=st.floats(9.144, 106.68), reference=st.floats(6.0, 17.07), alleviation=st.floats(0.5, 1.0))
 def test_a_gust_has_the_peak_and_the_length_of_the_formula(H: float, reference: float, alleviation: float) -> None:
     peak = reference * alleviation * (H * 3.280839895 / 350.0) ** (1.0 / 6.0)
-    gust = one(Gusts, 40.0, design_gust_speed(H, reference, alleviation), H)
+    gust = single(Gusts, 40.0, design_gust_speed(H, reference, alleviation), H)
 
     def w(s: float) -> float:
         return float(one_minus_cosine(np.array(40.0 + s / V0), gust, np.array(V0))[0])
 
-    # U_ds/2 (1 - cos(pi s/H)): U_ds at H, half of it at H/2 and 3H/2, nothing at 0 and from 2H on.
-    found = [w(share * H) for share in (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)]
-    assert found == pytest.approx([0.0, 0.5 * peak, peak, 0.5 * peak, 0.0, 0.0], rel=1e-6, abs=1e-9)
+    # U_ds/2 (1 - cos(pi s/H)): U_ds at H, half of it at H/2 and 3H/2, zero at 0 and from 2H on.
+    speeds = [w(distance * H) for distance in (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)]
+    assert speeds == pytest.approx([0.0, 0.5 * peak, peak, 0.5 * peak, 0.0, 0.0], rel=1e-6, abs=1e-9)
 
 
-def test_wind_along_an_axis_takes_the_airspeed_with_it() -> None:
-    # x_rel = x - w: minus the column of V, of beta = v / V0 and, as published to three digits, of alpha = w / V0.
+def test_wind_along_an_axis_changes_the_relative_velocity() -> None:
+    # x_rel = x - w gives minus the column of V, of beta = v / V0 and, published to three digits, of alpha = w / V0.
     osprey = load_airframe("osprey")
     A = osprey.matrix_a()
     assert osprey.gust_direction("longitudinal") == pytest.approx(-A[:, osprey.index("V")])
@@ -78,7 +80,7 @@ def test_wind_along_an_axis_takes_the_airspeed_with_it() -> None:
     assert set(osprey.gusts) == set(AXES)
 
 
-def test_an_airframe_file_names_the_axes_of_the_wind() -> None:
+def test_an_unknown_wind_axis_in_an_airframe_file_is_refused() -> None:
     values = load_airframe("osprey").model_dump()
     with pytest.raises(
         ParameterError, match=r"gusts\.up: found 'up', expected an axis of the wind: longitudinal, lateral, vert"
@@ -90,7 +92,7 @@ def test_an_airframe_file_names_the_axes_of_the_wind() -> None:
 
 
 def test_a_bias_rises_along_half_a_cosine_and_stays() -> None:
-    params = one(Bias, 2.0, 0.3, 4.0)
+    params = single(Bias, 2.0, 0.3, 4.0)
     at = [float(bias(np.array(t), params)[0]) for t in (0.0, 2.0, 3.0, 4.0, 5.0, 6.0, 60.0)]
     # 0.15 (1 - cos(pi s)) at s = 0, 1/4, 1/2, 3/4, 1
     assert at == pytest.approx(
@@ -99,24 +101,24 @@ def test_a_bias_rises_along_half_a_cosine_and_stays() -> None:
 
 
 def test_a_bias_without_a_rise_is_a_step() -> None:
-    params = one(Bias, 2.0, 0.3, 0.0)
+    params = single(Bias, 2.0, 0.3, 0.0)
     assert [float(bias(np.array(t), params)[0]) for t in (0.0, 2.0, 2.0 + 1e-9, 9.0)] == [0.0, 0.0, 0.3, 0.3]
 
 
-def test_a_sine_is_a_sine() -> None:
-    params = one(Sines, 0.2, 3.0, 0.5)
+def test_a_sine_follows_its_formula() -> None:
+    params = single(Sines, 0.2, 3.0, 0.5)
     assert [float(sines(np.array(t), params)[0]) for t in (0.0, 1.7)] == pytest.approx(
         [0.2 * math.sin(0.5), 0.2 * math.sin(5.6)]
     )
 
 
 def test_biases_and_sines_act_on_the_state_they_name() -> None:
-    given_parts = aircraft(
+    params = aircraft(
         bias={"q": {"start": 1.0, "value": 0.3, "rise": 0.0}, "V": {"start": 0.0, "value": -2.0, "rise": 1.0}},
         sines={"r": {"amplitude": 0.1, "frequency": 2.0}, "q": {"amplitude": 0.2, "frequency": 1.0, "phase": 1.0}},
     )
     osprey = load_airframe("osprey")
-    f = dict(zip(osprey.states, dynamics.f(3.0, np.zeros(8), given_parts), strict=True))
+    f = dict(zip(osprey.states, dynamics.f(3.0, np.zeros(8), params), strict=True))
     assert f["q"] == pytest.approx(0.3 + 0.2 * math.sin(4.0))
     assert f["V"] == pytest.approx(-2.0)
     assert f["r"] == pytest.approx(0.1 * math.sin(6.0))
@@ -126,28 +128,28 @@ def test_biases_and_sines_act_on_the_state_they_name() -> None:
 # Assumption 2: f in C1, f and f_dot bounded
 
 Disturbance = Callable[[FloatArray], FloatArray]
-GUST: Gusts = one(Gusts, 2.0, 10.0, 15.0)
-SMOOTH: dict[str, tuple[Disturbance, float, float]] = {  # with the largest derivative, and the largest second one
+GUST: Gusts = single(Gusts, 2.0, 10.0, 15.0)
+SMOOTH: dict[str, tuple[Disturbance, float, float]] = {  # the function, its largest derivative, its largest second derivative
     "gust": (lambda t: one_minus_cosine(t, GUST, np.array(V0)), 5.0 * math.pi * V0 / 15.0, 5.0 * (math.pi * V0 / 15.0) ** 2),
-    "bias": (lambda t: bias(t, one(Bias, 2.0, 10.0, 0.6)), 5.0 * math.pi / 0.6, 5.0 * (math.pi / 0.6) ** 2),
-    "sine": (lambda t: sines(t, one(Sines, 10.0, 4.0, 1.0)), 40.0, 160.0),
+    "bias": (lambda t: bias(t, single(Bias, 2.0, 10.0, 0.6)), 5.0 * math.pi / 0.6, 5.0 * (math.pi / 0.6) ** 2),
+    "sine": (lambda t: sines(t, single(Sines, 10.0, 4.0, 1.0)), 40.0, 160.0),
 }
 
 
 @pytest.mark.parametrize("name", SMOOTH)
 def test_gusts_sines_and_biases_with_a_rise_meet_assumption_2(name: str) -> None:
-    # A derivative that is bounded by d1 and changes by at most d2 dt in dt is continuous. Second differences beyond 2 ms round.
+    # A derivative bounded by d1 that changes by at most d2 dt in dt is continuous. Below 2 ms second differences are rounding.
     value, first, second = SMOOTH[name]
     for dt in (0.02, 0.002):
         d = value(np.arange(0.0, 5.0, dt))
         assert np.abs(np.diff(d)).max() <= first * dt * (1.0 + 1e-9)
         assert np.abs(np.diff(d, 2)).max() <= second * dt**2 * (1.0 + 1e-6)
-        assert np.abs(np.diff(d, 2)).max() > 0.5 * second * dt**2  # the bound is not an empty one
+        assert np.abs(np.diff(d, 2)).max() > 0.5 * second * dt**2  # the limit is tight
 
 
 def test_a_bias_without_a_rise_lies_outside_assumption_2() -> None:
-    # The largest difference does not fall with dt: no derivative bounds it.
-    step = one(Bias, 2.0, 10.0, 0.0)
+    # The largest difference does not fall with dt, so the derivative is unbounded.
+    step = single(Bias, 2.0, 10.0, 0.0)
     assert [np.abs(np.diff(bias(np.arange(0.0, 5.0, dt), step))).max() for dt in (0.02, 0.002, 0.0002)] == [10.0] * 3
 
 
@@ -162,28 +164,28 @@ OUTSIDE: dict[str, dict[str, Any]] = {
 
 
 def largest(disturbed: dict[str, Any], rate: float, scenario: Scenario) -> FloatArray:
-    """The largest errors of q and r of the default law at a rate, in 6 s without commands and gusts, mrad/s."""
-    quiet = scenario.vary(
+    """The largest errors of q and r with the default law at a rate, in 6 s without commands and gusts, mrad/s."""
+    no_commands = scenario.vary(
         aircraft={"gusts": {}, "rate": 400.0, "step": 0.0025} | disturbed,
         reference_model={"rate": 400.0, "pulses": {}},
         controller={"rate": rate, "delay": 0.0},
         flight={"duration": 6.0},
     )
-    error = true_error(simulate(quiet))
+    error = true_error(simulate(no_commands))
     assert error is not None
     return 1e3 * np.array([np.abs(error[name]).max() for name in ("q", "r")])
 
 
 @pytest.mark.parametrize("name", INSIDE)
 def test_inside_assumption_2_the_error_falls_with_the_square_of_the_period(name: str, osprey_gust: Scenario) -> None:
-    # Measured in q at 100 and 200 Hz: 1.00 and 0.25 mrad/s in the sine, 1.56 and 0.39 at the bias.
+    # Measured in q at 100 and 200 Hz: 1.00 and 0.25 mrad/s with the sine, 1.56 and 0.39 with the bias.
     coarse, fine = (largest(INSIDE[name], rate, osprey_gust)[0] for rate in (100.0, 200.0))
     assert coarse / fine == pytest.approx(4.0, rel=0.05)
 
 
 @pytest.mark.parametrize(("name", "channel"), [("step", 0), ("turbulence", 1)])
 def test_outside_assumption_2_a_shorter_period_does_not_help(name: str, channel: int, osprey_gust: Scenario) -> None:
-    # Measured at 100 and 200 Hz: 35.3 and 32.6 mrad/s in q at the step, 63 and 61 in r in light turbulence at 100 m.
+    # Measured at 100 and 200 Hz: 35.3 and 32.6 mrad/s in q with the step, 63 and 61 in r in light turbulence at 100 m.
     coarse, fine = (largest(OUTSIDE[name], rate, osprey_gust)[channel] for rate in (100.0, 200.0))
     assert coarse / fine < 1.2
 
@@ -191,11 +193,11 @@ def test_outside_assumption_2_a_shorter_period_does_not_help(name: str, channel:
 # Inertial coupling
 
 INERTIA = np.array([[0.8244, 0.0, -0.1204], [0.0, 1.135, 0.0], [-0.1204, 0.0, 1.759]])  # Aerosonde, kg m^2
-PQR = [5, 2, 6]  # places of p, q, r in the state of the osprey
+PQR = [5, 2, 6]  # indices of p, q, r in the state of the osprey
 
 
 def coupled(scale: float) -> Aircraft:
-    """Nothing but the inertial coupling: no A, B and gravity."""
+    """The inertial coupling alone, without A, B and gravity."""
     whole = aircraft(inertial_coupling=scale)
     return whole._replace(A=0.0 * whole.A, B=0.0 * whole.B, gravity=0.0 * whole.gravity)
 
@@ -214,12 +216,12 @@ def test_the_coupling_is_that_of_eulers_equations() -> None:
 
 
 def test_free_rotation_keeps_energy_and_angular_momentum() -> None:
-    # Ten seconds of tumbling at 2 rad/s, against an adaptive integrator of the vector equation, and against what is conserved.
-    w = np.array([0.3, 2.0, -0.4])  # about the middle axis, which is unstable: it turns over
+    # Ten seconds of tumbling at 2 rad/s, against an adaptive integrator of the vector equation and the conserved quantities.
+    w = np.array([0.3, 2.0, -0.4])  # about the intermediate axis, which is unstable: the body turns over
     x: FloatArray = np.zeros(8)
     x[PQR] = w
-    parts = AircraftParameters.validate_mapping({"airframe": "osprey", "rate": 100.0, "step": 0.002}, "aircraft").plant()
-    free = parts._replace(aircraft=coupled(1.0))
+    params = AircraftParameters.validate_mapping({"airframe": "osprey", "rate": 100.0, "step": 0.002}, "aircraft").plant()
+    free = params._replace(aircraft=coupled(1.0))
     exact = solve_ivp(
         lambda _, w: np.linalg.solve(INERTIA, -np.cross(w, INERTIA @ w)), (0.0, 10.0), w, rtol=1e-11, atol=1e-12, max_step=0.01
     )
@@ -230,9 +232,9 @@ def test_free_rotation_keeps_energy_and_angular_momentum() -> None:
         assert kept(end) == pytest.approx(kept(w), rel=1e-5)
 
 
-# Off is off, to the last bit
+# Amplitude 0 has no effect, to the last bit
 
-FLOWN: dict[str, Any] = {
+BASELINE: dict[str, Any] = {
     "gusts": {
         "vertical": {"start": 0.5, "speed": 5.0, "length": 15.0},
         "lateral": {"start": 0.8, "speed": 2.0, "length": 10.0},
@@ -266,16 +268,16 @@ SECTIONS: dict[str, tuple[str, Any, Any]] = {  # section, off, on
 
 
 @pytest.fixture(scope="module")
-def calm(osprey_gust: Scenario) -> Scenario:
-    """1.2 s of the default flight with servos, noise and two gusts, but without what is tried here."""
+def baseline(osprey_gust: Scenario) -> Scenario:
+    """1.2 s of the default flight with servos, noise and two gusts, without the disturbances under test."""
     slow = {"rate": 100.0, "step": 0.005}
-    return osprey_gust.vary(aircraft=FLOWN | slow, reference_model={"rate": 100.0}, flight={"duration": 1.2})
+    return osprey_gust.vary(aircraft=BASELINE | slow, reference_model={"rate": 100.0}, flight={"duration": 1.2})
 
 
 @pytest.fixture(scope="module")
-def without(calm: Scenario) -> dict[str, bytes]:
-    """What that flight publishes."""
-    return published(calm)
+def baseline_bytes(baseline: Scenario) -> dict[str, bytes]:
+    """The topics of the baseline flight."""
+    return published(baseline)
 
 
 def published(scenario: Scenario) -> dict[str, bytes]:
@@ -283,14 +285,14 @@ def published(scenario: Scenario) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", SECTIONS)
-def test_amplitude_zero_is_exactly_off(name: str, calm: Scenario, without: dict[str, bytes]) -> None:
+def test_amplitude_zero_has_exactly_no_effect(name: str, baseline: Scenario, baseline_bytes: dict[str, bytes]) -> None:
     section, off, on = SECTIONS[name]
 
     def vary(value: Any) -> Scenario:
-        return calm.vary(aircraft={section: FLOWN.get(section, {}) | value if isinstance(value, dict) else value})
+        return baseline.vary(aircraft={section: BASELINE.get(section, {}) | value if isinstance(value, dict) else value})
 
-    assert published(vary(off)) == without
-    assert published(vary(on)) != without
+    assert published(vary(off)) == baseline_bytes
+    assert published(vary(on)) != baseline_bytes
 
 
 STEP = {"start": 0.0, "value": 1.0, "rise": 0.0}
@@ -315,7 +317,7 @@ STEP = {"start": 0.0, "value": 1.0, "rise": 0.0}
         ),
     ],
 )
-def test_disturbances_that_do_not_fit_are_refused_by_name(values: dict[str, Any], sentence: str) -> None:
+def test_invalid_disturbances_are_refused_by_name(values: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"^aircraft.{sentence}"):
         AircraftParameters.validate_mapping({"airframe": "osprey", "rate": 100.0, "step": 0.002} | values, "aircraft")
 
@@ -334,7 +336,7 @@ def test_disturbances_that_do_not_fit_are_refused_by_name(values: dict[str, Any]
         ({"into": "w", "product": ["q", "p"], "gain": 1.0}, r"inertial_coupling\[0\]\.into: found 'w', expected a state"),
     ],
 )
-def test_products_that_do_not_fit_are_refused_by_name(term: dict[str, Any], sentence: str) -> None:
+def test_invalid_products_are_refused_by_name(term: dict[str, Any], sentence: str) -> None:
     values = load_airframe("osprey").model_dump() | {"inertial_coupling": [term]}
     with pytest.raises(ParameterError, match=sentence):
         Airframe.validate_mapping(values, "airframe")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Noise, loss and delay of samples: their statistics, their repeatability, and what they do to a flight."""
+"""Sensor noise, bias, drift, quantisation, dropout and transport delay: statistics, repeatability, effect on a flight."""
 
 from typing import Any
 
@@ -9,11 +9,11 @@ import pytest
 
 from aircraft_sim import sensors as sensor_maths
 from aircraft_sim.params import AircraftParameters
-from aircraft_sim.sensors import Drift, Sensors, DelayLine, arrives, initial_drift, measure, noise, transmit, walk
-from aircraft_sim.simulator import StateSpaceModel, Simulator
+from aircraft_sim.sensors import DelayLine, Drift, Sensors, arrives, initial_drift, measure, noise, transmit, walk
+from aircraft_sim.simulator import Simulator, StateSpaceModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import error_metrics, best_error, tracking_error, true_error
+from flight_analysis.metrics import best_error, error_metrics, tracking_error, true_error
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
@@ -21,9 +21,9 @@ from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard
 
 MS = 1_000_000
-SHOWN = {"q": 1e3, "V": 1.0, "p": 1e3, "r": 1e3}  # mrad/s, m/s
+FACTORS = {"q": 1e3, "V": 1.0, "p": 1e3, "r": 1e3}  # mrad/s, m/s
 NOISE = [0.0017, 0.03, 0.0017, 0.0017]
-MANY = 20_000
+COUNT = 20_000  # samples
 
 
 def sensors(std: list[float], delay_ms: int = 0, dropout: float = 0.0, seed: int = 1) -> Sensors:
@@ -31,47 +31,47 @@ def sensors(std: list[float], delay_ms: int = 0, dropout: float = 0.0, seed: int
 
 
 @pytest.fixture(scope="module")
-def drawn() -> FloatArray:
-    """Many samples of four channels of standard deviation 1."""
-    return np.array([noise(k, sensors([1.0] * 4)) for k in range(MANY)])
+def samples() -> FloatArray:
+    """COUNT samples of four channels of standard deviation 1."""
+    return np.array([noise(k, sensors([1.0] * 4)) for k in range(COUNT)])
 
 
-def test_noise_has_mean_zero_and_the_variance_asked_for(drawn: FloatArray) -> None:
-    # For N samples the mean scatters by 1/sqrt(N), the variance by sqrt(2/N). Four of these: true in 99.95 % of seeds,
-    # four channels of mean and variance together; the seed is fixed, so it holds always or never.
-    assert np.abs(drawn.mean(axis=0)).max() < 4.0 / np.sqrt(MANY)
-    assert np.abs(drawn.var(axis=0) - 1.0).max() < 4.0 * np.sqrt(2.0 / MANY)
+def test_noise_has_mean_zero_and_the_specified_variance(samples: FloatArray) -> None:
+    # For N samples the standard deviation of the mean is 1/sqrt(N), that of the variance sqrt(2/N). Four of these hold in
+    # 99.95 % of seeds for four channels of mean and variance together. The seed is fixed: the test is deterministic.
+    assert np.abs(samples.mean(axis=0)).max() < 4.0 / np.sqrt(COUNT)
+    assert np.abs(samples.var(axis=0) - 1.0).max() < 4.0 * np.sqrt(2.0 / COUNT)
     scaled = np.array([noise(k, sensors(NOISE)) for k in range(5)])
-    assert (scaled == drawn[:5] * NOISE).all()
+    assert (scaled == samples[:5] * NOISE).all()
 
 
-def test_noise_is_gaussian(drawn: FloatArray) -> None:
-    # Shares within one, two and three standard deviations; each scatters by sqrt(p (1 - p) / N), at most 0.0017.
-    shares = [np.mean(np.abs(drawn) < k) for k in (1, 2, 3)]
-    assert shares == pytest.approx([0.6827, 0.9545, 0.9973], abs=4 * 0.0017)
+def test_noise_is_gaussian(samples: FloatArray) -> None:
+    # Fractions within one, two and three standard deviations; each has standard deviation sqrt(p (1 - p) / N) <= 0.0017.
+    fractions = [np.mean(np.abs(samples) < k) for k in (1, 2, 3)]
+    assert fractions == pytest.approx([0.6827, 0.9545, 0.9973], abs=4 * 0.0017)
 
 
-def test_noise_is_white_over_samples_and_channels(drawn: FloatArray) -> None:
-    # A correlation of independent samples scatters by 1/sqrt(N).
-    between_samples = (drawn[1:] * drawn[:-1]).mean(axis=0)
-    between_channels = (drawn.T @ drawn / MANY)[np.triu_indices(4, 1)]
-    assert np.abs(np.concatenate([between_samples, between_channels])).max() < 4.0 / np.sqrt(MANY)
+def test_noise_is_white_over_samples_and_channels(samples: FloatArray) -> None:
+    # The correlation of independent samples has standard deviation 1/sqrt(N).
+    between_samples = (samples[1:] * samples[:-1]).mean(axis=0)
+    between_channels = (samples.T @ samples / COUNT)[np.triu_indices(4, 1)]
+    assert np.abs(np.concatenate([between_samples, between_channels])).max() < 4.0 / np.sqrt(COUNT)
 
 
-def test_sample_k_has_the_same_noise_whatever_was_asked_before() -> None:
+def test_the_noise_of_sample_k_does_not_depend_on_earlier_calls() -> None:
     params = sensors(NOISE)
-    alone = noise(1234, params)
+    first = noise(1234, params)
     for k in (7, 3, 99):
         noise(k, params)
         arrives(k, params._replace(dropout=0.5))
-    assert (noise(1234, params) == alone).all()
+    assert (noise(1234, params) == first).all()
 
 
-def test_another_seed_is_another_noise() -> None:
+def test_seeds_give_different_noise() -> None:
     assert (noise(5, sensors(NOISE, seed=1)) != noise(5, sensors(NOISE, seed=2))).all()
 
 
-def test_a_channel_without_noise_is_exact_and_leaves_the_others_as_they_are() -> None:
+def test_a_channel_without_noise_is_exact_and_does_not_change_the_others() -> None:
     some = noise(5, sensors([0.0, 0.03, 0.0017, 0.0017]))
     assert some[0] == 0.0
     assert (some[1:] == noise(5, sensors(NOISE))[1:]).all()
@@ -79,17 +79,17 @@ def test_a_channel_without_noise_is_exact_and_leaves_the_others_as_they_are() ->
 
 
 @pytest.mark.parametrize("dropout", [0.05, 0.2, 0.5])
-def test_the_share_of_lost_samples_is_the_one_asked_for(dropout: float) -> None:
-    lost = np.array([not arrives(k, sensors(NOISE, dropout=dropout)) for k in range(MANY)])
-    tolerance = 4.0 * np.sqrt(dropout * (1.0 - dropout) / MANY)  # four standard deviations of a share
+def test_the_fraction_of_dropped_samples_is_the_specified_one(dropout: float) -> None:
+    lost = np.array([not arrives(k, sensors(NOISE, dropout=dropout)) for k in range(COUNT)])
+    tolerance = 4.0 * np.sqrt(dropout * (1.0 - dropout) / COUNT)  # four standard deviations of a fraction
     assert lost.mean() == pytest.approx(dropout, abs=tolerance)
-    # Losses do not come in bursts: one after the other as often as chance has it.
+    # Dropouts are independent: the fraction of two in a row is dropout^2.
     assert (lost[1:] & lost[:-1]).mean() == pytest.approx(dropout**2, abs=tolerance)
 
 
-def test_losses_do_not_depend_on_the_noise(drawn: FloatArray) -> None:
-    lost = np.array([not arrives(k, sensors(NOISE, dropout=0.5)) for k in range(MANY)])
-    assert abs(drawn[lost].mean()) < 4.0 / np.sqrt(2.0 * MANY)  # half of the samples of four channels
+def test_dropouts_do_not_depend_on_the_noise(samples: FloatArray) -> None:
+    lost = np.array([not arrives(k, sensors(NOISE, dropout=0.5)) for k in range(COUNT)])
+    assert abs(samples[lost].mean()) < 4.0 / np.sqrt(2.0 * COUNT)  # half of the samples of four channels
 
 
 def test_without_dropout_every_sample_arrives() -> None:
@@ -111,7 +111,7 @@ def test_without_delay_a_sample_arrives_at_its_instant() -> None:
     assert transmit((), 6 * MS, y, sensors(NOISE)) == ((), (StampedVector(6 * MS, y),))
 
 
-def test_a_lost_sample_leaves_a_hole_and_holds_nothing_up() -> None:
+def test_a_dropped_sample_never_arrives_and_delays_no_other() -> None:
     params = sensors(NOISE, delay_ms=2)
     delay_line, _ = transmit((), 0, np.array([0.0]), params)
     delay_line, arrived = transmit(delay_line, 2 * MS, None, params)
@@ -120,8 +120,7 @@ def test_a_lost_sample_leaves_a_hole_and_holds_nothing_up() -> None:
     assert arrived == ()
 
 
-def test_samples_that_fell_due_while_nobody_looked_arrive_together_oldest_first() -> None:
-    # A node that missed ticks.
+def test_after_missed_ticks_due_samples_arrive_together_oldest_first() -> None:
     params = sensors(NOISE, delay_ms=2)
     delay_line, _ = transmit((), 0, np.array([0.0]), params)
     delay_line, _ = transmit(delay_line, MS, np.array([1.0]), params)
@@ -130,22 +129,22 @@ def test_samples_that_fell_due_while_nobody_looked_arrive_together_oldest_first(
     assert [sample.stamp_ns for sample in delay_line] == [9 * MS]
 
 
-def test_a_measured_sample_is_the_output_with_its_noise_or_nothing() -> None:
+def test_a_sample_is_the_output_with_its_noise_or_is_dropped() -> None:
     values = {"airframe": "osprey", "rate": 100.0, "step": 0.01, "sensors": {"noise": NOISE, "dropout": 0.5}}
     parameters = AircraftParameters.validate_mapping(values, "aircraft")
-    simulator, flying = Simulator(parameters), StateSpaceModel(parameters)
+    simulator, model = Simulator(parameters), StateSpaceModel(parameters)
     u = np.array([0.01, 0.1, 0.02, 0.03])
     arrivals = []
     for k in range(20):
         arrived = simulator.sample(k, u)
         if k:
-            flying.advance((k - 1) * 10 * MS, u, 10 * MS)
+            model.advance((k - 1) * 10 * MS, u, 10 * MS)
         error = noise(k, parameters.sensor_arrays())
         assert (simulator.truth()[-4:] == error).all()
         arrivals.append(len(arrived))
         for sample in arrived:
             assert sample.stamp_ns == k * 10 * MS
-            assert (sample.value == flying.y() + error).all()
+            assert (sample.value == model.y() + error).all()
     assert set(arrivals) == {0, 1}
 
 
@@ -156,7 +155,7 @@ def drifting(step: list[float], seed: int = 1) -> Sensors:
     return sensors([0.0] * len(step), seed=seed)._replace(drift=np.array(step))
 
 
-def test_the_errors_add_up_and_the_quantisation_comes_last() -> None:
+def test_errors_add_up_and_quantisation_comes_last() -> None:
     y = np.array([0.1234, -0.1234, 0.1234, 20.0])
     params = sensors([0.01] * 4)._replace(
         bias=np.array([0.2, -0.3, 0.0, 0.0]), drift=np.array([0.1, 0.1, 0.0, 0.1]), quantum=np.array([0.0, 0.05, 0.05, 0.5])
@@ -176,7 +175,7 @@ def test_quantisation_rounds_to_the_nearest_step_and_halves_to_even() -> None:
     assert measure(0, y, initial_drift(params), params).y.tolist() == [0.0, 0.0, 0.5, -0.0, -0.25, 0.25]
 
 
-def test_a_bias_is_the_whole_error_of_a_sensor_that_has_nothing_else() -> None:
+def test_a_bias_is_the_whole_error_of_an_otherwise_ideal_sensor() -> None:
     params = sensors([0.0] * 2)._replace(bias=np.array([0.5, -0.25]))
     for k in (0, 9):
         measured = measure(k, np.array([1.0, 2.0]), initial_drift(params), params)
@@ -184,20 +183,20 @@ def test_a_bias_is_the_whole_error_of_a_sensor_that_has_nothing_else() -> None:
         assert measured.y.tolist() == [1.5, 1.75]
 
 
-def test_drift_does_not_depend_on_what_was_missed() -> None:
+def test_drift_does_not_depend_on_which_samples_were_measured() -> None:
     params = drifting([0.1, 0.2])
     each: list[Drift] = [initial_drift(params)]
     for k in range(1, 101):
         each.append(walk(k, each[-1], params))
-    seen = initial_drift(params)
+    sparse = initial_drift(params)
     for k in (0, 3, 4, 50, 51, 100):
-        seen = walk(k, seen, params)
-        assert seen.value.tobytes() == each[k].value.tobytes()
-    assert walk(100, seen, params).value.tobytes() == seen.value.tobytes()  # nothing moves without time
+        sparse = walk(k, sparse, params)
+        assert sparse.value.tobytes() == each[k].value.tobytes()
+    assert walk(100, sparse, params).value.tobytes() == sparse.value.tobytes()  # no step without time
     assert (each[0].value == 0.0).all()
 
 
-def test_drift_does_not_depend_on_noise_and_loss_and_differs_by_seed() -> None:
+def test_drift_does_not_depend_on_noise_and_dropout_and_differs_by_seed() -> None:
     alone = walk(20, initial_drift(drifting([0.1] * 4)), drifting([0.1] * 4)).value
     noisy = drifting([0.1] * 4)._replace(noise=np.array(NOISE), dropout=0.5)
     assert (walk(20, initial_drift(noisy), noisy).value == alone).all()
@@ -207,9 +206,9 @@ def test_drift_does_not_depend_on_noise_and_loss_and_differs_by_seed() -> None:
     assert (first != noise(1, sensors([1.0] * 4))).all()  # a stream of its own under the same seed
 
 
-def test_the_variance_of_the_drift_grows_with_time_whatever_the_rate() -> None:
-    # 0.2 SI per sqrt(s): variance 0.04 t. 400 walks at two rates: chi-square of 400 has a standard deviation of 7 %; four of
-    # them hold in 99.99 % of seeds.
+def test_the_variance_of_the_drift_grows_with_time_at_any_rate() -> None:
+    # 0.2 SI per sqrt(s) gives variance 0.04 t. 400 walks at two rates: chi-square of 400 has a standard deviation of 7 %; the
+    # limit of four of them holds in 99.99 % of seeds.
     for rate, samples in ((10.0, 20), (40.0, 80)):
         values = {"airframe": "osprey", "rate": rate, "step": 0.005, "sensors": {"drift": [0.2, 0.0, 0.4, 0.0]}}
         params = AircraftParameters.validate_mapping(values, "aircraft").sensor_arrays()
@@ -241,14 +240,14 @@ def test_ideal_sensors_give_y_to_the_last_bit() -> None:
         ({"quantisation": [-0.1] * 4}, r"aircraft.sensors.quantisation\[0\]: found -0.1, expected greater than or equal to 0"),
     ],
 )
-def test_sensors_that_do_not_fit_are_refused_by_name(section: dict[str, Any], sentence: str) -> None:
+def test_invalid_sensor_parameters_are_refused_by_name(section: dict[str, Any], sentence: str) -> None:
     values = {"airframe": "osprey", "rate": 500.0, "step": 0.002, "sensors": section}
     with pytest.raises(ParameterError, match=sentence):
         AircraftParameters.validate_mapping(values, "aircraft")
 
 
-# In flight: scenario osprey_servo. With aircraft and controller both at 100 Hz a lost sample is a lost tick. The figures that
-# the flights are held against are those of the prototype that the gains come from: softened sign, width 3 (lag + 1.5 dt).
+# Flights of osprey_servo. With aircraft and controller both at 100 Hz a dropped sample is a missed tick. The expected figures
+# are those of the prototype of the gains: softened sign, width 3 (lag + 1.5 dt).
 
 
 @pytest.fixture(scope="module")
@@ -266,10 +265,10 @@ def rms(tape: Tape) -> FloatArray:
     """Root mean square of the true error over the whole flight, q, V, p, r in mrad/s and m/s."""
     error = true_error(tape)
     assert error is not None
-    return np.array([error_metrics(error[name]).rms * factor for name, factor in SHOWN.items()])
+    return np.array([error_metrics(error[name]).rms * factor for name, factor in FACTORS.items()])
 
 
-def test_truth_knows_the_noise_of_every_sample_also_of_those_that_are_lost(servo: Scenario) -> None:
+def test_truth_holds_the_noise_of_every_sample_even_of_dropped_ones(servo: Scenario) -> None:
     tape = simulate(with_sensors(servo, dropout=0.3).vary(flight={"duration": 3.0}))
     y, truth = tape["y"], tape["truth"]
     assert 0 < len(y.stamp_ns) < len(truth.stamp_ns) == 301
@@ -279,7 +278,7 @@ def test_truth_knows_the_noise_of_every_sample_also_of_those_that_are_lost(servo
         assert (truth[f"noise.{name}"] != 0.0).all()
 
 
-def test_truth_knows_the_whole_error_of_sensors_with_every_fault(servo: Scenario) -> None:
+def test_truth_holds_the_whole_error_of_sensors_with_every_fault(servo: Scenario) -> None:
     faults = {"bias": [0.01, 0.5, 0.0, -0.01], "drift": [1e-3, 0.0, 1e-3, 1e-3], "quantisation": [1e-3, 0.0, 1e-3, 5e-4]}
     tape = simulate(with_sensors(servo, dropout=0.3, **faults).vary(flight={"duration": 2.0}))
     y, truth = tape["y"], tape["truth"]
@@ -292,19 +291,19 @@ def test_truth_knows_the_whole_error_of_sensors_with_every_fault(servo: Scenario
     assert again["truth"].values.tobytes() == truth.values.tobytes()
 
 
-def test_the_true_error_leaves_out_the_noise_that_the_measured_error_holds(servo: Scenario) -> None:
+def test_the_measured_error_is_the_true_error_plus_noise(servo: Scenario) -> None:
     tape = simulate(servo.vary(flight={"duration": 3.0}))
     true, measured = true_error(tape), tracking_error(tape)
     assert true is not None
     for name in true.names:
         assert measured[name] - true[name] == pytest.approx(tape["truth"][f"noise.{name}"], abs=1e-15)
     assert best_error(tape)[0] == "true error"
-    seen = {topic: signal for topic, signal in tape.signals.items() if topic != "truth"}
-    assert best_error(Tape(seen))[0] == "measured error"
-    assert true_error(Tape(seen)) is None
+    without_truth = {topic: signal for topic, signal in tape.signals.items() if topic != "truth"}
+    assert best_error(Tape(without_truth))[0] == "measured error"
+    assert true_error(Tape(without_truth)) is None
 
 
-def test_a_noisy_flight_can_be_repeated_to_the_last_bit(servo: Scenario) -> None:
+def test_a_noisy_flight_is_repeatable_to_the_last_bit(servo: Scenario) -> None:
     short = with_sensors(servo, dropout=0.2, delay=0.01).vary(flight={"duration": 3.0})
     first, second = simulate(short), simulate(short)
     for topic, signal in first.signals.items():
@@ -312,19 +311,19 @@ def test_a_noisy_flight_can_be_repeated_to_the_last_bit(servo: Scenario) -> None
         assert (signal.stamp_ns == second[topic].stamp_ns).all()
 
 
-def test_delayed_samples_reach_the_controller_late_with_the_stamp_they_belong_to(servo: Scenario) -> None:
+def test_delayed_samples_keep_their_stamps(servo: Scenario) -> None:
     tape = simulate(with_sensors(servo, delay=0.02).vary(flight={"duration": 3.0}))
-    # Sampled until 3 s, of which the last two samples are still under way.
+    # Samples are taken until 3 s; the last two are still in the delay line.
     assert tape["y"].stamp_ns.tolist() == [10 * k * MS for k in range(299)]
     assert tape["internals"].stamp_ns.tolist() == tape["u"].stamp_ns.tolist() == tape["y"].stamp_ns.tolist()
     assert set(tape["internals"]["age"]) == {0.02}
     assert (tape["internals"]["y.q"] == tape["y"]["q"]).all()
-    assert set(tape["internals"]["y_m_offset"]) == {0.02}  # y_m is not late, and is brought back to the stamp of y
+    assert set(tape["internals"]["y_m_offset"]) == {0.02}  # y_m is not delayed; it is moved back to the stamp of y
 
 
-def test_a_delay_inside_the_margin_costs_little_and_one_beyond_it_is_lost(servo: Scenario) -> None:
-    # Linear theory gives these gains a margin of 45 ms. Measured 7.90, 0.0943, 10.1, 6.7 at 20 ms, where 7.64, 0.0884, 9.8, 6.5
-    # are without; 65 mrad/s in r at 50 ms.
+def test_a_delay_inside_the_margin_costs_little_and_one_beyond_it_loses_track(servo: Scenario) -> None:
+    # Linear theory gives these gains a delay margin of 45 ms. Measured 7.90, 0.0943, 10.1, 6.7 at 20 ms and 7.64, 0.0884, 9.8,
+    # 6.5 without delay; 65 mrad/s in r at 50 ms.
     assert (rms(simulate(with_sensors(servo, delay=0.02))) < [8.4, 0.1, 10.8, 7.2]).all()
     assert rms(simulate(with_sensors(servo, delay=0.05)))[3] > 3 * 6.5
 
@@ -334,11 +333,11 @@ def test_a_delay_inside_the_margin_costs_little_and_one_beyond_it_is_lost(servo:
     [(0.002, 2.1, 4.4), (0.010, 4.0, 22.0), (0.020, 7.2, 44.0)],
     ids=lambda value: f"{value:g}",
 )
-def test_noise_of_the_gyro_in_calm_air(servo: Scenario, gyro: float, expected: float, activity: float) -> None:
-    # q in mrad/s and mean abs(u_dot) of the elevator in deg/s, against the prototype's to 10 %.
+def test_effect_of_gyro_noise_without_gusts(servo: Scenario, gyro: float, expected: float, activity: float) -> None:
+    # q in mrad/s and mean abs(u_dot) of the elevator in deg/s, within 10 % of the prototype.
     # Measured 2.05, 3.85, 7.03 and 4.5, 22.3, 44.6.
-    quiet = servo.vary(aircraft={"gusts": {}})
-    tape = simulate(with_sensors(quiet, noise=[gyro, 0.0, gyro, gyro]))
+    no_gusts = servo.vary(aircraft={"gusts": {}})
+    tape = simulate(with_sensors(no_gusts, noise=[gyro, 0.0, gyro, gyro]))
     elevator = tape["u"]["elevator"]
     assert rms(tape)[0] == pytest.approx(expected, rel=0.1)
     assert np.rad2deg(np.mean(np.abs(np.diff(elevator))) / 0.01) == pytest.approx(activity, rel=0.1)
@@ -347,18 +346,18 @@ def test_noise_of_the_gyro_in_calm_air(servo: Scenario, gyro: float, expected: f
 @pytest.mark.parametrize(
     ("dropout", "expected"), [(0.05, [7.6, 0.088, 9.9, 6.4]), (0.2, [7.6, 0.088, 9.8, 6.4])], ids=("5 %", "20 %")
 )
-def test_lost_ticks_cost_nothing_because_the_real_dt_is_integrated(
+def test_missed_ticks_cost_nothing_because_the_real_dt_is_integrated(
     servo: Scenario, dropout: float, expected: list[float]
 ) -> None:
     # With the nominal dt the prototype had 8.9, 0.093, 11.8, 7.5 at 20 %. Measured 7.66, 0.090, 9.90, 6.80.
     assert rms(simulate(with_sensors(servo, dropout=dropout))) == pytest.approx(expected, rel=0.1)
 
 
-def test_every_other_tick_lost_costs_nothing_while_dt_is_trusted_up_to_the_age_limit(
+def test_half_of_the_ticks_missed_costs_nothing_while_dt_is_trusted_up_to_the_age_limit(
     servo: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # One gap in eight is longer than three periods: dt held to three leaves 8.75, 0.0915, 11.0, 8.0, to ten, which is max_age
-    # here, 7.64, 0.0904, 9.83, 6.55 (measured). The prototype: 7.8, 0.090, 9.8, 6.5; nominal dt: 12.6, 0.114, 17.1, 11.1.
+    # One gap in eight is longer than three periods. Measured with dt clipped to three periods: 8.75, 0.0915, 11.0, 8.0; to ten,
+    # max_age here: 7.64, 0.0904, 9.83, 6.55. The prototype: 7.8, 0.090, 9.8, 6.5; with nominal dt: 12.6, 0.114, 17.1, 11.1.
     lossy = with_sensors(servo, dropout=0.5)
     monkeypatch.setattr(guard, "DT_RANGE", (0.2, 10.0))
     assert rms(simulate(lossy)) == pytest.approx([7.8, 0.090, 9.8, 6.5], rel=0.1)
@@ -366,10 +365,10 @@ def test_every_other_tick_lost_costs_nothing_while_dt_is_trusted_up_to_the_age_l
     assert (rms(simulate(lossy)) < [10.0, 0.1, 13.0, 9.0]).all()
 
 
-def test_gaps_of_half_a_second_do_no_harm(servo: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
-    # 0.5 s of every 5 s without a sample, most of them between the commands. u is held, and beyond max_age the controller
-    # engages afresh when samples come again: the gap is integrated by nobody. Measured 8.5, 0.11, 9.8, 6.7; the prototype had
-    # 8.4 in q where it integrated one nominal dt, and 11.7 with the whole gap as dt.
+def test_gaps_of_half_a_second_cost_little(servo: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    # 0.5 s of every 5 s have no sample, mostly between the commands. u is held. After max_age the controller re-engages with
+    # the next sample and does not integrate over the gap. Measured 8.5, 0.11, 9.8, 6.7. The prototype had 8.4 in q with one
+    # nominal dt for the gap, and 11.7 with the whole gap as dt.
     monkeypatch.setattr(sensor_maths, "arrives", lambda number, params: not 300 <= number % 500 < 350)
     gaps = rms(simulate(servo))
     assert (gaps < [9.0, 0.12, 11.0, 7.5]).all(), gaps

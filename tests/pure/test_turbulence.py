@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Dryden turbulence against the published spectra: lengths, intensities, filters, and what an ensemble of flights sees."""
+"""Dryden turbulence against the published spectra: lengths, intensities, filters, ensemble statistics, repeatability."""
 
 import math
 from typing import Any
@@ -30,23 +30,23 @@ SMALL = Dryden(np.array([60.0, 60.0, 25.0]), np.array([1.1, 1.1, 0.8]))  # about
 ALL = (0, 1, 2)
 
 
-def spectrum(omega: FloatArray, axis: int, of: Dryden) -> FloatArray:
+def spectrum(omega: FloatArray, axis: int, model: Dryden) -> FloatArray:
     """The published spectrum, one-sided in omega, m^2/s^2 per rad/s: MIL-F-8785C, 3.7.1.2, in Omega = omega / V0."""
-    L, sigma, space = of.length[axis], of.sigma[axis], omega / V0
+    L, sigma, space = model.length[axis], model.sigma[axis], omega / V0
     if axis == 0:
         return np.asarray(sigma**2 * 2.0 * L / np.pi / (1.0 + (L * space) ** 2) / V0)
     return np.asarray(sigma**2 * L / np.pi * (1.0 + 3.0 * (L * space) ** 2) / (1.0 + (L * space) ** 2) ** 2 / V0)
 
 
-def correlation(lag: FloatArray, axis: int, of: Dryden) -> FloatArray:
+def correlation(lag: FloatArray, axis: int, model: Dryden) -> FloatArray:
     """Dryden's correlation at a distance d = V0 lag: sigma^2 exp(-d/L) along the flight, (1 - d/2L) times that across it."""
-    d = V0 * np.abs(lag) / of.length[axis]
-    return np.asarray(of.sigma[axis] ** 2 * np.exp(-d) * (1.0 if axis == 0 else 1.0 - d / 2.0))
+    d = V0 * np.abs(lag) / model.length[axis]
+    return np.asarray(model.sigma[axis] ** 2 * np.exp(-d) * (1.0 if axis == 0 else 1.0 - d / 2.0))
 
 
-def ensemble(of: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
+def ensemble(model: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
     """Winds of many seeds at multiples of dt, shape (3, seeds, steps)."""
-    params = [filters(of, V0, dt, ALL, seed) for seed in range(seeds)]
+    params = [filters(model, V0, dt, ALL, seed) for seed in range(seeds)]
     z = np.array([turbulence.initial_state(one) for one in params]).T
     numbers = np.array([turbulence.normals(0, steps, seed) for seed in range(seeds)])
     winds = np.empty((3, seeds, steps))
@@ -68,7 +68,7 @@ def ensemble(of: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
         (10.0, 30.0, 0.0, (10.0 / 0.18523**1.2, 10.0 / 0.18523**1.2, 10.0), (3.0 / 0.18523**0.4, 3.0 / 0.18523**0.4, 3.0)),
         (2000.0, 0.0, 5.0, (1750.0,) * 3, (5.0,) * 3),
         (30000.0, 0.0, 5.0, (1750.0,) * 3, (5.0,) * 3),
-        (1500.0, 15.0, 5.0, (1375.0,) * 3, (3.25,) * 3),  # half way
+        (1500.0, 15.0, 5.0, (1375.0,) * 3, (3.25,) * 3),  # in the middle
     ],
 )
 def test_lengths_and_intensities_are_those_published(
@@ -80,7 +80,7 @@ def test_lengths_and_intensities_are_those_published(
 
 
 @pytest.mark.parametrize("feet", [1000.0, 2000.0])
-def test_nothing_jumps_where_one_model_ends(feet: float) -> None:
+def test_lengths_and_intensities_are_continuous_between_the_models(feet: float) -> None:
     below, above = (dryden(h * FEET, 7.7, 1.5) for h in (feet - 1e-6, feet + 1e-6))
     assert np.concatenate(above) == pytest.approx(np.concatenate(below), rel=1e-8)
 
@@ -88,9 +88,9 @@ def test_nothing_jumps_where_one_model_ends(feet: float) -> None:
 # The filters: in frequency, in time, and over one step
 
 
-def continuous(of: Dryden) -> tuple[FloatArray, FloatArray]:
+def continuous(model: Dryden) -> tuple[FloatArray, FloatArray]:
     """F and G of the docstring's z_dot = F z + G n."""
-    a = V0 / of.length
+    a = V0 / model.length
     F, G = np.zeros((5, 5)), np.zeros((5, 3))
     for axis, first in enumerate((0, 1, 3)):
         F[first, first], G[first, axis] = -a[axis], math.sqrt(2.0 * a[axis])
@@ -111,15 +111,15 @@ def test_the_filters_have_the_published_spectra(axis: int) -> None:
 
 @given(dt=st.floats(1e-6, 10.0), altitude=st.floats(3.048, 600.0))
 def test_a_step_is_the_exact_solution_of_the_filters(dt: float, altitude: float) -> None:
-    # Van Loan: exp([[-F, G G'], [0, F']] dt) holds exp(F dt) and the covariance. exp(-F dt) grows, so that at h = 5 the
-    # covariance has lost four digits of sixteen: no further.
-    of = dryden(altitude, 7.7, 1.5)
-    params = filters(of, V0, dt, ALL, 1)
+    # Van Loan: exp([[-F, G G'], [0, F']] dt) holds exp(F dt) and the covariance. exp(-F dt) grows: at h = 5 the covariance has
+    # lost four digits of sixteen, so the comparison ends there.
+    model = dryden(altitude, 7.7, 1.5)
+    params = filters(model, V0, dt, ALL, 1)
     transition, added = params.transition, params.spread @ params.spread.T
     stationary = params.stationary @ params.stationary.T
     assert transition @ stationary @ transition.T + added == pytest.approx(stationary, abs=1e-14)
-    if dt * V0 / of.length.min() < 5.0:
-        F, G = continuous(of)
+    if dt * V0 / model.length.min() < 5.0:
+        F, G = continuous(model)
         double = expm(np.block([[-F, G @ G.T], [np.zeros((5, 5)), F.T]]) * dt)
         assert transition == pytest.approx(expm(F * dt), rel=1e-9, abs=1e-14)
         assert added == pytest.approx(double[5:, 5:].T @ double[:5, 5:], rel=1e-9, abs=1e-11)
@@ -127,7 +127,7 @@ def test_a_step_is_the_exact_solution_of_the_filters(dt: float, altitude: float)
 
 @pytest.mark.parametrize("dt", [0.002, 0.02, 0.5])
 @pytest.mark.parametrize("axis", ALL, ids=AXES)
-def test_samples_are_correlated_as_published_whatever_the_step(axis: int, dt: float) -> None:
+def test_samples_have_the_published_correlation_for_any_step(axis: int, dt: float) -> None:
     params = filters(SMALL, V0, dt, ALL, 1)
     stationary = params.stationary @ params.stationary.T
     for lag in (0, 1, 7, 50):
@@ -137,23 +137,23 @@ def test_samples_are_correlated_as_published_whatever_the_step(axis: int, dt: fl
 
 
 @pytest.mark.parametrize("axis", ALL, ids=AXES)
-def test_the_published_spectra_and_correlations_belong_together(axis: int) -> None:
-    # What the ensemble below is held against: sigma^2 and the correlation are integrals of the spectrum over omega.
+def test_the_published_correlations_are_integrals_of_the_published_spectra(axis: int) -> None:
+    # The ensemble tests below use both: sigma^2 and the correlation are integrals of the spectrum over omega.
     for lag in (0.0, 0.3, 2.0):
         weight: dict[str, Any] = {"weight": "cos", "wvar": lag} if lag else {}
         total = quad(lambda omega: float(spectrum(omega, axis, SMALL)), 0.0, np.inf, limit=500, **weight)[0]
         assert total == pytest.approx(float(correlation(np.array(lag), axis, SMALL)), abs=1e-6)
 
 
-# What is drawn, as an ensemble of seeds
+# Statistics over an ensemble of seeds
 
 
 SEEDS, STEPS = 300, 1024
-RATES = (10.0, 50.0)  # Hz: at 10 Hz, half the spectrum of w near half the rate is folded back from beyond it
+RATES = (10.0, 50.0)  # Hz: at 10 Hz, half of the spectrum of w near the Nyquist frequency is aliased
 
 
 @pytest.fixture(scope="module", params=RATES, ids=lambda rate: f"{rate:g} Hz")
-def seen(request: pytest.FixtureRequest) -> tuple[float, FloatArray]:
+def sampled(request: pytest.FixtureRequest) -> tuple[float, FloatArray]:
     """The step and the winds of the ensemble, shape (3, seeds, steps)."""
     dt = 1.0 / float(request.param)
     return dt, ensemble(SMALL, dt, SEEDS, STEPS)
@@ -164,9 +164,9 @@ def band(degrees: int, tests: int) -> tuple[float, float]:
     return float(chi2.ppf(0.005 / tests, degrees)) / degrees, float(chi2.ppf(1.0 - 0.005 / tests, degrees)) / degrees
 
 
-def test_the_variance_is_that_asked_for_from_the_first_sample_to_the_last(seen: tuple[float, FloatArray]) -> None:
-    # Seeds are independent: their sum of squares is chi-square, the band -25 % to +29 %. Both rates pass, so they agree too.
-    _, winds = seen
+def test_the_variance_is_the_specified_one_from_the_first_sample_to_the_last(sampled: tuple[float, FloatArray]) -> None:
+    # Seeds are independent: their sum of squares is chi-square, with a band of -25 % to +29 %.
+    _, winds = sampled
     low, high = band(SEEDS, 9)
     for k in (0, STEPS // 2, STEPS - 1):
         ratio = np.mean(winds[:, :, k] ** 2, axis=1) / SMALL.sigma**2
@@ -174,66 +174,68 @@ def test_the_variance_is_that_asked_for_from_the_first_sample_to_the_last(seen: 
         assert (ratio < high).all(), ratio
 
 
-def expected_periodogram(omega: FloatArray, dt: float, axis: int, of: Dryden, window: FloatArray) -> FloatArray:
-    """What the mean of periodograms of samples tends to: aliases and the window's leakage in it, one-sided in omega.
+def expected_periodogram(omega: FloatArray, dt: float, axis: int, model: Dryden, window: FloatArray) -> FloatArray:
+    """The expectation of the periodogram of samples, with aliasing and the window's leakage, one-sided in omega.
 
     E |sum_k h_k w(k dt) exp(-i omega k dt)|^2 = sum_k (h * h)(k) R(k dt) cos(omega k dt)
     """
     lags: FloatArray = np.arange(1 - len(window), len(window), dtype=np.float64)
-    weighted = np.correlate(window, window, "full") * correlation(lags * dt, axis, of)
+    weighted = np.correlate(window, window, "full") * correlation(lags * dt, axis, model)
     return np.asarray(np.cos(np.outer(omega, lags * dt)) @ weighted * dt / np.pi / np.sum(window**2))
 
 
-def periodogram_ratio(seen: tuple[float, FloatArray], axis: int, of: Dryden) -> FloatArray:
-    """Mean periodogram of the ensemble over that expected, at twelve frequencies from 1/50 of half the rate to 9/10 of it."""
-    dt, winds = seen
+def periodogram_ratio(sampled: tuple[float, FloatArray], axis: int, model: Dryden) -> FloatArray:
+    """Mean periodogram of the ensemble over the expected one, at twelve frequencies from 1/50 to 9/10 of Nyquist's."""
+    dt, winds = sampled
     window: FloatArray = np.asarray(get_window("hann", STEPS), dtype=np.float64)
     bins = np.unique(np.round(np.geomspace(STEPS / 100, 0.45 * STEPS, 12)).astype(int))
-    found = np.mean(np.abs(np.fft.rfft(winds[axis] * window, axis=1)[:, bins]) ** 2, axis=0) * dt / np.pi / np.sum(window**2)
-    return np.asarray(found / expected_periodogram(2.0 * np.pi * bins / (STEPS * dt), dt, axis, of, window))
+    periodogram = (
+        np.mean(np.abs(np.fft.rfft(winds[axis] * window, axis=1)[:, bins]) ** 2, axis=0) * dt / np.pi / np.sum(window**2)
+    )
+    return np.asarray(periodogram / expected_periodogram(2.0 * np.pi * bins / (STEPS * dt), dt, axis, model, window))
 
 
 @pytest.mark.parametrize("axis", ALL, ids=AXES)
-def test_the_spectrum_is_the_published_one_with_its_aliases(seen: tuple[float, FloatArray], axis: int) -> None:
-    # Each bin of each seed is chi-square of two degrees of freedom: the band is -18 % to +20 %.
+def test_the_spectrum_is_the_published_one_with_its_aliases(sampled: tuple[float, FloatArray], axis: int) -> None:
+    # Each bin of each seed is chi-square with two degrees of freedom: the band is -18 % to +20 %.
     low, high = band(2 * SEEDS, 12)
-    ratio = periodogram_ratio(seen, axis, SMALL)
+    ratio = periodogram_ratio(sampled, axis, SMALL)
     assert ((ratio > low) & (ratio < high)).all(), ratio
-    for factor in (0.7, 1.4):  # and it is no other: with L wrong by 40 % the estimate leaves the band
-        other = periodogram_ratio(seen, axis, SMALL._replace(length=factor * SMALL.length))
-        assert not ((other > low) & (other < high)).all()
+    for factor in (0.7, 1.4):  # with L wrong by 40 % the estimate leaves the band
+        wrong = periodogram_ratio(sampled, axis, SMALL._replace(length=factor * SMALL.length))
+        assert not ((wrong > low) & (wrong < high)).all()
 
 
-def test_folded_to_infinity_the_published_spectrum_is_what_the_estimate_is_held_against() -> None:
-    # sum over m of Phi(omega + 2 pi m / dt), with the tail beyond 2000 aliases as an integral; far from the window's leakage.
+def test_the_expected_periodogram_is_the_aliased_published_spectrum() -> None:
+    # Sum over m of Phi(omega + 2 pi m / dt); the tail beyond 2000 aliases is an integral. Leakage of the window is negligible.
     dt, axis = 0.1, 2
     omega = np.array([3.0, 10.0, 25.0])
     m = np.arange(-2000, 2001)
-    folded = np.sum(spectrum(np.abs(omega[:, None] + 2.0 * np.pi * m / dt), axis, SMALL), axis=1)
+    aliased = np.sum(spectrum(np.abs(omega[:, None] + 2.0 * np.pi * m / dt), axis, SMALL), axis=1)
     T = SMALL.length[axis] / V0
     tail = 2.0 * SMALL.sigma[axis] ** 2 * 3.0 / (np.pi * T) * (dt / (2.0 * np.pi)) ** 2 / 2000.5
     expected = expected_periodogram(omega, dt, axis, SMALL, get_window("hann", 4096))
-    assert folded + tail == pytest.approx(expected, rel=1e-3)
-    assert folded[-1] > 1.5 * float(spectrum(omega[-1], axis, SMALL))  # aliasing matters
+    assert aliased + tail == pytest.approx(expected, rel=1e-3)
+    assert aliased[-1] > 1.5 * float(spectrum(omega[-1], axis, SMALL))  # aliasing matters
 
 
 def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_the_theorem() -> None:
-    # A bounded derivative would give mean squares of increments in proportion to dt^2. They are in proportion to dt: 2 sigma^2
-    # dt / T along the flight, 3 sigma^2 dt / T across it, so that the quotient grows without bound.
+    # With a bounded derivative the mean squares of increments are proportional to dt^2. Here they are proportional to dt: 2
+    # sigma^2 dt / T along the flight, 3 sigma^2 dt / T across it. The difference quotient grows without limit.
     for axis, slope in enumerate((2.0, 3.0, 3.0)):
         for dt in (1e-3, 1e-4, 1e-5):
-            moved = 2.0 * (correlation(np.array(0.0), axis, SMALL) - correlation(np.array(dt), axis, SMALL))
+            increment = 2.0 * (correlation(np.array(0.0), axis, SMALL) - correlation(np.array(dt), axis, SMALL))
             expected = slope * SMALL.sigma[axis] ** 2 * dt * V0 / SMALL.length[axis]
-            assert float(moved) == pytest.approx(expected, rel=2e-3)
+            assert float(increment) == pytest.approx(expected, rel=2e-3)
     fine = ensemble(SMALL, 1e-3, 100, 64)
     mean = np.mean(np.diff(fine, axis=2) ** 2, axis=(1, 2)) / SMALL.sigma**2 * SMALL.length / (1e-3 * V0)
-    assert mean == pytest.approx([2.0, 3.0, 3.0], rel=0.1)  # 6300 increments, nearly independent: 1.8 % standard deviation
+    assert mean == pytest.approx([2.0, 3.0, 3.0], rel=0.1)  # 6300 nearly independent increments: 1.8 % standard deviation
 
 
 # Repeatability
 
 
-def test_step_k_has_the_same_numbers_whatever_was_asked_before() -> None:
+def test_the_numbers_of_step_k_do_not_depend_on_the_range() -> None:
     whole = turbulence.normals(0, 300, 5)
     for first, count in ((0, 1), (63, 2), (64, 64), (130, 99), (299, 1)):
         assert (turbulence.normals(first, count, 5) == whole[first : first + count]).all()
@@ -245,16 +247,16 @@ def turbulent(step_ms: float = 2.0, **values: Any) -> AircraftParameters:
     return AircraftParameters.validate_mapping(section | values, "aircraft")
 
 
-def test_a_flight_meets_the_same_air_however_its_time_is_cut() -> None:
-    parts, u = turbulent().plant(), np.array([0.01, 0.1, 0.0, 0.0])
-    whole = plant.advance(0, plant.initial_state(parts), u, 400 * MS, parts)
-    cut = plant.initial_state(parts)
+def test_the_turbulence_does_not_depend_on_how_the_flight_is_divided() -> None:
+    params, u = turbulent().plant(), np.array([0.01, 0.1, 0.0, 0.0])
+    whole = plant.advance(0, plant.initial_state(params), u, 400 * MS, params)
+    cut = plant.initial_state(params)
     for k in range(40):
-        cut = plant.advance(10 * k * MS, cut, u, 10 * MS, parts)
+        cut = plant.advance(10 * k * MS, cut, u, 10 * MS, params)
     assert cut.turbulence is not None
     assert whole.turbulence is not None
     assert cut.turbulence.tobytes() == whole.turbulence.tobytes()
-    assert cut.x == pytest.approx(whole.x, abs=1e-14)  # the gust's instants are rounded differently
+    assert cut.x == pytest.approx(whole.x, abs=1e-14)  # the instants are rounded differently
     first, second = Simulator(turbulent()), Simulator(turbulent())
     for number in range(20):
         for simulator in (first, second):
@@ -262,54 +264,54 @@ def test_a_flight_meets_the_same_air_however_its_time_is_cut() -> None:
         assert first.truth().tobytes() == second.truth().tobytes()
 
 
-def test_numbers_from_elsewhere_may_take_the_place_of_the_seed() -> None:
-    # As a campaign on other arrays does, which NumPy cannot draw for.
-    parts, u = turbulent().plant(), np.zeros(4)
-    assert parts.turbulence is not None
-    state = plant.initial_state(parts)
-    own = plant.advance(0, state, u, 20 * MS, parts)
-    given_numbers = plant.advance(0, state, u, 20 * MS, parts, normals=turbulence.normals(0, 10, parts.turbulence.seed))
+def test_given_numbers_replace_those_of_the_seed() -> None:
+    # Campaigns on other array types need this: the seed takes NumPy.
+    params, u = turbulent().plant(), np.zeros(4)
+    assert params.turbulence is not None
+    state = plant.initial_state(params)
+    own = plant.advance(0, state, u, 20 * MS, params)
+    given_numbers = plant.advance(0, state, u, 20 * MS, params, normals=turbulence.normals(0, 10, params.turbulence.seed))
     assert own.x.tobytes() == given_numbers.x.tobytes()
-    assert (plant.advance(0, state, u, 20 * MS, parts, normals=np.zeros((10, 5))).x != own.x).any()
+    assert (plant.advance(0, state, u, 20 * MS, params, normals=np.zeros((10, 5))).x != own.x).any()
 
 
-def test_truth_shows_the_wind_that_acts_from_then_on_and_f_holds_it() -> None:
+def test_truth_holds_the_wind_that_acts_from_now_on_and_f_includes_it() -> None:
     parameters = turbulent(gusts={"vertical": {"start": 0.0, "speed": 2.0, "length": 2.5}})
-    simulator, parts = Simulator(parameters), parameters.plant()
-    air = parts.turbulence
+    simulator, params = Simulator(parameters), parameters.plant()
+    air = params.turbulence
     assert air is not None
     z = turbulence.initial_state(air)
     for number in range(3):
         simulator.sample(number, np.zeros(4))
-        shown = dict(zip(simulator.truth_names, simulator.truth(), strict=True))
+        true = dict(zip(simulator.truth_names, simulator.truth(), strict=True))
         winds = dict(zip(parameters.sampled_airframe().gusts, turbulence.wind(z, air), strict=True))
         gust = 1.0 - math.cos(math.pi * 0.01 * number * 25.0 / 2.5)
-        assert shown["gust.lateral"] == winds["lateral"] != 0.0
-        assert shown["gust.vertical"] == pytest.approx(winds["vertical"] + gust, rel=1e-12)
-        assert shown["f.p"] == pytest.approx(3.13 / 25.0 * shown["gust.lateral"], rel=1e-12)
+        assert true["gust.lateral"] == winds["lateral"] != 0.0
+        assert true["gust.vertical"] == pytest.approx(winds["vertical"] + gust, rel=1e-12)
+        assert true["f.p"] == pytest.approx(3.13 / 25.0 * true["gust.lateral"], rel=1e-12)
         for normal in turbulence.normals(5 * number, 5, 1):
             z = turbulence.step(z, normal, air)
 
 
-def test_an_airframe_meets_the_axes_that_it_knows() -> None:
-    # Each axis has its noise, known to the airframe or not.
-    of = dryden(30.0, 7.7, 0.0)
-    whole, lateral = filters(of, V0, 0.01, ALL, 1), filters(of, V0, 0.01, [AXES.index("lateral")], 1)
+def test_the_wind_of_an_axis_does_not_depend_on_the_other_axes() -> None:
+    # Each axis has its own noise, used by the airframe or not.
+    model = dryden(30.0, 7.7, 0.0)
+    whole, lateral = filters(model, V0, 0.01, ALL, 1), filters(model, V0, 0.01, [AXES.index("lateral")], 1)
     assert (
         turbulence.wind(turbulence.initial_state(whole), whole)[1]
         == turbulence.wind(turbulence.initial_state(lateral), lateral)[0]
     )
 
 
-def parts_of(section: dict[str, Any], airframe: str = "osprey") -> PlantParams:
+def plant_params(section: dict[str, Any], airframe: str = "osprey") -> PlantParams:
     values = {"airframe": airframe, "rate": 100.0, "step": 0.002, "turbulence": section}
     return AircraftParameters.validate_mapping(values, "aircraft").plant()
 
 
-def test_no_intensity_is_no_turbulence() -> None:
-    assert parts_of({"altitude": 100.0, "wind": 0.0}).turbulence is None
-    assert parts_of({"altitude": 400.0, "wind": 0.0, "sigma": 0.0}).turbulence is None
-    assert isinstance(parts_of({"altitude": 400.0, "wind": 0.0, "sigma": 0.1}).turbulence, Turbulence)
+def test_without_intensity_there_is_no_turbulence() -> None:
+    assert plant_params({"altitude": 100.0, "wind": 0.0}).turbulence is None
+    assert plant_params({"altitude": 400.0, "wind": 0.0, "sigma": 0.0}).turbulence is None
+    assert isinstance(plant_params({"altitude": 400.0, "wind": 0.0, "sigma": 0.1}).turbulence, Turbulence)
 
 
 @pytest.mark.parametrize(
@@ -327,13 +329,13 @@ def test_no_intensity_is_no_turbulence() -> None:
         ({"altitude": 100.0, "winds": 1.0}, r"turbulence\.winds: unknown key, expected wind perhaps"),
     ],
 )
-def test_turbulence_that_does_not_fit_is_refused_by_name(section: dict[str, Any], sentence: str) -> None:
+def test_invalid_turbulence_is_refused_by_name(section: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"^aircraft.{sentence}"):
-        parts_of(section)
+        plant_params(section)
 
 
-def test_an_airframe_without_gusts_takes_no_turbulence() -> None:
+def test_turbulence_on_an_airframe_without_gusts_is_refused() -> None:
     with pytest.raises(
         ParameterError, match=r"^aircraft\.turbulence: found a section, expected none: the airframe f16_lateral has"
     ):
-        parts_of({"altitude": 100.0, "wind": 7.7}, "f16_lateral")
+        plant_params({"altitude": 100.0, "wind": 7.7}, "f16_lateral")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertain aircraft: how far they are from the published one, and that a seed is an aircraft."""
+"""Uncertain aircraft of Monte Carlo campaigns: distribution around the published airframe, repeatability by seed."""
 
 from pathlib import Path
 from typing import Any
@@ -20,34 +20,34 @@ from flight_core.vectors import FloatArray
 OSPREY = load_airframe("osprey")
 
 
-def parts(drawn: FloatArray, published: FloatArray) -> FloatArray:
-    """D of each entry that is not zero."""
-    return np.asarray(drawn[published != 0.0] / published[published != 0.0] - 1.0)
+def relative_change(sampled: FloatArray, published: FloatArray) -> FloatArray:
+    """The factor d of each entry that is not zero."""
+    return np.asarray(sampled[published != 0.0] / published[published != 0.0] - 1.0)
 
 
-def test_entries_are_spread_evenly_and_independently() -> None:
-    # Of 2000 draws of A's entry q, q: uniform on +-0.3. The Kolmogorov-Smirnov test refuses one seed in a hundred.
+def test_entries_are_uniform_and_independent() -> None:
+    # 2000 samples of A[q, q] are uniform on +-0.3. The Kolmogorov-Smirnov test rejects one seed in a hundred.
     A, B = nominal_and_sampled(OSPREY, 0.3, 2000, seed=3)
     q = OSPREY.index("q")
     d = A[1:, q, q] / A[0, q, q] - 1.0
     assert kstest(d, "uniform", args=(-0.3, 0.6)).pvalue > 0.01
     others = (A[1:, q, 1] / A[0, q, 1] - 1.0, B[1:, q, 0] / B[0, q, 0] - 1.0)
-    for other in others:  # a correlation of independent samples scatters by 1/sqrt(2000) = 0.022; four of them
+    for other in others:  # 1/sqrt(2000) = 0.022 is the standard deviation for independent samples; the limit is four of them
         assert abs(np.corrcoef(d, other)[0, 1]) < 0.09
 
 
-def test_a_draw_keeps_zeros_angles_and_everything_but_a_and_b() -> None:
-    drawn = sample_airframe(OSPREY, 0.3, 0.2, seed=7)
+def test_a_sampled_airframe_keeps_zeros_angles_and_everything_but_a_and_b() -> None:
+    sampled = sample_airframe(OSPREY, 0.3, 0.2, seed=7)
     A, B = OSPREY.matrix_a(), OSPREY.matrix_b()
     for angle in ("theta", "phi"):
-        assert drawn.A[drawn.index(angle)] == OSPREY.A[drawn.index(angle)]
-    assert ((drawn.matrix_a() == 0.0) == (A == 0.0)).all()
-    assert ((drawn.matrix_b() == 0.0) == (B == 0.0)).all()
+        assert sampled.A[sampled.index(angle)] == OSPREY.A[sampled.index(angle)]
+    assert ((sampled.matrix_a() == 0.0) == (A == 0.0)).all()
+    assert ((sampled.matrix_b() == 0.0) == (B == 0.0)).all()
     rows = [OSPREY.index(state) for state in OSPREY.states if state not in {"theta", "phi"}]
-    assert 0.2 < np.abs(parts(drawn.matrix_a()[rows], A[rows])).max() < 0.3
-    assert 0.1 < np.abs(parts(drawn.matrix_b()[rows], B[rows])).max() < 0.2
+    assert 0.2 < np.abs(relative_change(sampled.matrix_a()[rows], A[rows])).max() < 0.3
+    assert 0.1 < np.abs(relative_change(sampled.matrix_b()[rows], B[rows])).max() < 0.2
     kept = OSPREY.model_dump(exclude={"A", "B"})
-    assert drawn.model_dump(exclude={"A", "B"}) == kept
+    assert sampled.model_dump(exclude={"A", "B"}) == kept
 
 
 def test_one_uncertainty_leaves_the_other_matrix_as_published() -> None:
@@ -56,16 +56,20 @@ def test_one_uncertainty_leaves_the_other_matrix_as_published() -> None:
     assert sample_airframe(OSPREY, 0.0, 0.0, seed=7) is OSPREY
 
 
-def test_a_seed_is_an_aircraft() -> None:
-    assert sample_airframe(OSPREY, 0.3, 0.3, seed=7) == sample_airframe(OSPREY, 0.3, 0.3, seed=7) != sample_airframe(OSPREY, 0.3, 0.3, seed=8)
+def test_a_seed_determines_the_aircraft() -> None:
+    assert (
+        sample_airframe(OSPREY, 0.3, 0.3, seed=7)
+        == sample_airframe(OSPREY, 0.3, 0.3, seed=7)
+        != sample_airframe(OSPREY, 0.3, 0.3, seed=8)
+    )
     A, B = nominal_and_sampled(OSPREY, 0.3, 1, seed=7)
-    drawn = sample_airframe(OSPREY, 0.3, 0.3, seed=7)
-    assert drawn.matrix_a() == pytest.approx(A[1], rel=1e-15)  # but for the way through the file's units
-    assert drawn.matrix_b() == pytest.approx(B[1], rel=1e-15)
+    sampled = sample_airframe(OSPREY, 0.3, 0.3, seed=7)
+    assert sampled.matrix_a() == pytest.approx(A[1], rel=1e-15)  # rounding of the conversion to the file's units
+    assert sampled.matrix_b() == pytest.approx(B[1], rel=1e-15)
 
 
 @pytest.mark.parametrize("name", sorted(file.stem for file in LIBRARY.glob("*.yaml")))
-def test_the_text_of_an_airframe_is_its_file_to_the_last_bit(name: str, tmp_path: Path) -> None:
+def test_the_yaml_text_of_an_airframe_reads_back_to_the_last_bit(name: str, tmp_path: Path) -> None:
     for airframe in (load_airframe(name), sample_airframe(load_airframe(name), 0.3, 0.3, seed=1)):
         path = tmp_path / f"{name}.yaml"
         path.write_text(as_yaml(airframe), encoding="utf-8")
@@ -79,13 +83,13 @@ def parameters(**section: Any) -> AircraftParameters:
     return AircraftParameters.validate_mapping(values, "aircraft")
 
 
-def test_the_aircraft_drawn_is_the_aircraft_flown(osprey_gust: Scenario, tmp_path: Path) -> None:
-    # Flown from its own text, as the log holds it, it is the same flight to the last bit.
+def test_a_sampled_airframe_flies_like_its_yaml_text(osprey_gust: Scenario, tmp_path: Path) -> None:
+    # The log holds the text. A flight of it has the same bits.
     short = osprey_gust.vary(flight={"duration": 3.0})
-    drawn = short.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.3, "seed": 7}})
-    path = tmp_path / "drawn.yaml"
-    path.write_text(as_yaml(drawn.aircraft.sampled_airframe()), encoding="utf-8")
-    flights = [simulate(one)["y"].values for one in (drawn, short.vary(aircraft={"airframe": str(path)}), short)]
+    sampled = short.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.3, "seed": 7}})
+    path = tmp_path / "sampled.yaml"
+    path.write_text(as_yaml(sampled.aircraft.sampled_airframe()), encoding="utf-8")
+    flights = [simulate(scenario)["y"].values for scenario in (sampled, short.vary(aircraft={"airframe": str(path)}), short)]
     assert flights[0].tobytes() == flights[1].tobytes()
     assert flights[0].tobytes() != flights[2].tobytes()
 

@@ -136,7 +136,7 @@ def heard(outsider: Process) -> int:
 def test_by_default_any_process_of_this_machine_hears_y_and_has_its_u_flown(start: Start, osprey_gust: Scenario) -> None:
     flown = aircraft(start, osprey_gust)
     assert heard(start("tests.ros.outsider", "30", within=ON_LOOPBACK)) > 0
-    flown.wait_for("flown by /controller#1")
+    flown.wait_for("receiving u from /controller#1")
 
 
 @pytest.mark.parametrize("number", [0, 1], ids=["no key", "another key"])
@@ -147,13 +147,13 @@ def test_with_a_key_no_process_of_this_machine_without_it_has_its_u_flown(
     attacker = start("tests.ros.outsider", "30", *([str(keys[1])] if number else []), within=ON_LOOPBACK)
     assert heard(attacker) > 0  # what stays open: it can listen
     flown.wait_for("it is signed with another key" if number else "it is not signed")
-    assert "flown by" not in flown.output
+    assert "receiving u from" not in flown.output
 
 
 def test_with_the_key_it_is_flown(start: Start, osprey_gust: Scenario, keys: tuple[Path, Path]) -> None:
     flown = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
     assert heard(start("tests.ros.outsider", "30", str(keys[0]), within=ON_LOOPBACK)) > 0
-    flown.wait_for("flown by /controller#1")
+    flown.wait_for("receiving u from /controller#1")
     assert "sample refused" not in flown.output
 
 
@@ -186,7 +186,7 @@ def test_what_was_overheard_is_not_flown_again(
         overheard.append(sealed_u.encode(time.time_ns(), np.zeros(4)))
         publisher.publish(overheard[-1])
 
-    peer_node.until(lambda: "flown by" in first.output, BUSY, each=send)
+    peer_node.until(lambda: "receiving u from" in first.output, BUSY, each=send)
     again = overheard[-1]
     peer_node.until(counted(peer_node, "order"), BUSY, each=lambda: publisher.publish(again))
     first.interrupt()
@@ -196,7 +196,7 @@ def test_what_was_overheard_is_not_flown_again(
     second = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
     peer_node.until(counted(peer_node, "order"), BUSY, each=lambda: publisher.publish(again))
     peer_node.until(counted(peer_node, "mac"), BUSY, each=lambda: publisher.publish(u_message(before)))
-    assert "flown by" not in second.output
+    assert "receiving u from" not in second.output
 
 
 def test_a_flight_with_a_key_is_flown_and_signed(
@@ -320,7 +320,7 @@ def test_by_default_nobody_on_another_host_hears_y_or_has_its_u_flown(
 ) -> None:
     flown = aircraft(start, osprey_gust, within=hosts.first)
     assert heard(start("tests.ros.outsider", f"{PATIENCE}", within=(*hosts.second, *on_network))) == 0
-    assert "flown by" not in flown.output
+    assert "receiving u from" not in flown.output
     assert "sample refused" not in flown.output  # not even an attempt has arrived
 
 
@@ -329,7 +329,7 @@ def test_on_a_network_of_its_own_profile_another_host_hears_y_and_has_its_u_flow
 ) -> None:
     flown = aircraft(start, osprey_gust, within=(*hosts.first, *on_network))
     assert heard(start("tests.ros.outsider", "30", within=(*hosts.second, *on_network))) > 0
-    flown.wait_for("flown by /controller#1")
+    flown.wait_for("receiving u from /controller#1")
 
 
 def test_on_a_network_with_a_key_another_host_hears_y_but_has_no_u_flown(
@@ -338,4 +338,4 @@ def test_on_a_network_with_a_key_another_host_hears_y_but_has_no_u_flown(
     flown = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}", within=(*hosts.first, *on_network))
     assert heard(start("tests.ros.outsider", "30", within=(*hosts.second, *on_network))) > 0
     flown.wait_for("it is not signed")
-    assert "flown by" not in flown.output
+    assert "receiving u from" not in flown.output

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators between the command u and the aircraft: dead zone, lag, rate limit, end stops, in this order; and their faults."""
+"""Actuators between the command u and the aircraft: dead zone, lag, rate saturation, position saturation; actuator faults."""
 
 from typing import Any, NamedTuple
 
 from flight_core.vectors import Array, array_namespace
 
-MIN_LAG = 1e-30  # s, stands for no lag: exp(-dt / 1e-30) is exactly 0, in float32 too, and nothing is divided by 0
+MIN_LAG = 1e-30  # s, used for lag 0: exp(-dt / 1e-30) is exactly 0, in float32 too, and there is no division by 0
 
 
 class Actuators(NamedTuple):
-    """Parameters of m actuators, SI. An ideal one has lag 0 and infinite limits. What is None is absent from all of them."""
+    """Parameters of m actuators, SI. An ideal actuator has lag 0 and infinite limits. None: no actuator has this property."""
 
     lag: Array | None = None  # (m,) time constant of the first-order response, s, 0 = none
     lower: Array | None = None  # (m,) lower end stop, deviation from trim, -inf = none
@@ -24,13 +24,13 @@ class Actuators(NamedTuple):
 def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     """Actuator positions one step later, shape (m,), with the command held over the step.
 
-        felt    = command - clip(command, -dead_zone, dead_zone)               dead zone: nothing inside, no jump at its edge
-        lagged  = felt - (felt - position) exp(-dt / lag)                      exact solution of lag p_dot = felt - p
+        input   = command - clip(command, -dead_zone, dead_zone)               dead zone: zero inside, no jump at its edge
+        lagged  = input - (input - position) exp(-dt / lag)                    exact solution of lag p_dot = input - p
         limited = position + clip(lagged - position, -rate dt, rate dt)        rate limit
         p+      = clip(limited, lower, upper)                                  end stops
 
-    Each line is one property of the actuator, and works on what the line before leaves. An ideal actuator gives the command
-    to the last bit: the difference vanishes, and the limits only choose between values.
+    Each line is one property of the actuator and takes the result of the line before. An ideal actuator passes the command on
+    to the last bit: the difference is zero, and the limits only choose between values.
 
     Shapes: position, command (m,), dt (). Units: SI, deviations from trim; dt > 0 in s.
     Source: the lag is the zero-order-hold equivalent of 1 / (lag s + 1); Franklin, Powell, Workman, Digital Control, 4.3.
@@ -42,21 +42,21 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     if params.lag is not None:
         moved = moved - (moved - position) * xp.exp(-dt / xp.maximum(params.lag, MIN_LAG))
     if params.rate is not None:
-        reach = params.rate * dt
-        moved = xp.minimum(xp.maximum(moved, position - reach), position + reach)
+        largest = params.rate * dt
+        moved = xp.minimum(xp.maximum(moved, position - largest), position + largest)
     if params.lower is not None:
         moved = xp.maximum(moved, params.lower)
     return moved if params.upper is None else xp.minimum(moved, params.upper)
 
 
 def apply_faults(t: Any, position: Array, moved: Array, params: Actuators) -> Array:
-    """Positions at the end of a step that begins at t, where faults may have struck, shape (m,).
+    """Actuator positions at the end of a step that begins at t, with faults applied, shape (m,).
 
-        t >= stuck_at    position    it stays where it is
-        t >= lost_at     0           it gives no effect: the surface is free, floats to trim at once and stays; also if stuck
+        t >= stuck_at    position    the actuator keeps its position
+        t >= lost_at     0           the surface is free: it goes to trim at once and stays there, also if stuck before
         else             moved
 
-    Arguments: `position` at t, `moved` where it would be without faults. A fault within a step strikes at the next one.
+    Arguments: `position` at t, `moved` at the end of the step without faults. A fault within a step acts from the next one on.
     """
     xp = array_namespace(position)
     if params.stuck_at is not None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Airframe files: published matrices with their units and signs, converted to SI once, here."""
+"""Airframe files: published matrices with their units and signs, converted to SI here and nowhere else."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -23,7 +23,7 @@ Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1), BeforeValidator(as_
 
 
 class Input(Parameters):
-    """One input: the unit its column of B is given in, and what a positive value does."""
+    """One input: the unit of its column of B, and the effect of a positive value."""
 
     unit: Unit = Field(description="the unit of this column of B")
     positive: str = Field(description="what a positive value does")
@@ -46,7 +46,7 @@ class Product(Parameters):
 
 
 class Airframe(Parameters):
-    """An airframe as its file states it. `matrix_a` to `products` give SI arrays."""
+    """An airframe in the units of its file. `matrix_a` to `products` give SI arrays."""
 
     name: str
     source: str = Field(description="where the figures come from")
@@ -86,7 +86,7 @@ class Airframe(Parameters):
         return self
 
     def index(self, state: str) -> int:
-        """Place of a state in x."""
+        """Index of a state in x."""
         return list(self.states).index(state)
 
     def matrix_a(self) -> FloatArray:
@@ -103,7 +103,7 @@ class Airframe(Parameters):
         return matrix * row[:, None] / column[None, :]
 
     def matrix_c(self) -> FloatArray:
-        """C, shape (m, n): picks the outputs."""
+        """C, shape (m, n): selects the outputs."""
         return np.array([[float(state == output) for state in self.states] for output in self.outputs])
 
     def matrix_gravity(self) -> FloatArray:
@@ -123,14 +123,14 @@ class Airframe(Parameters):
         return gain, first, second
 
     def with_matrices(self, A: FloatArray, B: FloatArray) -> Self:
-        """The same airframe with other A, shape (n, n), and B, shape (n, m), SI; its file would hold them in its own units."""
+        """The same airframe with other A, shape (n, n), and B, shape (n, m), given in SI and stored in the file's units."""
         state: FloatArray = np.array([SI_PER_UNIT[u] for u in self.states.values()])
-        given: FloatArray = np.array([SI_PER_UNIT[i.unit] for i in self.inputs.values()])
-        values = {"A": (A / state[:, None] * state).tolist(), "B": (B / state[:, None] * given).tolist()}
+        inputs: FloatArray = np.array([SI_PER_UNIT[i.unit] for i in self.inputs.values()])
+        values = {"A": (A / state[:, None] * state).tolist(), "B": (B / state[:, None] * inputs).tolist()}
         return self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
 
     def gust_direction(self, gust: str) -> FloatArray:
-        """What 1 m/s of a gust adds to x_dot, shape (n,). Raises ParameterError for a gust the airframe does not know."""
+        """Change of x_dot for 1 m/s of wind along an axis, shape (n,). Raises ParameterError for an axis not in the file."""
         require(gust in self.gusts, "gusts", f"{gust!r}", f"one the airframe {self.name} knows: {', '.join(self.gusts)}")
         direction = np.zeros(len(self.states))
         for state, value in self.gusts[gust].items():

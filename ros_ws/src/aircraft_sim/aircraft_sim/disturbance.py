@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Disturbances that are given functions of time: 1-cosine gusts of the air, biases and sines on x_dot.
+"""Disturbances that are functions of time: 1-cosine gusts, biases and sines on x_dot.
 
-Assumption 2 asks for f in C1 with f and f_dot bounded. Gusts, sines and biases with a rise meet it; a bias with rise 0 is a
-step, does not, and lies outside the theorem.
+Assumption 2 requires f in C1 with f and f_dot bounded. Gusts, sines and biases with a rise meet it. A bias with rise 0 is a
+step: it does not meet it and lies outside the theorem.
 """
 
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from typing import NamedTuple
 from flight_core.vectors import Array, array_namespace
 
 AXES = ("longitudinal", "lateral", "vertical")
-"""Axes of the wind, FRD axes of trim: a tail wind is positive, and so are wind to the right and wind down."""
+"""Axes of the wind, FRD axes of trim. Positive: tail wind, wind to the right, wind down."""
 
 REFERENCE_LENGTH = 106.68  # m, 350 ft: FAR/CS 25.341(a)(4)
 
-MIN_RISE = 1e-30  # s, stands for a step: t / 1e-30 saturates for every t > 0, in float32 too, and nothing is divided by 0
+MIN_RISE = 1e-30  # s, used for rise 0, a step: t / 1e-30 saturates for every t > 0, in float32 too, without division by 0
 
 
 class Gusts(NamedTuple):
-    """Discrete gusts, G of them. The speed 0 is exactly no gust."""
+    """G discrete gusts. A speed of 0 is exactly no gust."""
 
     start: Array  # (G,) instant of entry, s
     speed: Array  # (G,) peak speed U_ds, m/s
@@ -27,15 +27,15 @@ class Gusts(NamedTuple):
 
 
 class Bias(NamedTuple):
-    """One bias a state; the value 0 is exactly none."""
+    """One bias per state. A value of 0 is exactly no bias."""
 
-    start: Array  # (n,) instant at which it begins, s
-    value: Array  # (n,) what it comes to, [x]/s
-    rise: Array  # (n,) how long it takes, s; 0 is a step
+    start: Array  # (n,) start of the rise, s
+    value: Array  # (n,) final value, [x]/s
+    rise: Array  # (n,) rise time, s; 0 is a step
 
 
 class Sines(NamedTuple):
-    """One sine a state; the amplitude 0 is exactly none."""
+    """One sine per state. An amplitude of 0 is exactly no sine."""
 
     amplitude: Array  # (n,) [x]/s
     frequency: Array  # (n,) rad/s
@@ -43,13 +43,13 @@ class Sines(NamedTuple):
 
 
 def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
-    """Speed of each gust in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)), s = V0 (t - start) held inside [0, 2H].
+    """Speed of each gust in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)), s = V0 (t - start) clipped to [0, 2H].
 
-    Zero before entry and after 2H/V0 seconds. The derivative is continuous and at most U_ds/2 pi V0/H, as Assumption 2 asks.
+    Zero before entry and after 2H/V0 seconds. The derivative is continuous and at most U_ds/2 pi V0/H: it meets Assumption 2.
     Source of the form: FAR/CS 25.341(a).
     """
     xp = array_namespace(gusts.speed)
-    # minimum and maximum: several times faster than clip, which checks its bounds' types first
+    # minimum and maximum are several times faster than clip, which checks the types of its limits first
     s = xp.minimum(xp.maximum(airspeed * (t - gusts.start) / gusts.length, 0.0), 2.0)
     return gusts.speed / 2.0 * (1.0 - xp.cos(xp.pi * s))
 
@@ -64,10 +64,10 @@ def design_gust_speed(length: Array, reference: Array, alleviation: Array) -> Ar
 
 
 def bias(t: Array, params: Bias) -> Array:
-    """Biases at t, shape (n,), [x]/s: value/2 (1 - cos(pi s)), s = (t - start)/rise held inside [0, 1].
+    """Biases at t, shape (n,), [x]/s: value/2 (1 - cos(pi s)), s = (t - start)/rise clipped to [0, 1].
 
-    With rise > 0 the derivative is continuous and at most value/2 pi/rise. With rise = 0 it is a step: zero up to start, the
-    value beyond it, and Assumption 2 does not hold at that instant.
+    With rise > 0 the derivative is continuous and at most value/2 pi/rise. With rise = 0 it is a step: zero up to start,
+    `value` after it. Assumption 2 does not hold at that instant.
     """
     xp = array_namespace(params.value)
     s = xp.minimum(xp.maximum((t - params.start) / xp.maximum(params.rise, MIN_RISE), 0.0), 1.0)
@@ -75,5 +75,5 @@ def bias(t: Array, params: Bias) -> Array:
 
 
 def sines(t: Array, params: Sines) -> Array:
-    """Sines at t, shape (n,), [x]/s: amplitude sin(frequency t + phase). Smooth, with derivatives up to amplitude frequency."""
+    """Sines at t, shape (n,), [x]/s: amplitude sin(frequency t + phase). The derivative is at most amplitude frequency."""
     return params.amplitude * array_namespace(params.amplitude).sin(params.frequency * t + params.phase)

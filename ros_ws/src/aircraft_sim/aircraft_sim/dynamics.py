@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The aircraft, equation (1): x_dot = A x + f(x, t) + B u, y = C x, in deviations from trim.
+"""Equation (1), the aircraft: x_dot = A x + f(x, t) + B u, y = C x, in deviations from trim.
 
-f is a sum of what depends on the state and of what depends on time: `x_dot` takes both at one instant, `plant.advance` the
-second at all instants of its steps together.
+f(x, t) = f_state(x) + f_time(t). `x_dot` computes both at one instant. `plant.advance` computes f_time once for all instants of
+its steps.
 """
 
 from typing import Any, NamedTuple
@@ -13,21 +13,21 @@ from flight_core.vectors import Array, array_namespace
 
 
 class Coupling(NamedTuple):
-    """Products of two states, P of them: f += gain @ (x[first] x[second])."""
+    """P products of two states: f += gain @ (x[first] x[second])."""
 
     gain: Array  # (n, P)
-    first: Array  # (P,) places in x
+    first: Array  # (P,) indices in x
     second: Array  # (P,)
 
 
 class Aircraft(NamedTuple):
-    """Matrices of equation (1) and what makes up f, SI and radians, as arrays. What is None is absent."""
+    """Matrices of equation (1) and the terms of f as arrays, SI and radians. None: the term is absent."""
 
     A: Array  # (n, n)
     B: Array  # (n, m)
     C: Array  # (m, n)
     gravity: Array  # (n, n), gravity @ sin(x)
-    gust_direction: Array  # (n, G), what one m/s of wind along each axis adds to x_dot
+    gust_direction: Array  # (n, G), change of x_dot for 1 m/s of wind along each axis
     gusts: Gusts
     speed: Array  # () trim speed V0, m/s
     coupling: Coupling | None = None
@@ -40,7 +40,7 @@ def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Ar
 
         f = gravity @ sin(x) + gain @ (x[first] x[second]) + gust_direction @ (w(t) + turbulence) + bias(t) + sines(t)
 
-    `turbulence` is its wind along the G axes, shape (G,), m/s, none where it is left out. Works on states in columns, (n, N).
+    `turbulence` is the wind along the G axes, shape (G,), m/s; None: no turbulence. x may hold N states in columns, (n, N).
     """  # noqa: D400, D415 - what follows is an equation
     return f_state(x, params) + f_time(t, wind(t, params, turbulence), params)
 
@@ -50,9 +50,9 @@ def x_dot(t: Any, x: Array, u: Array, params: Aircraft, turbulence: Array | None
     return x_dot_forced(x, f_time(t, wind(t, params, turbulence), params) + params.B @ u, params)
 
 
-def x_dot_forced(x: Array, rest: Array, params: Aircraft) -> Array:
-    """A x + f_state(x) + rest, shape (n,): equation (1) where `rest` is f_time + B u."""
-    return params.A @ x + f_state(x, params) + rest
+def x_dot_forced(x: Array, forced: Array, params: Aircraft) -> Array:
+    """A x + f_state(x) + forced, shape (n,): equation (1) with forced = f_time + B u."""
+    return params.A @ x + f_state(x, params) + forced
 
 
 def f_state(x: Array, params: Aircraft) -> Array:
@@ -75,23 +75,23 @@ def f_time(t: Any, wind: Array, params: Aircraft) -> Array:
 
 
 def wind(t: Any, params: Aircraft, turbulence: Array | None = None) -> Array:
-    """The wind along the G axes, shape (G,), m/s: gusts w(t) + turbulence."""
+    """The wind along the G axes, shape (G,), m/s: gusts + turbulence."""
     gusts = one_minus_cosine(t, params.gusts, params.speed)
     return gusts if turbulence is None else gusts + turbulence
 
 
 class Forcing(NamedTuple):
-    """What depends on time alone, at T instants."""
+    """Wind and f_time at T instants."""
 
-    wind: Array  # (T, G) of the gusts along the G axes, m/s
-    rate: Array  # (T, n) f_time in it
+    wind: Array  # (T, G) speed of the gusts along the G axes, m/s
+    rate: Array  # (T, n) f_time in this wind
 
 
 def at_times(t: Array, params: Aircraft) -> Forcing:
-    """The gusts and f_time in them at T instants at once, t of shape (T,)."""
+    """Forcing by the gusts, biases and sines at T instants, t of shape (T,)."""
 
-    def column(of: Any) -> Any:
-        return None if of is None else type(of)(*(one[:, None] for one in of))
+    def column(term: Any) -> Any:
+        return None if term is None else type(term)(*(values[:, None] for values in term))
 
     columns = params._replace(gusts=column(params.gusts), bias=column(params.bias), sines=column(params.sines))
     gusts = wind(t, columns)

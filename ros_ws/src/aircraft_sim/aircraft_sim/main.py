@@ -6,7 +6,7 @@ from flight_ros.startup import start_nodes
 
 
 def main() -> None:
-    """Its entry point."""
+    """Start the node."""
     start_nodes("aircraft_sim.node:AircraftNode")
 
 

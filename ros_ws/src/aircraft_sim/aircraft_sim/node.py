@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated aircraft's node: u in, y and truth out, in real time or in lockstep, whatever kind of aircraft it is."""
+"""The node of the simulated aircraft: it subscribes u and publishes y and truth, in real time or in lockstep.
+
+A watchdog measures the age of u. A u that times out gets the failsafe: hold the last value, then ramp it to trim.
+"""
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -8,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
 from flight_core.rates import nanoseconds, period_ns, seconds
-from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_not_future
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import NO_CHANNELS, instant, stamp_of
 from flight_ros.publisher_lock import PublisherLock
@@ -16,34 +19,34 @@ from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, RECORDED, TRUTH, NodeState, U, Y
 
 WINDOW = 100
-"""Samples that a lockstep flight may be ahead of its log: less than publishers keep for a recorder that is held up."""
+"""Largest lead of a lockstep flight over its log, in samples: less than publishers keep for a recorder that overruns."""
 
 
 class AircraftNode(FlightNode[AircraftParameters]):
-    """At tick k: the state from t(k-1) to t(k) under the u held since then, y and truth out, then the newest u is taken.
+    """At tick k it integrates from t(k-1) to t(k) with the last u held, publishes y and truth, then takes the newest u.
 
-    In lockstep it makes the time: /clock, y and truth at each of its instants, and at those of the controller it moves on when
-    u has come. Each instant has exactly one y, one without channels where no sample arrives.
+    In lockstep it sets the time: it publishes /clock, y and truth at each of its instants. At the controller's instants it
+    waits for u before it goes on. Each instant has exactly one y, without channels where no sample arrives.
     """
 
     def __init__(self) -> None:
         super().__init__("aircraft", AircraftParameters)
         self._simulator = Simulator(self.parameters)
         self._u = np.zeros(len(self._simulator.inputs))
-        self._source = PublisherLock()
+        self._publisher_lock = PublisherLock()
         self._u_stamp_ns = 0  # of the last u
-        self._said_silent = False
+        self._timeout_logged = False
         self._u_subscription, self._decoder = self.subscribe(U), self.decoder(U, self._simulator.inputs)
         self._publish_y, self._publish_truth = self.advertise(Y), self.advertise(TRUTH)
         self._y_encoder = self.encoder(Y, self._simulator.outputs)
         self._truth_encoder = self.encoder(TRUTH, self._simulator.truth_names)
         if self.parameters.lockstep:
-            self._number = 0  # of the sample that comes next
-            self._answered = True
+            self._number = 0  # of the next sample
+            self._u_received = True
             self._recorded_ns = 0
             self._control_ns = period_ns(self.parameters.control_rate, "control_rate")
             self._end_ns = nanoseconds(self.parameters.duration) or None
-            self._nothing = self.encoder(Y, ())
+            self._empty_encoder = self.encoder(Y, ())
             self._recorded_subscription = self.subscribe(RECORDED)
             self._publish_clock = self.advertise(CLOCK)
 
@@ -54,8 +57,8 @@ class AircraftNode(FlightNode[AircraftParameters]):
         return nanoseconds(self.parameters.start_time)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        share = self.parameters.failsafe_scale(self._source.silence_ns(now_ns))
-        self._publish(tick.number, now_ns - tick.number * self.period_ns(), self._u if share == 1.0 else share * self._u)
+        scale = self.parameters.failsafe_scale(self._publisher_lock.age_ns(now_ns))
+        self._publish(tick.number, now_ns - tick.number * self.period_ns(), self._u if scale == 1.0 else scale * self._u)
         self._take_u(now_ns)
 
     def _publish(self, number: int, start_ns: int, u: FloatArray) -> bool:
@@ -67,26 +70,26 @@ class AircraftNode(FlightNode[AircraftParameters]):
         return bool(arrived)
 
     def advance(self) -> bool:
-        if not self._answered and not self._take_u(self._number * self.period_ns()):
+        if not self._u_received and not self._take_u(self._number * self.period_ns()):
             return False
-        self._answered = True
-        if self._finished() or self._ahead_of_the_log():
+        self._u_received = True
+        if self._finished() or self._ahead_of_log():
             return False
         t_ns = self._number * self.period_ns()
-        self._publish_clock(instant(t_ns))  # first: y_m is made while the aircraft moves
+        self._publish_clock(instant(t_ns))  # first: the reference model computes y_m while the aircraft integrates
         if not self._publish(self._number, 0, self._u):
-            self._publish_y(self._nothing.encode(t_ns, NO_CHANNELS))
-        self._answered = t_ns % self._control_ns != 0
+            self._publish_y(self._empty_encoder.encode(t_ns, NO_CHANNELS))
+        self._u_received = t_ns % self._control_ns != 0
         self._number += 1
         if self._finished():
             self.publish_state(NodeState.COMPLETED)
-            self.get_logger().info(f"flown to its end at t = {seconds(t_ns):g} s")
+            self.get_logger().info(f"flight completed at t = {seconds(t_ns):g} s")
         return True
 
     def _finished(self) -> bool:
         return self._end_ns is not None and self._number * self.period_ns() > self._end_ns
 
-    def _ahead_of_the_log(self) -> bool:
+    def _ahead_of_log(self) -> bool:
         if not self.parameters.recorded:
             return False
         for received in self._recorded_subscription.take():
@@ -94,62 +97,63 @@ class AircraftNode(FlightNode[AircraftParameters]):
         return self._number * self.period_ns() >= self._recorded_ns + WINDOW * self.period_ns()
 
     def awaited_topic(self) -> str:
-        return self._u_subscription.name if not self._answered else self._recorded_subscription.name
+        return self._u_subscription.name if not self._u_received else self._recorded_subscription.name
 
     def _take_u(self, now_ns: int) -> bool:
-        came = False
-        for received in self._u_subscription.take(1 if self.parameters.lockstep else None):  # in lockstep there is one answer
+        received_any = False
+        for received in self._u_subscription.take(
+            1 if self.parameters.lockstep else None
+        ):  # in lockstep there is one u for each y
             try:
                 sample = self._decoder.decode(received.message)
                 if sample is not None and not self.parameters.lockstep:
                     self._require_timely(sample, now_ns)
                 if sample is not None:
-                    self._source.require(sample.sender, now_ns, self._max_age_ns, self._strange_ns)
+                    self._publisher_lock.check(sample.sender, now_ns, self._max_age_ns, self._takeover_ns)
             except ChannelError as error:
                 self.reject(self._u_subscription, error.reason, str(error))
                 continue
-            came = True
-            if sample is not None:  # else the controller has nothing to say at this instant of a lockstep flight
+            received_any = True
+            if sample is not None:  # else the controller has no output at this instant of a lockstep flight
                 self._accept(sample, now_ns)
-        if self._silent(now_ns):
+        if self._timed_out(now_ns):
             self.warn_no_publisher(self._u_subscription)
-            if self._source.name is not None and not self._said_silent:
-                self._said_silent = True
-                self.get_logger().error(self._silence)
-        return came
+            if self._publisher_lock.publisher is not None and not self._timeout_logged:
+                self._timeout_logged = True
+                self.get_logger().error(self._failsafe_message)
+        return received_any
 
     def _require_timely(self, sample: StampedVector, now_ns: int) -> None:
-        """Raise ChannelError where a u belongs to a time to come, or to one before the last u, by more than the age limit."""
-        ahead_ns, behind_ns = sample.stamp_ns - now_ns, self._u_stamp_ns - sample.stamp_ns
-        if ahead_ns > self._max_age_ns:
-            raise ChannelError("future", f"stamp {seconds(ahead_ns):g} s ahead of the clock")
-        if behind_ns > self._max_age_ns and not self._silent(now_ns):
+        """Raise ChannelError where a u is stamped in the future, or before the last u, by more than the age limit."""
+        require_not_future(sample.stamp_ns, now_ns, self._max_age_ns)
+        behind_ns = self._u_stamp_ns - sample.stamp_ns
+        if behind_ns > self._max_age_ns and not self._timed_out(now_ns):
             raise ChannelError("order", f"stamp {seconds(behind_ns):g} s before the last one")
 
     def _accept(self, sample: StampedVector, now_ns: int) -> None:
-        self._u, self._u_stamp_ns, self._said_silent = sample.value, sample.stamp_ns, False
-        if self._source.hear(sample.sender, now_ns):
-            self.get_logger().info(f"flown by {self._source.name}")
+        self._u, self._u_stamp_ns, self._timeout_logged = sample.value, sample.stamp_ns, False
+        if self._publisher_lock.refresh(sample.sender, now_ns):
+            self.get_logger().info(f"receiving u from {self._publisher_lock.publisher}")
 
     @property
     def _max_age_ns(self) -> int:
         return nanoseconds(self.parameters.max_age)
 
     @property
-    def _strange_ns(self) -> int:
-        """After which silence another node than the one before may fly it: once u is at trim."""
+    def _takeover_ns(self) -> int:
+        """Age of u from which another node may take over: u has reached trim."""
         return self._max_age_ns + nanoseconds(self.parameters.hold + self.parameters.ramp)
 
-    def _silent(self, now_ns: int) -> bool:
-        return self._source.silent(now_ns, self._max_age_ns)
+    def _timed_out(self, now_ns: int) -> bool:
+        return self._publisher_lock.timed_out(now_ns, self._max_age_ns)
 
     @property
-    def _silence(self) -> str:
-        return f"{self._source.name} is silent: its last u is held, then let go to trim"
+    def _failsafe_message(self) -> str:
+        return f"failsafe: u from {self._publisher_lock.publisher} timed out: the last value is held, then ramped to trim"
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
-        if self._source.name is None:
-            return DiagnosticStatus.WARN, "no u yet, flying in trim", {}
-        if not self.parameters.lockstep and self._silent(self.now_ns()):
-            return DiagnosticStatus.ERROR, self._silence, {}
-        return DiagnosticStatus.OK, f"flown by {self._source.name}", {}
+        if self._publisher_lock.publisher is None:
+            return DiagnosticStatus.WARN, "no u received yet: flying in trim", {}
+        if not self.parameters.lockstep and self._timed_out(self.now_ns()):
+            return DiagnosticStatus.ERROR, self._failsafe_message, {}
+        return DiagnosticStatus.OK, f"receiving u from {self._publisher_lock.publisher}", {}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the simulated aircraft, validated once, and the arrays that the maths takes."""
+"""Parameters of the simulated aircraft, validated once, and their conversion to the arrays of the equations."""
 
 from collections.abc import Mapping, Sequence
 from typing import Annotated, NamedTuple, Self
@@ -33,10 +33,10 @@ from flight_core.vectors import FloatArray
 
 
 class AircraftChannels(NamedTuple):
-    """What an aircraft shows to the outside, whatever kind it is."""
+    """Outputs and inputs of an aircraft of any kind."""
 
     outputs: dict[str, Unit]  # in the order of y
-    inputs: dict[str, Unit]  # in the order of u; the unit that people read, topics are SI
+    inputs: dict[str, Unit]  # in the order of u; display units, topics are SI
     speed: float  # trim speed V0, m/s
 
 
@@ -71,16 +71,16 @@ class TurbulenceParameters(Parameters):
 
     @property
     def has_intensity(self) -> bool:
-        """Whether it has any intensity."""
+        """Whether the intensity is above 0."""
         return bool(self.wind or self.sigma)
 
 
 class BiasParameters(Parameters):
-    """A bias on x_dot of one state: from 0 to its value along half a cosine, or a step with rise 0."""
+    """A bias on x_dot of one state. It rises from 0 to its value along half a cosine; with rise 0 it is a step."""
 
     start: float = Field(ge=0, description="the instant at which it begins, s")
-    value: float = Field(description="what it comes to, SI unit of the state per s")
-    rise: float = Field(ge=0, description="how long it takes, s; 0 is a step, which lies outside the theorem")
+    value: float = Field(description="the final value, SI unit of the state per s")
+    rise: float = Field(ge=0, description="the rise time, s; 0 is a step, which lies outside the theorem")
 
 
 class SineParameters(Parameters):
@@ -92,15 +92,15 @@ class SineParameters(Parameters):
 
 
 class UncertaintyParameters(Parameters):
-    """An aircraft drawn around the airframe: each entry times 1 + d, d uniform and independent; rows of angles stay."""
+    """An aircraft sampled around the airframe: each entry times 1 + d, d uniform and independent; rows of angles stay."""
 
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
-    number: int = Field(default=0, ge=0, lt=2**32, description="which of the seed's aircraft, from 0 on")
+    number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's aircraft, from 0 on")
 
 
-# One value a channel, or none at all for an ideal one. A limit may be infinite (.inf in YAML): none on that channel.
+# One value per channel; an empty list means ideal channels. A limit may be infinite (.inf in YAML): no limit on that channel.
 NonNegativesOrNone = Annotated[tuple[Annotated[float, Field(ge=0)], ...], BeforeValidator(as_tuple)]
 Lower = Annotated[tuple[Annotated[float, Field(le=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
 Upper = Annotated[tuple[Annotated[float, Field(ge=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
@@ -110,7 +110,7 @@ Times = Upper  # from 0 on, .inf for never
 
 
 class ActuatorParameters(Parameters):
-    """The actuators, one value an input in the airframe's order; a list that is left out is that of ideal ones."""
+    """The actuators, one value per input in the airframe's order. A list that is left out means ideal actuators."""
 
     lag: NonNegativesOrNone = Field(
         default=(), description="time constants of the first-order response, s, 0 where there is none"
@@ -119,12 +119,12 @@ class ActuatorParameters(Parameters):
     upper: Upper = Field(default=(), description="upper end stops, deviations from trim, SI")
     rate: Rates = Field(default=(), description="rate limits, SI per s")
     dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones of the commands, SI")
-    stuck_at: Times = Field(default=(), description="from when on each stays where it is, s; .inf is never")
-    lost_at: Times = Field(default=(), description="from when on each gives no effect and is at trim, s; .inf is never")
+    stuck_at: Times = Field(default=(), description="from when on each keeps its position, s; .inf is never")
+    lost_at: Times = Field(default=(), description="from when on each has no effect and is at trim, s; .inf is never")
 
 
 class SensorParameters(Parameters):
-    """The sensors; as they stand by default they are ideal."""
+    """The sensors. The defaults are ideal sensors."""
 
     bias: NumbersOrNone = Field(default=(), description="constant errors, one an output, SI")
     drift: NonNegativesOrNone = Field(default=(), description="random walks, one an output: standard deviation, SI per sqrt(s)")
@@ -132,7 +132,9 @@ class SensorParameters(Parameters):
     quantisation: NonNegativesOrNone = Field(
         default=(), description="steps of the measured values, one an output, SI, 0 for none"
     )
-    delay: float = Field(default=0.0, ge=0, le=1e6, description="from its instant to its arrival, s; whole periods of `rate`")
+    delay: float = Field(
+        default=0.0, ge=0, le=1e6, description="transport delay from measurement to arrival, s; whole periods of `rate`"
+    )
     dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is lost")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
@@ -143,9 +145,9 @@ class AircraftParameters(KeyedParameters):
     airframe: str = Field(
         description="the name of an airframe of the library, the path of an airframe file, or jsbsim:NAME for one of JSBSim's"
     )
-    speed: Positive | None = Field(default=None, description="of an aircraft of JSBSim: the true airspeed it trims at, m/s")
+    speed: Positive | None = Field(default=None, description="of an aircraft of JSBSim: the true airspeed of its trim, m/s")
     altitude: NonNegative | None = Field(
-        default=None, description="of an aircraft of JSBSim: the altitude above sea level it trims at, m"
+        default=None, description="of an aircraft of JSBSim: the altitude above sea level of its trim, m"
     )
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y is published and u taken, Hz")
     step: Annotated[float, Field(gt=0, le=1)] = Field(description="the integration step, s; a whole fraction of 1 / rate")
@@ -153,14 +155,16 @@ class AircraftParameters(KeyedParameters):
         default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
     )
     gusts: dict[str, Gust] = Field(default={}, description="gusts by the axis of the wind: longitudinal, lateral, vertical")
-    turbulence: TurbulenceParameters | None = Field(default=None, description="turbulence of all axes that the airframe knows")
+    turbulence: TurbulenceParameters | None = Field(
+        default=None, description="turbulence along all axes of the airframe's gusts"
+    )
     bias: dict[str, BiasParameters] = Field(default={}, description="biases on x_dot by state")
     sines: dict[str, SineParameters] = Field(default={}, description="sines on x_dot by state")
     inertial_coupling: float = Field(
-        default=0.0, ge=0, le=1, description="how much of the airframe's inertial coupling acts, 0 to 1"
+        default=0.0, ge=0, le=1, description="the factor on the airframe's inertial coupling, 0 to 1"
     )
     uncertainty: UncertaintyParameters = Field(
-        default=UncertaintyParameters(), description="how far the aircraft is from its airframe"
+        default=UncertaintyParameters(), description="how far the aircraft differs from its airframe"
     )
     actuators: ActuatorParameters = Field(default=ActuatorParameters(), description="the actuators, ideal where left out")
     sensors: SensorParameters = Field(default=SensorParameters(), description="the sensors, ideal where left out")
@@ -171,9 +175,11 @@ class AircraftParameters(KeyedParameters):
     duration: float = Field(default=0.0, ge=0, le=1e6, description="in lockstep: the flight time to stop at, s; 0 never stops")
     recorded: bool = Field(default=False, description="in lockstep: wait for the recorder too, so that nothing is lost")
 
-    max_age: float = Field(default=0.2, gt=0, le=1e6, description="how long without u until its controller counts as silent, s")
-    hold: float = Field(default=0.5, ge=0, le=1e6, description="how long the last u is then held, s")
-    ramp: float = Field(default=2.0, ge=0, le=1e6, description="how long it then takes to trim, s")
+    max_age: float = Field(
+        default=0.2, gt=0, le=1e6, description="watchdog: the age of u from which its controller counts as lost, s"
+    )
+    hold: float = Field(default=0.5, ge=0, le=1e6, description="failsafe: how long the last u is then held, s")
+    ramp: float = Field(default=2.0, ge=0, le=1e6, description="failsafe: how long the ramp to trim then takes, s")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -224,12 +230,12 @@ class AircraftParameters(KeyedParameters):
             require(getattr(self, key) is not None, key, "none", f"the {unit}")
         for name in self.gusts:
             require(name in AXES, f"gusts.{name}", f"{name!r}", f"an axis of the wind: {', '.join(AXES)}")
-        drawn = self.uncertainty.A > 0.0 or self.uncertainty.B > 0.0
+        uncertain = self.uncertainty.A > 0.0 or self.uncertainty.B > 0.0
         for key, found in (
             ("bias", self.bias),
             ("sines", self.sines),
             ("inertial_coupling", self.inertial_coupling),
-            ("uncertainty", drawn),
+            ("uncertainty", uncertain),
         ):
             require(not found, key, "it", f"none: {self.airframe} has no matrices that it could change")
 
@@ -243,31 +249,31 @@ class AircraftParameters(KeyedParameters):
         """The integration step in ns."""
         return nanoseconds(self.step)
 
-    def failsafe_scale(self, silence_ns: int) -> float:
-        """How much of the last u is still commanded after a silence of its controller: `fade` from max_age on."""
-        return failsafe_scale(silence_ns, nanoseconds(self.max_age + self.hold), nanoseconds(self.ramp))
+    def failsafe_scale(self, age_ns: int) -> float:
+        """Failsafe: scale of the last u at an age. It is held for max_age + hold, then ramped to trim."""
+        return failsafe_scale(age_ns, nanoseconds(self.max_age + self.hold), nanoseconds(self.ramp))
 
     def channels(self) -> AircraftChannels:
         """Outputs and inputs with their units, and the trim speed."""
         if self.is_jsbsim:
             return AircraftChannels(dict(OUTPUTS), dict.fromkeys(INPUTS, "1"), self.flight_condition().speed)
         airframe = load_airframe(self.airframe)
-        inputs = {name: one.unit for name, one in airframe.inputs.items()}
+        inputs = {name: given.unit for name, given in airframe.inputs.items()}
         return AircraftChannels({name: airframe.states[name] for name in airframe.outputs}, inputs, airframe.speed)
 
     def sampled_airframe(self) -> Airframe:
-        """The airframe that flies: the one named, or that of `uncertainty` around it."""
-        around = self.uncertainty
-        return uncertainty.sample_airframe(load_airframe(self.airframe), around.A, around.B, around.seed, around.number)
+        """The airframe in flight: the named one, or the sample of `uncertainty` around it."""
+        chosen = self.uncertainty
+        return uncertainty.sample_airframe(load_airframe(self.airframe), chosen.A, chosen.B, chosen.seed, chosen.number)
 
     def load(self) -> tuple[Airframe, Aircraft]:
-        """The airframe that flies and the arrays of equation (1) in this disturbance, all axes of the wind that it knows."""
+        """The airframe in flight and the arrays of equation (1) with all disturbances, for the axes of the airframe's gusts."""
         airframe = self.sampled_airframe()
         gusts = [self.gusts.get(axis, STILL_AIR) for axis in airframe.gusts]
         direction = [airframe.gust_direction(axis) for axis in airframe.gusts]
         gain, first, second = airframe.products()
-        biases = {name: one for name, one in self.bias.items() if one.value != 0.0}
-        sines = {name: one for name, one in self.sines.items() if one.amplitude != 0.0}
+        biases = {name: bias for name, bias in self.bias.items() if bias.value != 0.0}
+        sines = {name: sine for name, sine in self.sines.items() if sine.amplitude != 0.0}
         return airframe, Aircraft(
             airframe.matrix_a(),
             airframe.matrix_b(),
@@ -282,7 +288,7 @@ class AircraftParameters(KeyedParameters):
         )
 
     def plant(self) -> PlantParams:
-        """What moves as arrays: equation (1), the actuators and the turbulence."""
+        """The plant as arrays: equation (1), the actuators and the turbulence."""
         airframe, aircraft = self.load()
         return PlantParams(
             aircraft, self.actuator_model(), self.step_ns, self._turbulence(airframe.speed, list(airframe.gusts))
@@ -293,23 +299,23 @@ class AircraftParameters(KeyedParameters):
         return Actuators(**{key: _array(values, key in {"lag", "dead_zone"}) for key, values in self.actuators})
 
     def flight_condition(self) -> FlightCondition:
-        """The aircraft of JSBSim and the condition it flies in. Raises ParameterError where it is none of those."""
+        """The aircraft of JSBSim and its flight condition. Raises ParameterError for another aircraft."""
         if self.speed is None or self.altitude is None:
             raise ParameterError(f"airframe: found {self.airframe!r}, expected {PREFIX}NAME with a speed and an altitude")
         return FlightCondition(self.airframe.removeprefix(PREFIX), self.speed, self.altitude, self.step_ns)
 
     def wind_model(self) -> WindModel:
-        """What blows around an aircraft of JSBSim, on all axes."""
+        """The wind of an aircraft of JSBSim, on all axes."""
         gusts = [self.gusts.get(axis, STILL_AIR) for axis in AXES]
         arrays = (np.array([getattr(gust, key) for gust in gusts]) for key in Gusts._fields)
         return WindModel(Gusts(*arrays), self._turbulence(self.flight_condition().speed, AXES))
 
     def _turbulence(self, speed: float, axes: Sequence[str]) -> Turbulence | None:
-        air = self.turbulence
-        if air is None or not air.has_intensity:
+        section = self.turbulence
+        if section is None or not section.has_intensity:
             return None
-        spectrum = dryden(air.altitude, air.wind or 0.0, air.sigma or 0.0)  # none is given where it does not act
-        return filters(spectrum, speed, self.step, [AXES.index(axis) for axis in axes], air.seed)
+        spectrum = dryden(section.altitude, section.wind or 0.0, section.sigma or 0.0)  # None where it has no effect
+        return filters(spectrum, speed, self.step, [AXES.index(axis) for axis in axes], section.seed)
 
     def sensor_arrays(self) -> Sensors:
         """The sensors as arrays."""
@@ -330,10 +336,10 @@ STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)
 
 
 def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
-    """The values, None where they are left out or, if that is so here, all zero: what is off is absent."""
+    """The values as an array; None where they are left out or, with zero_is_none, where all are zero."""
     return None if not values or (zero_is_none and not any(values)) else np.array(values, dtype=np.float64)
 
 
 def _by_state(named: Mapping[str, Parameters], keys: Sequence[str], airframe: Airframe) -> list[FloatArray]:
-    """A column a key, with 0 for a state that is not named."""
+    """An array per key, over all states, with 0 for a state that is not named."""
     return [np.array([float(getattr(named.get(state), key, 0.0)) for state in airframe.states]) for key in keys]

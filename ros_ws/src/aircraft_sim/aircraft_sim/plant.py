@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The aircraft in time: equation (1) behind its actuators, in fixed steps."""
+"""The simulated plant: equation (1) behind its actuators, integrated in fixed steps, with zero-order hold of u."""
 
 from typing import NamedTuple
 
@@ -13,35 +13,35 @@ from flight_core.rates import divide, seconds
 from flight_core.vectors import Array, array_namespace
 
 DIVERGENCE_LIMIT = 1e6
-"""SI. No state of an aircraft comes near it; a diverged loop passes it on its way to infinity."""
+"""SI. A state above this limit counts as diverged; no state of an aircraft in flight comes near it."""
 
 
 class PlantParams(NamedTuple):
-    """What flies."""
+    """Parameters of the plant: aircraft, actuators, integration step and turbulence."""
 
     aircraft: Aircraft
     actuators: Actuators
     step_ns: int  # of the integration
-    turbulence: Turbulence | None = None  # of one step; None in calm air
+    turbulence: Turbulence | None = None  # of one step; None without turbulence
 
 
 class AircraftState(NamedTuple):
-    """What the aircraft carries in time, deviations from trim, SI."""
+    """State of the plant, deviations from trim, SI."""
 
     x: Array  # (n,)
-    position: Array  # (m,) of the actuators: the input that acts
-    turbulence: Array | None = None  # (5,) of its filters; None in calm air
+    position: Array  # (m,) of the actuators: the input of equation (1)
+    turbulence: Array | None = None  # (5,) of the turbulence filters; None without turbulence
 
 
 def initial_state(plant: PlantParams) -> AircraftState:
-    """The state in trim: x = 0, the actuators at 0, and the turbulence, if any, drawn from its stationary distribution."""
+    """The state in trim: x = 0, actuators at 0, turbulence filters in a sample of their stationary distribution."""
     xp = array_namespace(plant.aircraft.A)
     z = None if plant.turbulence is None else turbulence.initial_state(plant.turbulence)
     return AircraftState(xp.zeros_like(plant.aircraft.A[0, :]), xp.zeros_like(plant.aircraft.B[0, :]), z)
 
 
 def forcing(t_ns: int, steps: int, plant: PlantParams) -> Forcing:
-    """What depends on time alone at the beginnings, middles and ends of so many steps from t on: 2 steps + 1 instants."""
+    """Forcing at the beginnings, middles and ends of a number of steps from t on: 2 steps + 1 instants."""
     halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
     return dynamics.at_times(seconds(t_ns) + seconds(plant.step_ns) / 2.0 * halves, plant.aircraft)
 
@@ -59,40 +59,40 @@ def advance(
 
     Each step dt, from t_k on, is
 
-        position+ = actuators.step(position, u, dt), or what a fault leaves of it
+        position+ = actuators.apply_faults(t_k, position, actuators.step(position, u, dt))
         x+        = Runge-Kutta step of equation (1) with the input position+ and the turbulence at t_k
         z+        = turbulence.step(z, n_k)
 
-    The position at the end of the step acts during all of it: an ideal actuator then passes u on without a delay, to the last
-    bit, and a real one leads its continuous model by dt / 2. The turbulence at the beginning of the step acts during all of
-    it: seen at the steps it has its spectrum exactly, in between it is held. Time is counted in ns so that steps add up
-    exactly. `forced` is the `forcing` of these steps, where the caller has it. `normals` are the numbers n_k, shape (steps, 5);
-    by default those of the seed, which only NumPy can draw.
-    Raises ParameterError where the step does not divide the duration.
+    The position at the end of the step acts during the whole step. An ideal actuator then passes u on without delay, to the
+    last bit, and a real one leads its continuous model by dt / 2. The turbulence at the beginning of the step acts during the
+    whole step: sampled at the steps it has its spectrum exactly, in between it is held. Time is counted in ns, so that steps
+    add up exactly. `forced` is the `forcing` of these steps, if the caller has it. `normals` are the numbers n_k, shape
+    (steps, 5); by default they follow from the seed, which takes NumPy. Raises ParameterError where the step does not divide
+    the duration.
     """
     x, position, z = state
-    aircraft, air = plant.aircraft, plant.turbulence
+    aircraft, filters = plant.aircraft, plant.turbulence
     steps, dt = divide(duration_ns, plant.step_ns, "step", "the duration"), seconds(plant.step_ns)
     if normals is None:
-        normals = () if air is None else turbulence.normals(t_ns // plant.step_ns, steps, air.seed)
+        normals = () if filters is None else turbulence.normals(t_ns // plant.step_ns, steps, filters.seed)
 
-    def x_dot(since: float, x: Array, rest: Array, params: Aircraft) -> Array:
-        return dynamics.x_dot_forced(x, rest[round(2.0 * since / dt)], params)
+    def x_dot(since: float, x: Array, forced: Array, params: Aircraft) -> Array:
+        return dynamics.x_dot_forced(x, forced[round(2.0 * since / dt)], params)
 
-    given = (forcing(t_ns, steps, plant) if forced is None else forced).rate
+    rate = (forcing(t_ns, steps, plant) if forced is None else forced).rate
     for k in range(steps):
         moved = actuators.step(position, u, dt, plant.actuators)
         position = actuators.apply_faults(seconds(t_ns + k * plant.step_ns), position, moved, plant.actuators)
         held = aircraft.B @ position
-        if air is not None:
-            held = held + aircraft.gust_direction @ turbulence.wind(z, air)
-            z = turbulence.step(z, normals[k], air)
-        x = rk4(x_dot, 0.0, x, given[2 * k : 2 * k + 3] + held, aircraft, dt)
+        if filters is not None:
+            held = held + aircraft.gust_direction @ turbulence.wind(z, filters)
+            z = turbulence.step(z, normals[k], filters)
+        x = rk4(x_dot, 0.0, x, rate[2 * k : 2 * k + 3] + held, aircraft, dt)
     return AircraftState(x, position, z)
 
 
 def diverged(state: AircraftState) -> bool:
-    """Whether a state is beyond anything that flies: not finite, or above DIVERGENCE_LIMIT in any component."""
+    """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
     xp = array_namespace(state.x)
     return not bool(xp.all(xp.abs(state.x) < DIVERGENCE_LIMIT))  # False for NaN too
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Random numbers by counter: a draw depends on its seed, stream and number alone, whatever was drawn before.
+"""Counter-based random numbers (Philox): a draw depends on seed, stream and number alone, not on earlier draws.
 
-Two flights of one scenario therefore agree, whatever either of them missed. The generator is NumPy's and stays outside the
-maths that other array types run.
+Two flights of one scenario therefore agree, even if one of them misses samples. The generator is NumPy's. It stays outside
+the functions that run on other array types.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from flight_core.vectors import FloatArray
 
 NOISE, LOSS, DRIFT, TURBULENCE, TURBULENCE_START, AIRFRAME = range(6)
-"""Streams, one for each use. They are independent of one another under the same seed."""
+"""Streams, one for each use. Under the same seed they are independent of each other."""
 
 
 def generator(number: int, stream: int, seed: int) -> np.random.Generator:
@@ -24,9 +24,9 @@ def generator(number: int, stream: int, seed: int) -> np.random.Generator:
 
 
 def uniform(first: int, count: int, width: int, stream: int, seed: int) -> FloatArray:
-    """Draws first, first + 1, ... of `width` numbers each, uniform in [0, 1), shape (count, width), at once.
+    """Draws first, first + 1, ... of `width` numbers each, uniform in [0, 1), shape (count, width).
 
-    Here a draw is a whole number of the counter's steps, each of four numbers, so that draws follow each other.
+    Here a draw takes a whole number of counter steps of four numbers each, so that one generator gives all draws.
     """
     steps = -(-width // 4)
     generator = np.random.Generator(np.random.Philox(key=seed, counter=[first * steps, 0, stream, 0]))

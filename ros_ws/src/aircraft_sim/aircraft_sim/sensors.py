@@ -11,10 +11,10 @@ from flight_core.vectors import Array, FloatArray, StampedVector, array_namespac
 
 
 class Sensors(NamedTuple):
-    """Parameters of the sensors of m outputs. Ideal ones have noise 0, delay 0 and dropout 0. What is None is absent."""
+    """Parameters of the sensors of m outputs. Ideal sensors have noise 0, delay 0 and dropout 0. None: the error is absent."""
 
     noise: FloatArray  # (m,) standard deviation per sample, SI
-    delay_ns: int  # from the instant of a sample to its arrival
+    delay_ns: int  # transport delay, from the instant of a sample to its arrival
     dropout: float  # probability that a sample is lost, all channels together
     seed: int
     bias: FloatArray | None = None  # (m,) SI
@@ -23,14 +23,14 @@ class Sensors(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """What the sensors carry in time: a random walk up to a sample."""
+    """State of the sensors: the random walk at a sample."""
 
-    number: int
+    number: int  # of the sample
     value: FloatArray  # (m,) SI
 
 
 class Measured(NamedTuple):
-    """What the sensors make of one instant."""
+    """A measurement."""
 
     y: FloatArray  # (m,)
     error: FloatArray  # (m,) y measured - C x
@@ -38,6 +38,7 @@ class Measured(NamedTuple):
 
 
 DelayLine = tuple[StampedVector, ...]
+"""Samples that have been measured and have not arrived yet, the oldest first."""
 
 
 def initial_drift(params: Sensors) -> Drift:
@@ -46,11 +47,11 @@ def initial_drift(params: Sensors) -> Drift:
 
 
 def measure(number: int, y: FloatArray, drift: Drift, params: Sensors) -> Measured:
-    """What the sensors make of y = C x, shape (m,), at sample `number`, not before that of `drift`:
+    """Measurement of y = C x, shape (m,), at sample `number`, which is not before that of `drift`:
 
         measured = quantised(y + error(number))
 
-    The error of a quantised sample is its measured value less y, the whole of it. Ideal sensors give y to the last bit.
+    The error of a quantised sample is its measured value less y. Ideal sensors give y to the last bit.
     """  # noqa: D400, D415 - what follows is an equation
     added, drift = error(number, drift, params)
     measured = y + added
@@ -61,7 +62,7 @@ def measure(number: int, y: FloatArray, drift: Drift, params: Sensors) -> Measur
 
 
 def error(number: int, drift: Drift, params: Sensors) -> tuple[FloatArray, Drift]:
-    """What is added to y at sample `number`, whatever y is: bias + walk(number) + noise(number), shape (m,); and the walk."""
+    """Additive error at sample `number`, bias + walk(number) + noise(number), shape (m,), and the walk; y plays no part."""
     drift = walk(number, drift, params)
     added = noise(number, params)
     if params.bias is not None:
@@ -86,7 +87,7 @@ def noise(number: int, params: Sensors) -> FloatArray:
 def walk(number: int, drift: Drift, params: Sensors) -> Drift:
     """The random walk at sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k), with n standard normal and independent.
 
-    The steps of samples that nobody looked at are made up for, one by one: the walk does not depend on what was missed.
+    Steps of skipped samples are added too, so the walk does not depend on which samples were measured.
     """
     if params.drift is None:
         return drift
@@ -99,17 +100,17 @@ def walk(number: int, drift: Drift, params: Sensors) -> Drift:
 
 
 def arrives(number: int, params: Sensors) -> bool:
-    """Whether sample `number` >= 0 is not lost: v >= dropout with v uniform in [0, 1), independent of the noise."""
+    """Whether sample `number` >= 0 is not dropped: v >= dropout with v uniform in [0, 1), independent of the noise."""
     return (
         params.dropout == 0.0 or random_streams.generator(number, random_streams.LOSS, params.seed).random() >= params.dropout
     )
 
 
 def transmit(delay_line: DelayLine, now_ns: int, y: FloatArray | None, params: Sensors) -> tuple[DelayLine, DelayLine]:
-    """One sample instant of the way from the sensors: (under way, now, y) -> (under way, arrived).
+    """Transport delay at one sample instant: (delay line, now, y) -> (delay line, arrived samples).
 
-    The y of now, None where it is lost, sets out with the stamp now; whatever has been under way for the delay arrives, the
-    oldest first. A stamp stays the instant that its sample belongs to.
+    y enters the delay line with the stamp now; None: the sample is dropped. Samples that are as old as the delay arrive, the
+    oldest first. A stamp stays the instant of measurement.
     """
     sent = delay_line if y is None else (*delay_line, StampedVector(now_ns, y))
     arrived = sum(sample.stamp_ns + params.delay_ns <= now_ns for sample in sent)

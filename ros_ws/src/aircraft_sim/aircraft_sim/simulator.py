@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated aircraft at its sample instants: what moves, and the sensors that look at it.
+"""The simulated aircraft at its sample instants: a flight dynamics model and its sensors.
 
-The node over topics and the loop in one process both fly this, whatever kind of aircraft moves behind it.
+The node and the loop in one process both use this simulator, for every kind of aircraft.
 """
 
 from typing import Protocol
@@ -21,11 +21,11 @@ BLOCK = 100  # steps
 
 
 class FlightDynamicsModel(Protocol):
-    """What moves between the command and the sensors."""
+    """The interface of an aircraft between command and sensors."""
 
     @property
     def truth_names(self) -> tuple[str, ...]:
-        """AircraftChannels of `truth` that it knows: "group.name"."""
+        """Channels of `truth`: "group.name"."""
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """From t to t + duration with the command u held, deviations from trim, SI."""
@@ -37,13 +37,13 @@ class FlightDynamicsModel(Protocol):
         """Values in the order of `truth_names`."""
 
     def diverged(self) -> bool:
-        """Whether the state is beyond anything that flies."""
+        """Whether the state is not finite or too large for a flight."""
 
 
 class StateSpaceModel:
     """Equation (1) with the matrices of an airframe, behind its actuators.
 
-    What depends on time alone is worked out for BLOCK steps at once, in a tenth of the time.
+    The forcing is computed for BLOCK steps together, which takes a tenth of the time.
     """
 
     def __init__(self, parameters: AircraftParameters) -> None:
@@ -71,8 +71,8 @@ class StateSpaceModel:
 
     def truth(self, t_ns: int) -> FloatArray:
         """See FlightDynamicsModel."""
-        place = 2 * ((t_ns - self._block_ns) // self._plant.step_ns)
-        return truth.values(self._state, self._block.wind[place], self._block.rate[place], self._plant)
+        index = 2 * ((t_ns - self._block_ns) // self._plant.step_ns)
+        return truth.values(self._state, self._block.wind[index], self._block.rate[index], self._plant)
 
     def diverged(self) -> bool:
         """See FlightDynamicsModel."""
@@ -80,7 +80,7 @@ class StateSpaceModel:
 
 
 def flight_dynamics_model(parameters: AircraftParameters) -> FlightDynamicsModel:
-    """The vehicle that the parameters name, in trim at t = 0."""
+    """The aircraft of the parameters, in trim at t = 0."""
     if parameters.is_jsbsim:
         from aircraft_sim.jsbsim_model import JsbsimModel  # noqa: PLC0415 - other aircraft fly without JSBSim
 
@@ -89,7 +89,7 @@ def flight_dynamics_model(parameters: AircraftParameters) -> FlightDynamicsModel
 
 
 class Simulator:
-    """A vehicle and its sensors, sample by sample."""
+    """A flight dynamics model and its sensors, sample by sample."""
 
     def __init__(self, parameters: AircraftParameters) -> None:
         channels = parameters.channels()
@@ -104,10 +104,10 @@ class Simulator:
         self._number = 0
 
     def sample(self, number: int, u: FloatArray) -> DelayLine:
-        """Sample `number`, at number periods of flight time: moves there with u held since the one before, and measures.
+        """Advance to sample `number`, at number periods of flight time, with u held since the last sample, and measure.
 
-        The y that arrive now, the oldest first; their stamps are flight time. Raises FlightEnded where the aircraft has
-        diverged.
+        Returns the y that arrive now, the oldest first; their stamps are flight time. Raises FlightEnded where the aircraft
+        has diverged.
         """
         t_ns, before_ns = number * self.period_ns, self._number * self.period_ns
         if number > self._number:
@@ -121,6 +121,6 @@ class Simulator:
         return arrived
 
     def truth(self) -> FloatArray:
-        """What the aircraft really does at the instant of the last sample, in the order of `truth_names`."""
+        """The true values at the instant of the last sample, in the order of `truth_names`."""
         t_ns = self._number * self.period_ns
         return np.concatenate([[seconds(t_ns)], self._model.truth(t_ns), self._error])

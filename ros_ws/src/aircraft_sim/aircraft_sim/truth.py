@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the aircraft really does: the full state, f(x, t), the wind and the actuators, for the log alone."""
+"""Ground truth for the log: the full state, f(x, t), the wind and the actuator positions. No controller receives it."""
 
 import numpy as np
 
@@ -11,10 +11,10 @@ from flight_core.vectors import FloatArray
 
 
 def names(airframe: Airframe) -> tuple[str, ...]:
-    """AircraftChannels of `truth`, group by group.
+    """Channels of `truth`, group by group.
 
-    "x.state", "f.state" (the part of x_dot, all disturbances in it), "gust.axis" (the wind along each axis that the airframe
-    knows, 1-cosine gust and turbulence together, m/s), "actuator.input" (the position that has acted up to now).
+    "x.state", "f.state" (f of equation (1), with all disturbances), "gust.axis" (the wind along each axis of the airframe's
+    gusts, 1-cosine gust plus turbulence, m/s), "actuator.input" (the position that has acted up to now).
     """
     groups = {
         "x": tuple(airframe.states),
@@ -28,10 +28,10 @@ def names(airframe: Airframe) -> tuple[str, ...]:
 def values(state: AircraftState, wind: FloatArray, rate: FloatArray, plant: PlantParams) -> FloatArray:
     """Values of `truth` in the order of `names`; f and the wind are those that act from now on.
 
-    `wind` (G,) and `rate` (n,) are what `dynamics.Forcing` says of this instant.
+    `wind` (G,) and `rate` (n,) are the `dynamics.Forcing` of this instant.
     """
     f = dynamics.f_state(state.x, plant.aircraft) + rate
     if plant.turbulence is not None:
-        air = turbulence.wind(state.turbulence, plant.turbulence)
-        wind, f = wind + air, f + plant.aircraft.gust_direction @ air
+        turbulent = turbulence.wind(state.turbulence, plant.turbulence)
+        wind, f = wind + turbulent, f + plant.aircraft.gust_direction @ turbulent
     return np.concatenate([state.x, f, wind, state.position])

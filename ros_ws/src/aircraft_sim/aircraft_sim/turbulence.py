@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Dryden turbulence of MIL-F-8785C, MIL-HDBK-1797: intensities, lengths, and white noise through its filters, step by step.
+"""Dryden turbulence of MIL-F-8785C, MIL-HDBK-1797: intensities, lengths, and shaping filters driven by white noise.
 
-It lies outside the theorem. Assumption 2 asks for a bounded f with a bounded derivative: a Gaussian process has no bound, and
-none of the three winds has a derivative, for their filters have one pole more than zeros.
+Turbulence lies outside the theorem. Assumption 2 requires a bounded f with a bounded derivative. A Gaussian process has no
+bound, and none of the three winds has a derivative, because their filters have one pole more than zeros.
 
-The turbulence of the angular rates (p_g, q_g, r_g of the specifications) is left out: it takes a span and the aerodynamic
-part of A's columns of p, q, r, and no airframe of the library states them. It is not small everywhere: at 100 m, for a span
-of 3 m, the specification's p_g accelerates the `osprey` in roll seven times as hard (rms) as v_g does; q_g adds two fifths to
-what w_g does in pitch, r_g a sixteenth in yaw. So turbulent flights here roll less than real ones.
+The turbulence of the angular rates (p_g, q_g, r_g of the specifications) is left out: it depends on the span and on the
+aerodynamic part of A's columns of p, q, r, which no airframe of the library states. It is not small everywhere: at 100 m, for
+a span of 3 m, the specification's p_g gives the `osprey` seven times the roll acceleration (rms) of v_g; q_g adds two fifths to
+the pitch acceleration of w_g, r_g a sixteenth in yaw. Turbulent flights here therefore roll less than real ones.
 """
 
 from collections.abc import Sequence
@@ -27,18 +27,18 @@ LOWEST, LOW, HIGH = 10.0 * FOOT, 1000.0 * FOOT, 2000.0 * FOOT
 HIGH_LENGTH = 1750.0 * FOOT  # m, MIL-F-8785C 3.7.2.1, Dryden form
 
 STATES = 5  # one of the longitudinal filter, two of the lateral, two of the vertical one
-BLOCK = 64  # steps whose numbers are drawn together: making a generator takes as long as drawing hundreds of numbers
+BLOCK = 64  # steps that share a generator: creating one takes as long as hundreds of its numbers
 
 
 class Dryden(NamedTuple):
-    """What makes a Dryden spectrum, longitudinal, lateral, vertical."""
+    """Parameters of the Dryden spectra, longitudinal, lateral, vertical."""
 
     length: FloatArray  # (3,) scale lengths L of MIL-F-8785C, m
     sigma: FloatArray  # (3,) intensities: standard deviations, m/s
 
 
 class Turbulence(NamedTuple):
-    """The filters of turbulence over one step, for the winds of G axes; the state z is (5,), of unit variance or less."""
+    """Discretised turbulence filters of one step, for the winds of G axes. The state z is (5,), of unit variance or less."""
 
     transition: Array  # (5, 5)
     spread: Array  # (5, 5), lower triangular
@@ -56,21 +56,21 @@ def dryden(altitude: float, wind: float, sigma: float) -> Dryden:
         h <= 1000 ft    L_w = h,  L_u = L_v = h / c^1.2,  sigma_w = 0.1 W_20,  sigma_u = sigma_v = sigma_w / c^0.4
                         with c = 0.177 + 0.000823 h / ft
         h >= 2000 ft    L_u = L_v = L_w = 1750 ft,  sigma_u = sigma_v = sigma_w = sigma
-        in between      straight lines from the one to the other, of L and of sigma
+        in between      linear interpolation of L and of sigma
 
-    Source: MIL-F-8785C, 3.7.2 and 3.7.3.4. MIL-HDBK-1797 counts L_v and L_w half as long and writes 2 L in its spectra, which
-    are the same. Along and across the wind are taken for along and across the trimmed flight.
+    Source: MIL-F-8785C, 3.7.2 and 3.7.3.4. MIL-HDBK-1797 defines L_v and L_w half as long and writes 2 L in its spectra, which
+    are the same. The axes along and across the wind are taken as along and across the trimmed flight.
     """
     low = min(altitude, LOW)
     c = 0.177 + 0.000823 * low / FOOT
-    share = min(max((altitude - LOW) / (HIGH - LOW), 0.0), 1.0)
-    length = (1.0 - share) * np.array([low / c**1.2, low / c**1.2, low]) + share * HIGH_LENGTH
-    across = (1.0 - share) * 0.1 * wind * np.array([c**-0.4, c**-0.4, 1.0]) + share * sigma
-    return Dryden(length, across)
+    weight = min(max((altitude - LOW) / (HIGH - LOW), 0.0), 1.0)
+    length = (1.0 - weight) * np.array([low / c**1.2, low / c**1.2, low]) + weight * HIGH_LENGTH
+    intensity = (1.0 - weight) * 0.1 * wind * np.array([c**-0.4, c**-0.4, 1.0]) + weight * sigma
+    return Dryden(length, intensity)
 
 
 def filters(spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], seed: int) -> Turbulence:
-    """The filters of the spectra, discretised exactly: at multiples of dt the winds are distributed as in continuous time.
+    """The shaping filters, discretised exactly: at multiples of dt the winds are distributed as in continuous time.
 
     With a = V0/L of each axis and white noise n of unit intensity,
 
@@ -88,7 +88,7 @@ def filters(spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], s
 
     with g_k = gammainc(k, 2h), of the integrals of 2 s^(k-1) exp(-2s) from 0 to h; stationary stationary' is that for h = inf.
 
-    Arguments: `airspeed` V0, m/s; `dt` in s; `axes` those asked for, as places in AXES. Source: MIL-F-8785C, 3.7.1.2.
+    Arguments: `airspeed` V0, m/s; `dt` in s; `axes` the required ones, as indices in AXES. Source: MIL-F-8785C, 3.7.1.2.
     """
     steps = airspeed / spectrum.length * dt
     p, q = np.sqrt(1.5), (1.0 - np.sqrt(3.0)) / np.sqrt(2.0)
@@ -103,16 +103,16 @@ def filters(spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], s
 
 
 def initial_state(params: Turbulence) -> FloatArray:
-    """State at t = 0, drawn from the stationary distribution, shape (5,)."""
+    """State at t = 0, a sample of the stationary distribution, shape (5,)."""
     normal = random_streams.generator(0, random_streams.TURBULENCE_START, params.seed).standard_normal(STATES)
     return np.asarray(params.stationary @ normal)
 
 
 def normals(first: int, count: int, seed: int) -> FloatArray:
     """Standard normal numbers of the steps first, first + 1, ... of `count`, shape (count, 5); step k depends on seed and k."""
-    before = first % BLOCK
+    skipped = first % BLOCK
     blocks = [_block(block, seed) for block in range(first // BLOCK, (first + count - 1) // BLOCK + 1)]
-    return np.concatenate(blocks)[before : before + count]
+    return np.concatenate(blocks)[skipped : skipped + count]
 
 
 def step(z: Array, normal: Array, params: Turbulence) -> Array:
@@ -128,19 +128,19 @@ def wind(z: Array, params: Turbulence) -> Array:
 @lru_cache(maxsize=64)
 def _block(block: int, seed: int) -> FloatArray:
     numbers = random_streams.generator(block, random_streams.TURBULENCE, seed).standard_normal((BLOCK, STATES))
-    numbers.flags.writeable = False  # it is handed out again
+    numbers.flags.writeable = False  # the cache returns it again
     return numbers
 
 
 def _spread(h: float) -> FloatArray:
-    from scipy.special import gammainc  # noqa: PLC0415 - a tenth of a second that flights in calm air need not wait for
+    from scipy.special import gammainc  # noqa: PLC0415 - takes a tenth of a second, which flights without turbulence do not need
 
     g_1, g_2, g_3 = gammainc([1.0, 2.0, 3.0], 2.0 * h)
     return np.linalg.cholesky(np.array([[g_1, g_2 / 2.0], [g_2 / 2.0, g_3 / 2.0]]))
 
 
 def _axes(matrices: Sequence[FloatArray]) -> FloatArray:
-    """Block diagonal of the 2 x 2 matrices of the three axes, of which the first keeps its first entry alone; (5, 5)."""
+    """Block diagonal of the 2 x 2 matrices of the three axes, (5, 5). Of the first matrix it takes the first entry alone."""
     whole = np.zeros((STATES, STATES))
     whole[0, 0] = matrices[0][0, 0]
     whole[1:3, 1:3], whole[3:, 3:] = matrices[1:]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertain aircraft around a published one: A and B drawn at random, repeatably."""
+"""Uncertain aircraft for Monte Carlo campaigns: A and B sampled around a published airframe, repeatable by seed."""
 
 import numpy as np
 import yaml
@@ -15,7 +15,7 @@ KINEMATIC = ("theta", "phi", "psi")
 
 
 def nominal_and_sampled(airframe: Airframe, uncertainty: float, samples: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: as published first, then numbers 0, 1, ... of the seed.
+    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: the published ones, then numbers 0, 1, ... of the seed.
 
     Raises ParameterError for an uncertainty outside [0, 1).
     """
@@ -24,9 +24,9 @@ def nominal_and_sampled(airframe: Airframe, uncertainty: float, samples: int, se
 
 
 def sample_airframe(airframe: Airframe, of_A: float, of_B: float, seed: int, number: int = 0) -> Airframe:
-    """Uncertain airframe `number` of a seed, with an uncertainty of A and one of B; 0 and 0 leave it as published.
+    """Uncertain airframe `number` of a seed, with an uncertainty of A and one of B. 0 and 0 give the published airframe.
 
-    Its f, the gusts in it, is the published one. Raises ParameterError for an uncertainty outside [0, 1).
+    f, with the effect of gusts, stays as published. Raises ParameterError for an uncertainty outside [0, 1).
     """
     A, B = sampled_matrices(airframe, of_A, of_B, seed, number, 1)
     return airframe if of_A == of_B == 0.0 else airframe.with_matrices(A[0], B[0])
@@ -37,8 +37,8 @@ def sampled_matrices(
 ) -> tuple[FloatArray, FloatArray]:
     """A and B of the aircraft first, first + 1, ... of a seed, shapes (count, n, n) and (count, n, m), SI.
 
-    Every entry is multiplied by 1 + d, d uniform in +-uncertainty and independent; the rows of angles stay. An aircraft
-    depends on its seed and number alone, not on how many are drawn. Raises ParameterError for an uncertainty outside [0, 1).
+    Every entry is multiplied by 1 + d, d uniform in +-uncertainty and independent. The rows of angles stay. An aircraft
+    depends on its seed and number alone, not on `count`. Raises ParameterError for an uncertainty outside [0, 1).
     """
     for part in (of_A, of_B):
         require(0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1")
