@@ -224,7 +224,7 @@ def test_what_theorem_1_asks_of_the_osprey_does_not_fly_behind_servos(selected: 
     assert not gain_conditions.failing(literal.theorem)
     assert literal.delay_margin == 0.0
     failing = names(gain_conditions.failing(literal.loop), literal.controller.outputs)
-    assert {"share of q", "share of p", "linear stability", "delay margin"} <= set(failing)
+    assert {"lag product of q", "lag product of p", "linear stability", "delay margin"} <= set(failing)
     assert "k_g, step 2" in names(selected.engineering.failing, literal.controller.outputs)
 
 
@@ -266,7 +266,7 @@ def test_a_scenarios_gain_set_is_judged_condition_by_condition(osprey: Study) ->
     assert failing == ["beta above slew of q", "beta above slew of r", "beta above slew of V"]
     fast = servo.vary(controller={"k_g": 5.0, "beta": [40.0, 40.0, 40.0, 8.0]})
     failing = names(gain_conditions.failing(selection.check_gains(fast, osprey).loop), fast.controller.outputs)
-    assert "share of q" in failing
+    assert "lag product of q" in failing
     assert "beta below rate of r" in failing
 
 

@@ -1,13 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - K, U, Phi and N_d are the paper's names
-"""Gains of the law: Theorem 1 as a procedure, and the engineering procedure beside it.
+"""Gains of the law: Theorem 1 as a procedure, the engineering procedure, and the stability margins of the linear loop.
 
-The theorem's conditions are sufficient, not necessary, and know no actuator: `theorem_gains` meets them all, and on an
-aircraft with servos nothing can fly the result. `engineering_gains` starts from the lag of the loop instead. `check` says
-which of the theorem's conditions a gain set meets, `check_loop` does the same for what the loop asks.
+The theorem's conditions are sufficient, not necessary, and they contain no actuator. `theorem_gains` meets them all; behind
+servos its result is unstable. `engineering_gains` starts from the lag of the loop. `check` evaluates the theorem's conditions
+on a gain set, `check_loop` those of the loop. `delay_margin` is the delay that the sampled linear loop tolerates.
 
-Everything is in the law's channel order and its scaled inputs v (u = input_scale v), where abs(Omega_ii) is about 1.
+The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. It is the phase that the lag costs
+at the crossover: 57.3 degrees times the product. A loop that integrates then has a phase margin of 90 degrees minus that.
+With the lag taken as a pure delay its gain margin is (pi / 2) / product: 2.5 at 0.63, 2.0 at 0.8.
+
+All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), where abs(Omega_ii) is about 1.
 """
 
 import math
@@ -15,7 +19,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.signal import cont2discrete
 
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
@@ -24,37 +28,36 @@ from rise_di_controller.decomposition import decompose
 from rise_di_controller.law import LawParams, LawState, Sign, total_lag
 
 MIN_K = 1.5
-"""1/s. (22) wants K > 1; a slower channel is given this K and inputs of as much less response, which is the same loop."""
+"""1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller input scale: the same loop."""
 
 MIN_GAIN = 0.01
-"""The smallest k_d (1/s) and beta (units of y / s^2) handed out: (21), (22) want them positive where nothing asks for more."""
+"""Lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2): (21), (22) require them to be positive."""
 
 K_G_MARGIN = 1.5
-"""k_g is this much above rho^2 / (4 k_g) = min(Lambda, 1): step 2 then leaves a third of the decay to step 3."""
+"""Factor of k_g above its bound rho^2 / (4 min(Lambda, 1)). Step 2 then leaves a third of the decay to step 3."""
 
 MAX_STEP_3_FRACTION = 0.3
-"""What all of step 3 takes of the decay, out of that third."""
+"""Fraction of the decay that all of step 3 uses, out of that third."""
 
 MAX_CROSSOVER_LAG_PRODUCT = 0.8
-"""Bandwidth times the lag of the loop. On the `osprey` 0.63 leaves 45 ms of delay margin and 0.91 leaves 30, which is less
-than the lag of the loop itself."""
+"""rad, bandwidth times the lag of the loop: 46 degrees of phase at the crossover. On the `osprey` 0.63 (36 degrees) leaves a
+delay margin of 45 ms, and 0.91 (52 degrees) leaves 30 ms, which is less than the lag of the loop itself."""
 
 MAX_LAMBDA_TO_BANDWIDTH = 0.5
-"""Lambda_i beside the bandwidth K_i: at 0.5 the integral takes atan(0.5) = 27 degrees of phase at the crossover."""
+"""Upper bound of Lambda_i / bandwidth. At 0.5 the integral costs atan(0.5) = 27 degrees of phase at the crossover."""
 
 MAX_BETA_TO_RATE_LIMIT = 0.7
-"""beta_i beside the actuator's rate limit: at 2/3 the `osprey`'s yaw rate flew clean, at 1 it was in a limit cycle."""
+"""Upper bound of beta_i / rate limit of the actuator. At 1 the `osprey`'s yaw rate had a limit cycle, at 2/3 it had none."""
 
 SPECTRAL_RADIUS_TOLERANCE = 1e-6
-"""How far beyond 1 a spectral radius is unstable. Angles that integrate the outputs lie on 1 twice, which rounding splits
-by its root, 1e-8."""
+"""A spectral radius above 1 by more than this is unstable. Angles that integrate the outputs give a double eigenvalue 1, which
+rounding splits by the root of its size, 1e-8."""
 
 MAX_DELAY_MARGIN = 0.5
-"""s. Delay margins are looked for up to here; a loop that bears more is slower than any that this stack flies."""
-
+"""s, upper end of the search for a delay margin. A loop that tolerates more is slower than any that this stack flies."""
 
 BOUND_TOLERANCE = 1e-5
-"""How much of a bound may be missing: gain sets are written down with six digits."""
+"""Relative tolerance of a bound, since files hold gains with six digits."""
 
 
 class GainSet(NamedTuple):
@@ -72,28 +75,28 @@ class GainSet(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """What Theorem 1 takes for known about the aircraft."""
+    """Bounds of the aircraft that Theorem 1 requires."""
 
     U: FloatArray  # (m, m) bounds of abs(U_ij), j > i, zero elsewhere: zeta_U of (27), zeta_Psi of (30) with two indices
     N_d: FloatArray  # (m,) zeta_Nd,i of (19), units of y / s^2
     rho: float  # of (19), 1/s
-    gamma_2: FloatArray  # (m,) of Lemma 1, 1/s: stated, for nothing bounds it
+    gamma_2: FloatArray  # (m,) of Lemma 1, 1/s: an assumption, nothing bounds it
 
 
 class Condition(NamedTuple):
-    """One condition on a gain set: found >= bound, found <= bound, or, where that is strict, found > bound."""
+    """One condition on a gain set: found >= bound, found <= bound, or, if it is strict, found > bound."""
 
     name: str
     channel: int | None  # None: all of them together
     found: float
     bound: float
     at_least: bool = True
-    estimate: bool = False  # rests on a figure that nothing bounds: gamma_2
-    strict: bool = False  # found at the bound itself does not meet it
+    estimate: bool = False  # depends on gamma_2, an assumption
+    strict: bool = False  # found = bound does not meet it
 
     @property
     def side(self) -> str:
-        """Where found has to lie, in words: "at least", "at most" or "above" the bound."""
+        """The relation in words: found is "at least", "at most" or "above" the bound."""
         return "above" if self.strict else "at least" if self.at_least else "at most"
 
     @property
@@ -106,7 +109,7 @@ class Condition(NamedTuple):
 
     @property
     def margin(self) -> float:
-        """By which factor it is met, below 1 where it fails; 0 where nothing could meet it, NaN for a bound of 0 below it."""
+        """Factor by which it is met: below 1 if it fails, 0 if no gain can meet it, NaN for a lower bound of 0."""
         if self.at_least:
             return self.found / self.bound if self.bound > 0.0 else math.nan
         if self.bound <= 0.0:
@@ -114,13 +117,13 @@ class Condition(NamedTuple):
         return self.bound / self.found if self.found > 0.0 else math.inf
 
     def sentence(self, channels: Sequence[str]) -> str:
-        """As errors are worded: "beta (30) of q: found 15, expected at least 29.1"; `channels` are the names of y."""
+        """In the form of errors: "beta (30) of q: found 15, expected at least 29.1"; `channels` are the names of y."""
         where = self.name if self.channel is None else f"{self.name} of {channels[self.channel]}"
         return f"{where}: found {self.found:.4g}, expected {self.side} {self.bound:.4g}"
 
 
 def failing(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
-    """Those conditions that the gain set does not meet."""
+    """The conditions that the gain set does not meet."""
     return tuple(condition for condition in conditions if not condition.holds)
 
 
@@ -128,9 +131,9 @@ def failing(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
 
 
 def interval_samples(lower: FloatArray, upper: FloatArray, count: int, seed: int) -> FloatArray:
-    """Samples of Omega inside an interval, shape (count, m, m): the midpoint, then by turns a corner and an inner point.
+    """Samples of Omega inside an interval, shape (count, m, m): the midpoint, then alternately a corner and an inner point.
 
-    lower <= Omega <= upper entry by entry, shape (m, m). Raises ParameterError where lower exceeds upper.
+    lower <= Omega <= upper entry by entry, shape (m, m). Raises ParameterError if lower exceeds upper.
     """
     require(bool((lower <= upper).all()), "Omega", "a lower bound above its upper one", "lower <= upper in every entry")
     generator = np.random.default_rng(seed)
@@ -143,8 +146,8 @@ def interval_samples(lower: FloatArray, upper: FloatArray, count: int, seed: int
 def bound_U(Omegas: FloatArray) -> FloatArray:
     """Largest abs(U_ij), j > i, over samples of Omega, zero elsewhere; Omegas (N, m, m), result (m, m).
 
-    U is that of Omega = S D U (11). It bounds the off-diagonal entries of D U D as well, whose sizes are the same. Raises
-    DecompositionError where a sample has no decomposition.
+    U is that of Omega = S D U (11). The result bounds the off-diagonal entries of D U D as well: their sizes are the same.
+    Raises DecompositionError for a sample without decomposition.
     """
     return np.asarray(np.max([np.triu(np.abs(decompose(Omega).U), 1) for Omega in Omegas], axis=0))
 
@@ -153,18 +156,18 @@ def rho(Omega: FloatArray, CAC: FloatArray, Lambda: FloatArray) -> float:
     """Bound of norm(N~) / norm(z), (19), 1/s: the largest singular value of [I - G Lambda, G].
 
     G = M (C A C^+ + Lambda) with M = S^-1; N~ = G (r - Lambda e) + e, the reference term of (18) moved to N_d. Arguments:
-    Omega and CAC = C A C^+, shape (m, m); Lambda (m,). Raises DecompositionError where Omega has no S D U.
-    Source: (16)-(19) of Tanyer, Tatlicioglu, Zergeroglu, with the repair of docs/theory.md.
+    Omega and CAC = C A C^+, shape (m, m); Lambda (m,). Raises DecompositionError if Omega has no S D U.
+    Source: (16)-(19) of Tanyer, Tatlicioglu, Zergeroglu, with the correction of docs/theory.md.
     """
     G = np.linalg.solve(decompose(Omega).S, CAC + np.diag(Lambda))
     return float(np.linalg.norm(np.hstack([np.eye(len(G)) - G * Lambda, G]), 2))
 
 
 def least_beta(Lambda: FloatArray, bounds: Bounds) -> FloatArray:
-    """Step 1 of Theorem 1: the least beta, shape (m,), from the last channel up.
+    """Step 1 of Theorem 1: the smallest beta, shape (m,), from the last channel up.
 
     beta_i = (zeta_Nd,i + sum_(j>i) zeta_U,ij beta_j) (1 + gamma_2,i / Lambda_i), i = m .. 1
-    Source: (29), (30), with the two-index bound that Lemma 2 needs (docs/theory.md).
+    Source: (29), (30), with the two-index bound that Lemma 2 requires (docs/theory.md).
     """
     beta = np.zeros(len(Lambda))
     for i in reversed(range(len(Lambda))):
@@ -185,8 +188,8 @@ def theorem_gains(bounds: Bounds, Lambda: FloatArray) -> GainSet:
         k_d,i = zeta_Phi,i^2 / (4 part), part = 0.3 least / (m - 1)       step 3, i = m-1 .. 1
         beta  = `least_beta`                                              step 1
 
-    so that rho^2 / (4 k_g) + sum zeta_Phi,i^2 / (4 k_d,i) <= (2/3 + 0.3) least. The parts 1.5 and 0.3 are this project's:
-    the paper only asks for "small". bounds.rho must be that of the same Lambda.
+    so that rho^2 / (4 k_g) + sum zeta_Phi,i^2 / (4 k_d,i) <= (2/3 + 0.3) least. The factors 1.5 and 0.3 are this project's:
+    the paper only says "small". bounds.rho must be that of the same Lambda.
     """
     m = len(Lambda)
     least = min(float(Lambda.min()), 1.0)
@@ -205,24 +208,24 @@ def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
         k_g >= rho^2 / (4 min(Lambda, 1))
         sum_i zeta_Phi,i^2 / (4 k_d,i) <= min(Lambda, 1) - rho^2 / (4 k_g)
 
-    The last names the channel with the largest term. (22) needs no condition: k_g and k_d are what the gain set holds.
-    Raises ParameterError where a gain is not positive.
+    The last names the channel with the largest term. (22) needs no condition, since the gain set holds k_g and k_d.
+    Raises ParameterError if a gain is not positive.
     """
     for key in GainSet._fields:
         require(bool(np.all(np.asarray(getattr(gains, key)) > 0.0)), key, getattr(gains, key), "values above 0")
     m = len(gains.Lambda)
-    needed = (bounds.N_d + bounds.U @ gains.beta) * (1.0 + bounds.gamma_2 / gains.Lambda)
+    smallest = (bounds.N_d + bounds.U @ gains.beta) * (1.0 + bounds.gamma_2 / gains.Lambda)
     conditions = [
-        Condition("beta (29)" if i == m - 1 else "beta (30)", i, float(gains.beta[i]), float(needed[i]), estimate=True)
+        Condition("beta (29)" if i == m - 1 else "beta (30)", i, float(gains.beta[i]), float(smallest[i]), estimate=True)
         for i in reversed(range(m))
     ]
     least = min(float(gains.Lambda.min()), 1.0)
     conditions.append(Condition("k_g, step 2", None, gains.k_g, bounds.rho**2 / (4.0 * least)))
     terms = np.array([zeta_Phi(i, gains.K, bounds.U) ** 2 / (4.0 * gains.k_d[i]) for i in range(m - 1)])
     if m > 1:
-        left = least - bounds.rho**2 / (4.0 * gains.k_g)
+        remaining = least - bounds.rho**2 / (4.0 * gains.k_g)
         largest = int(np.argmax(terms))
-        conditions.append(Condition("k_d, step 3", largest, float(terms.sum()), left, at_least=False))
+        conditions.append(Condition("k_d, step 3", largest, float(terms.sum()), remaining, at_least=False))
     return tuple(conditions)
 
 
@@ -230,9 +233,9 @@ def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
 
 
 class Loop(NamedTuple):
-    """What lies between y and the response of the aircraft, over m channels."""
+    """Actuators, delay and sampling between y and the response of the aircraft, over m channels."""
 
-    lag: FloatArray  # (m,) time constants of the actuators, s; 0 where there is none
+    lag: FloatArray  # (m,) time constants of the actuators, s; 0 without one
     delay: float  # pure delay beyond sampling, s
     period: float  # of the law, s
 
@@ -243,19 +246,19 @@ class Loop(NamedTuple):
 
 
 class ScaledGains(NamedTuple):
-    """A gain set with the response of the inputs that it is for."""
+    """A gain set and the input response that it is designed for."""
 
     gains: GainSet
     response: FloatArray  # (m,) abs(Omega_ii) in scaled inputs: 1, or less in a channel too slow for (22)
 
 
-def bandwidths(loop: Loop, share: FloatArray) -> FloatArray:
-    """Bandwidth of each channel, share_i / (lag_i + 1.5 period + delay), shape (m,), rad/s.
+def bandwidths(loop: Loop, crossover_lag_product: FloatArray) -> FloatArray:
+    """Bandwidth of each channel, crossover_lag_product_i / (lag_i + 1.5 period + delay), shape (m,), rad/s.
 
-    Source: this project. A loop that integrates and lags by T has its phase margin from 90 degrees - share (rad), share
-    being the crossover times T: 54 degrees at 0.63.
+    A product of 0.63 rad costs 36 degrees of phase at the crossover: the phase margin is 90 - 36 = 54 degrees. Source: this
+    project.
     """
-    return np.asarray(share / loop.total)
+    return np.asarray(crossover_lag_product / loop.total)
 
 
 def order(bandwidth: FloatArray) -> tuple[int, ...]:
@@ -264,9 +267,9 @@ def order(bandwidth: FloatArray) -> tuple[int, ...]:
 
 
 def split_gain(K: FloatArray) -> tuple[float, FloatArray]:
-    """k_g and k_d of (22) for K = 1 + k_g + (k_d, 0), shape (m,), 1/s. k_d is at least 0.01: (22) wants it positive.
+    """k_g and k_d of (22) for K = 1 + k_g + (k_d, 0), shape (m,), 1/s. k_d is at least 0.01: (22) requires it to be positive.
 
-    Raises ParameterError where the last K is not the smallest or not above 1: (22) has no such K.
+    Raises ParameterError if the last K is not the smallest or not above 1: (22) has no such K.
     """
     require(float(K[-1]) <= float(K.min()), "K", K.tolist(), "the smallest in the last channel, as (22) has it")
     require(float(K[-1]) > 1.0, f"K[{len(K) - 1}]", float(K[-1]), "above 1 1/s, as (22) has it")
@@ -280,9 +283,9 @@ def engineering_gains(bandwidth: FloatArray, slew: FloatArray, factor: float, ra
         Lambda_i = bandwidth_i / 4
         beta_i = min(factor slew_i, 0.7 rate_limit_i) / response_i
 
-    `slew` is the largest rate of the ideal control and `rate_limit` that of the actuator (infinite where there is none),
-    both in inputs of unit response, units of y / s^2. Raises ParameterError as `split` does, and for a factor below 1.
-    Source: this project; beta because N_d = -D U v*_dot where e = 0, see `N_d`.
+    `slew` is the largest rate of the ideal control and `rate_limit` that of the actuator (infinite without one), both in
+    inputs of unit response, units of y / s^2. Raises ParameterError as `split` does, and for a factor below 1.
+    Source: this project; beta follows from N_d = -D U v*_dot at e = 0, see `N_d`.
     """
     require(factor >= 1.0, "factor", factor, "at least 1: beta above the slew of the ideal control")
     K = np.maximum(bandwidth, MIN_K)
@@ -296,7 +299,7 @@ def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
     """N_d of (17) along the ideal control v*, at e = 0: -D U v*_dot, shape of v_dot, (..., m), units of y / s^2.
 
     From Omega v*_dot = y_m_ddot - C (A x_dot + f_dot) and N_d = M (C A x_dot + C f_dot - y_m_ddot), M Omega = D U.
-    Omega (m, m) in the inputs of v. Raises DecompositionError where it has no S D U.
+    Omega (m, m) in the inputs of v. Raises DecompositionError if it has no S D U.
     """
     factors = decompose(Omega)
     return np.asarray(-v_dot @ (factors.D[:, None] * factors.U).T)
@@ -305,18 +308,18 @@ def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
 def check_loop(
     params: LawParams, loop: Loop, response: FloatArray, largest: FloatArray, slew: FloatArray, rate_limit: FloatArray
 ) -> tuple[Condition, ...]:
-    """Conditions that the loop puts on a gain set, channel by channel.
+    """Conditions of the loop on a gain set, channel by channel.
 
-        share:            K_i response_i total_i <= 0.8
+        lag product:      K_i response_i total_i <= 0.8      rad: the lag costs at most 46 degrees of phase
         Lambda below K:   Lambda_i <= 0.5 K_i response_i
         beta above slew:  beta_i >= slew_i
-        beta below rate:  beta_i <= 0.7 rate_limit_i               where there is a limit
-        softening:        eps_i K_i / beta_i >= total_i            softened sign: else the linear loop is unstable
-        implicit: lag:    lag_i + delay <= period / 2              implicit sign: else it chatters
-        implicit: omega:  omega_i >= largest_i                     the same
+        beta below rate:  beta_i <= 0.7 rate_limit_i         if there is a limit
+        softening:        eps_i K_i / beta_i >= total_i      softened sign: else the linear loop is unstable
+        implicit: lag:    lag_i + delay <= period / 2        implicit sign: else it chatters
+        implicit: omega:  omega_i >= largest_i               the same
 
-    Arguments: response_i = abs(Omega_ii) in the inputs of the law, nominal, and the largest it can be; slew and rate_limit
-    in those same inputs, units of y / s^2, infinite where there is no limit; all of shape (m,).
+    Arguments: response_i = abs(Omega_ii) in the inputs of the law, nominal, and `largest` its upper bound; slew and rate_limit
+    in those same inputs, units of y / s^2, infinite without a limit; all of shape (m,).
     """
     conditions: list[Condition] = []
     total = loop.total
@@ -326,7 +329,7 @@ def check_loop(
         finite = ((i, float(a), float(b)) for i, (a, b) in pairs if math.isfinite(b))
         conditions.extend(Condition(name, i, a, b, at_least) for i, a, b in finite)
 
-    add("share", params.K * response * total, np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT), at_least=False)
+    add("lag product", params.K * response * total, np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT), at_least=False)
     add("Lambda below K", params.Lambda, MAX_LAMBDA_TO_BANDWIDTH * params.K * response, at_least=False)
     add("beta above slew", params.beta, slew, at_least=True)
     add("beta below rate", params.beta, MAX_BETA_TO_RATE_LIMIT * rate_limit, at_least=False)
@@ -352,8 +355,8 @@ class LinearPlant(NamedTuple):
 def law_matrix(params: LawParams, period: float) -> FloatArray:
     """The law's step near e = 0 as a matrix, shape (4 m, 4 m): (e_p, integral_e, Pi, y) -> (e, integral_e, Pi, u), y_m = 0.
 
-    It is `law.step` of unit vectors: inside the width of its sign the step is linear. beta and eps are multiplied by 1e12,
-    which widens the sign and changes nothing inside it. Raises ParameterError for the literal sign, which has no width.
+    The columns are `law.step` of unit vectors: the step is linear inside the width of its sign. beta and eps are multiplied by
+    1e12, which widens the sign and changes nothing inside it. Raises ParameterError for the literal sign, which has no width.
     """
     require(params.sign is not Sign.LITERAL, "sign", "literal", "soft or implicit, which are linear near e = 0")
     m = len(params.K)
@@ -367,29 +370,29 @@ def law_matrix(params: LawParams, period: float) -> FloatArray:
 
 
 def closed_loop(plant: LinearPlant, params: LawParams, loop: Loop, extra: FloatArray) -> FloatArray:
-    """One period of the sampled loop as a matrix, exact: stable where no eigenvalue lies outside the unit circle.
+    """One period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the unit circle.
 
     u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,). The state is x, the
-    actuators, (e, integral_e, Pi) of the law, and the inputs on their way. Source: K. J. Astrom, B. Wittenmark,
+    actuators, (e, integral_e, Pi) of the law, and the delayed inputs. Source: K. J. Astrom, B. Wittenmark,
     "Computer-Controlled Systems", section 2.3, for the sampling of a plant with delay.
     """
     n, m = plant.B.shape
     has_lag = loop.lag > 0.0
-    rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)  # of an actuator that is none: any, it drives nothing
+    rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)  # without an actuator: any, it drives nothing
     motion = np.block([[plant.A, plant.B * has_lag], [np.zeros((m, n)), -np.diag(rate)]])
     drive = np.vstack([plant.B * ~has_lag, np.diag(rate * has_lag)])
     whole = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
     part = np.maximum(loop.delay + extra - whole * loop.period, 0.0)
-    held = int(whole.max()) + 1  # inputs on their way, the newest first
+    held = int(whole.max()) + 1  # delayed inputs, the newest first
 
     free, _ = _sampled(motion, drive, loop.period)
     size = n + m + 3 * m + held * m
-    law_, flying = slice(n + m, n + 4 * m), slice(n + 4 * m, size)
+    law_, delayed = slice(n + m, n + 4 * m), slice(n + 4 * m, size)
     step = law_matrix(params, loop.period)
     output = np.zeros((m, size))
     output[:, :n] = plant.C
     after = step @ np.vstack([np.eye(size)[law_], output])
-    inputs = np.vstack([after[3 * m :], np.eye(size)[flying]])  # of this tick, then those before
+    inputs = np.vstack([after[3 * m :], np.eye(size)[delayed]])  # of this tick, then of earlier ones
 
     matrix = np.zeros((size, size))
     matrix[: n + m, : n + m] = free
@@ -398,21 +401,21 @@ def closed_loop(plant: LinearPlant, params: LawParams, loop: Loop, extra: FloatA
         _, old = _sampled(motion, drive[:, [i]], part[i])
         matrix[: n + m] += np.outer(new, inputs[whole[i] * m + i]) + np.outer(rest @ old, inputs[(whole[i] + 1) * m + i])
     matrix[law_] = after[: 3 * m]
-    matrix[flying] = inputs[: held * m]
+    matrix[delayed] = inputs[: held * m]
     return matrix
 
 
 def is_stable(plant: LinearPlant, params: LawParams, loop: Loop, extra: FloatArray) -> bool:
-    """Whether no eigenvalue of `closed_loop` lies outside the unit circle, rounding apart."""
+    """Whether no eigenvalue of `closed_loop` lies outside the unit circle, up to rounding."""
     radius = np.max(np.abs(np.linalg.eigvals(closed_loop(plant, params, loop, extra))))
     return bool(radius <= 1.0 + SPECTRAL_RADIUS_TOLERANCE)
 
 
 def delay_margin(plant: LinearPlant, params: LawParams, loop: Loop, channel: int | None = None) -> float:
-    """Pure delay beyond loop.delay, s, at which the linear loop turns unstable, in all channels or in one of them.
+    """Delay margin: pure delay beyond loop.delay, s, at which the linear loop turns unstable, in all channels or in one.
 
-    0 where it is unstable already, infinite where it bears half a second. Looked for in steps of half a period, then
-    halved down to 0.1 ms. Raises ParameterError for the literal sign.
+    0 if the loop is unstable without it, infinite if the loop tolerates half a second. The search takes steps of half a period,
+    then bisects down to 0.1 ms. Raises ParameterError for the literal sign.
     """
     delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
     if not is_stable(plant, params, loop, 0.0 * delayed):
@@ -429,7 +432,6 @@ def delay_margin(plant: LinearPlant, params: LawParams, loop: Loop, channel: int
 
 
 def _sampled(motion: FloatArray, drive: FloatArray, duration: float) -> tuple[FloatArray, FloatArray]:
-    """exp(motion T) and integral_0^T exp(motion s) ds drive, from one exponential (C. Van Loan, IEEE TAC 23(3), 1978)."""
-    n, m = drive.shape
-    exponential = expm(np.block([[motion, drive], [np.zeros((m, n + m))]]) * duration)
-    return exponential[:n, :n], exponential[:n, n:]
+    """Zero-order hold over T: exp(motion T) and integral_0^T exp(motion s) ds drive."""
+    state, held, *_ = cont2discrete((motion, drive, np.eye(len(motion)), np.zeros_like(drive)), duration)
+    return np.asarray(state), np.asarray(held)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the gain procedures of the law need to know of an airframe, and the gain sets that come of it.
+"""Gain selection for an airframe: its ideal control along a manoeuvre, two gain sets, and their assessment.
 
-`study` finds what the inputs have to do along a manoeuvre, on the airframe as published and on uncertain ones around it.
-`select_gains` turns that into two gain sets, of Theorem 1 and of the engineering procedure; `check_gains` judges the gain
-set of a scenario; `as_yaml` writes one down as a scenario file has it.
+`study_airframe` finds the rates of the ideal control, on the airframe as published and on uncertain ones around it.
+`select_gains` derives two gain sets, of Theorem 1 and of the engineering procedure. `check_gains` assesses the gain set of a
+scenario: conditions, stability and delay margin. `as_yaml` writes a gain set as the section of a scenario file.
 """
 
 import math
@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jinja2 import Environment, StrictUndefined, Template
 from numpy.typing import NDArray
 
 from aircraft_sim import dynamics
@@ -37,28 +38,29 @@ from rise_di_controller.law import LawParams, Sign
 from rise_di_controller.params import ControllerParameters, FeedforwardParameters
 
 CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
-"""Bandwidth of a channel times the lag of its loop, by output. Yaw leaves room to the dutch roll, speed to the engine."""
+"""Bandwidth of a channel times the lag of its loop, rad, by output. 0.63, 0.32 and 0.23 cost 36, 18 and 13 degrees of phase at
+the crossover. Yaw has a margin for the dutch roll, speed for the engine."""
 
 DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23
-"""The share of an output that CROSSOVER_LAG_PRODUCTS does not know."""
+"""rad, for an output that is not in CROSSOVER_LAG_PRODUCTS."""
 
 BETA_TO_SLEW = 1.25
-"""beta beside the largest slew of the ideal control: 1 is needed, 1.5 is the most that was ever of use on the `osprey`."""
+"""beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing on the `osprey`."""
 
 MAX_COUPLING = 10.0
-"""max abs(U - I) above which inputs and outputs are paired wrongly. It is 25 on the `osprey` with aileron and rudder
-swapped and 13.6 on the first edition's Aerosonde, which no gain set of either procedure holds behind servos; 2.2 at most on
-the other airframes of the library."""
+"""Upper bound of max abs(U - I) for a pairing of inputs and outputs. The value is 25 on the `osprey` with aileron and rudder
+swapped, 13.6 on the first edition's Aerosonde, which neither procedure stabilises behind servos, and at most 2.2 on the other
+airframes of the library."""
 
 STEP = 0.01
-"""s. Steps of the ideal control: a gust of a second and hidden modes up to 10 1/s are resolved to 1e-6 of their size."""
+"""s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to 1e-6 of their size."""
 
 INPUT_LIMITS = ("lower", "upper", "slew")
-"""Limits of the controller, one an input: they stay with their inputs whatever the order."""
+"""Limits of the controller, one an input. They are reordered with the inputs."""
 
 
 class Manoeuvre(NamedTuple):
-    """What the gains are selected for."""
+    """The commands and gusts that the gains are selected for."""
 
     reference: ReferenceModelParameters
     gusts: dict[str, Gust]
@@ -73,18 +75,18 @@ class ChannelPairing(NamedTuple):
 
 
 class LoopSetting(NamedTuple):
-    """The loop that the gains are for, and how much they have to know."""
+    """The loop that the gains are selected for, and the settings of the selection."""
 
-    base: ControllerParameters  # what is not selected stays as it is here: softening, freshness, limits
+    base: ControllerParameters  # source of all parameters that are not selected: softening, max_age, limits
     rate: float  # Hz
-    lag: Mapping[str, float]  # s, by input; 0 for an input without
+    lag: Mapping[str, float]  # s, by input; 0 for an input without lag
     delay: float  # s
-    rate_limit: Mapping[str, float]  # SI, by input; an input without is not limited
-    gamma_2: float = 0.0  # 1/s, stated: 0 gives the least that (29), (30) can ask
-    factor: float = BETA_TO_SLEW  # beta beside the slew of the ideal control
+    rate_limit: Mapping[str, float]  # SI, by input; an input without entry is not limited
+    gamma_2: float = 0.0  # 1/s, an assumption: 0 gives the smallest bounds (29), (30)
+    factor: float = BETA_TO_SLEW  # beta / slew of the ideal control
     crossover_lag_products: Mapping[str, float] = CROSSOVER_LAG_PRODUCTS
-    inputs: tuple[str, ...] = ()  # what drives each output of the airframe, in its order; none: as the airframe has it
-    feedforward: bool = False  # whether the airframe as published goes along as the nominal model
+    inputs: tuple[str, ...] = ()  # input of each output, in the airframe's order; empty: the airframe's pairing
+    feedforward: bool = False  # whether the result has the published airframe as model of a feedforward
 
 
 class Study(NamedTuple):
@@ -97,8 +99,8 @@ class Study(NamedTuple):
     gravity: FloatArray  # (n, n), the Jacobian of f at trim
     u_dot: FloatArray  # (T, N, m) rate of the ideal control, units of u / s
     slew: FloatArray  # (m,) largest abs(u_dot) of the nominal airframe
-    slew_undisturbed: FloatArray  # (m,) the same in still air
-    stable: NDArray[np.bool_]  # (N,) where no zero lies in the right half plane
+    slew_undisturbed: FloatArray  # (m,) the same without gusts
+    stable: NDArray[np.bool_]  # (N,) whether no zero lies in the right half plane
     uncertainty: float
 
     @property
@@ -108,7 +110,7 @@ class Study(NamedTuple):
 
 
 class GainAssessment(NamedTuple):
-    """A gain set and what can be said about it."""
+    """A gain set, every condition on it, and its delay margins."""
 
     controller: ControllerParameters
     theorem: tuple[Condition, ...]
@@ -136,10 +138,10 @@ class Selection(NamedTuple):
 
 
 def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
-    """The commands and gusts of a scenario as far as an airframe has the channels and knows the gusts.
+    """The commands and gusts of a scenario for the channels and gust axes that an airframe has.
 
-    A coordinated turn stays where the airframe has both of its channels, at the airframe's own speed. Raises ParameterError
-    for an output that the scenario commands nothing for.
+    A coordinated turn stays if the airframe has both of its channels, at the airframe's own speed. Raises ParameterError for an
+    output without command in the scenario.
     """
     whole = scenario.reference_model
     for name in airframe.outputs:
@@ -161,26 +163,28 @@ def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
     return Manoeuvre(reference, gusts, scenario.flight.duration)
 
 
-def study_airframe(airframe: Airframe, flown: Manoeuvre, uncertainty: float = 0.3, samples: int = 100, seed: int = 1) -> Study:
-    """Find the rate of the ideal control along a manoeuvre, on the airframe as published and on uncertain ones.
+def study_airframe(
+    airframe: Airframe, manoeuvre: Manoeuvre, uncertainty: float = 0.3, samples: int = 100, seed: int = 1
+) -> Study:
+    """Rates of the ideal control along a manoeuvre, on the airframe as published and on uncertain ones.
 
-    The ideal control holds y on y_m. With x = C' y_m + H eta, eta the states that are not outputs:
+    The ideal control keeps y on y_m. With x = C' y_m + H eta, eta the states that are not outputs:
 
         eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot         the zero dynamics, eta(0) = 0
         u* = Omega^-1 (y_m_dot - C (A x + f)),  x_dot = A x + f + B u*
         u*_dot = Omega^-1 (y_m_ddot - C (A x_dot + f_dot)),  f_dot along (1, x_dot)
 
-    Runge-Kutta in steps of 0.01 s; u*_dot is taken at the steps and differenced nowhere but in f_dot and u_m_dot, where the
-    difference is central and over 1e-5 s. f is that of the nominal airframe. Raises ParameterError where Omega is singular
-    or the nominal airframe has a zero in the right half plane: then Assumption 3 does not hold.
+    Runge-Kutta in steps of 0.01 s; u*_dot is evaluated at the steps; only f_dot and u_m_dot are differences, central and over
+    1e-5 s. f is that of the nominal airframe. Raises ParameterError if Omega is singular or if the nominal airframe has a zero
+    in the right half plane: then Assumption 3 does not hold.
     """
     A, B = nominal_and_sampled(airframe, uncertainty, samples, seed)
     zeros = [invariant_zeros(*pair, airframe.matrix_c()).real.max(initial=-math.inf) for pair in zip(A, B, strict=True)]
     stable = np.array(zeros) <= ZERO_REAL_PART
     require(bool(stable[0]), f"airframe {airframe.name}", f"a zero at {zeros[0]:.3g} 1/s", "none in the right half plane")
-    # The last column is the nominal airframe in still air: the gusts have the speed 0 there.
+    # The last column is the nominal airframe without gusts: their speed is 0 there.
     A, B = np.concatenate([A, A[:1]]), np.concatenate([B, B[:1]])
-    aircraft = _columns(airframe, flown.gusts, len(A))
+    aircraft = _columns(airframe, manoeuvre.gusts, len(A))
     C, n, m = airframe.matrix_c(), len(airframe.states), len(airframe.outputs)
     H = np.eye(n)[:, ~C.any(axis=0)]
     Omega: FloatArray = np.einsum("ij,Njk->Nik", C, B)
@@ -189,7 +193,7 @@ def study_airframe(airframe: Airframe, flown: Manoeuvre, uncertainty: float = 0.
     project = np.asarray(H.T @ (np.eye(n) - B @ inverse @ C), dtype=np.float64)
     follow = H.T @ B @ inverse
 
-    reference = _references(flown, airframe)
+    reference = _references(manoeuvre, airframe)
 
     def times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
         return np.asarray(np.einsum("Nij,jN->iN", matrices, columns))
@@ -219,20 +223,20 @@ def study_airframe(airframe: Airframe, flown: Manoeuvre, uncertainty: float = 0.
         u_dot[k] = times(inverse, reference.y_ddot[2 * k][:, None] - C @ drift_dot).T
         if k < steps:
             eta = rk4(eta_dot, t, eta, None, None, STEP)
-    calm, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
-    return Study(airframe, A[:-1], B[:-1], C, airframe.matrix_gravity(), u_dot[:, :-1], slew, calm, stable, uncertainty)
+    undisturbed, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
+    return Study(airframe, A[:-1], B[:-1], C, airframe.matrix_gravity(), u_dot[:, :-1], slew, undisturbed, stable, uncertainty)
 
 
 class _References(NamedTuple):
-    """The reference and its derivatives every STEP / 2, for the stages of Runge-Kutta, airframe's order, (2 T - 1, m)."""
+    """The reference and its derivatives every STEP / 2, for the stages of Runge-Kutta; airframe's order, (2 T - 1, m)."""
 
     y: FloatArray
     y_dot: FloatArray
     y_ddot: FloatArray
 
 
-def _references(flown: Manoeuvre, airframe: Airframe) -> _References:
-    matrices, profile = flown.reference.model(), flown.reference.profile()
+def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> _References:
+    matrices, profile = manoeuvre.reference.model(), manoeuvre.reference.profile()
     near = 1e-5
 
     def commanded(t: Array) -> Array:
@@ -240,21 +244,21 @@ def _references(flown: Manoeuvre, airframe: Airframe) -> _References:
 
     x, step = zero_state(matrices), model.stepper(STEP / 2.0, matrices)
     rows = []
-    for k in range(2 * round(flown.duration / STEP) + 1):
+    for k in range(2 * round(manoeuvre.duration / STEP) + 1):
         t = k * STEP / 2.0
         x_dot = model.x_m_dot(t, x, commanded(t), matrices)
         u_dot = (commanded(t + near) - commanded(t - near)) / (2.0 * near)
         x_ddot = model.x_m_dot(t, x_dot, u_dot, matrices)  # (2) differentiated
         rows.append([model.output(z, matrices) for z in (x, x_dot, x_ddot)])
         x = model.step(x, np.concatenate([commanded(t + part * STEP / 2.0) for part in (0.0, 0.5, 1.0)]), step)
-    places = [flown.reference.outputs.index(name) for name in airframe.outputs]
+    places = [manoeuvre.reference.outputs.index(name) for name in airframe.outputs]
     y, y_dot, y_ddot = np.moveaxis(np.array(rows), 1, 0)[..., places]
     return _References(y, y_dot, y_ddot)
 
 
 def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
-    """The aircraft with f for states in columns, shape (n, columns), the last column in still air."""
-    blowing = np.append(np.ones(columns - 1), 0.0)
+    """The aircraft with f for states in columns, shape (n, columns), the last column without gusts."""
+    gust_on = np.append(np.ones(columns - 1), 0.0)
     start, speed, length = (
         np.array([[getattr(gust, key)] for gust in gusts.values()]).reshape(-1, 1) for key in ("start", "speed", "length")
     )
@@ -265,7 +269,7 @@ def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Air
         airframe.matrix_c(),
         airframe.matrix_gravity(),
         np.reshape(directions, (len(gusts), len(airframe.states))).T,
-        Gusts(start, speed * blowing, length),
+        Gusts(start, speed * gust_on, length),
         np.array(airframe.speed),
     )
 
@@ -276,11 +280,11 @@ def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Air
 def require_channels(
     Omega: FloatArray, channels: ChannelPairing, D: Sequence[int] | None = None, input_signs: Sequence[int] | None = None
 ) -> FloatArray:
-    """D of a choice of channels, shape (m,), or a ParameterError that says what contradicts Omega and what fits instead.
+    """D of a pairing of channels, shape (m,). Raises ParameterError with the contradiction to Omega and a choice that fits.
 
-    Omega = C B in the order of the channels, (m, m), the inputs counted as the airframe counts them; `input_signs` are -1
-    where the command is to be flipped on its way (D_k flips with it, and nothing else). Refused are, in this order: a
-    pairing without a D or with max abs(U - I) above 10, input signs that do not fit the D given, a D that does not fit.
+    Omega = C B in the order of the channels, (m, m), with the airframe's signs of the inputs. `input_signs` are -1 for an input
+    whose sign is flipped between law and airframe; this flips D_k and nothing else. The checks, in this order: the pairing has
+    a D and max abs(U - I) at most 10; the input signs fit the D given; D fits.
     """
     m = len(Omega)
     flips = np.ones(m) if input_signs is None else np.array(input_signs, dtype=np.float64)
@@ -298,15 +302,15 @@ def require_channels(
         fits = f"another pairing: {', '.join(pairs)}" if pairs else "inputs that can be paired: no order of these can"
         raise ParameterError(f"controller.inputs: found {found} with {problem}, expected {fits}")
     actual = signs(Omega) * flips
-    given = actual if D is None else np.array(D, dtype=np.float64)
-    wrong = [name for name, a, b in zip(channels.inputs, actual, given, strict=True) if a != b]
+    stated = actual if D is None else np.array(D, dtype=np.float64)
+    wrong = [name for name, a, b in zip(channels.inputs, actual, stated, strict=True) if a != b]
     if input_signs is not None:
-        fit = _integers(flips * actual * given)
+        fit = _integers(flips * actual * stated)
         require(
-            not wrong, "input_signs", list(input_signs), f"{fit} for D = {_integers(given)}: {', '.join(wrong)} the other way"
+            not wrong, "input_signs", list(input_signs), f"{fit} for D = {_integers(stated)}: {', '.join(wrong)} the other way"
         )
     expected = f"{_integers(actual)}, the signs of the minors of C B; or flip {', '.join(wrong)} and keep D"
-    require(not wrong, "controller.D", _integers(given), expected)
+    require(not wrong, "controller.D", _integers(stated), expected)
     return np.asarray(actual)
 
 
@@ -314,39 +318,41 @@ def _integers(values: FloatArray) -> list[int]:
     return [int(value) for value in values]
 
 
-# The answers
+# Selection and assessment
 
 
-def select_gains(found: Study, setting: LoopSetting) -> Selection:
+def select_gains(study: Study, setting: LoopSetting) -> Selection:
     """Two gain sets for an airframe: the literal one of Theorem 1 and that of the engineering procedure.
 
     Both have the same channels (the fastest first, so that the last has the smallest K), inputs scaled by 1 / abs(Omega_ii)
-    and D from the minors. The theorem's set takes Lambda = 1 1/s, which asks for the least k_g, and `theorem_gains`; the
-    other one is `engineering_gains` with the slew of the nominal airframe. `omega` is the largest abs(Omega_ii) of the
-    samples. Raises ParameterError as `require_channels` does, and for parameters that cannot be flown.
+    and D from the minors. The theorem's set is `theorem_gains` with Lambda = 1 1/s, which needs the smallest k_g. The other
+    one is `engineering_gains` with the slew of the nominal airframe. `omega` is the largest abs(Omega_ii) of the samples.
+    Raises ParameterError as `require_channels` does, and for parameters that the controller does not accept.
     """
-    airframe = found.airframe
-    known = list(airframe.inputs)
-    given = ChannelPairing(airframe.outputs, setting.inputs or tuple(known))
-    require(sorted(given.inputs) == sorted(known), "inputs", ", ".join(given.inputs), f"{', '.join(known)} in any order")
-    paired = [known.index(name) for name in given.inputs]
-    Omega, slew = found.Omega[:, paired], found.slew[paired]
-    require_channels(Omega, given)
-    share = np.array([setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT) for name in given.outputs])
-    bandwidth = gain_conditions.bandwidths(_loop(setting, given), share)
+    airframe = study.airframe
+    inputs = list(airframe.inputs)
+    pairing = ChannelPairing(airframe.outputs, setting.inputs or tuple(inputs))
+    require(sorted(pairing.inputs) == sorted(inputs), "inputs", ", ".join(pairing.inputs), f"{', '.join(inputs)} in any order")
+    paired = [inputs.index(name) for name in pairing.inputs]
+    Omega, slew = study.Omega[:, paired], study.slew[paired]
+    require_channels(Omega, pairing)
+    products = np.array([setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT) for name in pairing.outputs])
+    loop = Loop(_by_name(setting.lag, pairing.inputs, 0.0), setting.delay, 1.0 / setting.rate)
+    bandwidth = gain_conditions.bandwidths(loop, products)
     places = list(gain_conditions.order(bandwidth))
-    channels = ChannelPairing(*(tuple(names[i] for i in places) for names in given))
+    channels = ChannelPairing(*(tuple(names[i] for i in places) for names in pairing))
     columns = [paired[i] for i in places]
     D = require_channels(Omega[np.ix_(places, places)], channels)
     unit = 1.0 / np.abs(np.diag(Omega))[places]
     rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
     selected = gain_conditions.engineering_gains(bandwidth[places], slew[places] / unit, setting.factor, rate_limit / unit)
-    spread = np.abs(np.einsum("Nii->Ni", (found.C @ found.B)[:, places][..., columns])).max(axis=0)
+    spread = np.abs(np.einsum("Nii->Ni", (study.C @ study.B)[:, places][..., columns])).max(axis=0)
 
     def controller(gains: GainSet, response: FloatArray) -> ControllerParameters:
         scale = unit * response
-        known = setting.base.inputs
-        limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if set(channels.inputs) <= set(known) else {}
+        base_inputs = setting.base.inputs
+        has_limits = set(channels.inputs) <= set(base_inputs)
+        limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if has_limits else {}
         values = setting.base.model_dump(exclude=set(INPUT_LIMITS)) | {
             "rate": setting.rate,
             "outputs": channels.outputs,
@@ -363,22 +369,22 @@ def select_gains(found: Study, setting: LoopSetting) -> Selection:
             "delay": setting.delay,
             "feedforward": None,
         }
-        values |= {key: [row[known.index(name)] for name in channels.inputs] for key, row in limits.items() if row}
+        values |= {key: [row[base_inputs.index(name)] for name in channels.inputs] for key, row in limits.items() if row}
         chosen = ControllerParameters.validate_mapping(values, "controller")
         return with_feedforward(chosen, airframe) if setting.feedforward else chosen
 
     ones = np.ones(len(places))
-    bounds, *_ = _bounds(found, places, columns, unit, D, ones, setting.gamma_2)
+    bounds, *_ = _bounds(study, places, columns, unit, D, ones, setting.gamma_2)
     literal = controller(gain_conditions.theorem_gains(bounds, ones), ones)
     engineering = controller(*selected)
-    return Selection(found, setting, *(assess_gains(found, one, setting) for one in (literal, engineering)))
+    return Selection(study, setting, *(assess_gains(study, one, setting) for one in (literal, engineering)))
 
 
 def with_feedforward(controller: ControllerParameters, airframe: Airframe) -> ControllerParameters:
     """The same controller with the airframe as the nominal model of its feedforward, an extension of the paper.
 
-    lead = lag + delay + half a period, of the controller. Raises ParameterError for an airframe that cannot be its model,
-    such as one with a zero in the right half plane.
+    lead = lag + delay + half a period, of the controller. Raises ParameterError for an airframe that cannot be the
+    model, such as one with a zero in the right half plane.
     """
     columns = [list(airframe.inputs).index(name) for name in controller.inputs]
     gravity = airframe.matrix_gravity()
@@ -392,16 +398,16 @@ def with_feedforward(controller: ControllerParameters, airframe: Airframe) -> Co
     return ControllerParameters.validate_mapping(controller.model_dump() | {"feedforward": model.model_dump()}, "controller")
 
 
-def check_gains(scenario: Scenario, found: Study, gamma_2: float = 0.0) -> GainAssessment:
-    """Judge the gain set of a scenario's controller on an airframe studied along its manoeuvre, by every condition.
+def check_gains(scenario: Scenario, study: Study, gamma_2: float = 0.0) -> GainAssessment:
+    """Every condition on the gain set of a scenario's controller, for an airframe studied along the scenario's manoeuvre.
 
-    Raises ParameterError where D or the pairing contradict the airframe.
+    Raises ParameterError if D or the pairing contradict the airframe.
     """
-    return assess_gains(found, scenario.controller, loop_setting(scenario, gamma_2))
+    return assess_gains(study, scenario.controller, loop_setting(scenario, gamma_2))
 
 
 def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
-    """The loop as a scenario has it: its controller, and the rate limits of controller and actuators."""
+    """The loop of a scenario: its controller, and the rate limits of controller and actuators."""
     controller, rates = scenario.controller, scenario.aircraft.actuators.rate
     airframe, _ = scenario.aircraft.load()
     own = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
@@ -416,53 +422,53 @@ def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     )
 
 
-def assess_gains(found: Study, controller: ControllerParameters, setting: LoopSetting) -> GainAssessment:
-    """Every condition on a gain set. Rate, lag and delay are the controller's own; gamma_2 and rate limits of the setting.
+def assess_gains(study: Study, controller: ControllerParameters, setting: LoopSetting) -> GainAssessment:
+    """Every condition on a gain set. Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
 
-    Theorem: D and stable zero dynamics as parts of the samples where they hold; (29), (30), steps 2 and 3 with bounds that
-    are the largest over the samples where both hold; "V2_dot" is the least eigenvalue of Q in V2_dot = -z'Qz, over the
-    same samples: what steps 2 and 3 are sufficient for. Loop: `check_loop`, and the linear loop: the part of the samples
-    where it is stable, and its delay margin on the nominal airframe, which should outlast one lost tick. With the implicit
-    sign the linear loop is that inside its width, dt^2 omega beta: what its margin tells is when chatter begins, and no more
-    than half a period is to be had.
+    Theorem: "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of (29), (30), steps 2 and
+    3 are the largest over the samples for which both hold. "V2_dot" is the smallest eigenvalue of Q in V2_dot = -z'Qz over
+    these samples; steps 2 and 3 are sufficient for Q > 0. Loop: `check_loop`, the fraction of the samples for which the linear
+    loop is stable, and its delay margin on the nominal airframe, which should be at least one period, for one lost tick. With
+    the implicit sign the linear loop is the one inside the width of the sign, dt^2 omega beta. Its margin is then the delay at
+    which chatter begins, and at most half a period.
     """
-    airframe = found.airframe
+    airframe = study.airframe
     rows = [airframe.outputs.index(name) for name in controller.outputs]
     columns = [list(airframe.inputs).index(name) for name in controller.inputs]
     channels = ChannelPairing(controller.outputs, controller.inputs)
-    D = require_channels(found.Omega[np.ix_(rows, columns)], channels, controller.D)
+    D = require_channels(study.Omega[np.ix_(rows, columns)], channels, controller.D)
     params = controller.law()
     loop = Loop(params.K * 0.0 + controller.lag, controller.delay, 1.0 / controller.rate)
-    bounds, holds, counts = _bounds(found, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2)
+    bounds, holds, counts = _bounds(study, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2)
     gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
-    C, Bs = found.C[rows], found.B[:, :, columns]
+    C, Bs = study.C[rows], study.B[:, :, columns]
 
-    least = min(_least_decay(A, B, C, params) for A, B in zip(found.A[counts], Bs[counts], strict=True))
+    decay_rate = min(_smallest_decay(A, B, C, params) for A, B in zip(study.A[counts], Bs[counts], strict=True))
     theorem = (
         Condition("D (11)", None, float(np.mean(holds)), 1.0),
-        Condition("zero dynamics", None, float(np.mean(found.stable)), 1.0),
+        Condition("zero dynamics", None, float(np.mean(study.stable)), 1.0),
         *gain_conditions.check(gains, bounds),
-        Condition("V2_dot", None, least, 0.0, strict=True),
+        Condition("V2_dot", None, decay_rate, 0.0, strict=True),
     )
     responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
     rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
-    limits = tuple(values / params.input_scale for values in (found.slew[columns], rate_limit))
+    limits = tuple(values / params.input_scale for values in (study.slew[columns], rate_limit))
     conditions = gain_conditions.check_loop(params, loop, responses[0], responses.max(axis=0), *limits)
     if params.sign is Sign.LITERAL:
         return GainAssessment(controller, theorem, conditions, bounds, None, ())
-    plants = [LinearPlant(A + found.gravity, B, C) for A, B in zip(found.A, Bs, strict=True)]
-    still = np.zeros(len(rows))
-    steady = float(np.mean([gain_conditions.is_stable(plant, params, loop, still) for plant in plants]))
+    plants = [LinearPlant(A + study.gravity, B, C) for A, B in zip(study.A, Bs, strict=True)]
+    no_delay = np.zeros(len(rows))
+    stable = float(np.mean([gain_conditions.is_stable(plant, params, loop, no_delay) for plant in plants]))
     margin = gain_conditions.delay_margin(plants[0], params, loop)
     each = tuple(gain_conditions.delay_margin(plants[0], params, loop, channel) for channel in range(len(rows)))
-    conditions += (Condition("linear stability", None, steady, 1.0),)
+    conditions += (Condition("linear stability", None, stable, 1.0),)
     if params.sign is Sign.SOFT:
         conditions += (Condition("delay margin", None, margin, loop.period),)
     return GainAssessment(controller, theorem, conditions, bounds, margin, each)
 
 
 def _bounds(
-    found: Study,
+    study: Study,
     rows: list[int],
     columns: list[int],
     scale: FloatArray,
@@ -470,14 +476,14 @@ def _bounds(
     Lambda: FloatArray,
     gamma_2: float,
 ) -> tuple[Bounds, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Bounds of Theorem 1 in inputs scaled by `scale` (m,); which samples have this D; which of them count, being stable."""
-    C = found.C[rows]
-    Omegas = C @ found.B[:, :, columns] * scale
-    holds = np.array([_has(Omega, D) for Omega in Omegas])
-    counts = holds & found.stable
+    """Bounds of Theorem 1 in inputs scaled by `scale` (m,); which samples have this D; which of them have stable zeros too."""
+    C = study.C[rows]
+    Omegas = C @ study.B[:, :, columns] * scale
+    holds = np.array([_has_signs(Omega, D) for Omega in Omegas])
+    counts = holds & study.stable
     Omegas = Omegas[counts]
-    v_dot = np.moveaxis(found.u_dot[..., columns], 1, 0)[counts] / scale
-    CAC = C @ found.A[counts] @ C.T
+    v_dot = np.moveaxis(study.u_dot[..., columns], 1, 0)[counts] / scale
+    CAC = C @ study.A[counts] @ C.T
     bounds = Bounds(
         U=gain_conditions.bound_U(Omegas),
         N_d=np.max([np.abs(gain_conditions.N_d(*pair)).max(axis=0) for pair in zip(Omegas, v_dot, strict=True)], axis=0),
@@ -487,14 +493,14 @@ def _bounds(
     return bounds, holds, counts
 
 
-def _has(Omega: FloatArray, D: FloatArray) -> bool:
+def _has_signs(Omega: FloatArray, D: FloatArray) -> bool:
     try:
         return bool((signs(Omega) == D).all())
     except DecompositionError:
         return False
 
 
-def _least_decay(A: FloatArray, B: FloatArray, C: FloatArray, params: LawParams) -> float:
+def _smallest_decay(A: FloatArray, B: FloatArray, C: FloatArray, params: LawParams) -> float:
     plant = KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x)
     return float(np.linalg.eigvalsh(decay_matrix(plant, params)).min())
 
@@ -503,68 +509,11 @@ def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) 
     return np.array([values.get(name, default) for name in names])
 
 
-def _loop(setting: LoopSetting, channels: ChannelPairing) -> Loop:
-    return Loop(_by_name(setting.lag, channels.inputs, 0.0), setting.delay, 1.0 / setting.rate)
-
-
-# Writing a gain set down
-
-
-def as_yaml(selection: Selection) -> str:
-    """The engineering gain set as the section `/**/controller` of a scenario file, units and reasons beside the numbers."""
-    controller, found = selection.engineering.controller, selection.study
-    params = controller.law()
-    bandwidth = ", ".join(f"{value:.3g}" for value in params.K * _response(selection.engineering, found))
-    places = [list(found.airframe.inputs).index(name) for name in controller.inputs]
-    slew = ", ".join(f"{value:.3g}" for value in found.slew[places] / params.input_scale)
-    reasons = {
-        "rate": "Hz",
-        "outputs": "the fastest first: the last one has the smallest gain, as (22) has it",
-        "k_g": f"1/s; K = ({', '.join(f'{value:.3g}' for value in params.K)}) by (22), bandwidths ({bandwidth}) rad/s",
-        "k_d": "1/s",
-        "Lambda": "1/s, a quarter of the bandwidths",
-        "beta": f"units of y / s^2; {selection.setting.factor:g} x the ideal control's slew ({slew}), within 0.7 x rate limit",
-        "D": "signs of the leading minors of C B",
-        "input_scale": "units of u s / units of y: 1 / abs(Omega_ii), Omega = C B",
-        "omega": f"abs(Omega_ii) in scaled inputs, the largest within +-{100 * found.uncertainty:g} %",
-        "sign": params.sign.name.lower() + " with this lag and delay",
-        "lag": "s, actuators",
-        "delay": "s, beyond sampling",
-        "softening": "1, width of the softened sign in total lags",
-    }
-    margin = selection.engineering.delay_margin
-    lines = [
-        f"# Gains for the airframe {found.airframe.name} by the engineering procedure."
-        + ("" if margin is None else f" Predicted delay margin {1e3 * margin:.0f} ms."),
-        "/**/controller:",
-        "  ros__parameters:",
-    ]
-    for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward"}).items():
-        reason = reasons.get(key, "" if key == "inputs" else ControllerParameters.model_fields[key].description)
-        lines.append(f"    {key}: {yaml_flow(value)}" + (f"  # {reason}" if reason else ""))
-    if controller.feedforward is not None:
-        lines += _feedforward_lines(controller.feedforward, found.airframe.name)
-    return "\n".join(lines) + "\n"
-
-
-def _feedforward_lines(model: FeedforwardParameters, airframe: str) -> list[str]:
-    lines = [f"    feedforward:  # an extension of the paper: the input of {airframe} along y_m is added; SI, a line a state"]
-    for key, value in model.model_dump(exclude_none=True).items():
-        columns = len(value) if key in {"states", "lead"} else len(value) // len(model.states)
-        rows = [yaml_flow(value[i : i + columns])[1:-1] for i in range(0, len(value), columns)]
-        lines.append(f"      {key}: [" + (",\n" + " " * (9 + len(key))).join(rows) + "]" + ("  # s" if key == "lead" else ""))
-    return lines
-
-
-def _response(answer: GainAssessment, found: Study) -> FloatArray:
-    """abs(Omega_ii) of the nominal airframe in the inputs of the controller, shape (m,)."""
-    rows = [found.airframe.outputs.index(name) for name in answer.controller.outputs]
-    columns = [list(found.airframe.inputs).index(name) for name in answer.controller.inputs]
-    return np.asarray(np.abs(found.Omega[rows, columns]) * answer.controller.input_scale)
+# YAML
 
 
 def yaml_flow(value: Any) -> str:
-    """A value in YAML's flow style; floats with six digits and always a point, which YAML 1.1 needs to see a float."""
+    """A value in YAML's flow style. Floats have six digits and always a point, which YAML 1.1 requires of a float."""
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(yaml_flow(one) for one in value)}]"
     if isinstance(value, dict):
@@ -575,3 +524,77 @@ def yaml_flow(value: Any) -> str:
         digits, mark, exponent = f"{value:.6g}".partition("e")
         return (digits if "." in digits else digits + ".0") + mark + exponent
     return str(value)
+
+
+def yaml_template(text: str) -> Template:
+    """A template of a YAML file: "{{ value | flow }}" is `yaml_flow`, "| digits(3)" a number with three digits."""
+    environment = Environment(trim_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined, autoescape=False)  # noqa: S701 - no HTML
+    environment.filters["flow"] = yaml_flow
+    environment.filters["digits"] = lambda value, count: f"{value:.{count}g}"
+    return environment.from_string(text)
+
+
+CONTROLLER_YAML = yaml_template("""\
+# Gains for the airframe {{ airframe }} by the engineering procedure.
+{%- if delay_margin is not none %} Predicted delay margin {{ "%.0f" | format(1e3 * delay_margin) }} ms.{% endif %}
+
+/**/controller:
+  ros__parameters:
+{% for key, value, comment in parameters %}
+    {{ key }}: {{ value | flow }}{{ "  # " ~ comment if comment }}
+{% endfor %}
+{% if feedforward %}
+    feedforward:  # an extension of the paper: the input of {{ airframe }} along y_m is added; SI, a line a state
+{% for key, rows in feedforward.items() %}
+      {{ key }}: [{{ rows | join(",\n" ~ " " * (9 + key | length)) }}]{{ "  # s" if key == "lead" }}
+{% endfor %}
+{% endif %}
+""")
+
+
+def as_yaml(selection: Selection) -> str:
+    """The engineering gain set as the section `/**/controller` of a scenario file, with units and reasons in comments."""
+    controller, study = selection.engineering.controller, selection.study
+    params = controller.law()
+    rows = [study.airframe.outputs.index(name) for name in controller.outputs]
+    columns = [list(study.airframe.inputs).index(name) for name in controller.inputs]
+    response = np.abs(study.Omega[rows, columns]) * controller.input_scale  # abs(Omega_ii) in the inputs of the controller
+    K, bandwidth, slew = (
+        ", ".join(f"{value:.3g}" for value in values)
+        for values in (params.K, params.K * response, study.slew[columns] / params.input_scale)
+    )
+    comments = {
+        "rate": "Hz",
+        "outputs": "the fastest first: the last one has the smallest gain, as (22) has it",
+        "inputs": "",
+        "k_g": f"1/s; K = ({K}) by (22), bandwidths ({bandwidth}) rad/s",
+        "k_d": "1/s",
+        "Lambda": "1/s, a quarter of the bandwidths",
+        "beta": f"units of y / s^2; {selection.setting.factor:g} x the ideal control's slew ({slew}), within 0.7 x rate limit",
+        "D": "signs of the leading minors of C B",
+        "input_scale": "units of u s / units of y: 1 / abs(Omega_ii), Omega = C B",
+        "omega": f"abs(Omega_ii) in scaled inputs, the largest within +-{100 * study.uncertainty:g} %",
+        "sign": params.sign.name.lower() + " with this lag and delay",
+        "lag": "s, actuators",
+        "delay": "s, beyond sampling",
+        "softening": "1, width of the softened sign in total lags",
+    }
+    parameters = [
+        (key, value, comments.get(key, ControllerParameters.model_fields[key].description))
+        for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward"}).items()
+    ]
+    return CONTROLLER_YAML.render(
+        airframe=study.airframe.name,
+        delay_margin=selection.engineering.delay_margin,
+        parameters=parameters,
+        feedforward=None if controller.feedforward is None else _feedforward_rows(controller.feedforward),
+    )
+
+
+def _feedforward_rows(model: FeedforwardParameters) -> dict[str, list[str]]:
+    """Entries of each parameter in flow style, in rows: a row of a matrix is a state."""
+    rows = {}
+    for key, value in model.model_dump(exclude_none=True).items():
+        columns = len(value) if key in {"states", "lead"} else len(value) // len(model.states)
+        rows[key] = [yaml_flow(value[i : i + columns])[1:-1] for i in range(0, len(value), columns)]
+    return rows

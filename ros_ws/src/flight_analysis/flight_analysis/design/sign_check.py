@@ -9,7 +9,7 @@ import numpy as np
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from autopilot_bridge.params import ChannelMap, InputRow, OutputRow
-from autopilot_bridge.signs import SURE, Estimate, estimate, output_signs, through
+from autopilot_bridge.signs import MIN_ERROR_RATIO, Estimate, estimate, output_signs, through
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
@@ -56,7 +56,10 @@ def check_scenario(channel_map: ChannelMap, scenario: Scenario, frame: Airframe,
         require(sorted(found) == sorted(expected), key, ", ".join(found), f"the controller's: {', '.join(expected)}")
     Omega = frame.matrix_c() @ frame.matrix_b()
     in_map = Omega[
-        np.ix_([frame.outputs.index(one) for one in channel_map.outputs], [list(frame.inputs).index(one) for one in channel_map.inputs])
+        np.ix_(
+            [frame.outputs.index(one) for one in channel_map.outputs],
+            [list(frame.inputs).index(one) for one in channel_map.inputs],
+        )
     ]
     measured = None
     if bag is not None:
@@ -81,7 +84,8 @@ def check(
     ParameterError where the map does not fit the airframe, or Omega has no D.
     """
     rows, columns = (
-        [list(part).index(one) for one in names] for part, names in ((channel_map.outputs, outputs), (channel_map.inputs, inputs))
+        [list(part).index(one) for one in names]
+        for part, names in ((channel_map.outputs, outputs), (channel_map.inputs, inputs))
     )
     seen = through(channel_map, Omega)[np.ix_(rows, columns)]
     follows = [int(sign) for sign in signs(seen)]
@@ -101,7 +105,7 @@ def check(
                 f"with the map {channel_map.name} D of {output} and {name} is {follows[i]:+d}, the controller has {D[i]:+d}:"
                 f" a positive {name} makes the aircraft {motion_as_channel_grows(channel_map.inputs[name])}"
             )
-        if found is not None and ratio is not None and ratio >= SURE and found * seen[i, i] < 0.0:
+        if found is not None and ratio is not None and ratio >= MIN_ERROR_RATIO and found * seen[i, i] < 0.0:
             sentences.append(
                 f"the recorded flight has {output}_dot {'rise' if found > 0.0 else 'fall'} with {name}"
                 f" ({found:.3g}, {ratio:.0f} standard errors), the map {channel_map.name} says the opposite"
