@@ -24,11 +24,12 @@ from flight_analysis.closed_loop.replay import recorded_parameters, replay
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_bringup.scenarios import share
 from flight_core.parameters import ParameterError
-from flight_log.bag import SCENARIO, Contents, Count, information_of, read_information, read_metadata
+from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
 from flight_log.latency import latency
 from flight_log.named_vectors import decoder
 from flight_log.playback import read_playback
 from flight_log.repair import repair
+from flight_log.rosbag2_metadata import FileContents, TopicCount, bag_metadata_yaml, read_bag_metadata
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
 from flight_log.tape_reader import read_run
 from rise_di_controller.controller import Controller
@@ -71,8 +72,8 @@ def metadata(data: bytes, folder: Path) -> None:
     """metadata.yaml of a bag, and the file of metadata that goes into one."""
     run = _run(folder, _PLAIN)
     (run / "metadata.yaml").write_bytes(data)
-    refused(lambda: read_information(run))
-    refused(lambda: read_metadata(run / "metadata.yaml"))
+    refused(lambda: read_bag_metadata(run))
+    refused(lambda: read_metadata_records(run / "metadata.yaml"))
     refused(lambda: read_run(run))
     refused(lambda: repair(run))
 
@@ -184,7 +185,7 @@ def log(
     writer.start(profile="ros2", library="fuzz")
     channels: dict[str, int] = {}
     for name, content in attached.items():
-        writer.add_attachment(0, 0, name, SCENARIO, content)
+        writer.add_attachment(0, 0, name, SCENARIO_MEDIA_TYPE, content)
     for k, (topic, kind, data) in enumerate(messages):
         if topic not in channels:
             schema = writer.register_schema(kind, "ros2msg", b"std_msgs/Header header\n")
@@ -237,9 +238,9 @@ def _mcaps() -> list[bytes]:
 
 
 def _metadata() -> list[bytes]:
-    count = Count("/y", JOINT_STATE, "RIHS01_0", "- depth: 1\n", 8)
+    count = TopicCount("/y", JOINT_STATE, "RIHS01_0", "- depth: 1\n", 8)
     return [
-        information_of([Contents("run_0.mcap", 0, 7_000_000, (count,))]).encode(),
+        bag_metadata_yaml([FileContents("run_0.mcap", 0, 7_000_000, (count,))]).encode(),
         b"rise_di_flight: {start: a, command: b}\n",
     ]
 

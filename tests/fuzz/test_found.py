@@ -16,14 +16,14 @@ from tests.fuzz.targets import log
 from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.page import _json
+from flight_analysis.report.html import script_json
 from flight_analysis.report.run_folder import read_flight
 from flight_core.files import parse_yaml
 from flight_core.parameters import MAX_SENTENCE_LENGTH, ParameterError
-from flight_log.bag import METADATA, read_information
 from flight_log.latency import latency
 from flight_log.playback import read_playback
 from flight_log.repair import repair
+from flight_log.rosbag2_metadata import METADATA, read_bag_metadata
 from flight_log.scan import Scan
 from flight_log.tape_reader import read_run
 
@@ -120,7 +120,7 @@ def test_metadata_that_ends_at_no_instant_are_refused(last: str, tmp_path: Path)
     text = f"rosbag2_bagfile_information: {{starting_time: {{nanoseconds_since_epoch: 0}}, duration: {{nanoseconds: {last}}}}}"
     (tmp_path / METADATA).write_text(text, encoding="utf-8")
     with pytest.raises(ParameterError, match=r"metadata\.yaml: found .*, expected that of rosbag2"):
-        read_information(tmp_path)
+        read_bag_metadata(tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"", b"[: x", b"5", b"/**/flight: {ros__parameters: {duration: [1]}}"])
@@ -161,8 +161,8 @@ def test_a_sentence_stays_one_whatever_it_quotes() -> None:
 
 def test_no_text_of_a_log_ends_or_hides_the_script_it_stands_in() -> None:
     hostile = "</script><!--<script>"
-    assert "<" not in _json({"name": hostile})
-    assert json.loads(_json({"name": hostile})) == {"name": hostile}
+    assert "<" not in script_json({"name": hostile})
+    assert json.loads(script_json({"name": hostile})) == {"name": hostile}
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, on values that no flight has

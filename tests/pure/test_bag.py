@@ -22,7 +22,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
-from flight_log.bag import BagWriter, Enclosed
+from flight_log.bag import BagWriter, LogAttachments
 from flight_log.message_definitions import definition
 from flight_log.named_vectors import decoder
 from flight_log.scan import Scan
@@ -38,7 +38,7 @@ def tape(osprey_gust: Scenario) -> Tape:
 @pytest.fixture(scope="module")
 def recorded(tape: Tape, osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded") / "run"
-    write_run(tape, folder, Enclosed(osprey_gust.path))
+    write_run(tape, folder, LogAttachments(osprey_gust.path))
     return folder
 
 
@@ -75,7 +75,7 @@ def test_what_is_enclosed_comes_back_as_it_was(tape: Tape, osprey_gust: Scenario
     attached, metadata = tmp_path / "airframe.yaml", tmp_path / "metadata.yaml"
     attached.write_bytes(b"A: [[1.0]]\n\xc3\xa9")
     metadata.write_text("host: {cores: '2', kernel: '6.1 #1'}\nversions: {}\n", encoding="utf-8")
-    write_run(tape, tmp_path / "run", Enclosed(osprey_gust.path, (attached,), metadata))
+    write_run(tape, tmp_path / "run", LogAttachments(osprey_gust.path, (attached,), metadata))
     back = read_run(tmp_path / "run")
     assert back.attachments == (("airframe.yaml", attached.read_bytes()),)
     assert {name: back.metadata[name] for name in ("host", "versions")} == {
@@ -89,7 +89,7 @@ def test_metadata_that_are_no_strings_are_refused(text: str, tape: Tape, osprey_
     metadata = tmp_path / "metadata.yaml"
     metadata.write_text(text, encoding="utf-8")
     with pytest.raises(ParameterError, match="expected a mapping of mappings of strings"):
-        write_run(tape, tmp_path / "run", Enclosed(osprey_gust.path, (), metadata))
+        write_run(tape, tmp_path / "run", LogAttachments(osprey_gust.path, (), metadata))
 
 
 def test_rosbags_reads_every_topic(tape: Tape, recorded: Path) -> None:
@@ -133,7 +133,7 @@ def test_a_file_without_an_end_is_read_up_to_its_last_whole_chunk(share: float, 
     assert 0 < len(back["y"].stamp_ns) <= len(tape["y"].stamp_ns)
     assert (back["y"].values == tape["y"].values[: len(back["y"].stamp_ns)]).all()
     end = max(back.time(name)[-1] for name in back.signals)
-    assert f"run_0.mcap has no end: read up to its last whole chunk, t = {end:.3f} s" in back.notes[0]
+    assert f"run_0.mcap is truncated: read up to its last complete chunk, t = {end:.3f} s" in back.notes[0]
     assert back.notes[1] == f"metadata.yaml is missing: rise-di repair {run}"
 
 
@@ -143,7 +143,7 @@ def test_a_cut_file_says_how_much_is_missing_where_anything_knows(tape: Tape, ru
     back = read_run(run).tape  # metadata.yaml knows when the last message came
     missing = (tape["truth"].stamp_ns[-1] - back["truth"].stamp_ns[-1]) / NANOSECONDS
     assert missing > 0.1
-    assert f"{missing:.3f} s are missing behind it" in back.notes[0]
+    assert f"{missing:.3f} s are missing after it" in back.notes[0]
 
 
 @pytest.mark.parametrize("number", [0, 1])
@@ -198,19 +198,19 @@ def test_a_file_that_grows_while_it_is_read_is_read_as_it_was_at_first(tmp_path:
     bag.close()
     found = [first, *records]
     assert sum(isinstance(one, Message) for one in found) == len(SAMPLES)
-    assert not scan.whole
+    assert not scan.complete
     assert scan.damaged == 0
 
 
 def test_two_logs_in_a_folder_are_refused(run: Path) -> None:
     (run / "copy.mcap").write_bytes((run / "run_0.mcap").read_bytes())
-    with pytest.raises(ParameterError, match=r"run: found 2 \.mcap files that are no parts of one bag, expected one bag"):
+    with pytest.raises(ParameterError, match=r"run: found 2 \.mcap files that are not parts of one bag, expected one bag"):
         read_run(run)
 
 
 def test_a_tape_whose_first_signal_has_no_sample_is_written(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
     empty = {"y": tape["y"].until(-1), "u": tape["u"]}
-    write_run(Tape(empty), tmp_path / "run", Enclosed(osprey_gust.path))
+    write_run(Tape(empty), tmp_path / "run", LogAttachments(osprey_gust.path))
     assert list(read_run(tmp_path / "run").tape.signals) == ["u"]
 
 

@@ -16,7 +16,7 @@ from tests.small_disk import fill, small_disk
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
-from flight_log.bag import END_BYTES, BagWriter, Channel, Enclosed
+from flight_log.bag import END_BYTES, BagChannel, BagWriter, LogAttachments
 from flight_log.disk import ReservedFile, free_bytes
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
@@ -35,7 +35,7 @@ NAMES = [f"channel.{k}" for k in range(40)]
 GENERATOR = np.random.default_rng(1)
 
 
-def write(bag: BagWriter, channel: Channel, count: int) -> None:
+def write(bag: BagWriter, channel: BagChannel, count: int) -> None:
     """So many messages of 40 noisy channels, which do not compress; a chunk each tenth of them, as at 1 kHz and 0.1 s."""
     for _ in range(count):
         stamp_ns = 1_000_000 * (channel.messages + 1)
@@ -46,7 +46,7 @@ def write(bag: BagWriter, channel: Channel, count: int) -> None:
             bag.flush()
 
 
-def write_until_full(bag: BagWriter, channel: Channel) -> None:
+def write_until_full(bag: BagWriter, channel: BagChannel) -> None:
     while not bag.full:
         write(bag, channel, 1)
 
@@ -93,7 +93,7 @@ def test_without_any_room_the_log_stays_readable_to_its_last_whole_chunk(disk: P
     back = read_run(disk / "run").tape
     assert len(back["y"].stamp_ns) >= written - 10
     assert back["y"].stamp_ns.tolist() == [1_000_000 * (k + 1) for k in range(len(back["y"].stamp_ns))]
-    assert "run_0.mcap has no end: read up to its last whole chunk" in back.notes[0]
+    assert "run_0.mcap is truncated: read up to its last complete chunk" in back.notes[0]
 
 
 def test_a_fault_of_the_disk_is_not_taken_for_a_full_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,4 +121,4 @@ def test_short_writes_are_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_a_flight_in_one_process_that_finds_no_space_is_one_sentence(disk: Path, osprey_gust: Scenario) -> None:
     fill(disk / "other")
     with pytest.raises(ParameterError, match=r"disk/run cannot be written \(No space left on device\)"):
-        write_run(simulate(osprey_gust.vary(flight={"duration": 0.1})), disk / "run", Enclosed(osprey_gust.path))
+        write_run(simulate(osprey_gust.vary(flight={"duration": 0.1})), disk / "run", LogAttachments(osprey_gust.path))

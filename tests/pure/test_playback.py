@@ -13,7 +13,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
-from flight_log.bag import BagWriter, Enclosed
+from flight_log.bag import BagWriter, LogAttachments
 from flight_log.message_definitions import definition
 from flight_log.named_vectors import JOINT_STATE
 from flight_log.playback import begins_with_stamp, read_playback
@@ -28,7 +28,7 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One second in one process: y, y_m and truth at 500 Hz, u and internals at 100 Hz, from t = 0 to 1 s."""
     tape = simulate(osprey_gust.vary(flight={"duration": 1.0}))
-    return write_run(tape, tmp_path_factory.mktemp("playback") / "run", Enclosed(osprey_gust.path)).parent
+    return write_run(tape, tmp_path_factory.mktemp("playback") / "run", LogAttachments(osprey_gust.path)).parent
 
 
 def test_every_message_of_a_flight_in_one_process_is_due_at_its_stamp(run: Path) -> None:

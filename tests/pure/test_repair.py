@@ -18,7 +18,7 @@ from rosbags.highlevel import AnyReader
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.run_folder import enclosed
+from flight_analysis.report.run_folder import attachments_for
 from flight_core.parameters import ParameterError
 from flight_log.repair import repair
 from flight_log.tape_reader import read_run
@@ -32,7 +32,7 @@ def recorded(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) ->
     scenario = osprey_gust.vary(flight={"duration": DURATION})
     folder = tmp_path_factory.mktemp("recorded") / "run"
     folder.mkdir()
-    write_run(simulate(scenario), folder, enclosed(scenario, folder))
+    write_run(simulate(scenario), folder, attachments_for(scenario, folder))
     return folder
 
 
@@ -217,8 +217,8 @@ def test_the_command_says_what_was_kept_and_how_much_is_missing(run: Path) -> No
     metadata = (run / "metadata.yaml").read_bytes()
     cut(run, 0.5)
     end = last(run)
-    kept = r"run_0.mcap had no end: (\d+) messages kept; as it was: run_0.mcap.damaged\n"
-    said = rf"metadata.yaml written; the log ends at t = {end:.3f} s of the {DURATION:g} s that were to be flown\n"
+    kept = r"run_0.mcap had a truncated end: (\d+) messages kept; the damaged file is run_0.mcap.damaged\n"
+    said = rf"metadata.yaml written; the log ends at t = {end:.3f} s of the {DURATION:g} s of the scenario\n"
     assert re.fullmatch(kept + said, command())
     cut(run, 0.5)
     (run / "metadata.yaml").write_bytes(metadata)  # which knows when the last message came

@@ -30,7 +30,7 @@ from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
-from flight_log.bag import BagWriter, Enclosed
+from flight_log.bag import BagWriter, LogAttachments
 from flight_log.stored_messages import PARAMETER_EVENT, parameter_changes
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
@@ -470,7 +470,7 @@ def tape(tmp_path_factory: pytest.TempPathFactory) -> Tape:
 
 @pytest.fixture
 def run(tape: Tape, tmp_path: Path) -> Path:
-    return write_run(tape, tmp_path / "run", Enclosed(scenario_file(tmp_path))).parent
+    return write_run(tape, tmp_path / "run", LogAttachments(scenario_file(tmp_path))).parent
 
 
 def command(*arguments: str) -> Result:
@@ -484,7 +484,7 @@ def test_the_command_counts_the_ticks(run: Path) -> None:
 
 def test_the_command_finds_one_bit_of_one_gain_in_the_scenario_of_the_log(tape: Tape, tmp_path: Path) -> None:
     gains = [flipped(5.0), 5.0, 3.0, 0.5]
-    run = write_run(tape, tmp_path / "run", Enclosed(scenario_file(tmp_path, controller={"Lambda": gains}))).parent
+    run = write_run(tape, tmp_path / "run", LogAttachments(scenario_file(tmp_path, controller={"Lambda": gains}))).parent
     shown = command(str(run))
     assert shown.exit_code == 1
     first, count, note = shown.stdout.splitlines()
@@ -495,7 +495,7 @@ def test_the_command_finds_one_bit_of_one_gain_in_the_scenario_of_the_log(tape: 
         "note: 201 ticks, from tick 1 at t = 0 s on, flew with other parameters than the log holds: changed in"
     )
     # the same by --set, on the log with the right ones, and as JSON
-    right = write_run(tape, tmp_path / "right", Enclosed(scenario_file(tmp_path))).parent
+    right = write_run(tape, tmp_path / "right", LogAttachments(scenario_file(tmp_path))).parent
     shown = command(str(right), "--set", f"controller.Lambda={gains}", "--json")
     assert shown.exit_code == 1
     found = json.loads(shown.stdout)
@@ -511,7 +511,7 @@ def test_a_log_cut_short_is_checked_as_far_as_it_goes(run: Path) -> None:
     found = json.loads(command(str(run), "--json").stdout)
     assert found["equal"]
     assert 20 < found["ticks"] == found["checked"] < 201
-    assert any("has no end" in note for note in found["notes"])
+    assert any("is truncated" in note for note in found["notes"])
 
 
 def test_other_gains_are_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -> None:
@@ -548,12 +548,12 @@ def test_a_setting_that_is_none_is_one_sentence(setting: str, sentence: str, run
 
 def test_a_log_without_scenario_or_controller_is_one_sentence(tape: Tape, tmp_path: Path) -> None:
     scenario = scenario_file(tmp_path)
-    alone = write_run(Tape({"y": tape["y"]}), tmp_path / "alone", Enclosed(scenario)).parent
+    alone = write_run(Tape({"y": tape["y"]}), tmp_path / "alone", LogAttachments(scenario)).parent
     short = Tape({name: one.until(0) for name, one in tape.signals.items()})
     for run, sentence in (
         (alone, "the log: found no sample of internals"),
         (
-            write_run(without(short, lambda number: number < 1), tmp_path / "none", Enclosed(scenario)).parent,
+            write_run(without(short, lambda number: number < 1), tmp_path / "none", LogAttachments(scenario)).parent,
             "the log: found no sample",
         ),
     ):

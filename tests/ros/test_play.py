@@ -18,7 +18,7 @@ from tests.ros.peer import peer
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.rates import NANOSECONDS
-from flight_log.bag import Enclosed
+from flight_log.bag import LogAttachments
 from flight_log.playback import read_playback
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
@@ -34,7 +34,7 @@ MS = 1_000_000
 def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two seconds in one process: y and y_m at 500 Hz."""
     tape = simulate(osprey_gust.vary(flight={"duration": 2.0}))
-    return write_run(tape, tmp_path_factory.mktemp("play") / "run", Enclosed(osprey_gust.path)).parent
+    return write_run(tape, tmp_path_factory.mktemp("play") / "run", LogAttachments(osprey_gust.path)).parent
 
 
 class Listener:

@@ -120,7 +120,7 @@ def test_what_a_killed_recorder_left_comes_again(start: Start, tmp_path: Path) -
     assert flight.end(timeout=60) == 3, flight.output
     found = replayed(start, log[0].parent)
     assert found["ticks"] == found["checked"] > 100
-    assert any("has no end" in note for note in found["notes"])
+    assert any("is truncated" in note for note in found["notes"])
 
 
 def test_a_recorder_that_comes_late_leaves_its_first_tick_unchecked_and_says_what_is_missing(

@@ -11,9 +11,9 @@ from flight_analysis.report.run_folder import PARAMETERS
 from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError
 from flight_core.rates import seconds
-from flight_log.bag import METADATA
-from flight_log.repair import Repaired
+from flight_log.repair import FileRepair
 from flight_log.repair import repair as repair_bag
+from flight_log.rosbag2_metadata import METADATA
 from flight_log.tape_reader import read_run
 
 
@@ -32,7 +32,7 @@ def repair(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> Non
         print(f"{run} is intact: nothing to repair")
 
 
-def _missing_at_end(run: Path, last: Repaired) -> str:
+def _missing_at_end(run: Path, last: FileRepair) -> str:
     """Time missing at the end of the log: by what the files say of their end, else by the duration of the scenario."""
     if (missing := seconds(last.known_end_ns - last.last_ns)) > 0:
         return f"{missing:.3f} s are missing at its end"

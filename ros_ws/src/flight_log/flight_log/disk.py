@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files on a disk that may run full: how much is free, a file with room held for its end, a text replaced as a whole."""
+"""Files on a disk that may be full: free space, a file with reserved space, atomic replacement of a text file."""
 
 import errno
 import fcntl
@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import IO
 
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
-STEP = 64 * 1024  # bytes by which the room held grows at least
+RESERVE_STEP = 64 * 1024  # bytes; the reserve grows by at least this
 
 
 def free_bytes(folder: Path) -> int:
-    """Bytes that an ordinary user may still write to the disk of a folder."""
+    """Bytes that an unprivileged user may still write to the disk of a folder."""
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text file so that it is there as a whole or, after a crash, as it was."""
+    """Write a text file atomically: after a crash the file has either its new or its old content."""
     fresh = path.with_name(f"{path.name}.new")
     with fresh.open("w", encoding="utf-8") as stream:
         stream.write(text)
@@ -29,10 +29,10 @@ def replace_text(path: Path, text: str) -> None:
     fresh.replace(path)
 
 
-def lock(stream: IO[bytes] | int) -> bool:
-    """Take the lock that a file being written has, until the stream is closed; whether it was free.
+def try_lock(stream: IO[bytes] | int) -> bool:
+    """Lock a file until the stream is closed. False when another process, such as its recorder, holds the lock.
 
-    On a file system without locks it always is.
+    A file system without locks always grants it.
     """
     try:
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -44,41 +44,41 @@ def lock(stream: IO[bytes] | int) -> bool:
 
 
 class ReservedFile:
-    """A new file, unbuffered, with room held for its end, so that it can still be finished on a disk that has run full.
+    """A new unbuffered file with a reserve of disk space, so that it can be finished on a full disk.
 
-    The room is that of a second file without a name. It is given up for the first write that finds no space, which then
-    succeeds, and goes with the process if that is killed.
+    A second, unnamed file takes up the reserve. The first write that finds no space closes that file and then succeeds. The
+    reserve also ends with the process.
     """
 
     def __init__(self, path: Path) -> None:
-        self._reserve = tempfile.TemporaryFile(dir=path.parent, buffering=0)  # noqa: SIM115 - held as long as this one
+        self._reserve = tempfile.TemporaryFile(dir=path.parent, buffering=0)  # noqa: SIM115 - open as long as this file
         try:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         except OSError:
             self._reserve.close()
             raise
-        lock(self._descriptor)
-        self._held = 0
-        self._place = 0
+        try_lock(self._descriptor)
+        self._reserved_bytes = 0
+        self._position = 0
         self._closed = False
-        self.full = False  # the room was needed
+        self.full = False  # the reserve was needed
 
-    def hold(self, size: int) -> None:
-        """Hold room for so many bytes; where there is none the disk counts as full, and what was held stays so."""
-        if self.full or size <= self._held:
+    def reserve(self, size: int) -> None:
+        """Reserve this many bytes in total. Without space for them `full` is set and the earlier reserve stays."""
+        if self.full or size <= self._reserved_bytes:
             return
-        self._held = size + STEP
+        self._reserved_bytes = size + RESERVE_STEP
         try:
-            os.posix_fallocate(self._reserve.fileno(), 0, self._held)
-        except OSError as error:  # a file system that can hold no room does without
+            os.posix_fallocate(self._reserve.fileno(), 0, self._reserved_bytes)
+        except OSError as error:  # on a file system without fallocate there is no reserve
             self.full = error.errno in NO_SPACE
 
     def release(self) -> None:
-        """Give up the room held."""
+        """Free the reserve."""
         self._reserve.close()
 
     def write(self, data: bytes | memoryview) -> int:
-        """Write all of it. Raises OSError where the room held did not suffice, or for any other reason."""
+        """Write all data. Raises OSError when the reserve does not suffice, or for another reason."""
         rest = memoryview(data)
         size = rest.nbytes
         while rest:
@@ -90,19 +90,19 @@ class ReservedFile:
                 self.full = True
                 self.release()
                 continue
-            self._place += written
+            self._position += written
             rest = rest[written:]
         return size
 
     def tell(self) -> int:
-        """How much was written."""
-        return self._place
+        """Bytes written."""
+        return self._position
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: the file is unbuffered."""
 
     def close(self) -> None:
-        """Close it, and give up the room held."""
+        """Close the file and free the reserve."""
         if not self._closed:
             self._closed = True
             self.release()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How long the loop takes from y to u: from the instants at which the log says that they were sent."""
+"""Latency of the loop from y to u, by the times at which the log says that they were sent."""
 
 from pathlib import Path
 
@@ -8,20 +8,20 @@ import numpy as np
 
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
-from flight_log.bag import bag_files
 from flight_log.named_vectors import JOINT_STATE, STAMP
+from flight_log.rosbag2_metadata import bag_files
 from flight_log.stored_messages import stored_messages
 
 CHANNEL = "y_to_u"
 
 
 def latency(run: Path) -> Signal | None:
-    """Time from when a y was sent to when the u was that carries its stamp, s: one channel, by the stamps of u.
+    """Time from the sending of a y to the sending of the u with its stamp, s: one channel, by the stamps of u.
 
-    None where the log does not tell: it is no bag of MCAP files, it holds several aircraft, or all was sent at one instant, as
+    None when the log does not hold it: it is not a bag of MCAP files, it holds several aircraft, or all times are equal, as
     in a flight in one process.
     """
-    sent: dict[str, dict[int, int]] = {}  # by full topic name: instant of sending by stamp, ns
+    sent: dict[str, dict[int, int]] = {}  # by full topic name: time of sending by stamp, ns
     for message in stored_messages(run) if bag_files(run) else ():
         sample = message.type_name == JOINT_STATE and len(message.data) >= STAMP.stop
         if sample and message.topic.rpartition("/")[2] in ("y", "u"):

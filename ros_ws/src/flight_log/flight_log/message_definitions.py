@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Message definitions from the installed packages, as MCAP and rosbag2 want them. Needs no ROS, only its share folders."""
+"""Message definitions of the installed packages, for MCAP and rosbag2. Reads share folders; needs no ROS at run time."""
 
 import json
 import os
@@ -16,16 +16,16 @@ class Definition(NamedTuple):
     """A message type as a log stores it."""
 
     name: str  # "sensor_msgs/msg/JointState"
-    text: str  # its definition and those of all it refers to
+    text: str  # its definition and those of all referenced types
     type_hash: str  # "RIHS01_..."
 
 
 @cache
 def definition(name: str) -> Definition:
-    """Definition of "pkg/msg/Type". Raises ParameterError where its package is not installed.
+    """Definition of "pkg/msg/Type". Raises ParameterError when its package is not installed.
 
-    The text is the main definition, then for each type that it refers to a line of 80 "=", "MSG: pkg/Type" and that definition
-    (MCAP registry, schema encoding ros2msg). The hash is that of REP 2016, read from the package's own JSON.
+    The text is the main definition, then for each referenced type a line of 80 "=", "MSG: pkg/Type" and its definition (MCAP
+    registry, schema encoding ros2msg). The hash is that of REP 2016, read from the JSON of the package.
     """
     description = json.loads(_read(name, "json"))
     parts = [_read(name, "msg")]
@@ -38,7 +38,7 @@ def definition(name: str) -> Definition:
 
 def _read(name: str, suffix: str) -> str:
     package, _, kind = name.partition("/msg/")
-    # The wheels install into the prefix of the interpreter and set no AMENT_PREFIX_PATH.
+    # The wheels install into the prefix of the interpreter and do not set AMENT_PREFIX_PATH.
     prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
     for prefix in prefixes:
         path = Path(prefix) / "share" / package / "msg" / f"{kind}.{suffix}"

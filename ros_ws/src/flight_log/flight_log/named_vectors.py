@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a log as named vectors: which topics and types hold any, and how they are read. Needs no ROS.
+"""Decodes the messages of a topic as named vectors. Needs no ROS.
 
-A topic of samples is as good as always written by one sender with the same channels: its messages then differ in the stamp and
-the values alone. So the layout is learnt from one message, and all that share it are read at once.
+The messages of a topic usually have one sender and the same channels. They then differ in stamp and values only. The decoder
+learns the byte layout from one message and decodes all messages of that layout together.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,23 +22,22 @@ from flight_core.vectors import FloatArray
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
-STAMP = slice(4, 12)  # int32 seconds and uint32 nanoseconds, behind the 4 bytes of the encapsulation
+STAMP = slice(4, 12)  # int32 seconds and uint32 nanoseconds, after the 4 bytes of the encapsulation
 
-
-LONGEST_FLIGHT = 1e9
-"""s. What says that more have passed is no flight time."""
+MAX_FLIGHT_TIME = 1e9
+"""s. A larger value is not a flight time."""
 
 
 class Samples(NamedTuple):
     """N samples with the same k channels."""
 
     names: tuple[str, ...]
-    stamp_ns: NDArray[np.int64]  # (N,), the instant each sample belongs to
+    stamp_ns: NDArray[np.int64]  # (N,), the instant of each sample
     values: FloatArray  # (N, k)
 
 
 class Decoded(NamedTuple):
-    """What some messages hold. Vectors without channels, which say that there is no sample, are left out."""
+    """The content of some messages. A vector without channels stands for a missing sample and is left out."""
 
     samples: list[Samples]
     unreadable: int
@@ -49,37 +48,37 @@ Decoder = Callable[[Sequence[bytes]], Decoded]
 
 @cache
 def typestore() -> Typestore:
-    """The message types of this ROS 2, made once: each takes 20 ms to be read for the first time."""
+    """The message types of ROS 2 Jazzy. Made once: loading them takes 20 ms."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def decoder(topic: str, type_name: str) -> Decoder | None:
-    """What turns messages of a topic, by its full name, of a type into named vectors; None where they are none.
+    """Decoder from messages to named vectors, for a topic by its full name; None for a type without named vectors.
 
-    A decoder is for one topic, whose messages it is given in their order, some at a time.
+    A decoder serves one topic. It takes the messages in their order, several at a time.
     """
-    return _JointStates() if type_name == JOINT_STATE else None
+    return _JointStateDecoder() if type_name == JOINT_STATE else None
 
 
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
-    """The stamp of flight time 0, of a sample of `truth` and its t in s: stamp - t; None where t is no flight time."""
-    return stamp_ns - nanoseconds(t) if abs(t) <= LONGEST_FLIGHT else None
+    """Stamp of flight time 0, from a sample of `truth` and its t in s: stamp - t. None when t is not a flight time."""
+    return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 
 
-class _JointStates:
+class _JointStateDecoder:
     """sensor_msgs/JointState with names and positions."""
 
     def __init__(self) -> None:
         self._store = typestore()
         self._names: tuple[str, ...] = ()
-        self._fixed = np.zeros(0, dtype=np.uint8)  # the message learnt from
-        self._is_fixed = np.zeros(0, dtype=np.bool_)  # which of its bytes all messages of its layout share
+        self._template = np.zeros(0, dtype=np.uint8)  # the bytes of the message that the layout was learnt from
+        self._is_constant = np.zeros(0, dtype=np.bool_)  # the bytes that are equal in all messages of the layout
         self._values = slice(0, 0)
 
     def __call__(self, messages: Sequence[bytes]) -> Decoded:
         if not self._names and messages:
             self._learn(messages[0])
-        samples, rest = self._at_once(messages)
+        samples, rest = self._decode_layout(messages)
         unreadable = 0
         for message in rest:
             try:
@@ -96,16 +95,16 @@ class _JointStates:
             self._learn(rest[-1])
         return Decoded(samples, unreadable)
 
-    def _at_once(self, messages: Sequence[bytes]) -> tuple[list[Samples], list[bytes]]:
-        """The samples in messages of the layout that was learnt, and the other messages."""
-        size = len(self._fixed)
-        fitting = [message for message in messages if len(message) == size] if self._names else []
+    def _decode_layout(self, messages: Sequence[bytes]) -> tuple[list[Samples], list[bytes]]:
+        """The samples in messages of the learnt layout, and the other messages."""
+        size = len(self._template)
+        same_size = [message for message in messages if len(message) == size] if self._names else []
         rest = [message for message in messages if len(message) != size] if self._names else list(messages)
-        if not fitting:
+        if not same_size:
             return [], rest
-        table = np.frombuffer(b"".join(fitting), dtype=np.uint8).reshape(-1, size)
-        same = (table == self._fixed)[:, self._is_fixed].all(axis=1)
-        rest += [message for message, alike in zip(fitting, same, strict=True) if not alike]
+        table = np.frombuffer(b"".join(same_size), dtype=np.uint8).reshape(-1, size)
+        same = (table == self._template)[:, self._is_constant].all(axis=1)
+        rest += [message for message, matches in zip(same_size, same, strict=True) if not matches]
         table = table[same]
         stamps = np.ascontiguousarray(table[:, STAMP])
         stamp_ns = stamps.view("<i4")[:, 0] * np.int64(NANOSECONDS) + stamps.view("<u4")[:, 1]
@@ -113,7 +112,7 @@ class _JointStates:
         return [Samples(self._names, stamp_ns, values)] if len(table) else [], rest
 
     def _learn(self, message: bytes) -> None:
-        """Where its values stand: where another message with the same strings has values that stand nowhere else."""
+        """Learn the layout: serialise marked values with the same strings, and find the position of the marks."""
         try:
             one: Any = self._store.deserialize_cdr(message, JOINT_STATE)
         except SerdeError:
@@ -123,11 +122,11 @@ class _JointStates:
             return
         marks: FloatArray = -np.arange(1.0, k + 1.0) * np.pi
         marked = bytes(self._store.serialize_cdr(type(one)(one.header, one.name, marks, one.velocity, one.effort), JOINT_STATE))
-        place = marked.index(marks.tobytes())
-        if len(marked) != len(message) or message[place : place + 8 * k] != one.position.tobytes():
+        start = marked.index(marks.tobytes())
+        if len(marked) != len(message) or message[start : start + 8 * k] != one.position.tobytes():
             return
-        self._names, self._values = tuple(one.name), slice(place, place + 8 * k)
-        self._fixed = np.frombuffer(message, dtype=np.uint8)
-        self._is_fixed = np.ones(len(message), dtype=np.bool_)
-        self._is_fixed[STAMP] = self._is_fixed[self._values] = False
-        self._is_fixed[mac_slice(message)] = False
+        self._names, self._values = tuple(one.name), slice(start, start + 8 * k)
+        self._template = np.frombuffer(message, dtype=np.uint8)
+        self._is_constant = np.ones(len(message), dtype=np.bool_)
+        self._is_constant[STAMP] = self._is_constant[self._values] = False
+        self._is_constant[mac_slice(message)] = False

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a flight comes from: versions, revision, machine, command. Named sets of strings, for the log's metadata."""
+"""Provenance of a flight for the metadata of its log: versions, revision, host, command, as named sets of strings."""
 
 import os
 import platform
@@ -14,17 +14,23 @@ from pathlib import Path
 
 import psutil
 
+# All packages of the stack, as in ros_ws/src.
 STACK = (
     "aircraft_sim",
+    "autopilot_bridge",
+    "control_laws",
     "flight_analysis",
     "flight_bringup",
+    "flight_campaign",
+    "flight_cli",
     "flight_core",
+    "flight_log",
     "flight_recorder",
     "flight_ros",
     "reference_model",
     "rise_di_controller",
 )
-# What the numbers and the bytes of a flight depend on; the middleware under its names in the wheels.
+# The dependencies that the numbers and the bytes of a flight depend on; the middleware by the names of its wheels.
 DEPENDENCIES = (
     "jsbsim",
     "mcap",
@@ -42,7 +48,7 @@ GIT_TIMEOUT = 5.0  # s
 
 
 def provenance() -> dict[str, dict[str, str]]:
-    """All of it, of this process now. What cannot be found is left out."""
+    """The provenance of this process now. What cannot be determined is left out."""
     return {
         "rise_di_flight": {"start": datetime.now(UTC).isoformat(timespec="seconds"), "command": shlex.join(sys.argv)},
         "rise_di_versions": versions(),
@@ -52,39 +58,39 @@ def provenance() -> dict[str, dict[str, str]]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of this stack's packages and of the main dependencies, of those that are installed."""
-    found = {"python": platform.python_version()}
+    """Versions of Python, of the installed packages of the stack and of the installed main dependencies."""
+    installed = {"python": platform.python_version()}
     for name in (*STACK, *DEPENDENCIES):
         try:
-            found[name] = version(name)
+            installed[name] = version(name)
         except PackageNotFoundError:
             continue
     if distribution := os.environ.get("ROS_DISTRO"):
-        found["ROS_DISTRO"] = distribution
-    return found
+        installed["ROS_DISTRO"] = distribution
+    return installed
 
 
 def revision(source: Path) -> dict[str, str]:
-    """The git commit of a source file, and "true" for `dirty` where a tracked file was changed; empty where there is none."""
+    """The git commit of a source file, and `dirty`, "true" when a tracked file was changed. Empty without a commit."""
     git = shutil.which("git")
     if git is None:
         return {}
 
-    def said(*words: str) -> str:
-        command = [git, "--no-optional-locks", "-C", str(source.parent), *words]
+    def output(*arguments: str) -> str:
+        command = [git, "--no-optional-locks", "-C", str(source.parent), *arguments]
         return subprocess.run(command, capture_output=True, text=True, timeout=GIT_TIMEOUT, check=True).stdout.strip()  # noqa: S603
 
     try:
-        said("ls-files", "--error-unmatch", source.name)  # an installed copy may lie in a checkout of something else
-        commit = said("rev-parse", "HEAD")
-        changed = said("status", "--porcelain", "--untracked-files=no")
+        output("ls-files", "--error-unmatch", source.name)  # an installed copy may be inside another project's checkout
+        commit = output("rev-parse", "HEAD")
+        changed = output("status", "--porcelain", "--untracked-files=no")
     except (OSError, subprocess.SubprocessError):
         return {}
     return {"commit": commit, "dirty": "true" if changed else "false"}
 
 
 def host() -> dict[str, str]:
-    """The machine, without its name: system and kernel, processor, cores, memory."""
+    """The host without its name: system and kernel, processor, cores, memory."""
     return {
         "system": platform.system(),
         "kernel": platform.release(),

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag whose recorder was killed, or whose files are damaged, made one that every reader of rosbag2 takes. Needs no ROS."""
+"""Repairs a bag that is truncated, because its recorder was killed, or damaged: every rosbag2 reader accepts the result.
+
+Needs no ROS.
+"""
 
 import os
 import shutil
@@ -13,62 +16,70 @@ from mcap.writer import CompressionType, Writer
 
 from flight_core.files import is_file
 from flight_core.parameters import ParameterError, require
-from flight_log.bag import CHUNK_BYTES, METADATA, Contents, Count, bag_files, information_of, read_information
-from flight_log.disk import lock, replace_text
+from flight_log.bag import CHUNK_BYTES
+from flight_log.disk import replace_text, try_lock
+from flight_log.rosbag2_metadata import (
+    METADATA,
+    FileContents,
+    TopicCount,
+    bag_files,
+    bag_metadata_yaml,
+    read_bag_metadata,
+)
 from flight_log.scan import Scan
 
 
-class Repaired(NamedTuple):
-    """What was done to one file."""
+class FileRepair(NamedTuple):
+    """The result for one file."""
 
     path: Path
     kept: int  # messages in it now
     last_ns: int  # log time of the last one
-    known_end_ns: int  # the latest log time that anything speaks of, 0 where nothing does
-    faults: str  # what was wrong with it, empty where nothing was
-    damaged: Path | None  # where the file as it was is kept; None where it was not touched
+    known_end_ns: int  # the latest log time in any index or metadata, 0 without one
+    faults: str  # empty for an intact file
+    damaged: Path | None  # copy of the damaged file; None for an intact file
 
 
 class Repair(NamedTuple):
-    """What was done to a bag."""
+    """The result for a bag."""
 
-    files: tuple[Repaired, ...]
+    files: tuple[FileRepair, ...]
     wrote_metadata: bool
 
 
 def repair(run: Path) -> Repair:
-    """Rebuild what is damaged in the folder of a bag: files without an end or with damaged parts, and metadata.yaml.
+    """Rebuild what is damaged in the folder of a bag: truncated files, files with damaged parts, and metadata.yaml.
 
-    A rebuilt file holds all that could be read and has an index; it takes the place of the damaged one at once, which is kept
-    beside it as *.damaged. An intact bag is left alone. Raises ParameterError where there is no bag, it is still being
-    recorded, nothing in it can be read, or the folder cannot be written.
+    A rebuilt file holds all readable records and has an index. It replaces the damaged file atomically; that one stays beside
+    it as *.damaged. An intact bag stays as it is. Raises ParameterError when there is no bag, a recorder is writing it, nothing
+    in it is readable, or the folder cannot be written.
     """
     directory = run.parent if is_file(run) else run
     files = bag_files(directory)
     require(bool(files), str(run), "no .mcap file", "the folder of a run")
     try:
-        before, end_ns = read_information(directory)
-        whole = before.get("relative_file_paths") == [file.name for file in files]
+        previous, end_ns = read_bag_metadata(directory)
+        lists_all_files = previous.get("relative_file_paths") == [file.name for file in files]
     except ParameterError:
-        before, end_ns, whole = {}, 0, False
+        previous, end_ns, lists_all_files = {}, 0, False
     try:
-        surveys = [_Survey(file) for file in files]
-        repaired = [survey.rebuild() if survey.faults else survey.unchanged() for survey in surveys]
-        write = not whole or any(one.damaged for one in repaired)
+        scans = [_FileScan(file) for file in files]
+        repaired = [scan.rebuild() if scan.faults else scan.unchanged() for scan in scans]
+        write = not lists_all_files or any(one.damaged for one in repaired)
         if write:
-            replace_text(directory / METADATA, information_of([survey.contents() for survey in surveys], before))
+            replace_text(directory / METADATA, bag_metadata_yaml([scan.contents() for scan in scans], previous))
     except OSError as error:
         raise ParameterError(f"{run}: cannot be repaired ({error.strerror}), expected a folder that can be written") from None
     *others, last = repaired
     return Repair((*others, last._replace(known_end_ns=max(last.known_end_ns, end_ns))), write)
 
 
-class _Survey:
-    """One file, read through."""
+class _FileScan:
+    """The content of one file, except its messages' data."""
 
     def __init__(self, path: Path) -> None:
         with path.open("rb") as stream:
-            require(lock(stream), str(path), "a recorder that is writing it", "one that has ended")
+            require(try_lock(stream), str(path), "a recorder that is writing it", "one that has ended")
         self.path = path
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -77,11 +88,11 @@ class _Survey:
         self.last_ns = 0
         scan = Scan(path)
         for record in scan.records():
-            self._take(record)
+            self._add(record)
         self.known_end_ns = scan.known_end_ns
         self.faults = scan.faults
 
-    def _take(self, record: McapRecord) -> None:
+    def _add(self, record: McapRecord) -> None:
         if isinstance(record, Message):
             self.messages[record.channel_id] += 1
             self.first_ns = record.log_time if self.first_ns is None else min(self.first_ns, record.log_time)
@@ -91,19 +102,19 @@ class _Survey:
         elif isinstance(record, Schema):
             self.schemas[record.id] = record
 
-    def contents(self) -> Contents:
+    def contents(self) -> FileContents:
         counts = []
         for identity, channel in self.channels.items():
             schema = self.schemas.get(channel.schema_id)
             type_hash, qos = (channel.metadata.get(key, "") for key in ("topic_type_hash", "offered_qos_profiles"))
-            counts.append(Count(channel.topic, schema.name if schema else "", type_hash, qos, self.messages[identity]))
-        return Contents(self.path.name, self.first_ns or 0, self.last_ns, tuple(counts))
+            counts.append(TopicCount(channel.topic, schema.name if schema else "", type_hash, qos, self.messages[identity]))
+        return FileContents(self.path.name, self.first_ns or 0, self.last_ns, tuple(counts))
 
-    def unchanged(self) -> Repaired:
-        return Repaired(self.path, self.messages.total(), self.last_ns, self.known_end_ns, "", None)
+    def unchanged(self) -> FileRepair:
+        return FileRepair(self.path, self.messages.total(), self.last_ns, self.known_end_ns, "", None)
 
-    def rebuild(self) -> Repaired:
-        """Write a file of all that can be read, then put it in the place of the damaged one."""
+    def rebuild(self) -> FileRepair:
+        """Write a file with all readable records, then replace the damaged file."""
         known = {identity: count for identity, count in self.messages.items() if identity in self.channels}
         require(bool(known), str(self.path), "no message that could be read", "any")
         fresh = self.path.with_name(f"{self.path.name}.new")
@@ -113,15 +124,15 @@ class _Survey:
                 self._copy(writer)
                 stream.flush()
                 os.fsync(stream.fileno())
-            damaged = _keep(self.path)
+            damaged = _keep_damaged(self.path)
             fresh.replace(self.path)
         except OSError:
             fresh.unlink(missing_ok=True)
             raise
-        return Repaired(self.path, sum(known.values()), self.last_ns, self.known_end_ns, self.faults, damaged)
+        return FileRepair(self.path, sum(known.values()), self.last_ns, self.known_end_ns, self.faults, damaged)
 
     def _copy(self, writer: Writer) -> None:
-        """All records, schemas and channels first: those of a damaged chunk stand in the index too."""
+        """Copy all records. Schemas and channels come first, because the index also holds those of a damaged chunk."""
         writer.start(profile="ros2", library="rise-di repair")
         schemas = {identity: writer.register_schema(one.name, one.encoding, one.data) for identity, one in self.schemas.items()}
         channels = {
@@ -137,12 +148,12 @@ class _Survey:
                 writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
             elif isinstance(record, Metadata) and record.name != "rosbag2":
                 writer.add_metadata(record.name, record.metadata)
-        writer.add_metadata("rosbag2", {"serialized_metadata": information_of([self.contents()])})
+        writer.add_metadata("rosbag2", {"serialized_metadata": bag_metadata_yaml([self.contents()])})
         writer.finish()
 
 
-def _keep(path: Path) -> Path:
-    """A second name for a file, so that the first can be given to another; a copy where the file system has no links."""
+def _keep_damaged(path: Path) -> Path:
+    """Give the damaged file a second name, which it keeps when it is replaced; a copy on a file system without hard links."""
     number = 1
     while (damaged := path.with_name(f"{path.name}.damaged{f'-{number}' if number > 1 else ''}")).exists():
         number += 1

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An MCAP file, whole or not: all records up to where it was cut, but for damaged parts."""
+"""Reads all records of an MCAP file that may be truncated or damaged: up to the truncation, without the damaged parts."""
 
 import os
 import struct
@@ -31,22 +31,22 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-# What reading raises where bytes were changed: between records, inside one, inside a compressed chunk.
-DAMAGE = (McapError, MemoryError, OverflowError, UnicodeDecodeError, struct.error, zstandard.ZstdError)
+# What reading raises when bytes were changed: between records, inside a record, inside a compressed chunk.
+DECODE_ERRORS = (McapError, MemoryError, OverflowError, UnicodeDecodeError, struct.error, zstandard.ZstdError)
 
-RECORD = struct.Struct("<BQ")  # opcode and length, in front of each record (MCAP specification, Records)
-MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time and publish time, in front of each message
-TIMES = struct.Struct("<QQ")  # log times of the first and the last message, in front of each chunk
-FOOTER = struct.Struct("<BQQQI")  # opcode, length, where the index and its offsets begin, checksum
+RECORD = struct.Struct("<BQ")  # opcode and length, before each record (MCAP specification, Records)
+MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time and publish time, before each message
+TIMES = struct.Struct("<QQ")  # log times of the first and the last message, before each chunk
+FOOTER = struct.Struct("<BQQQI")  # opcode, length, offsets of the summary and of its offsets, checksum
 CRC = struct.Struct("<I")
 
-LARGEST_UNPACKED = 64 << 20
-"""Bytes of a chunk that is larger than it is packed: one of 1 kB may say that it holds any number of them, and may hold 20 MB.
+MAX_CHUNK_BYTES = 64 << 20
+"""Limit for a chunk that is larger than its compressed bytes. A damaged chunk of 1 kB may give any size, and hold 20 MB.
 
-Recorders close a chunk at about 1 MB, or behind the message that makes it larger.
+Recorders close a chunk at about 1 MB, or after the message that exceeds it.
 """
 
-READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+RECORD_READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,
     Opcode.ATTACHMENT: Attachment.read,
@@ -59,26 +59,26 @@ READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
 
 
 class Scan:
-    """One file, read once by `records`; afterwards the attributes say how it stands with it."""
+    """One file, read once by `records`. The attributes are valid afterwards."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.whole = False  # it has its end
+        self.complete = False  # it has its footer
         self.damaged = 0  # chunks and other parts that could not be read
-        self.known_end_ns = 0  # the latest log time that it speaks of, in what is lost too
+        self.known_end_ns = 0  # the latest log time in the index and the chunk headers, including lost messages
 
     @property
     def faults(self) -> str:
-        """What is wrong with it; empty where nothing is."""
-        faults = [] if self.whole else ["no end"]
+        """The faults of the file; empty for an intact file."""
+        faults = [] if self.complete else ["a truncated end"]
         faults += [f"{self.damaged} damaged parts"] if self.damaged else []
         return " and ".join(faults)
 
     def records(self) -> Iterator[McapRecord]:
-        """All schemas, channels, messages, attachments and metadata; schemas and channels of the index come first.
+        """All schemas, channels, messages, attachments and metadata.
 
-        A chunk that is damaged then takes none of those with it. Raises OSError where the file cannot be read, nothing where
-        its content cannot.
+        Schemas and channels of the index come first, so that a damaged chunk does not lose them. Raises OSError when the file
+        cannot be read, and nothing when its content is damaged.
         """
         with self.path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
@@ -87,33 +87,33 @@ class Scan:
             missing = sum(record.message_count for record in index if isinstance(record, Statistics))
             for opcode, content in self._frames(stream, size, index):
                 try:
-                    records = list(_unpack(opcode, content))
-                except DAMAGE:
+                    records = list(_decode(opcode, content))
+                except DECODE_ERRORS:
                     self.damaged += 1
                     continue
                 missing -= sum(isinstance(record, Message) for record in records)
                 yield from records
-            if missing > 0 and not self.damaged:  # a record that no longer looks like one
+            if missing > 0 and not self.damaged:  # a changed opcode makes a record unrecognisable
                 self.damaged += 1
 
     def _index(self, stream: IO[bytes], size: int) -> list[McapRecord]:
-        """The records of the index at the end of the file; none where there is no such end, or it is damaged."""
-        place = size - FOOTER.size - len(MCAP0_MAGIC)
-        if place < len(MCAP0_MAGIC):
+        """The records of the index (the MCAP summary); empty when the file is truncated or the index damaged."""
+        position = size - FOOTER.size - len(MCAP0_MAGIC)
+        if position < len(MCAP0_MAGIC):
             return []
-        stream.seek(place)
+        stream.seek(position)
         footer, magic = stream.read(FOOTER.size), stream.read()
         opcode, _, start, _, crc = FOOTER.unpack(footer)
-        self.whole = magic == MCAP0_MAGIC and opcode == Opcode.FOOTER and start <= place
-        if not self.whole or start == 0:
+        self.complete = magic == MCAP0_MAGIC and opcode == Opcode.FOOTER and start <= position
+        if not self.complete or start == 0:
             return []
         stream.seek(start)
-        content = stream.read(place - start)
+        content = stream.read(position - start)
         try:
             if crc not in (0, zlib.crc32(footer[: -CRC.size], zlib.crc32(content))):
                 raise McapError("an index whose bytes were changed")
             index = list(_split(content))
-        except DAMAGE:
+        except DECODE_ERRORS:
             self.damaged += 1
             return []
         ends = [record.message_end_time for record in index if isinstance(record, Statistics | ChunkIndex)]
@@ -121,7 +121,7 @@ class Scan:
         return index
 
     def _frames(self, stream: IO[bytes], size: int, index: Sequence[McapRecord]) -> Iterator[tuple[int, bytes]]:
-        """Opcode and content of each record up to the index; behind one that is damaged, of the next that the index knows."""
+        """Opcode and content of each record up to the index. After a damaged record the next one in the index follows."""
         starts = (
             record.chunk_start_offset if isinstance(record, ChunkIndex) else record.offset
             for record in index
@@ -129,65 +129,65 @@ class Scan:
         )
         known = [*sorted(start for start in starts if start < size), size]
         stream.seek(0)
-        place = len(MCAP0_MAGIC)
-        if stream.read(place) != MCAP0_MAGIC:
-            self.whole = False
+        position = len(MCAP0_MAGIC)
+        if stream.read(position) != MCAP0_MAGIC:
+            self.complete = False
             return
-        while place + RECORD.size <= size:  # a file that is being written grows meanwhile
+        while position + RECORD.size <= size:  # a file that is being written may grow during the scan
             opcode, length = RECORD.unpack(stream.read(RECORD.size))
-            ahead = known[bisect_right(known, place)]
-            place += RECORD.size + length
-            if place <= ahead:
+            next_known = known[bisect_right(known, position)]
+            position += RECORD.size + length
+            if position <= next_known:
                 if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                     return
                 yield opcode, stream.read(length)
-            elif ahead < size:
+            elif next_known < size:
                 self.damaged += 1
-                place = ahead
-                stream.seek(place)
+                position = next_known
+                stream.seek(position)
             else:
                 start = stream.read(TIMES.size)
                 if opcode == Opcode.CHUNK and len(start) == TIMES.size:
                     self.known_end_ns = max(self.known_end_ns, TIMES.unpack(start)[1])
                 break
-        self.whole = False
+        self.complete = False
 
 
 def _split(data: bytes) -> Iterator[McapRecord]:
-    """The records in some bytes. Raises one of DAMAGE."""
-    place = 0
-    while place < len(data):
-        opcode, length = RECORD.unpack_from(data, place)
-        place += RECORD.size
-        if place + length > len(data):
-            raise McapError("a record longer than what it stands in")
-        yield from _unpack(opcode, data[place : place + length])
-        place += length
+    """The records in a sequence of bytes. Raises one of DECODE_ERRORS."""
+    position = 0
+    while position < len(data):
+        opcode, length = RECORD.unpack_from(data, position)
+        position += RECORD.size
+        if position + length > len(data):
+            raise McapError("a record longer than its container")
+        yield from _decode(opcode, data[position : position + length])
+        position += length
 
 
-def _unpack(opcode: int, content: bytes) -> Iterator[McapRecord]:
-    """The record, or those in a chunk. Raises one of DAMAGE."""
+def _decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
+    """The record, or the records of a chunk. Raises one of DECODE_ERRORS."""
     if opcode == Opcode.CHUNK:
-        yield from _split(_unpacked(Chunk.read(ReadDataStream(BytesIO(content)))))
+        yield from _split(_decompress(Chunk.read(ReadDataStream(BytesIO(content)))))
     elif opcode == Opcode.MESSAGE:
         channel, sequence, log_time, publish_time = MESSAGE.unpack_from(content)
         yield Message(channel, log_time, content[MESSAGE.size :], publish_time, sequence)
-    elif opcode in READ:
+    elif opcode in RECORD_READERS:
         if opcode == Opcode.ATTACHMENT:
             (crc,) = CRC.unpack(content[-CRC.size :])
             if crc not in (0, zlib.crc32(content[: -CRC.size])):
                 raise McapError("an attachment whose bytes were changed")
-        yield READ[opcode](ReadDataStream(BytesIO(content)))
+        yield RECORD_READERS[opcode](ReadDataStream(BytesIO(content)))
 
 
-def _unpacked(chunk: Chunk) -> bytes:
-    """The records of a chunk as bytes, no more of them than it says. Raises one of DAMAGE."""
+def _decompress(chunk: Chunk) -> bytes:
+    """The bytes of a chunk's records, limited to the size that the chunk gives. Raises one of DECODE_ERRORS."""
     size = chunk.uncompressed_size
-    if size > max(LARGEST_UNPACKED, len(chunk.data)):
-        raise McapError(f"a chunk that says it holds {size} bytes")
+    if size > max(MAX_CHUNK_BYTES, len(chunk.data)):
+        raise McapError(f"a chunk with a size of {size} bytes")
     if chunk.compression == "zstd":
-        if zstandard.frame_content_size(chunk.data) > size:  # it would be taken at its word
-            raise McapError("a chunk that holds more than it says")
+        if zstandard.frame_content_size(chunk.data) > size:  # the decompressor would allocate that much
+            raise McapError("a chunk that holds more than its size")
         data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
     elif chunk.compression == "lz4":
         try:
@@ -195,7 +195,7 @@ def _unpacked(chunk: Chunk) -> bytes:
         except RuntimeError as error:
             raise McapError(str(error)) from None
     elif chunk.compression:
-        raise McapError(f"a chunk packed by {chunk.compression}")
+        raise McapError(f"a chunk with the unknown compression {chunk.compression}")
     else:
         data = chunk.data
     if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of a log as they are stored, one by one, of whatever type; and the changes of parameters among them."""
+"""The messages of a log as stored bytes, of any type; and the parameter changes among them."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -11,8 +11,8 @@ from rosbags.serde.errors import SerdeError
 
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
-from flight_log.bag import bag_files
 from flight_log.named_vectors import typestore
+from flight_log.rosbag2_metadata import bag_files
 from flight_log.scan import Scan
 
 PARAMETER_EVENTS = "/parameter_events"
@@ -33,8 +33,8 @@ FIELDS = (
 )
 
 
-class Stored(NamedTuple):
-    """One message; times in ns of the recorder's clock."""
+class StoredMessage(NamedTuple):
+    """One message. Times in ns of the recorder's clock."""
 
     topic: str  # in full
     type_name: str
@@ -44,10 +44,10 @@ class Stored(NamedTuple):
     data: bytes  # CDR
 
 
-def stored_messages(run: Path) -> Iterator[Stored]:
-    """All messages of a bag of MCAP files, in the order in which they were written; of files without an end those there are.
+def stored_messages(run: Path) -> Iterator[StoredMessage]:
+    """All messages of a bag of MCAP files in the order of writing; of truncated files those that are readable.
 
-    Raises ParameterError where there is no such bag, or it cannot be read.
+    Raises ParameterError when there is no such bag, or it cannot be read.
     """
     files = bag_files(run)
     require(bool(files), str(run), "no .mcap file", "the folder of a run or an MCAP file")
@@ -57,7 +57,7 @@ def stored_messages(run: Path) -> Iterator[Stored]:
         try:
             for record in Scan(file).records():
                 if isinstance(record, Message) and record.channel_id in channels:
-                    yield Stored(*channels[record.channel_id], record.log_time, record.publish_time, record.data)
+                    yield StoredMessage(*channels[record.channel_id], record.log_time, record.publish_time, record.data)
                 elif isinstance(record, Schema):
                     schemas[record.id] = record
                 elif isinstance(record, Channel) and (schema := schemas.get(record.schema_id)) is not None:
@@ -67,10 +67,10 @@ def stored_messages(run: Path) -> Iterator[Stored]:
 
 
 def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list[dict[str, Any]]:
-    """What `/parameter_events` says of a node, by its name in any namespace, in the order of the stamps.
+    """The changes of a node's parameters on `/parameter_events`, in the order of the stamps.
 
-    Each a mapping from the dotted names of `known` parameters, or groups of them, to their values, None where one was taken
-    away; SI as everywhere.
+    `node` is the node's name in any namespace. Each change maps dotted names to values, for `known` parameters or groups of
+    them. None stands for a deleted parameter. SI units.
     """
     store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []
@@ -83,15 +83,15 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
             continue
         if event.node.rpartition("/")[2] != node:
             continue
-        found = {one.name: _value(one.value) for one in (*event.new_parameters, *event.changed_parameters)}
-        found |= {one.name: None for one in event.deleted_parameters}
-        values = {name: value for name, value in found.items() if name.split(".")[0] in known}
+        changes = {one.name: _value(one.value) for one in (*event.new_parameters, *event.changed_parameters)}
+        changes |= {one.name: None for one in event.deleted_parameters}
+        values = {name: value for name, value in changes.items() if name.split(".")[0] in known}
         if values:
             events.append((event.stamp.sec * NANOSECONDS + event.stamp.nanosec, values))
     return [values for _, values in sorted(events, key=lambda one: one[0])]
 
 
-def _value(value: Any) -> Any:
-    field = FIELDS[value.type] if value.type < len(FIELDS) else ""
-    found: Any = getattr(value, field) if field else None
-    return found.tolist() if hasattr(found, "tolist") else found
+def _value(parameter_value: Any) -> Any:
+    field = FIELDS[parameter_value.type] if parameter_value.type < len(FIELDS) else ""
+    value: Any = getattr(parameter_value, field) if field else None
+    return value.tolist() if hasattr(value, "tolist") else value

@@ -18,42 +18,42 @@ import yaml
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import SCHEMAS, ParameterOverrides, Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.run_folder import enclosed
-from flight_bringup.graph import AIRCRAFT, ONE_PROCESS, RECORDER, parameters
+from flight_analysis.report.run_folder import attachments_for
+from flight_bringup.graph import AIRCRAFT, ONE_PROCESS, RECORDER, parameter_overrides
 from flight_bringup.scenarios import find_scenario, scenarios
 from flight_core.parameters import ParameterError
-from flight_log.bag import Enclosed, read_metadata
+from flight_log.bag import LogAttachments, read_metadata_records
 from flight_log.provenance import provenance, revision
-from flight_log.tape_reader import Run, read_run
+from flight_log.tape_reader import RecordedRun, read_run
 from flight_log.tape_writer import write_run
 
 
 @pytest.fixture(scope="module")
-def flown(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def flown(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     """A flight in one process with another duration than its scenario file's, read back."""
     scenario, run = osprey_gust.vary(flight={"duration": 0.5}), tmp_path_factory.mktemp("flown")
-    write_run(simulate(scenario), run, enclosed(scenario, run))
+    write_run(simulate(scenario), run, attachments_for(scenario, run))
     return read_run(run)
 
 
-def stored(files: Enclosed | Run, name: str, folder: Path) -> Path:
+def stored(files: LogAttachments | RecordedRun, name: str, folder: Path) -> Path:
     """A file that goes with a log, as a file."""
-    if isinstance(files, Run):
+    if isinstance(files, RecordedRun):
         (folder / name).write_bytes(next(one.content for one in files.attachments if one.name == name))
         return folder / name
-    return next(path for path in files.attached if path.name == name)
+    return next(path for path in files.files if path.name == name)
 
 
-def told_to_recorder(scenario: Scenario, run: Path, *, one_process: bool) -> Enclosed:
+def told_to_recorder(scenario: Scenario, run: Path, *, one_process: bool) -> LogAttachments:
     node, before = (ONE_PROCESS, "recorder:") if one_process else (RECORDER, "")
-    told: ParameterOverrides = parameters(node, scenario, run, 0.0, lockstep=True)
+    told: ParameterOverrides = parameter_overrides(node, scenario, run, 0.0, lockstep=True)
     attach, metadata = told[f"{before}attach"], told[f"{before}metadata_file"]
     assert isinstance(attach, list)
-    return Enclosed(scenario.path, tuple(map(Path, attach)), Path(str(metadata)))
+    return LogAttachments(scenario.path, tuple(map(Path, attach)), Path(str(metadata)))
 
 
 def test_the_parameters_in_a_log_are_a_scenario_that_is_the_same_flight(
-    flown: Run, osprey_gust: Scenario, tmp_path: Path
+    flown: RecordedRun, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     again = load_scenario(stored(flown, "parameters.yaml", tmp_path))
     assert again.flight.duration == 0.5  # as flown, not as in the file
@@ -66,7 +66,7 @@ def test_the_parameters_in_a_log_are_a_scenario_that_is_the_same_flight(
 @pytest.mark.parametrize("name", scenarios())
 def test_every_scenario_comes_back_from_its_parameters(name: str, tmp_path: Path) -> None:
     scenario = find_scenario(name)
-    again = load_scenario(stored(enclosed(scenario, tmp_path), "parameters.yaml", tmp_path))
+    again = load_scenario(stored(attachments_for(scenario, tmp_path), "parameters.yaml", tmp_path))
     for section in SCHEMAS:
         assert getattr(again, section) == getattr(scenario, section)
 
@@ -85,15 +85,15 @@ def test_what_the_nodes_are_told_is_in_the_parameters(osprey_gust: Scenario, tmp
 
 
 def test_nothing_is_made_for_a_node_that_is_not_the_recorder(osprey_gust: Scenario, tmp_path: Path) -> None:
-    told = parameters(AIRCRAFT, osprey_gust, tmp_path, 12.5, lockstep=False)
+    told = parameter_overrides(AIRCRAFT, osprey_gust, tmp_path, 12.5, lockstep=False)
     assert told == {"lockstep": False, "start_time": 12.5}
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_airframe_in_a_log_is_the_one_that_flew(flown: Run, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_the_airframe_in_a_log_is_the_one_that_flew(flown: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:
     assert load_airframe(str(stored(flown, "airframe.yaml", tmp_path))) == load_airframe("osprey")
     drawn = osprey_gust.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.1, "seed": 7}})
-    again = load_airframe(str(stored(enclosed(drawn, tmp_path), "airframe.yaml", tmp_path)))
+    again = load_airframe(str(stored(attachments_for(drawn, tmp_path), "airframe.yaml", tmp_path)))
     assert again.A == drawn.aircraft.sampled_airframe().A
     assert not np.array_equal(again.matrix_a(), load_airframe("osprey").matrix_a())
 
@@ -102,11 +102,11 @@ def test_limits_that_are_infinite_stay_so(osprey_gust: Scenario, tmp_path: Path)
     varied = osprey_gust.vary(
         aircraft={"actuators": {"lower": [-0.5, float("-inf"), -0.4, -0.3], "upper": [0.5, 1.0, 0.4, 0.3]}}
     )
-    again = load_scenario(stored(enclosed(varied, tmp_path), "parameters.yaml", tmp_path))
+    again = load_scenario(stored(attachments_for(varied, tmp_path), "parameters.yaml", tmp_path))
     assert again.aircraft.actuators.lower[1] == float("-inf")
 
 
-def test_the_metadata_say_with_what_and_where_it_flew(flown: Run) -> None:
+def test_the_metadata_say_with_what_and_where_it_flew(flown: RecordedRun) -> None:
     assert flown.metadata["rise_di_versions"]["numpy"] == version("numpy")
     assert flown.metadata["rise_di_versions"]["flight_recorder"] == version("flight_recorder")
     assert flown.metadata["rise_di_flight"]["command"] == shlex.join(sys.argv)
@@ -123,8 +123,8 @@ def test_the_name_of_the_machine_stays_out_of_the_log(monkeypatch: pytest.Monkey
 def test_the_metadata_of_a_flight_over_topics_are_those_in_one_process(osprey_gust: Scenario, tmp_path: Path) -> None:
     over_topics = told_to_recorder(osprey_gust, tmp_path, one_process=False).metadata
     assert over_topics is not None
-    assert read_metadata(over_topics)["rise_di_host"] == provenance()["rise_di_host"]
-    assert set(read_metadata(over_topics)) == set(provenance())
+    assert read_metadata_records(over_topics)["rise_di_host"] == provenance()["rise_di_host"]
+    assert set(read_metadata_records(over_topics)) == set(provenance())
 
 
 def test_a_revision_is_that_of_the_checkout_with_a_mark_where_it_was_changed(tmp_path: Path) -> None:
@@ -155,4 +155,4 @@ def test_a_machine_without_git_has_no_revision(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_folder_that_cannot_be_written_is_one_sentence(osprey_gust: Scenario, tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"nowhere/parameters.yaml cannot be written \(No such file or directory\)"):
-        enclosed(osprey_gust, tmp_path / "nowhere")
+        attachments_for(osprey_gust, tmp_path / "nowhere")

@@ -1,0 +1,49 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Quality of service (QoS) of recorded topics: the strongest compatible profile, and rosbag2's text of offered profiles."""
+
+from collections.abc import Sequence
+
+import yaml
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from flight_core.rates import NANOSECONDS
+from flight_ros.topics import RECORD
+
+INFINITE_NS = 2**63 - 1  # rmw: RMW_DURATION_INFINITE
+
+
+def strongest_compatible(offered: Sequence[QoSProfile]) -> QoSProfile:
+    """The strongest profile that is compatible with all offered ones."""
+    reliable = all(one.reliability == ReliabilityPolicy.RELIABLE for one in offered)
+    durable = reliable and all(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offered)
+    return QoSProfile(
+        depth=RECORD.depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if durable else DurabilityPolicy.VOLATILE,
+    )
+
+
+def qos_yaml(offered: Sequence[QoSProfile]) -> str:
+    """Profiles as rosbag2 stores them, a YAML list."""
+    return yaml.safe_dump([_as_mapping(one) for one in offered], sort_keys=False)
+
+
+def _as_mapping(qos: QoSProfile) -> dict[str, object]:
+    return {
+        "history": qos.history.short_key,
+        "depth": qos.depth,
+        "reliability": qos.reliability.short_key,
+        "durability": qos.durability.short_key,
+        "deadline": _duration(qos.deadline),
+        "lifespan": _duration(qos.lifespan),
+        "liveliness": "automatic",
+        "liveliness_lease_duration": _duration(qos.liveliness_lease_duration),
+        "avoid_ros_namespace_conventions": False,
+    }
+
+
+def _duration(duration: Duration) -> dict[str, int]:
+    sec, nsec = divmod(duration.nanoseconds or INFINITE_NS, NANOSECONDS)  # 0 stands for an unset duration
+    return {"sec": sec, "nsec": nsec}
