@@ -48,7 +48,7 @@ def with_silence(neutral: float, release: float) -> ChannelMap:
 
 def test_it_engages_by_the_service_alone_and_only_with_all_that_it_needs() -> None:
     bridge = made()
-    for missing, bring in (("q has not come yet", hear), ("u has not come yet", command)):
+    for missing, bring in (("q not received yet", hear), ("u not received yet", command)):
         assert missing in bridge.engage(at(0.0))
         assert bridge.step(at(0.0)) is Phase.DISENGAGED
         bring(bridge, 0.0)
@@ -134,7 +134,7 @@ def test_the_pilot_disengages_at_once_and_no_one_engages_over_him() -> None:
     assert bridge.step(at(0.01)) is Phase.ENGAGED
     bridge.take_override("gamepad", 1.0, at(0.02))
     assert bridge.phase is Phase.RELEASE
-    assert bridge.engage(at(0.03)) == "the pilot has the aircraft by gamepad"
+    assert bridge.engage(at(0.03)) == "pilot override active: gamepad"
     bridge.take_override("gamepad", 0.0, at(0.04))
     assert bridge.engage(at(0.05)) == ""
 
@@ -143,10 +143,10 @@ def test_of_a_set_of_bits_those_count_that_are_the_pilots() -> None:
     """ROSflight's rc_override: 0x01 to 0x20 are switches and sticks, 0x40 to 0x200 say that no command comes yet."""
     bridge = made(load_map("rosflight"))
     bridge.take_override("transmitter", float(0x40 | 0x80 | 0x100 | 0x200), at(0.0))
-    assert not bridge.refusal(at(0.0)).startswith("the pilot")
+    assert not bridge.refusal(at(0.0)).startswith("pilot override")
     for bit in (0x01, 0x02, 0x04, 0x08, 0x10, 0x20):
         bridge.take_override("transmitter", float(0x40 | bit), at(0.0))
-        assert bridge.refusal(at(0.0)) == "the pilot has the aircraft by transmitter"
+        assert bridge.refusal(at(0.0)) == "pilot override active: transmitter"
 
 
 def test_zero_times_stop_at_once() -> None:

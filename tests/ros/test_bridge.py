@@ -192,17 +192,17 @@ def test_pilot_silent_autopilot_and_end_of_the_bridge_each_give_the_channels_bac
     gamepad = sky.peer.node.create_publisher(Joy, "/joy", 10)
     sky.peer.until(lambda: gamepad.get_subscription_count() == 1)
     gamepad.publish(Joy(buttons=[1]))
-    sky.peer.until(lambda: sky.engage() == "the pilot has the aircraft by gamepad")
+    sky.peer.until(lambda: sky.engage() == "pilot override active: gamepad")
     gamepad.publish(Joy(buttons=[0]))
     sky.take_over()
     pressed = time.time()
     gamepad.publish(Joy(buttons=[1]))
-    bridge.wait_for("ENGAGED -> RELEASE: the pilot has taken over by gamepad", timeout=2.0)
+    bridge.wait_for("ENGAGED -> RELEASE: pilot override by gamepad", timeout=2.0)
     sky.spin(RELEASE + LATE)
     flown, released = sky.after(pressed)
     assert max(flown, default=0.0) < LATE  # at once
     assert min(released) < LATE
-    assert sky.engage() == "the pilot has the aircraft by gamepad"
+    assert sky.engage() == "pilot override active: gamepad"
     gamepad.publish(Joy(buttons=[0]))
 
     sky.take_over()
@@ -372,7 +372,7 @@ def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Sta
         bridge.wait_for(
             "/ap/airspeed: /peer publishes geometry_msgs/msg/TwistStamped, expected geometry_msgs/msg/Vector3Stamped"
         )
-        bridge.wait_for("/ap/joy: /peer takes sensor_msgs/msg/Imu, the map ardupilot sends sensor_msgs/msg/Joy")
+        bridge.wait_for("/ap/joy: /peer subscribes to sensor_msgs/msg/Imu, expected sensor_msgs/msg/Joy")
 
 
 def test_a_message_package_that_is_missing_ends_the_bridge_with_what_to_install(start: Start) -> None:

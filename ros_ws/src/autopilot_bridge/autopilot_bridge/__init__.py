@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A real autopilot in the simulated aircraft's place: channel maps, the conversion, engagement and silence, the node."""
+"""Bridge to an autopilot, in place of the simulated aircraft: channel maps, conversion, engagement, failsafe, node."""

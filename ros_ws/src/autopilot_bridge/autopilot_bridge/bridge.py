@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge from sample to sample: y from what the autopilot said, what it is to be sent for u, and when nothing is.
+"""Bridge to an autopilot, without ROS: y from its messages, setpoints for u, engagement, pilot override and failsafe.
 
-No ROS and no clock: every instant is an argument, ns of one clock.
+It reads no clock: every instant is an argument, in ns of one clock. The watchdogs of y and u end an engagement.
 """
 
 from enum import IntEnum
@@ -17,52 +17,52 @@ from flight_core.vectors import ChannelError, FloatArray, StampedVector, require
 
 
 class Phase(IntEnum):
-    """What the autopilot is sent."""
+    """Phase of the engagement: what the autopilot is sent."""
 
-    DISENGAGED = 0  # nothing, but heartbeats that are sent before engagement too
+    DISENGAGED = 0  # nothing, except an offboard heartbeat
     ENGAGED = 1  # u
-    NEUTRAL = 2  # u has fallen silent: the neutral values
-    RELEASE = 3  # the values that give the channels back
+    NEUTRAL = 2  # failsafe: u timed out, the neutral values are sent
+    RELEASE = 3  # the release values, which return the channels to the autopilot
 
 
 class Reading(NamedTuple):
-    """A channel's newest value and the instant it belongs to."""
+    """The newest value of a channel and the instant to which it belongs."""
 
     stamp_ns: int
     value: float
 
 
 class Bridge:
-    """What has come, what goes out. Engaged by `engage` alone: what has ended an engagement never begins another one."""
+    """The newest y and u, the phase and the pilot override. Only `engage` engages: the bridge never re-engages by itself."""
 
     def __init__(self, channel_map: ChannelMap, *, dry_run: bool) -> None:
         self.channel_map = channel_map
         self.dry_run = dry_run
         self.outputs, self.inputs = tuple(channel_map.outputs), tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
-        self.reason = "not engaged yet"  # why it is not engaged
+        self.reason = "not engaged yet"  # why the bridge is not engaged
         self._readings: dict[str, Reading] = {}
-        self._given_ns = -1  # the instant of the last y
+        self._last_y_ns = -1  # stamp of the last y
         self._u: FloatArray = np.zeros(len(self.inputs))
-        self._u_from: str | None = None
-        self._u_ns = 0  # when it came
-        self._pilot = ""  # the override with which the pilot has taken over
-        self._phase_ns = 0  # when the phase began
+        self._u_sender: str | None = None
+        self._u_ns = 0  # when u was received
+        self._active_override = ""  # name of the pilot override
+        self._phase_ns = 0  # start of the phase
         rows = channel_map.inputs.values()
         self._lower, self._upper = (np.array([getattr(row, key) for row in rows]) for key in ("lower", "upper"))
         self._max_age_ns = nanoseconds(channel_map.silence.max_age)
 
-    # What comes
+    # Inputs
 
     def take_output(self, name: str, raw: float, stamp_ns: int, now_ns: int) -> None:
-        """A new value of a channel of y, y = sign scale raw + offset.
+        """Take a value of a channel of y: y = sign scale raw + offset.
 
-        Raises ChannelError, reason "stamp" where its instant is further from now than its age limit, "order" where it is not
-        newer than the last one.
+        Raises ChannelError: reason "stamp" where the stamp differs from now by more than the age limit, reason "order" where it
+        is not later than the previous one.
         """
         row = self.channel_map.outputs[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
-            hint = "" if row.stamp == "arrival" else "; where the autopilot keeps another time, say stamp: arrival in the map"
+            hint = "" if row.stamp == "arrival" else "; set stamp: arrival in the map if the autopilot has another clock"
             raise ChannelError("stamp", f"{name} is stamped {seconds(now_ns - stamp_ns):.3f} s before now{hint}")
         last = self._readings.get(name)
         if last is not None:
@@ -70,41 +70,41 @@ class Bridge:
         self._readings[name] = Reading(stamp_ns, to_channel(raw, row.line))
 
     def take_u(self, u: FloatArray, sender: str, now_ns: int) -> None:
-        """A new u, shape (m,) in the map's order. Raises ChannelError, reason "sender", while another one flies."""
-        if sender != self._u_from and not self.u_timed_out(now_ns):
-            raise ChannelError("sender", f"conflicting publisher {sender} ignored: already receiving from {self._u_from}")
-        self._u, self._u_from, self._u_ns = u, sender, now_ns
+        """Take u, shape (m,) in the map's order. Raises ChannelError, reason "sender", for a conflicting publisher."""
+        if sender != self._u_sender and not self.u_timed_out(now_ns):
+            raise ChannelError("sender", f"conflicting publisher {sender} ignored: already receiving from {self._u_sender}")
+        self._u, self._u_sender, self._u_ns = u, sender, now_ns
 
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
-        """The pilot's field: beyond its threshold the pilot has the aircraft, at once."""
+        """Take the field of a pilot override. Beyond its threshold the bridge disengages at once."""
         if self.channel_map.overrides[name].is_active(raw):
-            self._pilot = name
+            self._active_override = name
             if self.phase in {Phase.ENGAGED, Phase.NEUTRAL}:
-                self.disengage(f"the pilot has taken over by {name}", now_ns)
-        elif self._pilot == name:
-            self._pilot = ""
+                self.disengage(f"pilot override by {name}", now_ns)
+        elif self._active_override == name:
+            self._active_override = ""
 
-    # What is said of it
+    # State
 
     def stale(self, now_ns: int) -> dict[str, str]:
-        """Channels of y that are missing or older than their limit, each with what is wrong with it."""
-        found = {}
+        """The stale channels of y, each with the reason as a sentence."""
+        reasons = {}
         for name, row in self.channel_map.outputs.items():
             reading = self._readings.get(name)
             if reading is None:
-                found[name] = f"{name} has not come yet ({row.topic})"
+                reasons[name] = f"{name} not received yet ({row.topic})"
             elif now_ns - reading.stamp_ns > nanoseconds(row.max_age):
-                found[name] = f"{name} is {seconds(now_ns - reading.stamp_ns):.2f} s old ({row.topic})"
-        return found
+                reasons[name] = f"{name} is {seconds(now_ns - reading.stamp_ns):.2f} s old ({row.topic})"
+        return reasons
 
     def u_timed_out(self, now_ns: int) -> bool:
-        """Whether there is no u, or none for longer than its limit."""
-        return self._u_from is None or now_ns - self._u_ns > self._max_age_ns
+        """Whether no u was received, or none for longer than its age limit."""
+        return self._u_sender is None or now_ns - self._u_ns > self._max_age_ns
 
-    def _silence(self, now_ns: int) -> tuple[str, ...]:
-        """What is wrong with u, nothing where it is fresh."""
-        if self._u_from is None:
-            return ("u has not come yet",)
+    def _u_timeout(self, now_ns: int) -> tuple[str, ...]:
+        """The reason why u has timed out, as a sentence; empty where u is fresh."""
+        if self._u_sender is None:
+            return ("u not received yet",)
         return (f"u is {seconds(now_ns - self._u_ns):.2f} s old",) if self.u_timed_out(now_ns) else ()
 
     def ready(self, now_ns: int) -> bool:
@@ -112,21 +112,21 @@ class Bridge:
         return not self.stale(now_ns) and not self.u_timed_out(now_ns)
 
     def refusal(self, now_ns: int) -> str:
-        """Why it would not engage now, empty where it would."""
+        """The reason why `engage` would be refused now; empty where it would not."""
         if self.dry_run:
             return "dry_run is true: nothing is sent"
-        if self._pilot:
-            return f"the pilot has the aircraft by {self._pilot}"
-        if missing := (*self.stale(now_ns).values(), *self._silence(now_ns)):
-            return "; ".join(missing)
-        room = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
-        for name, u, most in zip(self.inputs, self._u, room, strict=True):
-            if abs(u) > most:
-                return f"u.{name} is {u:.3g} from trim, more than {most:.3g}: deactivate the controller until u is at trim"
+        if self._active_override:
+            return f"pilot override active: {self._active_override}"
+        if stale := (*self.stale(now_ns).values(), *self._u_timeout(now_ns)):
+            return "; ".join(stale)
+        limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
+        for name, u, limit in zip(self.inputs, self._u, limits, strict=True):
+            if abs(u) > limit:
+                return f"u.{name} is {u:.3g} from trim, more than {limit:.3g}: deactivate the controller until u is at trim"
         return ""
 
     def engage(self, now_ns: int) -> str:
-        """Engage, unless there is something against it, which is returned as a sentence."""
+        """Engage. Returns the reason of a refusal as a sentence, empty where it engaged."""
         if self.phase is Phase.ENGAGED:
             return ""
         refusal = self.refusal(now_ns)
@@ -136,18 +136,18 @@ class Bridge:
         return refusal
 
     def disengage(self, reason: str, now_ns: int) -> None:
-        """Give the channels back, whatever phase it is."""
+        """Disengage from any phase: return the channels to the autopilot."""
         if self.phase not in {Phase.DISENGAGED, Phase.RELEASE}:
             self.reason = reason
             self._enter(Phase.RELEASE, now_ns)
 
     def step(self, now_ns: int) -> Phase:
-        """The phase at an instant: y or u too old ends an engagement; neutral and releasing values have their time."""
+        """Phase at an instant. A stale y or u ends an engagement, and the phases NEUTRAL and RELEASE end after their times."""
         if self.phase is Phase.ENGAGED:
             if stale := self.stale(now_ns):
                 self.disengage("; ".join(stale.values()), now_ns)
-            elif silence := self._silence(now_ns):
-                self.reason = silence[0]
+            elif timeout := self._u_timeout(now_ns):
+                self.reason = timeout[0]
                 self._enter(Phase.NEUTRAL, now_ns)
         times = self.channel_map.silence
         if self.phase is Phase.NEUTRAL and now_ns - self._phase_ns >= nanoseconds(times.neutral):
@@ -156,31 +156,31 @@ class Bridge:
             self._enter(Phase.DISENGAGED, now_ns)
         return self.phase
 
-    # What goes out
+    # Outputs
 
     def y(self, now_ns: int) -> StampedVector | None:
-        """The newest value of each output, at the instant of the map's `instant`; None where it was given, or one is stale."""
+        """Sample of y at the stamp of the map's output `instant`; None where it was returned before or a channel is stale."""
         newest = self._readings.get(self.channel_map.instant)
-        if newest is None or newest.stamp_ns <= self._given_ns or self.stale(now_ns):
+        if newest is None or newest.stamp_ns <= self._last_y_ns or self.stale(now_ns):
             return None
-        self._given_ns = newest.stamp_ns
+        self._last_y_ns = newest.stamp_ns
         return StampedVector(newest.stamp_ns, np.array([self._readings[name].value for name in self.outputs]))
 
     def raw_u(self) -> FloatArray:
-        """The raw values for the newest u inside its limits, shape (m,): raw of trim + min(max(u, lower), upper)."""
+        """Raw values of the newest u after saturation, shape (m,): raw of trim + min(max(u, lower), upper)."""
         u = np.minimum(np.maximum(self._u, self._lower), self._upper)
         rows = self.channel_map.inputs.values()
-        return np.array([to_raw(row.trim + one, row.line) for row, one in zip(rows, u.tolist(), strict=True)])
+        return np.array([to_raw(row.trim + u_i, row.line) for row, u_i in zip(rows, u.tolist(), strict=True)])
 
     def raw(self) -> FloatArray:
-        """The raw values that this phase sends, shape (m,)."""
+        """Raw values that are sent in this phase, shape (m,)."""
         if self.phase is Phase.ENGAGED:
             return self.raw_u()
         key = "neutral" if self.phase is Phase.NEUTRAL else "release"
         return np.array([getattr(row, key) for row in self.channel_map.inputs.values()])
 
     def sends(self, name: str, now_ns: int) -> bool:
-        """Whether a message of the map is sent in this phase; in a dry run none is."""
+        """Whether a message of the map is sent now. A dry run sends none."""
         if self.dry_run:
             return False
         if self.channel_map.messages[name].when == "ready":

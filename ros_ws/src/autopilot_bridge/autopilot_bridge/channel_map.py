@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a row of a channel map does: a field of a message, by its path, and the line between its value and the channel.
+"""Conversion between a field of a message, given by its path, and a channel of y or u.
 
-Works on any object with the published field names, so it needs no message package. Arrays of a message may be lists,
+It works on any object with the published field names, so it needs no message package. Arrays of a message may be lists,
 array.array or NumPy arrays.
 """
 
@@ -22,11 +22,11 @@ PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
 STEP = re.compile(r"(\w+)(?:\[(\d+)\])?")
 
 SEA_LEVEL_DENSITY = 1.225
-"""kg/m^3, ISO 2533; with it the speed from a pressure is the indicated one, not the true one."""
+"""kg/m^3, ISO 2533. With it the speed of a dynamic pressure is the indicated airspeed."""
 
 
 class Line(NamedTuple):
-    """Channel = sign scale raw + offset; SI and radians on the side of the channel, the autopilot's unit on the raw one."""
+    """Channel = sign scale raw + offset. The channel is in SI and radians, the raw value in the autopilot's unit."""
 
     sign: int  # +1 or -1
     scale: float  # above 0, units of the channel per unit of the raw value
@@ -44,12 +44,12 @@ def to_raw(channel: float, line: Line) -> float:
 
 
 def is_path(text: str) -> bool:
-    """Whether the text is the path of a field: names with dots between them, each with a place in brackets or none."""
+    """Whether the text is the path of a field: names separated by dots, each with an optional index in brackets."""
     return PATH.fullmatch(text) is not None
 
 
 def get_field(message: Any, path: str) -> Any:
-    """The value at a path such as "twist.angular.y" or "axes[1]". Raises ChannelError, reason "field", where there is none."""
+    """Value at a path such as "twist.angular.y" or "axes[1]". Raises ChannelError, reason "field", where there is none."""
     value = message
     for name, place in STEP.findall(path):
         try:
@@ -62,14 +62,14 @@ def get_field(message: Any, path: str) -> Any:
 
 
 def set_field(message: Any, path: str, value: Any) -> None:
-    """Put a value at a path; a number into a field of whole numbers is rounded. Raises ChannelError, reason "field" or "range".
+    """Set the value at a path. A number for an integer field is rounded. Raises ChannelError, reason "field" or "range".
 
-    A whole number cannot be NaN or infinite, and one outside its type is refused, never wrapped or cut.
+    An integer field refuses NaN, infinity and values outside the range of its type.
     """
-    found = get_field(message, path)
-    if isinstance(found, int | np.integer) and isinstance(value, float):
+    current = get_field(message, path)
+    if isinstance(current, int | np.integer) and isinstance(value, float):
         if not math.isfinite(value):
-            raise ChannelError("range", f"{path} takes whole numbers, not {value:g}")
+            raise ChannelError("range", f"{path} takes integers, not {value:g}")
         value = round(value)
     *parents, (name, place) = STEP.findall(path)
     parent = message
@@ -86,41 +86,37 @@ def set_field(message: Any, path: str, value: Any) -> None:
         raise ChannelError("range", f"{path} cannot be {value!r} ({error})") from None
 
 
-def _itself(found: Any) -> float:
-    return float(found)
-
-
-def _norm(found: Any) -> float:
-    """sqrt(x^2 + y^2 + z^2) of a vector with members x, y, z or with three places."""
-    parts = (found.x, found.y, found.z) if hasattr(found, "x") else found
+def _norm(vector: Any) -> float:
+    """sqrt(x^2 + y^2 + z^2) of a vector with members x, y, z or with three elements."""
+    parts = (vector.x, vector.y, vector.z) if hasattr(vector, "x") else vector
     return math.hypot(*(float(part) for part in parts))
 
 
-def _dynamic_pressure(found: Any) -> float:
-    """The indicated airspeed sqrt(2 dp / rho_0), m/s, of a dynamic pressure in Pa; below zero it is noise at standstill: 0."""
-    return math.sqrt(2.0 * max(float(found), 0.0) / SEA_LEVEL_DENSITY)
+def _airspeed_of_pressure(pressure: Any) -> float:
+    """Indicated airspeed sqrt(2 dp / rho_0), m/s, of a dynamic pressure in Pa; 0 for a negative one, which is noise."""
+    return math.sqrt(2.0 * max(float(pressure), 0.0) / SEA_LEVEL_DENSITY)
 
 
 DERIVED: Mapping[str, Callable[[Any], float]] = MappingProxyType(
-    {"value": _itself, "norm": _norm, "airspeed_of_pressure": _dynamic_pressure}
+    {"value": float, "norm": _norm, "airspeed_of_pressure": _airspeed_of_pressure}
 )
-"""How the raw value comes from the field: itself, the length of a vector, the speed of a dynamic pressure."""
+"""Functions from a field to the raw value: the number itself, the length of a vector, the airspeed of a dynamic pressure."""
 
 
 def read_raw(message: Any, path: str, function: str) -> float:
-    """The raw value of a row. Raises ChannelError, reason "field" where it is not there, "finite" where it is not finite."""
-    found = get_field(message, path)
+    """Raw value of a row. Raises ChannelError: reason "field" where the field is missing, "finite" where it is not finite."""
+    value = get_field(message, path)
     try:
-        raw = DERIVED[function](found)
+        raw = DERIVED[function](value)
     except (AttributeError, TypeError, ValueError):
-        raise ChannelError("field", f"{path} of {type(message).__name__} is nothing to take the {function} of") from None
+        raise ChannelError("field", f"function {function} cannot convert {path} of {type(message).__name__}") from None
     if not math.isfinite(raw):
         raise ChannelError("finite", f"{path} = {raw} is not finite")
     return raw
 
 
 def message_type(name: str, load: Callable[[str], Any] = importlib.import_module) -> type:
-    """The class of "package/msg/Type". Raises ParameterError that says what to install."""
+    """The class of "package/msg/Type". Raises ParameterError with the package to install."""
     package, _, kind = name.split("/")
     try:
         module = load(f"{package}.msg")
@@ -130,7 +126,7 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
             f"{name}: found no Python package {package}, expected it: install {debian}, or build {package} in a workspace and"
             " source it"
         ) from None
-    found = getattr(module, kind, None)
-    if not isinstance(found, type):
+    message_class = getattr(module, kind, None)
+    if not isinstance(message_class, type):
         raise ParameterError(f"{name}: found no {kind} in the installed {package}, expected another version of {package}")
-    return found
+    return message_class

@@ -6,7 +6,7 @@ from flight_ros.startup import start_nodes
 
 
 def main() -> None:
-    """Its entry point."""
+    """Start the bridge node."""
     start_nodes("autopilot_bridge.node:BridgeNode")
 
 

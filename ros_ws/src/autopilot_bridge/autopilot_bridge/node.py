@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge's node: y from the topics of an autopilot, u to them, by a channel map; in the place of the aircraft's node."""
+"""The bridge node, in place of the aircraft node: y from an autopilot and setpoints for u to it, by a channel map."""
 
 import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
@@ -24,24 +24,26 @@ from flight_ros.ticker import Tick
 from flight_ros.topics import Topic, U, Y
 
 WOULD_SEND = Topic("bridge/would_send", JointState)
-FAREWELL = 5  # messages that give the channels back when the node ends: one alone may be lost
+RELEASES_AT_SHUTDOWN = 5  # messages with release values at the end of the node; a single one may be lost
+
+NamedRow = tuple[str, OutputRow | OverrideRow]
 
 
 class BridgeNode(FlightNode[BridgeParameters]):
-    """At each tick: what the autopilot said, y out when it is new, the newest u, and the messages that are due."""
+    """At each tick it polls the autopilot's topics, publishes a new y, takes the newest u and sends the due messages."""
 
     def __init__(self) -> None:
         super().__init__("bridge", BridgeParameters)
         self._map = load_map(self.parameters.map)
         dry_run = self._map.dry_run if self.parameters.dry_run is None else self.parameters.dry_run
         self._bridge = Bridge(self._map, dry_run=dry_run)
-        self._said_phase = self._bridge.phase
-        named: list[tuple[str, OutputRow | OverrideRow]] = [*self._map.outputs.items(), *self._map.overrides.items()]
-        readers: dict[str, list[tuple[str, OutputRow | OverrideRow]]] = {}
+        self._logged_phase = self._bridge.phase
+        named: list[NamedRow] = [*self._map.outputs.items(), *self._map.overrides.items()]
+        rows_by_topic: dict[str, list[NamedRow]] = {}
         for name, row in named:
-            readers.setdefault(row.topic, []).append((name, row))
-        self._readers: list[tuple[PolledSubscription, list[tuple[str, OutputRow | OverrideRow]]]] = []
-        for topic, rows in readers.items():
+            rows_by_topic.setdefault(row.topic, []).append((name, row))
+        self._readers: list[tuple[PolledSubscription, list[NamedRow]]] = []
+        for topic, rows in rows_by_topic.items():
             kind = message_type(rows[0][1].type)
             for name, row in rows:
                 _require_field(kind(), name, row)
@@ -58,7 +60,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
             + ("dry run, nothing is sent" if dry_run else f"disengaged, waiting for {self.get_name()}/engage")
         )
 
-    def _make(self, name: str, row: MessageRow) -> "Outgoing":
+    def _make(self, name: str, row: MessageRow) -> "OutgoingMessage":
         message = message_type(row.type)()
         rows = [(number, one) for number, one in enumerate(self._map.inputs.values()) if one.message == name]
         try:
@@ -72,7 +74,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
         except ChannelError as error:
             raise ParameterError(f"map {self._map.name}: messages.{name} of type {row.type}: {error}") from None
         publisher = self.create_publisher(type(message), row.topic, _qos(self._map.topics[row.topic]))
-        return Outgoing(publisher, message, row, rows)
+        return OutgoingMessage(publisher, message, row, rows)
 
     def period_ns(self) -> int:
         return period_ns(self._map.rate, "rate")
@@ -88,18 +90,11 @@ class BridgeNode(FlightNode[BridgeParameters]):
         if self._take_u(now_ns):
             self._publish_would_send(self._would_send_encoder.encode(now_ns, self._bridge.raw_u()))
         self._bridge.step(now_ns)
-        self._say_phase()
+        self._log_phase()
         self._send(now_ns, self.period_ns() // 2)
-        self._say_what_is_missing(now_ns)
+        self._warn_stale_inputs(now_ns)
 
-    def _read(
-        self,
-        subscription: PolledSubscription,
-        rows: list[tuple[str, OutputRow | OverrideRow]],
-        raw: bytes,
-        arrived_ns: int,
-        now_ns: int,
-    ) -> None:
+    def _read(self, subscription: PolledSubscription, rows: list[NamedRow], raw: bytes, arrived_ns: int, now_ns: int) -> None:
         try:
             message = deserialize_message(raw, subscription.topic.type)
         except DeserializationError as error:
@@ -119,16 +114,17 @@ class BridgeNode(FlightNode[BridgeParameters]):
                 self.reject(subscription, error.reason, str(error))
 
     def _take_u(self, now_ns: int) -> bool:
-        came = False
+        """Take the received u; whether there was a valid one."""
+        accepted = False
         for received in self._u_subscription.take():
             try:
                 sample = self._decoder.decode(received.message)
                 if sample is not None:
                     self._bridge.take_u(sample.value, sample.sender, now_ns)
-                    came = True
+                    accepted = True
             except ChannelError as error:
                 self.reject(self._u_subscription, error.reason, str(error))
-        return came
+        return accepted
 
     def _send(self, now_ns: int, slack_ns: int) -> None:
         for name, outgoing in self._outgoing.items():
@@ -143,24 +139,24 @@ class BridgeNode(FlightNode[BridgeParameters]):
         if request.data:
             response.message = self._bridge.engage(now_ns)
         else:
-            self._bridge.disengage("told to disengage", now_ns)
+            self._bridge.disengage("disengaged by request", now_ns)
         response.success = not response.message
         if response.message:
             self.get_logger().warning(f"not engaged: {response.message}")
-        self._say_phase()
+        self._log_phase()
         return response
 
-    def _say_phase(self) -> None:
+    def _log_phase(self) -> None:
         phase = self._bridge.phase
-        if phase is not self._said_phase:
-            sentence = f"{self._said_phase.name} -> {phase.name}"
+        if phase is not self._logged_phase:
+            sentence = f"{self._logged_phase.name} -> {phase.name}"
             if phase is Phase.ENGAGED:
                 self.get_logger().info(sentence)
             else:
                 self.get_logger().warning(f"{sentence}: {self._bridge.reason}")
-            self._said_phase = phase
+            self._logged_phase = phase
 
-    def _say_what_is_missing(self, now_ns: int) -> None:
+    def _warn_stale_inputs(self, now_ns: int) -> None:
         stale = self._bridge.stale(now_ns)
         for subscription, rows in self._readers:
             if any(name in stale for name, row in rows if isinstance(row, OutputRow)):
@@ -169,25 +165,10 @@ class BridgeNode(FlightNode[BridgeParameters]):
             self.warn_no_publisher(self._u_subscription)
 
     def check_graph(self) -> None:
-        """Also what keeps the autopilot from hearing: a topic that it takes in another type, or another quality of service."""
+        """Also report a topic to which the autopilot subscribes with another type or an incompatible quality of service."""
         super().check_graph()
         for outgoing in self._outgoing.values():
-            topic = outgoing.publisher.topic_name
-            for peer in self.get_subscriptions_info_by_topic(topic):
-                node = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
-                if peer.topic_type != outgoing.row.type:
-                    self.get_logger().error(
-                        f"{topic}: {node} takes {peer.topic_type}, the map {self._map.name} sends {outgoing.row.type}",
-                        throttle_duration_sec=5.0,
-                    )
-                    continue
-                offered, wanted = _qos(self._map.topics[outgoing.row.topic]), peer.qos_profile
-                asked = QoSProfile(depth=1, reliability=wanted.reliability, durability=wanted.durability)
-                compatibility, reason = qos_check_compatible(offered, asked)
-                if compatibility == QoSCompatibility.ERROR:
-                    self.get_logger().error(
-                        f"{topic}: quality of service of {node} does not fit: {reason}", throttle_duration_sec=5.0
-                    )
+            self.check_subscribers(outgoing.publisher)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         bridge, now_ns = self._bridge, self.get_clock().now().nanoseconds
@@ -199,14 +180,14 @@ class BridgeNode(FlightNode[BridgeParameters]):
     def close(self) -> None:
         if self._bridge.phase is Phase.DISENGAGED or self._map.silence.release == 0.0:
             return
-        self._bridge.disengage("the bridge ends", time.time_ns())
-        for _ in range(FAREWELL):
-            self._send(time.time_ns(), NANOSECONDS)  # due whenever the last one was
+        self._bridge.disengage("bridge shut down", time.time_ns())
+        for _ in range(RELEASES_AT_SHUTDOWN):
+            self._send(time.time_ns(), NANOSECONDS)  # this slack makes every message due
             time.sleep(0.01)
 
 
-class Outgoing:
-    """One message towards the autopilot, laid out once."""
+class OutgoingMessage:
+    """A message to the autopilot and its publisher. Its constant fields are set once."""
 
     def __init__(self, publisher: Any, message: Any, row: MessageRow, inputs: list[tuple[int, InputRow]]) -> None:
         self.publisher, self.row = publisher, row
@@ -215,11 +196,11 @@ class Outgoing:
         self._sent_ns = 0
 
     def due(self, now_ns: int, slack_ns: int) -> bool:
-        """Whether its period has passed since it was sent, to within half a tick."""
+        """Whether its period has passed since it was last sent, to within `slack_ns`."""
         return now_ns - self._sent_ns >= self._period_ns - slack_ns
 
     def send(self, now_ns: int, raw: list[float]) -> None:
-        """Send it with the raw values of all inputs, of which it takes its own."""
+        """Send it. `raw` holds the raw values of all inputs; the message takes its own."""
         for number, row in self._inputs:
             set_field(self._message, row.field, raw[number])
         if self.row.stamped:
@@ -238,7 +219,7 @@ def _qos(row: QosRow) -> QoSProfile:
 
 
 def _require_field(empty: Any, name: str, row: OutputRow | OverrideRow) -> None:
-    """Where a field lies behind a sequence, which is empty here, the first message tells; else it has to be there."""
+    """Raise ParameterError for a field that is missing. One inside a sequence is checked with the first message only."""
     if "[" in row.field:
         return
     try:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A channel map as its file states it, checked as a whole, and the parameters of the bridge's node."""
+"""Schema of a channel map file, and the parameters of the bridge node."""
 
 from collections.abc import Mapping
 from importlib.resources import files
@@ -43,7 +43,7 @@ MOTIONS: Mapping[str, tuple[str, int]] = MappingProxyType(
         "less thrust": ("V", -1),
     }
 )
-"""The output that a motion shows in, and its sign there: FRD, q nose up +, p roll right +, r nose right +, V faster +."""
+"""The output that responds to a motion, and its sign: FRD, q nose up +, p roll right +, r nose right +, V faster +."""
 
 Rate = Annotated[float, Field(ge=1, le=1000)]
 MessageType = Annotated[str, Field(pattern=r"^[a-z]\w*/msg/[A-Z]\w*$")]
@@ -54,80 +54,78 @@ Value = bool | int | Raw | str | Annotated[tuple[int, ...] | tuple[Raw, ...], Be
 
 
 class Row(Parameters):
-    """What each row of a map says: y or u = sign scale raw + offset, and why."""
+    """Common part of the rows of a map: y or u = sign scale raw + offset, with frame and source."""
 
     field: str = Field(description="the path of the field in the message, such as twist.angular.y or axes[1]")
-    positive: Motion = Field(description="what the aircraft does, or is made to do, as the raw value grows")
-    frame: str = Field(description="the frame and the unit of the raw value, for people")
-    sign: Literal[-1, 1] = Field(description="+1, or -1 where the channel falls as the raw value grows")
+    positive: Motion = Field(description="motion of the aircraft for an increasing raw value")
+    frame: str = Field(description="the frame and the unit of the raw value, as a note for the reader")
+    sign: Literal[-1, 1] = Field(description="+1, or -1 where the channel decreases for an increasing raw value")
     scale: Positive = Field(description="units of the channel (SI, radians) per unit of the raw value")
     offset: float = Field(description="the value of the channel at raw = 0, SI")
     source: str = Field(min_length=1, description="where the row is from")
 
     @property
     def line(self) -> Line:
-        """The arrays' side of the row."""
+        """The conversion between the raw value and the channel."""
         return Line(self.sign, self.scale, self.offset)
 
     @property
     def motion(self) -> tuple[str, int]:
-        """The output that a growing channel shows in (what a growing raw value does, times the sign), and its sign there."""
+        """The output that responds to an increasing channel, and the sign of its response."""
         output, sign = MOTIONS[self.positive]
         return output, sign * self.sign
 
 
 class OutputRow(Row):
-    """One channel of y, the deviation from trim: from which field of which topic."""
+    """A channel of y, the deviation from trim: topic and field of its source."""
 
     topic: TopicName = Field(description="the autopilot's topic")
     type: MessageType = Field(description="its type, package/msg/Type")
     function: Literal["value", "norm", "airspeed_of_pressure"] = Field(
-        default="value", description="how the raw value comes from the field: itself, a vector's length, a pressure's speed"
+        default="value", description="conversion of the field to the raw value: none, vector length, airspeed of a pressure"
     )
-    stamp: Literal["header", "arrival"] = Field(description="whose instant counts: the message's own, or that of its arrival")
-    max_age: Positive = Field(description="the age beyond which the channel is stale, s")
+    stamp: Literal["header", "arrival"] = Field(description="stamp of the sample: that of the message header, or its arrival")
+    max_age: Positive = Field(description="the age above which the channel is stale, s")
 
 
 class InputRow(Row):
-    """One channel of u, the deviation from trim: to which field of which message; trim + u = sign scale raw + offset."""
+    """A channel of u, the deviation from trim: message and field of its setpoint. trim + u = sign scale raw + offset."""
 
-    message: str = Field(description="the message that the field is in, one of `messages`")
-    trim: float = Field(description="what is commanded in trim, to which u adds, SI")
+    message: str = Field(description="the message with the field, one of `messages`")
+    trim: float = Field(description="the command in trim, to which u is added, SI")
     lower: Annotated[float, Field(le=0)] = Field(description="the lower limit of u around trim, SI")
     upper: Annotated[float, Field(ge=0)] = Field(description="the upper limit of u around trim, SI")
-    range: Range = Field(description="the lowest and the highest raw value that the field takes")
-    neutral: float = Field(description="the raw value that is sent when u has fallen silent")
-    release: Raw = Field(description="the raw value that gives the channel back to the autopilot; NaN where the field says so")
+    range: Range = Field(description="the lowest and the highest raw value of the field")
+    neutral: float = Field(description="failsafe: the raw value that is sent when u has timed out")
+    release: Raw = Field(description="the raw value that returns the channel to the autopilot, for example NaN")
 
 
 class MessageRow(Parameters):
-    """One message towards the autopilot; one that no input has a field in is a heartbeat."""
+    """A message to the autopilot. A message without a field of an input is a heartbeat."""
 
     topic: TopicName = Field(description="the autopilot's topic")
     type: MessageType = Field(description="its type, package/msg/Type")
-    rate: Rate = Field(description="how often it is sent, Hz")
+    rate: Rate = Field(description="the rate at which it is sent, Hz")
     when: Literal["engaged", "ready"] = Field(
-        description="engaged: while u is flown and given back; ready: also before, while y and u are fresh"
+        description="engaged: from engagement to the end of the release; ready: while y and u are fresh"
     )
     stamped: bool = Field(description="whether header.stamp is set to the instant of sending")
-    values: dict[str, Value] = Field(default={}, description="what its other fields hold, by their paths")
+    values: dict[str, Value] = Field(default={}, description="values of its other fields, by their paths")
 
 
 class OverrideRow(Parameters):
-    """A field with which the pilot takes over: beyond the threshold the bridge disengages at once."""
+    """A pilot override: the bridge disengages at once where the field is beyond the threshold."""
 
     topic: TopicName = Field(description="the topic")
     type: MessageType = Field(description="its type, package/msg/Type")
     field: str = Field(description="the path of the field")
-    above: float | None = Field(default=None, description="the pilot has it where the field is above this")
-    below: float | None = Field(default=None, description="the pilot has it where the field is below this")
-    bits: Annotated[int, Field(gt=0)] | None = Field(
-        default=None, description="of a whole number that is a set of bits: those that count"
-    )
+    above: float | None = Field(default=None, description="the override is active where the field is above this")
+    below: float | None = Field(default=None, description="the override is active where the field is below this")
+    bits: Annotated[int, Field(gt=0)] | None = Field(default=None, description="for a bit field: mask of the bits that count")
     source: str = Field(min_length=1, description="where the row is from")
 
     def is_active(self, raw: float) -> bool:
-        """Whether the pilot takes over."""
+        """Whether the override is active."""
         if self.bits is not None:
             raw = float(int(raw) & self.bits)
         return (self.above is not None and raw > self.above) or (self.below is not None and raw < self.below)
@@ -142,29 +140,29 @@ class QosRow(Parameters):
 
 
 class SilenceParameters(Parameters):
-    """What is sent when u falls silent while engaged: neutral values, then those that release, then nothing."""
+    """Failsafe for a u that times out while engaged: neutral values, then release values, then nothing."""
 
-    max_age: Positive = Field(description="how long without u until it counts as silent, s")
-    neutral: NonNegative = Field(description="how long the neutral values are then sent, s; 0 is not at all")
-    release: NonNegative = Field(description="how long the releasing values are then sent, s; 0 stops at once")
+    max_age: Positive = Field(description="the age above which u has timed out, s")
+    neutral: NonNegative = Field(description="how long the neutral values are then sent, s; 0 skips them")
+    release: NonNegative = Field(description="how long the release values are then sent, s; 0 skips them")
 
 
 class ChannelMap(Parameters):
-    """A channel map: which field of which topic each channel of y and u is."""
+    """A channel map: the topic and field of each channel of y and u."""
 
     name: str
-    source: str = Field(min_length=1, description="where the map is from, and for which releases")
-    dry_run: bool = Field(default=True, description="say what would be sent, and send nothing to the autopilot")
-    rate: Rate = Field(description="how often the topics are looked at, Hz; y comes no faster")
-    instant: str = Field(description="the output whose newest sample gives the instant of y")
+    source: str = Field(min_length=1, description="where the map is from, and the releases for which it is valid")
+    dry_run: bool = Field(default=True, description="publish what would be sent, and send nothing to the autopilot")
+    rate: Rate = Field(description="the rate at which the topics are polled, Hz; the highest rate of y")
+    instant: str = Field(description="the output whose newest stamp is the stamp of y")
     engage_within: Annotated[float, Field(gt=0, le=1)] = Field(
-        description="how far u may be from trim at engagement, as a part of its limits"
+        description="the largest deviation of u from trim at engagement, as a fraction of its limits"
     )
-    silence: SilenceParameters = Field(description="what is sent when u falls silent")
+    silence: SilenceParameters = Field(description="failsafe for a u that times out")
     outputs: Annotated[dict[str, OutputRow], Field(min_length=1)] = Field(description="the channels of y")
     inputs: Annotated[dict[str, InputRow], Field(min_length=1)] = Field(description="the channels of u")
-    messages: Annotated[dict[str, MessageRow], Field(min_length=1)] = Field(description="what goes to the autopilot")
-    overrides: dict[str, OverrideRow] = Field(default={}, description="how the pilot takes over")
+    messages: Annotated[dict[str, MessageRow], Field(min_length=1)] = Field(description="the messages to the autopilot")
+    overrides: dict[str, OverrideRow] = Field(default={}, description="the pilot overrides")
     topics: dict[str, QosRow] = Field(description="the quality of service by topic")
 
     @model_validator(mode="after")
@@ -173,7 +171,7 @@ class ChannelMap(Parameters):
         require(self.instant in self.outputs, "instant", f"{self.instant!r}", f"one of the outputs {outputs}")
         self._check_fields()
         self._check_topics()
-        taken: dict[tuple[str, str], str] = {}
+        owners: dict[tuple[str, str], str] = {}
         for name, row in self.inputs.items():
             key = f"inputs.{name}"
             messages = ", ".join(self.messages)
@@ -182,18 +180,18 @@ class ChannelMap(Parameters):
             require(
                 when == "engaged", f"{key}.message", f"one sent when {when}", "one sent when engaged: it moves the aircraft"
             )
-            other = taken.setdefault((row.message, row.field), name)
+            other = owners.setdefault((row.message, row.field), name)
             require(other == name, f"{key}.field", f"{row.field}, that of {other}", "a field of its own")
             low, high = row.range
             require(low < high, f"{key}.range", list(row.range), "the lower end before the upper one")
-            for what, u in (("trim", 0.0), ("lower", row.lower), ("upper", row.upper)):
+            for limit, u in (("trim", 0.0), ("lower", row.lower), ("upper", row.upper)):
                 raw = to_raw(row.trim + u, row.line)
                 inside = low - ROUNDING <= raw <= high + ROUNDING
-                require(inside, f"{key}.{what}", f"{row.field} = {raw:.6g}", f"one in the range [{low:g}, {high:g}]")
+                require(inside, f"{key}.{limit}", f"{row.field} = {raw:.6g}", f"one in the range [{low:g}, {high:g}]")
             require(low <= row.neutral <= high, f"{key}.neutral", row.neutral, f"one in the range [{low:g}, {high:g}]")
         for name, override in self.overrides.items():
-            given = (override.above is None) != (override.below is None)
-            require(given, f"overrides.{name}", "above and below, or neither", "one of the two")
+            one_threshold = (override.above is None) != (override.below is None)
+            require(one_threshold, f"overrides.{name}", "above and below, or neither", "one of the two")
         return self
 
     def _check_fields(self) -> None:
@@ -225,7 +223,7 @@ class ChannelMap(Parameters):
 
 
 ROUNDING = 1e-6
-"""Limits may be written with six digits where they are the ends of a range."""
+"""Tolerance for limits with six digits that are the ends of a range."""
 
 
 def maps() -> list[str]:
@@ -249,10 +247,12 @@ def load_map(name: str) -> ChannelMap:
 
 
 class BridgeParameters(KeyedParameters):
-    """All parameters of the bridge's node."""
+    """All parameters of the bridge node."""
 
     map: str = Field(description="the name of a channel map of the library, or the path of a file ending in .yaml")
-    dry_run: bool | None = Field(default=None, description="in place of the map's: say what would be sent, and send nothing")
+    dry_run: bool | None = Field(
+        default=None, description="replaces dry_run of the map: publish what would be sent and send nothing"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:

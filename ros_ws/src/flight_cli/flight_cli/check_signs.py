@@ -12,7 +12,7 @@ from rich.console import Console
 
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.params import ChannelMap, InputRow, OutputRow, load_map
-from autopilot_bridge.signs import SURE
+from autopilot_bridge.signs import MIN_ERROR_RATIO
 from flight_analysis.design.sign_check import SignCheck, check_scenario, motion_as_channel_grows
 from flight_bringup.scenarios import find_scenario
 from flight_cli.output import new_table
@@ -59,7 +59,7 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
             f"{one.D_controller:+d}" + ("" if one.D_controller == one.D else " !"),
         ]
         if one.measured is not None and one.ratio is not None:
-            cells.append(f"{one.measured:+.3g} ({one.ratio:.0f}){' ' if one.ratio >= SURE else '?'}")
+            cells.append(f"{one.measured:+.3g} ({one.ratio:.0f}){' ' if one.ratio >= MIN_ERROR_RATIO else '?'}")
         table.add_row(*cells)
     console.print(table)
     headings = ("channel", "raw value", "topic")
@@ -72,7 +72,7 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
     if checked.intervals:
         console.print(
             f"recorded: least squares over {checked.intervals} intervals, in brackets the ratio to its standard error;"
-            f" below {SURE:g} the sign is unsure (?)",
+            f" below {MIN_ERROR_RATIO:g} the sign is unsure (?)",
             style="dim",
         )
 

@@ -6,7 +6,7 @@ from flight_ros.startup import start_nodes
 
 
 def main() -> None:
-    """Its entry point."""
+    """Start the reference model node."""
     start_nodes("reference_model.node:ReferenceModelNode")
 
 

@@ -29,16 +29,16 @@ def output(x_m: Array, params: Model) -> Array:
 
 
 class Stepper(NamedTuple):
-    """One Runge-Kutta step of equation (2), which is linear, as matrices."""
+    """Matrices of one Runge-Kutta step of equation (2), which is linear."""
 
     Phi: Array  # (n, n)
     Gamma: Array  # (n, 3m), for u_m at t, t + dt/2 and t + dt
 
 
 def stepper(dt: float, params: Model) -> Stepper:
-    """The matrices of x_m(t + dt) = Phi x_m(t) + Gamma [u_m(t), u_m(t + dt/2), u_m(t + dt)].
+    """Matrices of x_m(t + dt) = Phi x_m(t) + Gamma [u_m(t), u_m(t + dt/2), u_m(t + dt)].
 
-    They are what a Runge-Kutta step makes of each unit vector: to rounding the same step, at a quarter of its time.
+    Their columns are Runge-Kutta steps of the unit vectors. The product is the same step to rounding, in a quarter of the time.
     """
     n, m = params.B_m.shape
     x = np.eye(n, n + 3 * m)
@@ -57,9 +57,9 @@ def step(x_m: Array, u_m: Array, matrices: Stepper) -> Array:
 
 
 def second_order(natural_frequency: FloatArray, damping: FloatArray) -> Model:
-    """One filter a channel: y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i, with n = 2m.
+    """One filter per channel: y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i, with n = 2m.
 
-    States are [y_m,1, y_m,1', y_m,2, ...]; up to their order these are n = 2m states of which C picks the outputs, as (2) asks.
+    The states are [y_m,1, y_m,1', y_m,2, ...]. C selects the outputs from them, as (2) requires.
     Arguments: shape (m,), rad/s and 1.
     """
     m = len(natural_frequency)

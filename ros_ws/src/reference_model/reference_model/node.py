@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The reference model's node: equation (2) in real time or in lockstep, y_m out."""
+"""The reference model node: publishes y_m of equation (2) in real time or in lockstep."""
 
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError
@@ -13,9 +13,9 @@ from reference_model.reference import Reference
 
 
 class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
-    """At tick k: x_m from t(k-1) to t(k), y_m(k) out. Commands are the scenario's profile until one comes on u_m.
+    """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k). Commands are the scenario's profile until u_m is received.
 
-    In lockstep: all y_m up to the instant of /clock, and the next one is computed ahead. Commands are the profile's alone then.
+    In lockstep it publishes every y_m up to the instant of /clock and computes the next one ahead, from the profile only.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
             if sample is None:
                 continue
             if self._reference.live is None:
-                self.get_logger().info(f"commands come from {self._u_m_subscription.name} now, in place of the profile")
+                self.get_logger().info(f"commands from {self._u_m_subscription.name} replace the profile")
             self._reference.live = sample.value
 
     def advance(self) -> bool:

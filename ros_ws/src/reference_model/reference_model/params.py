@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the reference model, validated once, and the arrays that the maths takes."""
+"""Parameters of the reference model: validation, and conversion to the arrays of model and profile."""
 
 from typing import Annotated, Self
 
@@ -28,9 +28,9 @@ from reference_model.model import Model, second_order
 class Pulses(Parameters):
     """Pulses on one channel."""
 
-    start: Numbers = Field(description="the instants at which the pulses begin to rise, s")
-    stop: Numbers = Field(description="the instants at which they begin to fall, s")
-    value: Numbers = Field(description="their heights, in the channel's unit")
+    start: Numbers = Field(description="start times of the rising edges, s")
+    stop: Numbers = Field(description="start times of the falling edges, s")
+    value: Numbers = Field(description="heights of the pulses, in the channel's unit")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -50,18 +50,18 @@ class Sine(Parameters):
 
 
 class CoordinatedTurn(Parameters):
-    """Adds the turn rate of a coordinated turn, g/V0 sin(integral of the bank rate's command), to a channel."""
+    """Adds the turn rate of a coordinated turn, g/V0 sin(integral of the commanded bank rate), to a channel."""
 
     bank_rate: str = Field(description="the channel whose integral is the bank angle, e.g. p")
-    turn_rate: str = Field(description="the channel that takes the turn rate, e.g. r")
+    turn_rate: str = Field(description="the channel to which the turn rate is added, e.g. r")
     speed: Positive = Field(description="the speed V0, m/s")
 
 
 class SecondOrder(Parameters):
-    """The model as one second-order filter a channel."""
+    """The model as one second-order filter per channel."""
 
-    natural_frequency: Positives = Field(description="natural frequencies, one a channel, rad/s")
-    damping: Numbers = Field(description="damping ratios, one a channel")
+    natural_frequency: Positives = Field(description="natural frequencies, one per channel, rad/s")
+    damping: Numbers = Field(description="damping ratios, one per channel")
 
 
 class Linear(Parameters):
@@ -73,16 +73,16 @@ class Linear(Parameters):
 
 
 class ReferenceModelParameters(KeyedParameters):
-    """All parameters of the reference model's node."""
+    """All parameters of the reference model node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y_m is published, Hz")
     start_time: float = Field(
         default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
     )
     outputs: Names = Field(description="the names of the outputs y_m")
-    second_order: SecondOrder | None = Field(default=None, description="the model, one filter a channel")
+    second_order: SecondOrder | None = Field(default=None, description="the model, one filter per channel")
     linear: Linear | None = Field(default=None, description="the model, as matrices")
-    rise: Positive = Field(description="the duration of a pulse's edge, s; bounds u_m_dot as equation (2) demands")
+    rise: Positive = Field(description="the duration of a pulse's edge, s; bounds u_m_dot as equation (2) requires")
     pulses: dict[str, Pulses] = Field(default={}, description="pulses by channel")
     sines: dict[str, Sine] = Field(default={}, description="sines by channel")
     coordinated_turn: CoordinatedTurn | None = Field(default=None, description="turn coordination")
@@ -113,8 +113,8 @@ class ReferenceModelParameters(KeyedParameters):
         elif self.linear is not None:
             key, n, m = "linear.A_m", len(self.linear.states), len(self.outputs)
             for name, rows, columns in (("A_m", n, n), ("B_m", n, m)):
-                found = len(getattr(self.linear, name))
-                require(found == rows * columns, f"linear.{name}", f"{found} values", f"{rows} rows of {columns}")
+                count = len(getattr(self.linear, name))
+                require(count == rows * columns, f"linear.{name}", f"{count} values", f"{rows} rows of {columns}")
             for output in self.outputs:
                 require(output in self.linear.states, "linear.states", ", ".join(self.linear.states), f"{output} among them")
         with np.errstate(over="ignore"):
@@ -135,10 +135,10 @@ class ReferenceModelParameters(KeyedParameters):
         return Model(np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C)
 
     def profile(self) -> Profile:
-        """The commands u_m(t) as arrays over the outputs: two edges a pulse, shorter lists padded with edges of height 0."""
+        """The commands u_m(t) as arrays over the outputs: two edges per pulse, padded with edges of height 0."""
         m = len(self.outputs)
-        most = 2 * max((len(pulses.start) for pulses in self.pulses.values()), default=0)
-        time, change = np.zeros((m, most)), np.zeros((m, most))
+        edges = 2 * max((len(pulses.start) for pulses in self.pulses.values()), default=0)
+        time, change = np.zeros((m, edges)), np.zeros((m, edges))
         for name, pulses in self.pulses.items():
             row, count = self.outputs.index(name), 2 * len(pulses.start)
             time[row, :count] = (*pulses.start, *pulses.stop)
@@ -161,5 +161,5 @@ class ReferenceModelParameters(KeyedParameters):
 
 
 def zero_state(model: Model) -> FloatArray:
-    """x_m(0) = 0: the reference starts in trim."""
+    """State x_m(0) = 0: the reference starts in trim."""
     return np.zeros(len(model.A_m))
