@@ -146,7 +146,7 @@ def test_the_others_end_within_two_seconds_of_a_kill_and_name_who_is_gone(victim
             assert process.end(timeout=10.0) == 3, process.output
             # One second is the lease of the signs of life; a second is left for a busy machine.
             assert time.monotonic() - killed < 2.0, role
-            assert f"{victim} is gone" in process.output, role
+            assert f"lost contact with {victim}" in process.output, role
     assert len(read_run(tmp_path / "run").tape["y"].stamp_ns) > 100
 
 

@@ -377,7 +377,7 @@ def step_of_clock(by: float) -> Callable[[Flight, Generator], None]:
         flight.until(lambda: time.time() - begin >= 3.0, 5.0, "three seconds with the wrong clock")
         flight.set_clock(0.0)
         flight.over()
-        flight.until(lambda: flight.said("controller", "it is right again", flight.end), 5.0, "the right clock noticed")
+        flight.until(lambda: flight.said("controller", "it is correct again", flight.end), 5.0, "the right clock noticed")
 
     return inject
 
@@ -424,7 +424,7 @@ def full_disk(flight: Flight, random: Generator) -> None:
         (file,) = (folder / "run").glob("*.mcap")
         scan = Scan(file)
         times = [record.log_time for record in scan.records() if isinstance(record, Message)]
-        assert scan.whole, "the log on the full disk has its end"
+        assert scan.complete, "the log on the full disk has its end"
         assert flight.begin - seconds(max(times)) <= 0.3, "and all until then"
         flight.runs.pop()
         flight.over()
@@ -517,7 +517,7 @@ CASES = (
     Case("stronger quality of service", demanding_listener, DEMANDING, REPORT + FOUND, Does.FLIES, 0.0),
     Case("CPU starved", starve, grows("aircraft", "missed ticks"), REPORT + 3.0, Does.LATE, 0.5),
     Case("disk full", full_disk, says("recorder", "recording ended"), 0.1, Does.FLIES, 0.0),
-    Case("storm of parameters", parameters, says("controller", "parameters refused"), 0.0, Does.FLIES, 0.0),
+    Case("storm of parameters", parameters, says("controller", "parameters rejected"), 0.0, Does.FLIES, 0.0),
     Case(
         "clock set back",
         step_of_clock(-5.0),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The loop of a node's process: ticks on the monotonic clock or lockstep steps, services in between, a clean shutdown."""
+"""Event loop of a node: ticks on the monotonic clock or lockstep steps, services in between, clean shutdown."""
 
 import gc
 import signal
@@ -27,17 +27,17 @@ from flight_ros.topics import NodeState
 
 ENDED_EARLY = 3  # exit status
 
-MAX_START_AGE_NS = 10 * NANOSECONDS  # a node that comes late catches up with what it missed, but not with hours
+MAX_START_AGE_NS = 10 * NANOSECONDS  # a late node catches up with its missed ticks, but not with hours
 
-PEER_TIMEOUT_NS = 30 * NANOSECONDS  # in lockstep, for others that never come
+PEER_TIMEOUT_NS = 30 * NANOSECONDS  # of a lockstep flight that never begins
 
-SERVICE_POLL_PERIOD = 0.1  # s, between two looks at signals of life and service calls while a lockstep flight moves
+SERVICE_POLL_PERIOD = 0.1  # s, between two checks of liveliness and service calls in lockstep
 
-IDLE_POLL_PERIOD = 0.02  # s, the longest sleep, so that a signal or a service call is not left waiting
+IDLE_POLL_PERIOD = 0.02  # s, the longest sleep, so that signals and service calls are handled soon
 
 
 class _Stop:
-    """Set by a signal handler. No lock: an Event's would hang for ever when a second signal comes inside the first handler."""
+    """Set by a signal handler. It has no lock: that of an Event deadlocks when a second signal interrupts the first handler."""
 
     requested = False
 
@@ -46,35 +46,34 @@ class _Stop:
 
 
 def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participant | None = None) -> None:
-    """Run a node, or several in lockstep, until SIGINT or SIGTERM, then leave with exit status 0.
+    """Run a node, or several in lockstep, until SIGINT or SIGTERM. The exit status is then 0.
 
-    Otherwise 2 for bad parameters, 3 for a flight that cannot go on, 1 for a fault. `early_participant` joined before them and
-    is destroyed once they exist (flight_ros.startup).
+    Other exit statuses: 2 for invalid parameters, 3 for a flight that cannot continue, 1 for an unexpected exception. The
+    `early_participant` of flight_ros.startup is destroyed once the nodes exist.
 
-    Ticks run on the monotonic clock in the main thread; what comes over topics is taken at the tick. In lockstep there are no
-    ticks: a node moves when what it needs has come. The executor serves parameters and services, after ticks and without ever
-    waiting.
+    Ticks run on the monotonic clock in the main thread and poll the subscriptions. In lockstep there are no ticks: a node
+    advances when its input has arrived. The executor serves parameters and services after a tick and never blocks.
     """
     stop = _Stop()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop.request)
     try:
-        nodes = _made(make_nodes, early_participant)
+        nodes = _create_nodes(make_nodes, early_participant)
     except ParameterError as error:
-        sys.exit(_refuse(str(error)))
+        sys.exit(_print_error(str(error)))
     except FlightEnded as error:
-        _refuse(str(error))
+        _print_error(str(error))
         sys.exit(ENDED_EARLY)
     except ARGUMENT_ERRORS as error:
-        sys.exit(_refuse(" ".join(str(error).split())))
+        sys.exit(_print_error(" ".join(str(error).split())))
     node = nodes[0]
     try:
         if sockets := transport.open_to_network():
-            node.get_logger().error(f"the loopback profile is not in force: sockets open to the network: {', '.join(sockets)}")
-        if node.steps():
-            _step(nodes, stop)
+            node.get_logger().error(f"the loopback profile has no effect: sockets open to the network: {', '.join(sockets)}")
+        if node.runs_in_lockstep():
+            _run_lockstep(nodes, stop)
         else:
-            _loop(node, stop)
+            _run_real_time(node, stop)
     except ParameterError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -82,7 +81,7 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
         node.get_logger().fatal(str(error))
         sys.exit(ENDED_EARLY)
     except Exception:
-        node.get_logger().fatal(f"fault, the node ends: {traceback.format_exc()}")
+        node.get_logger().fatal(f"unexpected exception, the node ends: {traceback.format_exc()}")
         sys.exit(1)
     finally:
         for one in nodes:
@@ -91,7 +90,9 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
         rclpy.try_shutdown()
 
 
-def _made(make_nodes: Sequence[Callable[[], FlightNode[Any]]], early_participant: Participant | None) -> list[FlightNode[Any]]:
+def _create_nodes(
+    make_nodes: Sequence[Callable[[], FlightNode[Any]]], early_participant: Participant | None
+) -> list[FlightNode[Any]]:
     transport.prepare()
     if not rclpy.ok():
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
@@ -101,30 +102,30 @@ def _made(make_nodes: Sequence[Callable[[], FlightNode[Any]]], early_participant
     return nodes
 
 
-def _refuse(sentence: str) -> int:
+def _print_error(sentence: str) -> int:
     print(f"error: {sentence}", file=sys.stderr)
     rclpy.try_shutdown()
     return 2
 
 
 def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: int = 0) -> None:
-    """Serve one request, where there is one, and further ones until an instant of the monotonic clock."""
+    """Serve one pending request, and further ones until an instant of the monotonic clock."""
     while True:
         if (execute := ready_callback(executor)) is None:
             return
         try:
             execute()
-        except Exception as error:  # a service request that rclpy cannot serve, such as an invalid lifecycle transition
-            node.get_logger().error(f"request refused: {' '.join(str(error).split())}")
+        except Exception as error:  # rclpy cannot serve the request, e.g. an invalid lifecycle transition
+            node.get_logger().error(f"request rejected: {' '.join(str(error).split())}")
         if time.monotonic_ns() >= until_ns:
             return
 
 
-def _begin(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
+def _start(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
     executor = SingleThreadedExecutor()
     for node in nodes:
         executor.add_node(node)
-    gc.freeze()  # a collection then takes microseconds, not tens of milliseconds, as the one of now would
+    gc.freeze()  # later collections take microseconds instead of tens of milliseconds
     gc.enable()
     for node in nodes:
         node.publish_state(NodeState.READY)
@@ -132,19 +133,19 @@ def _begin(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
     return executor
 
 
-def _step(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
-    executor = _begin(nodes)
+def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
+    executor = _start(nodes)
     wait_set = WaitSet(
         [subscription.entity for node in nodes for subscription in node.polled_subscriptions()], nodes[0].context
     )
     begin_ns = serve_ns = report_ns = time.monotonic_ns()
-    moved = False
+    began = False
     while not stop.requested:
-        moving = [node.advance() for node in nodes]
-        if any(moving):
-            moved = True
+        advanced = [node.advance() for node in nodes]  # each of them, without a short circuit
+        if any(advanced):
+            began = True
         elif not wait_set.wait(nanoseconds(IDLE_POLL_PERIOD)):
-            serve_ns = 0  # nothing comes: perhaps one of the others is gone
+            serve_ns = 0  # no message: check the liveliness of the peers now
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
             serve_ns = now_ns + nanoseconds(SERVICE_POLL_PERIOD)
@@ -156,24 +157,26 @@ def _step(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
             for node in nodes:
                 node.publish_diagnostics()
                 node.check_graph()
-            if not moved and now_ns - begin_ns > PEER_TIMEOUT_NS:
-                raise FlightEnded(f"waited {seconds(PEER_TIMEOUT_NS):g} s for {nodes[0].awaited_topic()}: nobody there")
+            if not began and now_ns - begin_ns > PEER_TIMEOUT_NS:
+                raise FlightEnded(
+                    f"timed out waiting for {nodes[0].awaited_topic()}: no message in {seconds(PEER_TIMEOUT_NS):g} s"
+                )
 
 
-def _loop(node: FlightNode[Any], stop: _Stop) -> None:
-    executor = _begin([node])
+def _run_real_time(node: FlightNode[Any], stop: _Stop) -> None:
+    executor = _start([node])
     start_ns = node.start_ns() or time.time_ns()
-    if (past := time.time_ns() - start_ns) > MAX_START_AGE_NS:
+    if (age := time.time_ns() - start_ns) > MAX_START_AGE_NS:
         raise ParameterError(
-            f"{node.get_name()}.start_time: found an instant {seconds(past):.0f} s ago, expected one to come, or 0"
+            f"{node.get_name()}.start_time: found an instant {seconds(age):.0f} s ago, expected a future one, or 0"
         )
     begin_ns = time.monotonic_ns() + start_ns - time.time_ns()
-    node.keep_time(start_ns, begin_ns)
+    node.set_time_origin(start_ns, begin_ns)
     ticker = Ticker(node.period_ns(), begin_ns)
     if (lead := start_ns - time.time_ns()) > nanoseconds(60):
         node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
     serve_ns = report_ns = time.monotonic_ns()
-    chores: deque[Callable[[], None]] = deque()
+    reports: deque[Callable[[], None]] = deque()
     disable_timer_slack()
     while not stop.requested:
         ticker.wait(IDLE_POLL_PERIOD)
@@ -182,11 +185,11 @@ def _loop(node: FlightNode[Any], stop: _Stop) -> None:
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
             serve_ns = now_ns + nanoseconds(IDLE_POLL_PERIOD)
-            # half of what is left to the next tick, which no request may hold up
+            # Requests may take half of the time to the next tick.
             _serve(executor, node, now_ns + nanoseconds(max(ticker.remaining(), 0.0) / 2.0))
             node.require_peers()
         if now_ns >= report_ns:
             report_ns = now_ns + NANOSECONDS
-            chores += (node.publish_diagnostics, node.check_graph, node.check_clock)
-        if chores:  # one a tick: together they may outlast a period of 2 ms
-            chores.popleft()()
+            reports += (node.publish_diagnostics, node.check_graph, node.check_clock)
+        if reports:  # one after each tick: all of them together may exceed a period of 2 ms
+            reports.popleft()()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Who else takes part in a lockstep flight, and whether they all live."""
+"""Liveliness monitor of a lockstep flight: detects the loss of a peer by DDS liveliness, a watchdog inside the middleware."""
 
 import time
 from functools import partial
@@ -13,22 +13,22 @@ from std_msgs.msg import Empty
 from flight_ros.topics import LIVELINESS
 
 SHUTDOWN_GRACE_NS = 600_000_000
-"""How much later a busy process may notice a death than another one that has left over it."""
+"""A peer that shuts down may do so because it lost another one. A busy process may notice that loss this much later."""
 
 ROLES = ("aircraft", "reference_model", "controller", "recorder")
 
 
 class LivelinessMonitor:
-    """A node of a lockstep flight shows on `alive/<role>` that it lives, and watches the others do.
+    """Asserts the liveliness of a node on `alive/<role>` and monitors that of the other roles.
 
-    The middleware keeps the signs of life going, and notices within the lease of `LIVELINESS` that a process has gone, whatever
-    ended it; where it went before its first sign of life, within the lease of its participant, two seconds. A role that was
-    never seen is not missed: a flight may do without a recorder.
+    The middleware sends the heartbeats. It reports the end of a process within the lease duration of `LIVELINESS`, or within
+    that of the participant, two seconds, if the process ended before its first heartbeat. A role that never appeared is not
+    lost: a flight can run without a recorder.
     """
 
     def __init__(self, node: Node, role: str) -> None:
-        self._dead = ""  # the first role whose signs of life have stopped
-        self._left = ""  # the first one that has taken its leave
+        self._dead = ""  # the first role whose heartbeats stopped
+        self._left = ""  # the first role that shut down cleanly
         self._left_ns = 0
         self._publisher = node.create_publisher(Empty, f"alive/{role}", LIVELINESS)
         self._subscriptions = [
@@ -38,29 +38,29 @@ class LivelinessMonitor:
                 lambda _: None,
                 LIVELINESS,
                 event_callbacks=SubscriptionEventCallbacks(
-                    liveliness=partial(self._changed, other), matched=partial(self._matched, other)
+                    liveliness=partial(self._on_liveliness, other), matched=partial(self._on_matched, other)
                 ),
             )
             for other in ROLES
             if other != role
         ]
 
-    def missing(self) -> str:
-        """The role that was there and no longer is, empty where all are.
+    def lost(self) -> str:
+        """The role that was lost; empty if none was.
 
-        One that has taken its leave may have done so because another died, which is then about to be noticed here too.
+        A role that shut down cleanly is reported after SHUTDOWN_GRACE_NS, unless the role that it lost is reported first.
         """
         if self._dead or not self._left or time.monotonic_ns() - self._left_ns < SHUTDOWN_GRACE_NS:
             return self._dead
         return self._left
 
-    def _changed(self, role: str, event: Any) -> None:
-        if event.alive_count > 0:  # one of the role lives: perhaps a new one, after that of a flight before
+    def _on_liveliness(self, role: str, event: Any) -> None:
+        if event.alive_count > 0:  # alive, possibly as the role of a new flight
             self._dead = "" if self._dead == role else self._dead
         elif event.not_alive_count_change > 0:
             self._dead = self._dead or role
 
-    def _matched(self, role: str, event: Any) -> None:
+    def _on_matched(self, role: str, event: Any) -> None:
         if event.current_count > 0:
             self._left = "" if self._left == role else self._left
         elif event.current_count_change < 0 and not self._left:
