@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identify and fly the aircraft of JSBSim, all by the procedure of `rise-di identify`, and print docs/experiments.md's tables.
+"""Identify and fly aircraft of JSBSim by the procedure of `rise-di identify`, and print the tables of docs/experiments.md.
 
-.venv/bin/python benchmarks/jsbsim_fleet.py               the fleet, some ten seconds an aircraft
-.venv/bin/python benchmarks/jsbsim_fleet.py f16 c172p     some of it
-.venv/bin/python benchmarks/jsbsim_fleet.py --all         every aircraft that comes with JSBSim: which ones fly, and why not
+.venv/bin/python benchmarks/jsbsim_fleet.py               the aircraft of FLEET, some ten seconds each
+.venv/bin/python benchmarks/jsbsim_fleet.py f16 c172p     the named aircraft
+.venv/bin/python benchmarks/jsbsim_fleet.py --all         every aircraft of JSBSim, with the reason where one does not fly
 """
 
 import sys
@@ -21,7 +21,7 @@ KNOT, FOOT = 1852.0 / 3600.0, 0.3048  # m/s, m; exact
 
 
 class Condition(NamedTuple):
-    """Where an aircraft is flown."""
+    """Flight condition of an aircraft."""
 
     speed: float  # true airspeed, kt
     altitude: float  # ft
@@ -41,7 +41,7 @@ FLEET = {
     "737": Condition(300, 20000),
     "B747": Condition(350, 25000),
 }
-"""Light, utility, trainers, fighters, business jet, airliners: a usual speed and altitude of each."""
+"""Light and utility aircraft, trainers, fighters, business jet, airliners, each at a usual speed and altitude."""
 
 OTHERS = {
     "787-8": Condition(350, 25000),
@@ -75,25 +75,25 @@ OTHERS = {
     "wrightFlyer1903": Condition(30, 50),
     "x24b": Condition(250, 20000),
 }
-UNKNOWN = Condition(100, 3000)
+DEFAULT = Condition(100, 3000)
 
 
 def main() -> None:
-    """Print the tables asked for."""
-    asked = sys.argv[1:]
-    names = list(FLEET) if not asked else list(aircraft_names()) if asked == ["--all"] else asked
+    """Print the tables of the selected aircraft."""
+    arguments = sys.argv[1:]
+    names = list(aircraft_names()) if arguments == ["--all"] else arguments or list(FLEET)
     rows, reasons = [], []
     for number, name in enumerate(names, 1):
         print(f"{number} of {len(names)}: {name}", file=sys.stderr)
-        where = (FLEET | OTHERS).get(name, UNKNOWN)
+        condition = (FLEET | OTHERS).get(name, DEFAULT)
         try:
-            found = identify(name, where.speed * KNOT, where.altitude * FOOT)
+            aircraft = identify(name, condition.speed * KNOT, condition.altitude * FOOT)
         except (FlightEnded, ParameterError) as error:
-            reasons.append(f"| {name} | {where.speed:g} kt, {where.altitude:g} ft | {error} |")
+            reasons.append(f"| {name} | {condition.speed:g} kt, {condition.altitude:g} ft | {error} |")
             continue
-        rows.append(_row(name, where, found))
-        if found.failure:
-            reasons.append(f"| {name} | {where.speed:g} kt, {where.altitude:g} ft | {found.failure} |")
+        rows.append(_row(name, condition, aircraft))
+        if aircraft.failure:
+            reasons.append(f"| {name} | {condition.speed:g} kt, {condition.altitude:g} ft | {aircraft.failure} |")
     flights = [f"{title}{law}" for title in ("calm", "gust", "turbulence") for law in ("", ", PI")]
     headings = ("aircraft", "Omega_ii", "D", "lag (s)", "zero (1/s)", *flights, "largest u")
     print(f"| {' | '.join(headings)} |\n|{'---|' * len(headings)}")
@@ -102,18 +102,18 @@ def main() -> None:
     print("\n".join(reasons))
 
 
-def _row(name: str, where: Condition, found: IdentifiedAircraft) -> str:
-    steps = found.responses
-    pi = fly_all(without_beta(found.scenario()))
+def _row(name: str, condition: Condition, aircraft: IdentifiedAircraft) -> str:
+    steps = aircraft.responses
+    pi = fly_all(without_beta(aircraft.scenario()))
     return " | ".join(
         (
-            f"| {name}, {where.speed:g} kt, {where.altitude:g} ft",
+            f"| {name}, {condition.speed:g} kt, {condition.altitude:g} ft",
             " / ".join(f"{value:.3g}" for value in np.diag(steps.Omega)),
-            " ".join(f"{sign:+d}"[0] for sign in found.D),
+            " ".join(f"{sign:+d}"[0] for sign in aircraft.D),
             " / ".join(f"{lag:.2g}" for lag in steps.lag),
-            f"{found.sideslip_zero:.2g}",
-            *(_errors(one) for title in found.flights for one in (found.flights[title], pi[title])),
-            " / ".join(f"{found.flights['turbulence'].largest[one]:.2g}" for one in INPUTS) + " |",
+            f"{aircraft.sideslip_zero:.2g}",
+            *(_errors(flight) for title in aircraft.flights for flight in (aircraft.flights[title], pi[title])),
+            " / ".join(f"{aircraft.flights['turbulence'].largest[name]:.2g}" for name in INPUTS) + " |",
         )
     )
 
@@ -121,7 +121,7 @@ def _row(name: str, where: Condition, found: IdentifiedAircraft) -> str:
 def _errors(flight: ManoeuvreResult) -> str:
     if flight.outcome != COMPLETED:
         return flight.outcome
-    return " / ".join(f"{flight.rms[one] * (1.0 if one == 'V' else 1e3):.2g}" for one in OUTPUTS)
+    return " / ".join(f"{flight.rms[name] * (1.0 if name == 'V' else 1e3):.2g}" for name in OUTPUTS)
 
 
 if __name__ == "__main__":

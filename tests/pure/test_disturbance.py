@@ -313,7 +313,7 @@ STEP = {"start": 0.0, "value": 1.0, "rise": 0.0}
         ),
         (
             {"gusts": {"up": {"start": 0.0, "speed": 1.0, "length": 9.0}}},
-            r"gusts: found 'up', expected one the airframe osprey knows: vertical, lateral, longitudinal",
+            r"gusts: found 'up', expected a gust of the airframe osprey: vertical, lateral, longitudinal",
         ),
     ],
 )

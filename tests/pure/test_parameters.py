@@ -44,7 +44,7 @@ BAD = {
     (
         "vertical: {start",
         "upward: {start",
-    ): "gusts: found 'upward', expected one the airframe osprey knows: vertical, lateral",
+    ): "gusts: found 'upward', expected a gust of the airframe osprey: vertical, lateral",
     ("length: 15.24}   #", "length: 0.0}   #"): "aircraft.gusts.vertical.length: found 0.0, expected greater than 0",
     ("stop: [4.0, 8.0", "stop: [1.0, 8.0"): "reference_model.pulses.q.stop[0]: found 1.0, expected later than start[0] = 2 s",
     ("rise: 0.1", "rise: 0.0"): "reference_model.rise: found 0.0, expected greater than 0",

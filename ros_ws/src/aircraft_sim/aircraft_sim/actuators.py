@@ -36,29 +36,29 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     Source: the lag is the zero-order-hold equivalent of 1 / (lag s + 1); Franklin, Powell, Workman, Digital Control, 4.3.
     """
     xp = array_namespace(position)
-    moved = command
+    new = command
     if params.dead_zone is not None:
-        moved = moved - xp.minimum(xp.maximum(moved, -params.dead_zone), params.dead_zone)
+        new = new - xp.minimum(xp.maximum(new, -params.dead_zone), params.dead_zone)
     if params.lag is not None:
-        moved = moved - (moved - position) * xp.exp(-dt / xp.maximum(params.lag, MIN_LAG))
+        new = new - (new - position) * xp.exp(-dt / xp.maximum(params.lag, MIN_LAG))
     if params.rate is not None:
         largest = params.rate * dt
-        moved = xp.minimum(xp.maximum(moved, position - largest), position + largest)
+        new = xp.minimum(xp.maximum(new, position - largest), position + largest)
     if params.lower is not None:
-        moved = xp.maximum(moved, params.lower)
-    return moved if params.upper is None else xp.minimum(moved, params.upper)
+        new = xp.maximum(new, params.lower)
+    return new if params.upper is None else xp.minimum(new, params.upper)
 
 
-def apply_faults(t: Any, position: Array, moved: Array, params: Actuators) -> Array:
+def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:
     """Actuator positions at the end of a step that begins at t, with faults applied, shape (m,).
 
         t >= stuck_at    position    the actuator keeps its position
         t >= lost_at     0           the surface is free: it goes to trim at once and stays there, also if stuck before
-        else             moved
+        else             new
 
-    Arguments: `position` at t, `moved` at the end of the step without faults. A fault within a step acts from the next one on.
+    Arguments: `position` at t, `new` at the end of the step without faults. A fault within a step acts from the next one on.
     """
     xp = array_namespace(position)
     if params.stuck_at is not None:
-        moved = xp.where(t >= params.stuck_at, position, moved)
-    return moved if params.lost_at is None else xp.where(t >= params.lost_at, 0.0 * moved, moved)
+        new = xp.where(t >= params.stuck_at, position, new)
+    return new if params.lost_at is None else xp.where(t >= params.lost_at, 0.0 * new, new)

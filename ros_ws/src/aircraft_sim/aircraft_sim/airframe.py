@@ -61,7 +61,8 @@ class Airframe(Parameters):
         default=(), description="terms of f from products of states"
     )
     gusts: dict[str, dict[str, float]] = Field(
-        default={}, description="what w / V0 of wind along each axis adds to each x_dot: longitudinal, lateral, vertical"
+        default={},
+        description="what wind w along each axis adds to each x_dot, per w / V0; axes: longitudinal, lateral, vertical",
     )
 
     @model_validator(mode="after")
@@ -131,7 +132,7 @@ class Airframe(Parameters):
 
     def gust_direction(self, gust: str) -> FloatArray:
         """Change of x_dot for 1 m/s of wind along an axis, shape (n,). Raises ParameterError for an axis not in the file."""
-        require(gust in self.gusts, "gusts", f"{gust!r}", f"one the airframe {self.name} knows: {', '.join(self.gusts)}")
+        require(gust in self.gusts, "gusts", f"{gust!r}", f"a gust of the airframe {self.name}: {', '.join(self.gusts)}")
         direction = np.zeros(len(self.states))
         for state, value in self.gusts[gust].items():
             direction[self.index(state)] = value / self.speed

@@ -135,7 +135,7 @@ class SensorParameters(Parameters):
     delay: float = Field(
         default=0.0, ge=0, le=1e6, description="transport delay from measurement to arrival, s; whole periods of `rate`"
     )
-    dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is lost")
+    dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is dropped")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
 
@@ -173,11 +173,9 @@ class AircraftParameters(KeyedParameters):
         default=0.0, ge=0, le=1000, description="in lockstep: the controller's rate, at whose instants u is waited for, Hz"
     )
     duration: float = Field(default=0.0, ge=0, le=1e6, description="in lockstep: the flight time to stop at, s; 0 never stops")
-    recorded: bool = Field(default=False, description="in lockstep: wait for the recorder too, so that nothing is lost")
+    recorded: bool = Field(default=False, description="in lockstep: wait for the recorder too, so that the log is complete")
 
-    max_age: float = Field(
-        default=0.2, gt=0, le=1e6, description="watchdog: the age of u from which its controller counts as lost, s"
-    )
+    max_age: float = Field(default=0.2, gt=0, le=1e6, description="watchdog: the age of u at which it times out, s")
     hold: float = Field(default=0.5, ge=0, le=1e6, description="failsafe: how long the last u is then held, s")
     ramp: float = Field(default=2.0, ge=0, le=1e6, description="failsafe: how long the ramp to trim then takes, s")
 
@@ -211,7 +209,7 @@ class AircraftParameters(KeyedParameters):
     def _check_airframe(self) -> None:
         for key in ("speed", "altitude"):
             value = getattr(self, key)
-            require(value is None, key, value, f"none: the airframe {self.airframe} is what it is in one trim")
+            require(value is None, key, value, f"none: the airframe {self.airframe} has a fixed trim")
         airframe = load_airframe(self.airframe)
         for name in self.gusts:
             airframe.gust_direction(name)
@@ -220,8 +218,8 @@ class AircraftParameters(KeyedParameters):
                 states = ", ".join(airframe.states)
                 require(name in airframe.states, f"{key}.{name}", f"{name!r}", f"a state of {airframe.name}: {states}")
         has_none = f"the airframe {airframe.name} has no"
-        known = bool(airframe.inertial_coupling) or self.inertial_coupling == 0.0
-        require(known, "inertial_coupling", f"{self.inertial_coupling:g}", f"0: {has_none} inertial_coupling")
+        possible = bool(airframe.inertial_coupling) or self.inertial_coupling == 0.0
+        require(possible, "inertial_coupling", f"{self.inertial_coupling:g}", f"0: {has_none} inertial_coupling")
         require(bool(airframe.gusts) or self.turbulence is None, "turbulence", "a section", f"none: {has_none} gusts")
 
     def _check_jsbsim(self) -> None:
@@ -231,13 +229,13 @@ class AircraftParameters(KeyedParameters):
         for name in self.gusts:
             require(name in AXES, f"gusts.{name}", f"{name!r}", f"an axis of the wind: {', '.join(AXES)}")
         uncertain = self.uncertainty.A > 0.0 or self.uncertainty.B > 0.0
-        for key, found in (
+        for key, value in (
             ("bias", self.bias),
             ("sines", self.sines),
             ("inertial_coupling", self.inertial_coupling),
             ("uncertainty", uncertain),
         ):
-            require(not found, key, "it", f"none: {self.airframe} has no matrices that it could change")
+            require(not value, key, "a value", f"none: {self.airframe} has no matrices to change")
 
     @property
     def is_jsbsim(self) -> bool:

@@ -81,8 +81,8 @@ def advance(
 
     rate = (forcing(t_ns, steps, plant) if forced is None else forced).rate
     for k in range(steps):
-        moved = actuators.step(position, u, dt, plant.actuators)
-        position = actuators.apply_faults(seconds(t_ns + k * plant.step_ns), position, moved, plant.actuators)
+        new = actuators.step(position, u, dt, plant.actuators)
+        position = actuators.apply_faults(seconds(t_ns + k * plant.step_ns), position, new, plant.actuators)
         held = aircraft.B @ position
         if filters is not None:
             held = held + aircraft.gust_direction @ turbulence.wind(z, filters)

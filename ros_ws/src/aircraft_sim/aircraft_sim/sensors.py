@@ -15,7 +15,7 @@ class Sensors(NamedTuple):
 
     noise: FloatArray  # (m,) standard deviation per sample, SI
     delay_ns: int  # transport delay, from the instant of a sample to its arrival
-    dropout: float  # probability that a sample is lost, all channels together
+    dropout: float  # probability that a sample is dropped, all channels together
     seed: int
     bias: FloatArray | None = None  # (m,) SI
     drift: FloatArray | None = None  # (m,) standard deviation of the random walk's step from sample to sample, SI
