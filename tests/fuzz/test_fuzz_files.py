@@ -19,7 +19,7 @@ from tests.fuzz.targets import SEEDS, TARGETS, log, refused
 from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.run_folder import conclude, read_flight
+from flight_analysis.report.run_folder import read_flight, write_report
 from flight_bringup.scenarios import find_scenario
 from flight_log.tape_reader import read_run
 
@@ -248,4 +248,4 @@ def test_a_flight_of_any_values_has_figures_or_is_refused(reported: Report, mess
 @given(FLIGHTS)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_flight_of_any_values_has_a_page_or_is_refused(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
-    reported(conclude, messages)
+    reported(write_report, messages)

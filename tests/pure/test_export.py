@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights as tables and pictures for other programs, read back by others than wrote them."""
+"""Export of flights as tables and figures, read back with independent readers."""
 
 import csv
 from pathlib import Path
@@ -12,7 +12,7 @@ from matplotlib.image import imread
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.export import table, write_csv, write_parquet, write_png
+from flight_analysis.report.export import wide_table, write_csv, write_parquet, write_png
 from flight_analysis.report.recorded_flight import RecordedFlight
 from flight_analysis.report.summary import summarise
 from flight_core.tape import Signal, Tape
@@ -21,16 +21,16 @@ EPOCH = 1_795_000_000_000_000_000  # a stamp of today, which float64 cannot hold
 
 
 @pytest.fixture(scope="module")
-def flown(osprey_gust: Scenario) -> RecordedFlight:
+def flight(osprey_gust: Scenario) -> RecordedFlight:
     scenario = osprey_gust.vary(flight={"duration": 3.0})
     tape = simulate(scenario)
-    return RecordedFlight("flown", scenario, tape, summarise(scenario, tape, tape.outcome))
+    return RecordedFlight("run", scenario, tape, summarise(scenario, tape, tape.outcome))
 
 
-def test_the_table_has_a_row_an_instant_and_nothing_where_there_is_no_sample() -> None:
+def test_the_table_has_a_row_per_instant_and_null_without_a_sample() -> None:
     y = Signal(np.array([EPOCH, EPOCH + 1, EPOCH + 2]), ("q", "V"), np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
     u = Signal(np.array([EPOCH + 1, EPOCH + 3, EPOCH + 3]), ("thrust",), np.array([[0.5], [0.25], [0.75]]))
-    assert table(Tape({"y": y, "u": u}, EPOCH)).to_dict(as_series=False) == {
+    assert wide_table(Tape({"y": y, "u": u}, EPOCH)).to_dict(as_series=False) == {
         "stamp_ns": [EPOCH, EPOCH + 1, EPOCH + 2, EPOCH + 3],
         "t": [0.0, 1e-9, 2e-9, 3e-9],
         "y.q": [1.0, 3.0, 5.0, None],
@@ -39,33 +39,33 @@ def test_the_table_has_a_row_an_instant_and_nothing_where_there_is_no_sample() -
     }
 
 
-def test_csv_and_parquet_hold_every_sample_to_the_last_bit(flown: RecordedFlight, tmp_path: Path) -> None:
-    write_csv(tmp_path / "flown.csv", [flown])
-    write_parquet(tmp_path / "flown.parquet", [flown])
-    with (tmp_path / "flown.csv").open(newline="", encoding="utf-8") as stream:
+def test_csv_and_parquet_hold_every_sample_to_the_last_bit(flight: RecordedFlight, tmp_path: Path) -> None:
+    write_csv(tmp_path / "run.csv", [flight])
+    write_parquet(tmp_path / "run.parquet", [flight])
+    with (tmp_path / "run.csv").open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-    read = pl.read_parquet(tmp_path / "flown.parquet")
+    read = pl.read_parquet(tmp_path / "run.parquet")
     assert len(rows) == len(read) == 1501
     for topic, name in (("y", "q"), ("u", "thrust"), ("internals", "Pi.r"), ("truth", "x.alpha")):
-        column, expected = f"{topic}.{name}", flown.tape[topic][name].tolist()
+        column, expected = f"{topic}.{name}", flight.tape[topic][name].tolist()
         assert [float(row[column]) for row in rows if row[column]] == expected
         assert read[column].drop_nulls().to_list() == expected
     assert [row["u.thrust"] != "" for row in rows[:11]] == [True, *[False] * 4, True, *[False] * 4, True]  # 100 Hz of 500
 
 
-def test_tables_of_several_flights_say_whose_each_row_is(flown: RecordedFlight, tmp_path: Path) -> None:
-    bare = flown._replace(name="bare", tape=Tape({"y": flown.tape["y"], "y_m": flown.tape["y_m"]}))
-    write_parquet(tmp_path / "both.parquet", [flown, bare])
+def test_the_table_of_several_flights_has_a_column_run(flight: RecordedFlight, tmp_path: Path) -> None:
+    bare = flight._replace(name="bare", tape=Tape({"y": flight.tape["y"], "y_m": flight.tape["y_m"]}))
+    write_parquet(tmp_path / "both.parquet", [flight, bare])
     both = pl.read_parquet(tmp_path / "both.parquet")
-    assert both["run"].value_counts(sort=True).rows() == [("flown", 1501), ("bare", 1501)]
+    assert both["run"].value_counts(sort=True).rows() == [("run", 1501), ("bare", 1501)]
     assert both.filter(pl.col("run") == "bare")["u.thrust"].null_count() == 1501
 
 
-def test_the_picture_is_one_of_all_flights(flown: RecordedFlight, tmp_path: Path) -> None:
-    bare = flown._replace(name="bare", tape=Tape({"y": flown.tape["y"], "y_m": flown.tape["y_m"]}))
-    for flights, width in (([flown], 1800), ([bare], 1800), ([flown, bare], 1800)):
-        write_png(tmp_path / "flown.png", flights)
-        pixels = imread(tmp_path / "flown.png")
+def test_one_png_shows_all_flights(flight: RecordedFlight, tmp_path: Path) -> None:
+    bare = flight._replace(name="bare", tape=Tape({"y": flight.tape["y"], "y_m": flight.tape["y_m"]}))
+    for flights, width in (([flight], 1800), ([bare], 1800), ([flight, bare], 1800)):
+        write_png(tmp_path / "run.png", flights)
+        pixels = imread(tmp_path / "run.png")
         assert pixels.shape[1] == width
         assert pixels.shape[0] > 1000  # four rows
-        assert (pixels[..., :3].min(axis=2) < 0.5).mean() > 0.005  # something is drawn
+        assert (pixels[..., :3].min(axis=2) < 0.5).mean() > 0.005  # not blank

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a flight, against numbers worked by hand."""
+"""Metrics of a flight against numbers worked by hand."""
 
 import math
 
@@ -10,21 +10,21 @@ import pytest
 from flight_analysis.metrics import (
     Transient,
     engagements,
-    error_figures,
-    error_table,
+    error_metrics,
+    errors_by_part,
     in_spans,
-    input_table,
-    latency_figures,
-    limited_shares,
+    inputs_by_part,
+    latency_metrics,
     live_commands,
     noise_floor,
     part_masks,
-    settled,
+    saturation_shares,
     settling_bands,
     settling_time,
+    settling_times,
     sign_switches,
     spectra,
-    tick_figures,
+    tick_metrics,
     tracking_error,
 )
 from flight_core.parameters import ParameterError
@@ -33,7 +33,7 @@ from rise_di_controller.guard import Mode
 from rise_di_controller.internals import Saturation
 
 MS = 1_000_000
-EPOCH = 1_795_000_000_000_000_000  # a stamp of today, where float64 seconds resolve no better than 0.2 us
+EPOCH = 1_795_000_000_000_000_000  # ns, a stamp of today; float64 seconds resolve it to 0.2 us
 
 
 def signal(stamps_ms: list[float], **channels: list[float]) -> Signal:
@@ -43,11 +43,11 @@ def signal(stamps_ms: list[float], **channels: list[float]) -> Signal:
 
 def test_rms_and_max() -> None:
     # sqrt((9 + 16 + 0 + 0) / 4) = 2.5
-    assert error_figures(np.array([3.0, -4.0, 0.0, 0.0])) == (2.5, 4.0)
+    assert error_metrics(np.array([3.0, -4.0, 0.0, 0.0])) == (2.5, 4.0)
 
 
-def test_a_part_without_samples_has_no_figure() -> None:
-    assert all(math.isnan(figure) for figure in error_figures(np.zeros(0)))
+def test_a_part_without_samples_has_nan_metrics() -> None:
+    assert all(math.isnan(metric) for metric in error_metrics(np.zeros(0)))
 
 
 def test_error_is_formed_at_the_stamps_of_y_by_name() -> None:
@@ -64,30 +64,30 @@ def test_y_outside_the_reference_is_left_out() -> None:
     assert tracking_error(Tape({"y": y, "y_m": y_m}, EPOCH))["q"].tolist() == [1.0, 1.0]
 
 
-def test_a_span_holds_for_a_while_after_its_end() -> None:
+def test_a_span_extends_beyond_its_end() -> None:
     assert in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [False, True, True, True, False]
 
 
-def test_the_parts_of_a_flight_are_told_apart() -> None:
-    happened = [
+def test_each_instant_belongs_to_one_part_of_the_flight() -> None:
+    transients = [
         Transient("engagement", "", 0.0, 0.0),
         Transient("command", "q", 3.0, 3.1),
         Transient("gust", "vertical", 3.5, 4.0),
     ]
     t = np.array([0.0, 0.5, 1.5, 3.0, 3.4, 3.6, 4.5, 5.5])
-    masks = {part: t[mask].tolist() for part, mask in part_masks(t, happened, settle=1.0).items()}
+    masks = {part: t[mask].tolist() for part, mask in part_masks(t, transients, settle=1.0).items()}
     assert masks == {
         "whole": t.tolist(),
-        "calm": [1.5, 5.5],  # 0 and 0.5 are of the engagement
+        "calm": [1.5, 5.5],  # 0 and 0.5 belong to the engagement
         "command": [3.0, 3.4],
         "gust": [3.6, 4.5],  # although the command lasts to 4.1
     }
 
 
-def test_errors_are_told_by_part_and_the_bound_is_the_largest_in_calm() -> None:
+def test_errors_are_split_by_part_and_the_ultimate_bound_is_the_largest_undisturbed_error() -> None:
     y = signal([0, 1000, 2000], q=[3.0, 4.0, 0.0])
     tape = Tape({"y": y, "y_m": signal([0, 2000], q=[0.0, 0.0])}, EPOCH)
-    table = error_table(tape, [Transient("gust", "g", 0.9, 1.1)], settle=0.0)
+    table = errors_by_part(tape, [Transient("gust", "g", 0.9, 1.1)], settle=0.0)
     assert table["q"]["gust"] == (4.0, 4.0)
     assert tuple(table["q"]["calm"]) == pytest.approx((math.sqrt(4.5), 3.0))
     assert table["q"]["whole"].max == 4.0
@@ -96,44 +96,44 @@ def test_errors_are_told_by_part_and_the_bound_is_the_largest_in_calm() -> None:
 # Transients
 
 
-def test_the_controller_engages_where_its_mode_becomes_so() -> None:
+def test_engagements_are_changes_of_the_mode_to_engaged() -> None:
     mode = [Mode.ENGAGED, Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]
     internals = signal([0, 10, 20, 30, 40], mode=[float(one) for one in mode])
     assert [one.start for one in engagements(Tape({"internals": internals}, EPOCH))] == [0.0, 0.04]
 
 
-def test_live_commands_that_follow_each_other_closely_are_one() -> None:
+def test_close_live_commands_are_one_transient() -> None:
     stamps = [0.0, 500.0, 1000.0, 1500.0, 3000.0, 3500.0]
     u_m = signal(stamps, q=[0.0, 0.1, 0.2, 0.2, 0.0, 0.0], V=[1.0] * 6)
     assert live_commands(Tape({"u_m": u_m}, EPOCH)) == [
-        Transient("command", "V", 0.0, 0.0),  # what begins elsewhere than at 0 has moved
+        Transient("command", "V", 0.0, 0.0),  # a first value other than 0 is a change
         Transient("command", "q", 0.5, 1.0),
         Transient("command", "q", 3.0, 3.0),
     ]
 
 
-def test_settling_is_timed_to_the_sample_from_which_on_the_error_stays_in_the_band() -> None:
+def test_settling_time_ends_where_the_error_begins_to_stay_in_the_band() -> None:
     t = np.arange(6.0) + 10.0
     for e, settling in (
         ([0.0, 3.0, -2.0, 1.0, 0.5, 0.0], 3.0),
         ([0.0, 1.0, -1.0, 0.0, 0.0, 0.0], 0.0),
-        ([0.0, 0.0, 0.0, 5.0, 0.0, 0.0], 0.0),  # it left the band after the 2 s
+        ([0.0, 0.0, 0.0, 5.0, 0.0, 0.0], 0.0),  # leaves the band after the 2 s
         ([5.0, 0.0, 5.0, 5.0, 5.0, 2.0], None),
-        ([5.0, 0.0, 0.0, 0.0, 5.0, 0.0], 1.0),  # back for 3 s, which is enough
-        ([5.0, 0.0, 0.0, 5.0, 5.0, 0.0], 5.0),  # back for 2 s, then to the end
+        ([5.0, 0.0, 0.0, 0.0, 5.0, 0.0], 1.0),  # in the band for the dwell of 3 s
+        ([5.0, 0.0, 0.0, 5.0, 5.0, 0.0], 5.0),  # in the band for 2 s, then to the end
     ):
         assert settling_time(t, np.array(e), band=1.0, leaves=2.0, dwell=3.0) == settling
     assert settling_time(np.zeros(0), np.zeros(0), band=1.0, leaves=2.0) is None
 
 
-def test_the_band_is_a_share_of_the_reference_or_of_the_error_where_that_rests() -> None:
+def test_the_settling_band_is_a_fraction_of_the_reference_or_of_the_error_without_one() -> None:
     y = signal([0, 10], q=[0.5, -3.0], p=[0.25, 0.0])
     y_m = signal([0, 10], q=[0.0, -2.0], p=[0.0, 0.0])
     assert settling_bands(Tape({"y": y, "y_m": y_m}, EPOCH)) == {"q": 0.02, "p": 0.0025}
 
 
-def test_the_band_of_a_measured_error_is_wide_enough_for_its_noise() -> None:
-    # Second differences of +-1 about 0 are +-4: the floor is 4 / (0.6745 sqrt(6)), and 4 of it exceed 1 % of a reference of 10.
+def test_the_settling_band_of_a_measured_error_is_at_least_four_noise_floors() -> None:
+    # Second differences of +-1 are +-4: the floor is 4 / (0.6745 sqrt(6)). Four floors exceed 1 % of a reference of 10.
     stamps = [10.0 * k for k in range(100)]
     noisy, y_m = signal(stamps, q=[1.0, -1.0] * 50), signal(stamps, q=[10.0] * 100)
     floor = 4.0 / (0.6745 * math.sqrt(6.0))
@@ -142,20 +142,20 @@ def test_the_band_of_a_measured_error_is_wide_enough_for_its_noise() -> None:
     assert settling_bands(Tape({"y": noisy, "y_m": y_m, "truth": truth}, EPOCH)) == {"q": pytest.approx(0.1)}
 
 
-def test_a_transient_is_judged_up_to_the_next_that_concerns_the_channel() -> None:
+def test_settling_is_measured_up_to_the_next_transient_of_the_channel() -> None:
     # q leaves the band at 1 s and at 5 s, each time for 0.2 s; its reference of 1 makes it 0.01 wide.
     stamps = [100.0 * k for k in range(81)]
     t = np.array(stamps) / 1000.0
     error = np.where(((t > 0.95) & (t < 1.15)) | ((t > 4.95) & (t < 5.15)), 0.5, 0.0)
     y = signal(stamps, q=(1.0 + error).tolist(), p=[0.0] * 81)
     tape = Tape({"y": y, "y_m": signal(stamps, q=[1.0] * 81, p=[0.0] * 81)}, EPOCH)
-    happened = [
-        Transient("gust", "late", 9.0, 9.5),  # the flight did not come to it
+    transients = [
+        Transient("gust", "late", 9.0, 9.5),  # after the end of the flight
         Transient("command", "q", 1.0, 1.1),
         Transient("command", "p", 3.0, 3.1),
         Transient("gust", "vertical", 5.0, 5.1),
     ]
-    first, other, gust = settled(tape, happened)
+    first, other, gust = settling_times(tape, transients)
     assert first.until == {"q": 5.0}
     assert first.time == {"q": pytest.approx(0.2)}
     assert (other.transient.name, other.until, other.time) == ("p", {"p": 5.0}, {"p": 0.0})
@@ -163,28 +163,28 @@ def test_a_transient_is_judged_up_to_the_next_that_concerns_the_channel() -> Non
     assert gust.time == {"q": pytest.approx(0.2), "p": 0.0}
 
 
-# Inputs and the sign term
+# Inputs, saturation and the sign term
 
 
-def test_effort_is_the_rms_about_trim_and_the_rate_the_way_over_the_time() -> None:
-    # 0 -> 2 -> -2 -> -2 in 0.1 s each: a way of 6 in 0.3 s. sqrt((0 + 4 + 4 + 4) / 4) = sqrt(3).
+def test_control_effort_is_the_rms_about_trim_and_the_mean_rate() -> None:
+    # 0 -> 2 -> -2 -> -2 in 0.1 s each: a total variation of 6 in 0.3 s. sqrt((0 + 4 + 4 + 4) / 4) = sqrt(3).
     tape = Tape({"u": signal([0, 100, 200, 300], elevator=[0.0, 2.0, -2.0, -2.0])}, EPOCH)
-    whole = input_table(tape, [])["elevator"]["whole"]
+    whole = inputs_by_part(tape, [])["elevator"]["whole"]
     assert tuple(whole) == pytest.approx((math.sqrt(3.0), 2.0, 20.0))
     # The step into the gust and the one within it end there: 4 and 0 in 0.2 s.
-    parts = input_table(tape, [Transient("gust", "g", 0.15, 0.35)], settle=0.0)["elevator"]
+    parts = inputs_by_part(tape, [Transient("gust", "g", 0.15, 0.35)], settle=0.0)["elevator"]
     assert tuple(parts["gust"]) == pytest.approx((2.0, 2.0, 20.0))
     assert parts["calm"].rate == pytest.approx(20.0)  # 2 in 0.1 s
     assert math.isnan(parts["command"].rms)
     assert math.isnan(parts["command"].rate)
-    assert input_table(Tape({}, EPOCH), []) == {}
+    assert inputs_by_part(Tape({}, EPOCH), []) == {}
 
 
-def test_limited_ticks_are_shared_out_by_what_limited_them() -> None:
+def test_saturated_ticks_are_counted_by_kind() -> None:
     kinds = [Saturation.NO, Saturation.MAGNITUDE, Saturation.RATE, Saturation.RATE]
     internals = signal([0, 10, 20, 30], **{"limited.thrust": [float(one) for one in kinds]})
-    assert limited_shares(Tape({"internals": internals}, EPOCH)) == {"thrust": {"magnitude": 0.25, "rate": 0.5}}
-    assert limited_shares(Tape({}, EPOCH)) == {}
+    assert saturation_shares(Tape({"internals": internals}, EPOCH)) == {"thrust": {"magnitude": 0.25, "rate": 0.5}}
+    assert saturation_shares(Tape({}, EPOCH)) == {}
 
 
 def test_sign_switches_are_counted_on_the_increments_of_pi() -> None:
@@ -193,34 +193,34 @@ def test_sign_switches_are_counted_on_the_increments_of_pi() -> None:
     assert sign_switches(Tape({"internals": internals}, EPOCH)) == {"q": pytest.approx(2 / 0.06)}
 
 
-def test_sign_switches_are_those_of_the_error_where_the_controller_is_not_known() -> None:
+def test_sign_switches_without_internals_are_those_of_the_error() -> None:
     y, y_m = signal([0, 10, 20], q=[1.0, -1.0, 2.0]), signal([0, 20], q=[0.0, 0.0])
     assert sign_switches(Tape({"y": y, "y_m": y_m}, EPOCH)) == {"q": pytest.approx(2 / 0.02)}
 
 
-# What the sensors leave
+# Noise floor and spectrum
 
 
-def test_the_floor_is_the_noise_that_the_tape_knows() -> None:
+def test_the_noise_floor_is_the_recorded_noise() -> None:
     tape = Tape({"y": signal([0, 10], q=[1.0, 2.0]), "truth": signal([0, 10], **{"noise.q": [3.0, -4.0]})}, EPOCH)
     assert noise_floor(tape) == {"q": pytest.approx(math.sqrt(12.5))}
 
 
-def test_the_floor_is_found_in_y_where_the_truth_is_not_known() -> None:
-    # Normal noise of rms 0.02 on a slow sine of 1; of 20 000 samples the estimate is good to some per cent.
+def test_the_noise_floor_is_estimated_from_y_without_truth() -> None:
+    # Normal noise of rms 0.02 on a slow sine of 1; with 20 000 samples the estimate is within some per cent.
     k = np.arange(20_000)
     y = np.sin(k / 2000.0) + 0.02 * np.random.default_rng(1).standard_normal(len(k))
     tape = Tape({"y": Signal(EPOCH + k * 2 * MS, ("q",), y[:, None])}, EPOCH)
     assert noise_floor(tape)["q"] == pytest.approx(0.02, rel=0.05)
 
 
-def test_the_floor_is_never_below_the_rounding_of_y() -> None:
-    still = Tape({"y": signal([0, 10, 20, 30], q=[0.1] * 4, V=[0.0] * 4)}, EPOCH)
-    assert noise_floor(still) == {"q": 2.0**-56, "V": 0.0}  # 0.1 lies between 2^-4 and 2^-3, and 52 bits follow the first
+def test_the_noise_floor_is_at_least_the_rounding_of_y() -> None:
+    constant = Tape({"y": signal([0, 10, 20, 30], q=[0.1] * 4, V=[0.0] * 4)}, EPOCH)
+    assert noise_floor(constant) == {"q": 2.0**-56, "V": 0.0}  # 0.1 lies between 2^-4 and 2^-3, and 52 bits follow the first
 
 
-def test_the_spectrum_of_a_sine_stands_at_its_frequency_and_holds_its_variance() -> None:
-    # 5 Hz of amplitude 2: variance 2, which the square of the density gives back over all frequencies.
+def test_the_spectrum_of_a_sine_peaks_at_its_frequency_and_has_its_variance() -> None:
+    # 5 Hz of amplitude 2: variance 2, the integral of the squared density over all frequencies.
     k = np.arange(6000)
     u = Signal(EPOCH + k * 10 * MS, ("elevator",), 2.0 * np.sin(2 * np.pi * 5.0 * k / 100.0)[:, None])
     frequency, density = spectra(u, 10 * MS)
@@ -228,44 +228,44 @@ def test_the_spectrum_of_a_sine_stands_at_its_frequency_and_holds_its_variance()
     assert np.sum(density["elevator"] ** 2) * (frequency[1] - frequency[0]) == pytest.approx(2.0, rel=0.01)
 
 
-def test_a_spectrum_stands_missing_samples() -> None:
+def test_a_spectrum_bridges_missing_samples() -> None:
     k = np.delete(np.arange(1000), [100, 101, 500])
     frequency, density = spectra(Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS)
     assert frequency[-1] == 50.0
-    assert np.all(density["u"] < 1e-12)  # held over the gaps it is a constant
+    assert np.all(density["u"] < 1e-12)  # constant, for gaps repeat the sample before
 
 
-# Time
+# Timing
 
 
-def test_ticks_are_counted_against_their_period() -> None:
+def test_periods_without_a_tick_are_counted() -> None:
     # Ticks at 0, 10, 20, 40 ms: none at 30, mean 13.3 ms; the stamps are those of y, 1 ms older.
     internals = signal([-1, 9, 19, 39], late=[0.0, 1e-4, 0.0, 3e-4], age=[1e-3] * 4)
-    figures = tick_figures(Tape({"internals": internals}, EPOCH), 10 * MS)
-    assert figures is not None
-    assert (figures.ticks, figures.without_new_y, figures.period_max, figures.late_max) == (4, 1, 0.02, 3e-4)
-    assert figures.period_mean == pytest.approx(0.04 / 3, abs=1e-9)
-    assert figures.jitter == 0.0  # the last took two whole periods
+    metrics = tick_metrics(Tape({"internals": internals}, EPOCH), 10 * MS)
+    assert metrics is not None
+    assert (metrics.ticks, metrics.without_new_y, metrics.period_max, metrics.late_max) == (4, 1, 0.02, 3e-4)
+    assert metrics.period_mean == pytest.approx(0.04 / 3, abs=1e-9)
+    assert metrics.jitter == 0.0  # the last took two whole periods
 
 
-def test_jitter_is_how_far_ticks_are_from_a_whole_number_of_periods() -> None:
+def test_jitter_is_the_deviation_from_a_whole_number_of_periods() -> None:
     # 10 + 0.3, 10 - 0.4 and 20 ms: sqrt((0.09 + 0.16 + 0) / 3) ms
     internals = signal([0, 10.3, 19.9, 39.9], late=[0.0] * 4, age=[0.0] * 4)
-    figures = tick_figures(Tape({"internals": internals}, EPOCH), 10 * MS)
-    assert figures is not None
-    assert figures.jitter == pytest.approx(math.sqrt(0.25 / 3) * 1e-3)
+    metrics = tick_metrics(Tape({"internals": internals}, EPOCH), 10 * MS)
+    assert metrics is not None
+    assert metrics.jitter == pytest.approx(math.sqrt(0.25 / 3) * 1e-3)
 
 
-def test_latency_has_figures_where_the_tape_knows_it() -> None:
+def test_latency_has_metrics_if_it_is_recorded() -> None:
     latency = signal([0, 10, 20], y_to_u=[1e-3, 3e-3, 2e-3])
-    figures = latency_figures(Tape({"latency": latency}, EPOCH))
-    assert figures is not None
-    assert (figures.median, figures.max) == (2e-3, 3e-3)
-    assert latency_figures(Tape({}, EPOCH)) is None
+    metrics = latency_metrics(Tape({"latency": latency}, EPOCH))
+    assert metrics is not None
+    assert (metrics.median, metrics.max) == (2e-3, 3e-3)
+    assert latency_metrics(Tape({}, EPOCH)) is None
 
 
-def test_a_flight_of_one_tick_has_no_tick_figures() -> None:
-    assert tick_figures(Tape({"internals": signal([0], late=[0.0], age=[0.0])}, EPOCH), 10 * MS) is None
+def test_a_flight_of_one_tick_has_no_tick_metrics() -> None:
+    assert tick_metrics(Tape({"internals": signal([0], late=[0.0], age=[0.0])}, EPOCH), 10 * MS) is None
 
 
 def test_groups_of_channels_lose_their_prefix() -> None:
@@ -276,9 +276,9 @@ def test_groups_of_channels_lose_their_prefix() -> None:
         tape["x"]
 
 
-def test_a_period_is_without_a_new_y_whether_the_sample_or_the_tick_was_lost() -> None:
-    # Ticks at 0, 10, 30 ms: at 20 ms there was no y to step on, and no tick came late.
+def test_a_lost_sample_counts_like_a_missed_tick() -> None:
+    # Ticks at 0, 10, 30 ms: at 20 ms there was no new y, and no tick was late.
     internals = signal([0, 10, 30], late=[0.0] * 3, age=[0.0] * 3)
-    figures = tick_figures(Tape({"internals": internals}, EPOCH), 10 * MS)
-    assert figures is not None
-    assert (figures.ticks, figures.without_new_y, figures.late_max) == (3, 1, 0.0)
+    metrics = tick_metrics(Tape({"internals": internals}, EPOCH), 10 * MS)
+    assert metrics is not None
+    assert (metrics.ticks, metrics.without_new_y, metrics.late_max) == (3, 1, 0.0)

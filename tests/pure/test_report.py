@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report: which pictures it has of which flight, what they mark, and that it stays one small page."""
+"""The report: its figures, shaded intervals, tables and events, and the size of the page."""
 
 import base64
 import re
@@ -13,12 +13,20 @@ import plotly.graph_objects as go
 import pytest
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report import comparison, figures, plotting, tables
-from flight_analysis.report.figures import known_limits
-from flight_analysis.report.page import write_page
-from flight_analysis.report.plotting import Band, Scene, drawn_points, spans
+from flight_analysis.report import comparison, figures, plotting
+from flight_analysis.report.figures import input_limits
+from flight_analysis.report.html import Page, TableGroup, page_html, write_page
+from flight_analysis.report.plotting import Interval, PlotContext, SampleStore, decimate, mask_spans
 from flight_analysis.report.recorded_flight import RecordedFlight
-from flight_analysis.report.summary import DisplayUnit, cell, commanded, display_units, slowest, summarise, transients
+from flight_analysis.report.summary import (
+    DisplayUnit,
+    display_units,
+    format_value,
+    pulse_edges,
+    slowest_settling,
+    summarise,
+    transients,
+)
 from flight_analysis.report.tables import events
 from flight_bringup.scenarios import find_scenario
 from flight_core.outcome import COMPLETED
@@ -44,11 +52,11 @@ def signal(stamps_ms: list[float], **channels: list[float]) -> Signal:
 
 
 def ticks(count: int, **channels: list[float]) -> Signal:
-    """Internals of a controller at 100 Hz that flew on time and inside its limits, but for the channels given."""
-    quiet = {"mode": [float(Mode.ENGAGED)] * count, "dt": [0.01] * count, "late": [0.0] * count, "age": [0.0] * count}
+    """Internals of a controller at 100 Hz that was on time and never saturated, except in the channels given."""
+    default = {"mode": [float(Mode.ENGAGED)] * count, "dt": [0.01] * count, "late": [0.0] * count, "age": [0.0] * count}
     limited = {f"limited.{name}": [float(Saturation.NO)] * count for name in INPUTS}
     integrals = {f"{group}.{name}": [0.0] * count for group in ("integral_e", "Pi") for name in OUTPUTS}
-    return signal([10.0 * k for k in range(count)], **(quiet | limited | integrals | channels))
+    return signal([10.0 * k for k in range(count)], **(default | limited | integrals | channels))
 
 
 def truth(count: int, **channels: float) -> Signal:
@@ -59,14 +67,14 @@ def truth(count: int, **channels: float) -> Signal:
 
 
 def flight(count: int = 101, **signals: Signal) -> Tape:
-    """A flight at 100 Hz in which nothing moved, but for the signals given."""
+    """A flight at 100 Hz whose outputs are zero, with the signals given."""
     stamps = [10.0 * k for k in range(count)]
-    still = signal(stamps, **{name: [0.0] * count for name in OUTPUTS})
-    return Tape({"y": still, "y_m": still, **signals}, EPOCH)
+    zero = signal(stamps, **{name: [0.0] * count for name in OUTPUTS})
+    return Tape({"y": zero, "y_m": zero, **signals}, EPOCH)
 
 
-def scene(tape: Tape, units: dict[str, DisplayUnit] | None = None) -> Scene:
-    return figures.flight_scene(tape, units or {}, {})
+def context(tape: Tape, units: dict[str, DisplayUnit] | None = None) -> PlotContext:
+    return figures.plot_context(tape, units or {}, {})
 
 
 def traces(figure: go.Figure | None, name: str) -> list[Any]:
@@ -75,14 +83,14 @@ def traces(figure: go.Figure | None, name: str) -> list[Any]:
 
 
 def titles(figure: go.Figure | None) -> list[str]:
-    """What the rows are called, top down."""
+    """Titles of the rows from top to bottom."""
     assert figure is not None
     return [axis.title.text for axis in figure.select_yaxes()]
 
 
 def page_of(tmp_path: Path, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> str:
     path = tmp_path / "report.html"
-    write_page(path, [recorded("flown", scenario, tape, outcome)])
+    write_page(path, [recorded("run", scenario, tape, outcome)])
     return path.read_text(encoding="utf-8")
 
 
@@ -97,13 +105,13 @@ def headings(page: str) -> list[str]:
 # The page
 
 
-def test_a_simulated_flight_shows_everything_that_moved(tmp_path: Path, servo: Scenario) -> None:
-    whole = flight(
+def test_a_simulated_flight_has_every_figure(tmp_path: Path, servo: Scenario) -> None:
+    tape = flight(
         u=signal([10.0 * k for k in range(101)], **{name: [0.1] * 101 for name in INPUTS}),
         internals=ticks(101, late=[1e-3] * 101),
         truth=truth(101, x__q=0.0, x__V=0.0, x__p=0.0, x__r=0.0, gust__vertical=2.0, actuator__elevator=0.0, noise__q=1e-3),
     )
-    assert headings(page_of(tmp_path, servo, whole)) == [
+    assert headings(page_of(tmp_path, servo, tape)) == [
         "Output y over the reference y_m",
         "Tracking error e = y - y_m",
         "Input u and the actuators",
@@ -113,24 +121,23 @@ def test_a_simulated_flight_shows_everything_that_moved(tmp_path: Path, servo: S
         "Error of the sensors",
         "Spectrum of u",
         "Ticks of the controller",
-        "How the ticks were spread",
+        "Timing of the ticks",
     ]
 
 
-def test_a_log_that_knows_only_y_and_its_reference_has_a_report(tmp_path: Path, servo: Scenario) -> None:
+def test_a_log_of_only_y_and_its_reference_has_a_report(tmp_path: Path, servo: Scenario) -> None:
     page = page_of(tmp_path, servo, flight())
     assert headings(page) == ["Output y over the reference y_m", "Tracking error e = y - y_m"]
-    assert "What happened" not in page
+    assert "Events" not in page
 
 
 def test_a_flight_of_one_sample_has_a_report(tmp_path: Path, servo: Scenario) -> None:
     one = flight(1, u=signal([0], **{name: [0.0] for name in INPUTS}), internals=ticks(1), truth=truth(1, x__q=0.0))
-    assert len(headings(page_of(tmp_path, servo, one))) == 5  # y, e, u, states, integrals: nothing blew, no tick was late
+    assert len(headings(page_of(tmp_path, servo, one))) == 5  # y, e, u, states, integrals: no wind, no late tick
 
 
-def test_a_minute_is_a_page_below_eight_megabytes(tmp_path: Path, servo: Scenario) -> None:
-    # White noise on all channels of the scenario at its rates, all samples of it: nothing can be left out, and little
-    # compressed. plotly itself takes 2 MB. Measured 7.3 MB.
+def test_the_page_of_a_minute_is_below_eight_megabytes(tmp_path: Path, servo: Scenario) -> None:
+    # White noise on all channels at the rates of the scenario hardly compresses. plotly itself takes 2 MB. Measured 7.3 MB.
     random = np.random.default_rng(1)
 
     def noise(rate: int, names: list[str]) -> Signal:
@@ -153,71 +160,71 @@ def test_a_minute_is_a_page_below_eight_megabytes(tmp_path: Path, servo: Scenari
     assert 'src="http' not in page
 
 
-def test_words_from_outside_are_shown_as_words(tmp_path: Path, servo: Scenario) -> None:
+def test_text_of_a_log_is_escaped(tmp_path: Path, servo: Scenario) -> None:
     page = page_of(tmp_path, servo, flight(), outcome="ended: <script>alert(1)</script>")
     assert "ended: &lt;script&gt;alert(1)&lt;/script&gt;" in page
     assert "<script>alert" not in page
 
 
-def test_every_colour_of_a_page_has_its_own_in_the_dark(tmp_path: Path, servo: Scenario) -> None:
-    # Colours of modes and limits are told apart on both grounds; all others are drawn on the ground of the page.
-    both = {*figures.MODE_COLOURS.values(), *figures.LIMITED_COLOURS.values(), figures.GUST}
-    whole = flight(
+def test_every_colour_of_a_page_has_a_dark_counterpart(tmp_path: Path, servo: Scenario) -> None:
+    # Colours of modes, saturations and gusts serve light and dark pages alike.
+    shared = {*figures.MODE_COLOURS.values(), *figures.SATURATION_COLOURS.values(), figures.GUST}
+    tape = flight(
         u=signal([10.0 * k for k in range(101)], **{name: [0.1] * 101 for name in INPUTS}),
         internals=ticks(101, late=[1e-3] * 101),
         truth=truth(101, x__q=0.0, x__V=0.0, x__p=0.0, x__r=0.0, gust__up=2.0, actuator__elevator=0.0, noise__q=1e-3),
     )
-    specifications = re.findall(r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, whole))
+    specifications = re.findall(r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, tape))
     used = set(re.findall(r"#[0-9a-f]{6}", " ".join(specifications)))
-    assert used - both <= set(plotting.DARK | figures.DARK)
+    assert used - shared <= set(plotting.DARK | figures.DARK)
     assert len(used) > 5
 
 
-# What happened
+# Events and intervals
 
 
-def test_events_are_told_once_each_in_the_order_of_their_first_instant() -> None:
+def test_each_event_is_listed_once_in_order_of_its_start() -> None:
     mode = (
         [Mode.ENGAGED] * 20 + [Mode.HOLD] * 10 + [Mode.ENGAGED] * 20 + [Mode.HOLD] * 5 + [Mode.RAMP] * 5 + [Mode.ENGAGED] * 41
     )
     rate = [Saturation.NO] * 2 + [Saturation.RATE] * 3 + [Saturation.NO] * 90 + [Saturation.RATE] + [Saturation.NO] * 5
     tape = flight(internals=ticks(101, mode=[float(one) for one in mode], **{"limited.thrust": [float(one) for one in rate]}))
-    told = events(tape, {"lateral": (0.9, 2.0), "vertical": (5.0, 6.0)})
-    assert [(event.what, round(event.start, 3), round(event.stop, 3), event.how_much) for event in told] == [
-        ("thrust limited: rate", 0.02, 0.95, "4 of 101 ticks"),
+    listed = events(tape, {"lateral": (0.9, 2.0), "vertical": (5.0, 6.0)})
+    assert [(event.name, round(event.start, 3), round(event.stop, 3), event.extent) for event in listed] == [
+        ("thrust saturated: rate", 0.02, 0.95, "4 of 101 ticks"),
         ("hold", 0.2, 0.55, "0.15 s, 2 times"),  # 0.2 s to 0.3 s and 0.5 s to 0.55 s
         ("ramp", 0.55, 0.6, "0.05 s"),
-        ("lateral gust", 0.9, 1.0, "0.10 s"),  # the flight ends in it, and before the other
+        ("lateral gust", 0.9, 1.0, "0.10 s"),  # the flight ends during it, before the other gust
     ]
 
 
 def test_a_span_ends_where_the_next_sample_begins() -> None:
     t = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
-    assert spans(t, np.array([False, True, True, False, True])) == [(1.0, 4.0), (5.0, 5.0)]
-    assert spans(t, np.zeros(5, dtype=bool)) == []
-    assert spans(np.zeros(0), np.zeros(0, dtype=bool)) == []
+    assert mask_spans(t, np.array([False, True, True, False, True])) == [(1.0, 4.0), (5.0, 5.0)]
+    assert mask_spans(t, np.zeros(5, dtype=bool)) == []
+    assert mask_spans(np.zeros(0), np.zeros(0, dtype=bool)) == []
 
 
-def test_spans_closer_than_can_be_seen_are_one_and_none_is_too_short_to_see() -> None:
+def test_close_spans_are_merged_and_short_ones_lengthened() -> None:
     t = np.arange(10.0)
     mask = np.array([True, False, True, False, False, False, False, True, False, False])
-    assert spans(t, mask) == [(0.0, 1.0), (2.0, 3.0), (7.0, 8.0)]
-    assert spans(t, mask, join=1.5) == [(0.0, 3.5), (7.0, 8.5)]
+    assert mask_spans(t, mask) == [(0.0, 1.0), (2.0, 3.0), (7.0, 8.0)]
+    assert mask_spans(t, mask, min_length=1.5) == [(0.0, 3.5), (7.0, 8.5)]
 
 
-def test_every_mode_but_engaged_is_a_band_under_its_name() -> None:
+def test_every_mode_but_engaged_is_an_interval_with_its_name() -> None:
     assert set(figures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
-    assert set(figures.LIMITED_COLOURS) == set(Saturation) - {Saturation.NO}
+    assert set(figures.SATURATION_COLOURS) == set(Saturation) - {Saturation.NO}
     modes = [float(one) for one in Mode for _ in range(10)]
-    bands = figures.mode_bands(flight(60, internals=ticks(60, mode=modes)))
-    assert {band.label: (round(band.start, 3), round(band.stop, 3)) for band in bands} == {
+    intervals = figures.mode_intervals(flight(60, internals=ticks(60, mode=modes)))
+    assert {one.label: (round(one.start, 3), round(one.stop, 3)) for one in intervals} == {
         "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5), "inactive": (0.5, 0.59),
     }  # fmt: skip
 
 
-def test_bands_are_drawn_over_the_whole_height_of_every_figure() -> None:
-    bands = [Band("hold", 0.2, 0.3, "#f2c230", False), Band("a gust", 0.5, 0.6, "#7f7f7f", True)]
-    drawn = figures.tracking_figure(scene(flight())._replace(bands=bands))
+def test_intervals_are_shaded_over_the_whole_height_of_a_figure() -> None:
+    intervals = [Interval("hold", 0.2, 0.3, "#f2c230", False), Interval("a gust", 0.5, 0.6, "#7f7f7f", True)]
+    drawn = figures.tracking_figure(context(flight())._replace(intervals=intervals))
     assert [(shape.x0, shape.x1, shape.y0, shape.y1, shape.yref) for shape in drawn.layout.shapes] == [
         (0.2, 0.3, 0, 1, "paper"),
         (0.5, 0.6, 0, 1, "paper"),
@@ -230,7 +237,7 @@ def test_bands_are_drawn_over_the_whole_height_of_every_figure() -> None:
 
 
 def input_flight(**limited: list[float]) -> Tape:
-    """Elevator up to 2 deg, the others at rest."""
+    """The elevator at 2 deg, the other inputs at trim."""
     u = {name: [0.0] * 101 for name in INPUTS} | {"elevator": [2.0 * DEG] * 101}
     return flight(u=signal([10.0 * k for k in range(101)], **u), internals=ticks(101, **limited))
 
@@ -240,7 +247,7 @@ def test_limits_near_the_input_are_in_view_and_far_ones_are_not(servo: Scenario)
     near = servo.vary(controller={"lower": [-3 * DEG, -1.0, -1.0, -1.0], "upper": [3 * DEG, 1.0, 1.0, 1.0]})
     for scenario, limit, inside in ((near, 3.0, True), (servo, 30.0, False)):
         tape = input_flight()
-        figure = figures.input_figure(scene(tape, units), known_limits(scenario, tape))
+        figure = figures.input_figure(context(tape, units), input_limits(scenario, tape))
         assert figure is not None
         lines = traces(figure, "limits of the controller")
         assert [line.y[0] for line in lines[:2]] == pytest.approx([-limit, limit])  # deg
@@ -248,29 +255,29 @@ def test_limits_near_the_input_are_in_view_and_far_ones_are_not(servo: Scenario)
         assert (low <= 2.0 <= high, low <= limit <= high) == (True, inside)
 
 
-def test_end_stops_are_those_of_actuators_that_are_simulated(servo: Scenario) -> None:
-    # The scenario gives them in the airframe's order, u has the law's: thrust is the one of 50 %.
+def test_end_stops_are_drawn_where_actuators_are_simulated(servo: Scenario) -> None:
+    # End stops are in the airframe's order, u in the law's: only thrust has 50 %.
     tape = input_flight()
-    assert set(known_limits(servo, tape)) == {"limits of the controller"}
+    assert set(input_limits(servo, tape)) == {"limits of the controller"}
     simulated = flight(truth=truth(101, actuator__elevator=0.0))
-    stops = known_limits(servo, simulated)["end stops"]
+    stops = input_limits(servo, simulated)["end stops"]
     assert stops["thrust"] == (-0.5, 0.5)
     assert stops["elevator"] == pytest.approx((-30.0 * DEG, 30.0 * DEG), rel=1e-5)
 
 
 def test_an_input_without_limits_has_no_lines(osprey_gust: Scenario) -> None:
     tape = input_flight()
-    figure = figures.input_figure(scene(tape), known_limits(osprey_gust, tape))
+    figure = figures.input_figure(context(tape), input_limits(osprey_gust, tape))
     assert not traces(figure, "limits of the controller")
 
 
-def test_when_an_input_was_limited_is_marked_in_its_row_alone() -> None:
+def test_saturation_of_an_input_is_marked_in_its_row_alone() -> None:
     limited = [float(Saturation.NO)] * 101
     limited[50:60] = [float(Saturation.MAGNITUDE)] * 10
     limited[80] = float(Saturation.RATE)
     tape = input_flight(**{"limited.aileron": limited})
-    figure = figures.input_figure(scene(tape), {})
-    (magnitude,), (rate,) = traces(figure, "limited: magnitude"), traces(figure, "limited: rate")
+    figure = figures.input_figure(context(tape), {})
+    (magnitude,), (rate,) = traces(figure, "saturated: magnitude"), traces(figure, "saturated: rate")
     assert magnitude.yaxis == rate.yaxis == "y2"  # aileron is the second row
     assert magnitude.x[:2] == pytest.approx((0.5, 0.6))
     assert rate.x[:2] == pytest.approx((0.8, 0.81))
@@ -278,58 +285,58 @@ def test_when_an_input_was_limited_is_marked_in_its_row_alone() -> None:
 
 def test_the_actuator_is_drawn_over_the_command_by_name() -> None:
     tape = input_flight()
-    behind = flight(u=tape["u"], truth=truth(101, actuator__thrust=0.3, actuator__elevator=0.01))
-    figure = figures.input_figure(scene(behind, {"elevator": DisplayUnit("deg", 1 / DEG)}), {})
+    lagging = flight(u=tape["u"], truth=truth(101, actuator__thrust=0.3, actuator__elevator=0.01))
+    figure = figures.input_figure(context(lagging, {"elevator": DisplayUnit("deg", 1 / DEG)}), {})
     assert titles(figure) == ["elevator (deg)", "aileron", "rudder", "thrust"]
     by_axis = {trace.yaxis: trace.y[0] for trace in traces(figure, "actuator")}
     assert by_axis == {"y": pytest.approx(0.01 / DEG), "y4": pytest.approx(0.3)}
     assert len(traces(figure, "command u")) == 4
 
 
-# What only a simulation knows
+# Signals that only a simulation records
 
 
-def test_states_of_any_name_are_shown_those_of_known_unit_in_it() -> None:
+def test_all_states_are_drawn_in_their_unit_where_it_is_known() -> None:
     tape = flight(truth=truth(101, x__q=0.25, x__altitude=1200.0))
-    figure = figures.state_figure(scene(tape, {"q": DisplayUnit("mrad/s", 1e3)}))
+    figure = figures.state_figure(context(tape, {"q": DisplayUnit("mrad/s", 1e3)}))
     assert titles(figure) == ["q (mrad/s)", "altitude"]
     assert [trace.y[0] for trace in traces(figure, "x")] == [250.0, 1200.0]
 
 
-def test_sensors_without_error_and_air_at_rest_are_left_out() -> None:
-    calm = scene(flight(truth=truth(101, noise__q=0.0, gust__vertical=0.0, x__q=0.0)))
-    assert figures.sensor_figure(calm) is None
-    assert figures.wind_figure(calm) is None
-    some = scene(flight(truth=truth(101, noise__q=0.0, noise__V=0.1, gust__vertical=0.0, gust__longitudinal=1.0)))
-    assert titles(figures.sensor_figure(some)) == ["V"]
-    assert titles(figures.wind_figure(some)) == ["longitudinal (m/s)"]
+def test_ideal_sensors_and_still_air_have_no_figure() -> None:
+    ideal = context(flight(truth=truth(101, noise__q=0.0, gust__vertical=0.0, x__q=0.0)))
+    assert figures.sensor_figure(ideal) is None
+    assert figures.wind_figure(ideal) is None
+    real = context(flight(truth=truth(101, noise__q=0.0, noise__V=0.1, gust__vertical=0.0, gust__longitudinal=1.0)))
+    assert titles(figures.sensor_figure(real)) == ["V"]
+    assert titles(figures.wind_figure(real)) == ["longitudinal (m/s)"]
 
 
 def test_the_true_error_is_drawn_over_the_measured_one_where_they_differ() -> None:
     states = {f"x__{name}": 0.5 for name in OUTPUTS}
-    quiet = figures.error_figure(scene(flight(truth=truth(101, **states, noise__q=0.0))))
-    assert {trace.name for trace in quiet.data} == {"e"}
-    noisy = figures.error_figure(scene(flight(truth=truth(101, **states, noise__q=0.1))))
+    ideal = figures.error_figure(context(flight(truth=truth(101, **states, noise__q=0.0))))
+    assert {trace.name for trace in ideal.data} == {"e"}
+    noisy = figures.error_figure(context(flight(truth=truth(101, **states, noise__q=0.1))))
     assert [traces(noisy, name)[0].y[0] for name in ("measured", "true")] == [0.0, 0.5]
 
 
-def test_ticks_are_shown_where_one_was_late_or_y_old_or_dt_changed() -> None:
-    assert figures.tick_figure(scene(flight(internals=ticks(101)))) is None
+def test_ticks_have_a_figure_if_one_was_late_or_y_was_old_or_dt_changed() -> None:
+    assert figures.tick_figure(context(flight(internals=ticks(101)))) is None
     for channel, values in (("late", [0.0] * 100 + [1e-4]), ("age", [2e-3] * 101), ("dt", [0.0] + [0.01] * 99 + [0.02])):
-        figure = figures.tick_figure(scene(flight(internals=ticks(101, **{channel: values}))))
+        figure = figures.tick_figure(context(flight(internals=ticks(101, **{channel: values}))))
         assert titles(figure) == ["late (ms)", "age (ms)", "dt (ms)"]
 
 
-def test_the_floor_of_the_error_is_drawn_on_both_sides_where_it_can_be_seen() -> None:
+def test_a_visible_noise_floor_is_drawn_on_both_sides_of_zero() -> None:
     tape = flight(y=signal([0, 1000], **{name: [1.0, 0.0] for name in OUTPUTS}))
-    figure = figures.error_figure(scene(tape), {"q": 0.5, "V": 1e-9})
-    (floor,) = traces(figure, "floor")
-    assert (floor.yaxis, set(floor.y)) == ("y", {0.5, -0.5})  # q alone
+    figure = figures.error_figure(context(tape), {"q": 0.5, "V": 1e-9})
+    (floor,) = traces(figure, "noise floor")
+    assert (floor.yaxis, set(floor.y)) == ("y", {0.5, -0.5})  # only that of q is visible
 
 
 def test_both_integrals_of_an_output_stand_side_by_side() -> None:
     tape = flight(internals=ticks(101, **{"Pi.p": [0.0] * 100 + [3.0], "integral_e.p": [0.0] * 100 + [2.0]}))
-    figure = figures.integral_figure(scene(tape))
+    figure = figures.integral_figure(context(tape))
     assert figure is not None
     assert titles(figure)[4:6] == ["∫e p", "Pi p"]
     assert [trace.y[-1] for trace in figure.data[4:6]] == [2.0, 3.0]
@@ -339,17 +346,17 @@ def test_the_spectrum_of_a_commanded_sine_has_its_peak_there() -> None:
     stamps = [10.0 * k for k in range(1001)]
     sine = np.sin(2.0 * np.pi * 5.0 * np.array(stamps) / 1000.0)
     u = signal(stamps, elevator=sine.tolist(), thrust=[0.0] * 1001)
-    figure = figures.spectrum_figure(scene(flight(u=u), {"elevator": DisplayUnit("deg", 1 / DEG)}), 10 * MS)
+    figure = figures.spectrum_figure(context(flight(u=u), {"elevator": DisplayUnit("deg", 1 / DEG)}), 10 * MS)
     assert figure is not None
     assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
     assert figure.data[0].x[np.argmax(figure.data[0].y)] == pytest.approx(5.0, abs=0.2)
-    assert figures.spectrum_figure(scene(flight(u=u.until(EPOCH + 100 * MS))), 10 * MS) is None  # eleven samples
+    assert figures.spectrum_figure(context(flight(u=u.until(EPOCH + 100 * MS))), 10 * MS) is None  # eleven samples
 
 
-def test_the_controllers_time_is_spread_where_there_is_any() -> None:
-    assert figures.timing_figure(scene(flight(internals=ticks(101))), 10 * MS) is None
-    waiting = flight(internals=ticks(101), latency=signal([0, 10, 20], y_to_u=[1e-3, 1e-3, 3e-3]))
-    figure = figures.timing_figure(scene(waiting), 10 * MS)
+def test_timing_has_a_histogram_if_it_is_not_zero() -> None:
+    assert figures.timing_figure(context(flight(internals=ticks(101))), 10 * MS) is None
+    delayed = flight(internals=ticks(101), latency=signal([0, 10, 20], y_to_u=[1e-3, 1e-3, 3e-3]))
+    figure = figures.timing_figure(context(delayed), 10 * MS)
     assert figure is not None
     assert [axis.title.text for axis in figure.select_xaxes()] == ["y sent to u sent (ms)"]
     assert [count for count in figure.data[0].y if count] == [2.0, 1.0]
@@ -367,50 +374,53 @@ def pair(servo: Scenario) -> list[RecordedFlight]:
     return [recorded("a", servo, first), recorded("b", servo, second)]
 
 
-def test_figures_of_several_flights_stand_beside_each_other_by_name(pair: list[RecordedFlight]) -> None:
-    blocks = {block.name: {row.what: row for row in block.rows} for block in comparison.error_blocks(pair)}
-    assert list(blocks) == ["q (mrad/s)", "V (m/s)", "p (mrad/s)", "r (mrad/s)"]
-    whole = blocks["q (mrad/s)"]["rms whole"]
+def test_metrics_of_several_flights_are_compared_by_channel_name(pair: list[RecordedFlight]) -> None:
+    compared = {table.caption: {row.name: row for row in table.rows} for table in comparison.error_tables(pair)}
+    assert list(compared) == ["q (mrad/s)", "V (m/s)", "p (mrad/s)", "r (mrad/s)"]
+    whole = compared["q (mrad/s)"]["rms whole"]
     assert whole.texts == ("200", "100")
     assert whole.ratios == pytest.approx((1.0, 0.5))
-    assert blocks["p (mrad/s)"]["rms whole"].texts == ("0.00", "-")
-    assert blocks["p (mrad/s)"]["rms whole"].ratios == (None, None)  # nothing divides by 0
-    assert "rms gust" not in blocks["q (mrad/s)"]  # neither came to one
+    assert compared["p (mrad/s)"]["rms whole"].texts == ("0.00", "-")
+    assert compared["p (mrad/s)"]["rms whole"].ratios == (None, None)  # no ratio to 0
+    assert "rms gust" not in compared["q (mrad/s)"]  # neither flight had one
 
 
-def test_less_error_is_better_and_less_input_is_neither(pair: list[RecordedFlight]) -> None:
-    def cells(judged: bool) -> str:
-        rows = tuple(comparison.ComparisonRow("rms", ("1", "2"), (1.0, ratio), judged) for ratio in (0.5, 1.01, 2.0, None))
-        return tables.compared_tables([comparison.ComparisonBlock("q", rows)], ["", ""])
+def test_less_error_is_better_and_less_input_is_neither() -> None:
+    def verdicts(lower_is_better: bool) -> list[str]:
+        ratios = (0.5, 1.01, 2.0, None)
+        rows = [comparison.ComparisonRow("rms", ("1", "2"), (1.0, ratio), lower_is_better) for ratio in ratios]
+        group = TableGroup([comparison.ComparisonTable("q", tuple(rows))], colours=comparison.COLOURS[:2])
+        page = page_html(Page("", [], [group], [], SampleStore()))
+        return re.findall('class="(better|same|worse)"', page)
 
-    assert re.findall('class="(better|same|worse)"', cells(True)) == ["better", "same", "worse", "same"]
-    assert set(re.findall('class="(better|same|worse)"', cells(False))) == {"same"}
+    assert verdicts(True) == ["better", "same", "worse", "same"]
+    assert verdicts(False) == ["same"] * 4
 
 
-def test_curves_of_several_flights_lie_over_each_other_and_one_reference_below(pair: list[RecordedFlight]) -> None:
-    drawn = comparison.tracking_figure(comparison.scene(pair), pair)
-    of_q = [trace for trace in drawn.data if trace.yaxis == "y"]
-    assert [trace.name for trace in of_q] == ["y_m", "a", "b"]
-    assert [trace.y[0] for trace in of_q] == pytest.approx([1000.0, 1200.0, 1100.0])
+def test_curves_of_several_flights_are_drawn_over_one_reference(pair: list[RecordedFlight]) -> None:
+    drawn = comparison.tracking_figure(comparison.plot_context(pair), pair)
+    q = [trace for trace in drawn.data if trace.yaxis == "y"]
+    assert [trace.name for trace in q] == ["y_m", "a", "b"]
+    assert [trace.y[0] for trace in q] == pytest.approx([1000.0, 1200.0, 1100.0])
     assert [trace.name for trace in drawn.data if trace.yaxis == "y3"] == ["y_m", "a"]  # p
-    errors = comparison.error_figure(comparison.scene(pair), pair)
+    errors = comparison.error_figure(comparison.plot_context(pair), pair)
     assert [trace.y[0] for trace in errors.data if trace.yaxis == "y"] == pytest.approx([200.0, 100.0])
 
 
-def test_a_reference_of_its_own_is_drawn_for_each_flight(pair: list[RecordedFlight], servo: Scenario) -> None:
+def test_each_distinct_reference_is_drawn(pair: list[RecordedFlight], servo: Scenario) -> None:
     other = flight(y_m=signal([0, 1000], **{name: [0.0, 2.0] for name in OUTPUTS}))
     three = [*pair, recorded("c", servo, other)]
-    drawn = comparison.tracking_figure(comparison.scene(three), three)
+    drawn = comparison.tracking_figure(comparison.plot_context(three), three)
     assert [trace.name for trace in drawn.data if trace.yaxis == "y"] == ["y_m a", "y_m c", "a", "b", "c"]
 
 
-def test_every_flight_is_in_the_legend_once_whatever_channels_it_has(servo: Scenario) -> None:
+def test_each_flight_is_in_the_legend_once_whatever_its_channels(servo: Scenario) -> None:
     def only(*names: str) -> Tape:
         y = signal([10.0 * k for k in range(101)], **{name: [1.0] * 101 for name in names})
         return Tape({"y": y, "y_m": y, "u": y, "latency": signal([0, 10], y_to_u=[1e-3, 2e-3])}, EPOCH)
 
     two = [recorded("a", servo, only("q", "V")), recorded("b", servo, only("V", "p"))]
-    shared = comparison.scene(two)
+    shared = comparison.plot_context(two)
     for drawn in (
         comparison.error_figure(shared, two),
         comparison.spectrum_figure(shared, two),
@@ -420,7 +430,7 @@ def test_every_flight_is_in_the_legend_once_whatever_channels_it_has(servo: Scen
         assert [trace.name for trace in drawn.data if trace.showlegend] == ["a", "b"]
 
 
-def test_flights_of_one_name_are_numbered(pair: list[RecordedFlight]) -> None:
+def test_flights_of_equal_names_are_numbered(pair: list[RecordedFlight]) -> None:
     assert comparison.labels([pair[0], pair[1], pair[0]]) == ["a (1)", "b", "a (3)"]
 
 
@@ -433,100 +443,100 @@ def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> N
     assert headings(page) == ["Tracking error", "Output y over the reference y_m", "Tracking error e = y - y_m"]
 
 
-# Words and numbers
+# Transients and formats
 
 
-def test_the_edges_of_pulses_are_the_commands(osprey_gust: Scenario) -> None:
+def test_commands_are_the_edges_of_pulses(osprey_gust: Scenario) -> None:
     pulses = {"q": {"start": [2.0, 6.0], "stop": [4.0, 8.0], "value": [0.1, -0.1]}}
-    edges = commanded(osprey_gust.vary(reference_model={"pulses": pulses, "rise": 0.1}))
+    edges = pulse_edges(osprey_gust.vary(reference_model={"pulses": pulses, "rise": 0.1}))
     assert [(edge.kind, edge.name, edge.start) for edge in edges] == [("command", "q", at) for at in (2.0, 4.0, 6.0, 8.0)]
     assert [edge.stop for edge in edges] == pytest.approx([2.1, 4.1, 6.1, 8.1])
 
 
-def test_live_commands_take_the_place_of_the_scenarios(osprey_gust: Scenario) -> None:
+def test_live_commands_replace_those_of_the_scenario(osprey_gust: Scenario) -> None:
     live = signal([5000, 5500], q=[0.0, 0.1])
-    happened = [one for one in transients(osprey_gust, flight(u_m=live)) if one.kind == "command"]
-    assert [one.start for one in happened] == [2.0, 4.0, 5.5]  # the scenario has q at 2, 4, 6 and 8 s, and more
+    commands = [one for one in transients(osprey_gust, flight(u_m=live)) if one.kind == "command"]
+    assert [one.start for one in commands] == [2.0, 4.0, 5.5]  # the scenario has q at 2, 4, 6 and 8 s, and more
 
 
-def test_the_slowest_settling_says_where_the_time_was_too_short_for_it() -> None:
+def test_slowest_settling_marks_a_transient_after_which_the_error_did_not_settle() -> None:
     def settling(*times: float | None) -> str:
-        told = [{"kind": "gust", "start": 1.0, "until": {"q": 3.5}, "settling": {"q": time}} for time in times]
-        return slowest({"transients": told}, "q", "gust")
+        entries = [{"kind": "gust", "start": 1.0, "until": {"q": 3.5}, "settling": {"q": time}} for time in times]
+        return slowest_settling({"transients": entries}, "q", "gust")
 
     assert settling() == "-"
     assert settling(0.5, 2.0) == "2.00"
     assert settling(0.5, None) == "> 2.50"
 
 
-def test_figures_have_three_digits() -> None:
-    assert [cell(value) for value in (None, 0.0, 1.0, 123.4, 4.5678e-7)] == ["-", "0.00", "1.00", "123", "4.57e-07"]
+def test_values_have_three_digits() -> None:
+    assert [format_value(value) for value in (None, 0.0, 1.0, 123.4, 4.5678e-7)] == ["-", "0.00", "1.00", "123", "4.57e-07"]
 
 
 # Curves
 
 
-def test_a_curve_is_broken_where_samples_are_missing_and_u_is_held() -> None:
+def test_a_curve_is_broken_at_a_gap_and_u_is_held() -> None:
     stamps = [10.0 * k for k in range(101) if not 30 <= k < 60]
-    holed = signal(stamps, **{name: [1.0] * len(stamps) for name in OUTPUTS})
+    gapped = signal(stamps, **{name: [1.0] * len(stamps) for name in OUTPUTS})
     u = signal(stamps, **{name: [1.0] * len(stamps) for name in INPUTS})
-    tape = Tape({"y": holed, "y_m": flight()["y"], "u": u}, EPOCH)
-    y: FloatArray = traces(figures.tracking_figure(scene(tape)), "y")[0].y
+    tape = Tape({"y": gapped, "y_m": flight()["y"], "u": u}, EPOCH)
+    y: FloatArray = traces(figures.tracking_figure(context(tape)), "y")[0].y
     assert np.flatnonzero(np.isnan(y)).tolist() == [30]
-    assert not np.isnan(traces(figures.input_figure(scene(tape), {}), "u")[0].y).any()
+    assert not np.isnan(traces(figures.input_figure(context(tape), {}), "u")[0].y).any()
 
 
-def test_what_is_drawn_of_a_long_signal_keeps_its_peaks() -> None:
+def test_decimation_keeps_peaks() -> None:
     values = np.zeros(11_999)
-    values[[5001, 7003]] = 4.0, -3.0  # one sample each: every second sample would miss both
-    drawn = drawn_points(values, 6000)
+    values[[5001, 7003]] = 4.0, -3.0  # one sample each, which every second sample would miss
+    drawn = decimate(values, 6000)
     assert len(drawn) <= 6000
     assert (np.diff(drawn) > 0).all()
     assert (values[drawn].max(), values[drawn].min()) == (4.0, -3.0)
-    assert drawn_points(values[:6000], 6000).tolist() == list(range(6000))
+    assert decimate(values[:6000], 6000).tolist() == list(range(6000))
 
 
-def test_a_break_of_a_curve_is_drawn_beside_its_peaks() -> None:
+def test_decimation_keeps_gaps_beside_peaks() -> None:
     values = np.zeros(10_000)
     values[[500, 501, 502]] = 1.0, np.nan, -1.0
-    drawn = drawn_points(values, 100)
+    drawn = decimate(values, 100)
     assert {500, 501, 502} <= set(drawn.tolist())
     assert len(drawn) <= 101
 
 
 def unpacked(text: str, kind: str) -> FloatArray:
-    """What the page's script makes of packed samples."""
-    sorted_bytes = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype=np.uint8)
-    return np.ascontiguousarray(sorted_bytes.reshape(np.dtype(kind).itemsize, -1).T).view(kind)[:, 0]
+    """Unpack samples as the page's script does."""
+    shuffled = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype=np.uint8)
+    return np.ascontiguousarray(shuffled.reshape(np.dtype(kind).itemsize, -1).T).view(kind)[:, 0]
 
 
-def test_all_samples_of_what_is_thinned_out_are_kept_once() -> None:
+def test_all_samples_of_decimated_curves_are_stored_once() -> None:
     count = 5000
     stamps = EPOCH + np.arange(count, dtype=np.int64) * 2 * MS
     y = Signal(stamps, OUTPUTS, np.random.default_rng(1).standard_normal((count, 4)))
-    shared = scene(Tape({"y": y, "y_m": Signal(stamps, OUTPUTS, np.zeros((count, 4)))}, EPOCH - 7))
+    shared = context(Tape({"y": y, "y_m": Signal(stamps, OUTPUTS, np.zeros((count, 4)))}, EPOCH - 7))
     drawn = [*figures.tracking_figure(shared).data, *figures.error_figure(shared).data]
-    of_q = [trace for trace in drawn if trace.yaxis == "y"]
-    assert [len(trace.y) < count for trace in of_q] == [True] * 3
-    instants = np.cumsum(unpacked(shared.samples.packed[of_q[1].meta["t"]], "<f8"))
+    q = [trace for trace in drawn if trace.yaxis == "y"]
+    assert [len(trace.y) < count for trace in q] == [True] * 3
+    instants = np.cumsum(unpacked(shared.samples.packed[q[1].meta["t"]], "<f8"))
     assert instants.tolist() == (stamps - EPOCH + 7).tolist()  # to the nanosecond
-    assert unpacked(shared.samples.packed[of_q[1].meta["v"]], "<f4").tolist() == y["q"].astype(np.float32).tolist()
-    assert of_q[1].meta["v"] == of_q[2].meta["v"]  # y_m is 0: e is y
+    assert unpacked(shared.samples.packed[q[1].meta["v"]], "<f4").tolist() == y["q"].astype(np.float32).tolist()
+    assert q[1].meta["v"] == q[2].meta["v"]  # y_m is 0, so e equals y
     assert len(shared.samples.packed) == 1 + 4 + 1  # one time, four y, and the zeros of all y_m
 
 
-def test_a_curve_of_few_samples_is_drawn_whole_and_kept_nowhere_else() -> None:
-    shared = scene(flight())
+def test_a_curve_of_few_samples_is_drawn_whole_and_not_stored() -> None:
+    shared = context(flight())
     assert traces(figures.tracking_figure(shared), "y")[0].meta is None
     assert shared.samples.packed == {}
 
 
-def test_names_of_bands_that_would_run_into_each_other_are_one() -> None:
-    bands = [Band(name, start, start + 1.0, "#7f7f7f", True) for name, start in (("c", 50.0), ("a", 10.0), ("b", 12.0))]
-    drawn = figures.tracking_figure(scene(flight(10_001))._replace(bands=bands))
+def test_overlapping_labels_of_intervals_are_merged() -> None:
+    intervals = [Interval(name, start, start + 1.0, "#7f7f7f", True) for name, start in (("c", 50.0), ("a", 10.0), ("b", 12.0))]
+    drawn = figures.tracking_figure(context(flight(10_001))._replace(intervals=intervals))
     assert [(note.x, note.text) for note in drawn.layout.annotations] == [(10.0, "a, b"), (50.0, "c")]
 
 
-def test_time_is_that_of_the_flight_whatever_the_stamps() -> None:
-    drawn = traces(figures.tracking_figure(scene(flight())), "y")[0]
+def test_the_time_axis_is_flight_time_whatever_the_stamps() -> None:
+    drawn = traces(figures.tracking_figure(context(flight())), "y")[0]
     assert (drawn.x[0], drawn.x[-1]) == (0.0, 1.0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di report`: of one run or several, as page, picture, table and JSON."""
+"""`rise-di report`: one run or several, as page, figure, table and JSON."""
 
 import json
 from pathlib import Path
@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from tests.joint_states import JOINT_STATE, vector
 
-from flight_analysis.report.run_folder import conclude, new_run
-from flight_analysis.report.summary import summarise_unflown
+from flight_analysis.report.run_folder import new_run, write_report
+from flight_analysis.report.summary import empty_summary
 from flight_bringup.fly import fly_in_process
 from flight_bringup.scenarios import find_scenario
 from flight_cli.report import report
@@ -25,17 +25,17 @@ EPOCH = 1_795_000_000_000_000_000
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two flights of two seconds, of different scenarios."""
-    where, flown = tmp_path_factory.mktemp("runs"), []
+    folder, runs = tmp_path_factory.mktemp("runs"), []
     for name in ("osprey_gust", "osprey_servo"):
         scenario = find_scenario(name).vary(flight={"duration": 2.0})
-        run = new_run(scenario, where)
-        conclude(run, fly_in_process(scenario, run, lambda t, shown: None))
-        flown.append(run)
-    return flown
+        run = new_run(scenario, folder)
+        write_report(run, fly_in_process(scenario, run, lambda t, shown: None))
+        runs.append(run)
+    return runs
 
 
-def test_one_run_as_picture_tables_and_json(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    png, csv, parquet = (tmp_path / f"flown.{suffix}" for suffix in ("png", "csv", "parquet"))
+def test_one_run_as_figure_tables_and_json(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    png, csv, parquet = (tmp_path / f"run.{suffix}" for suffix in ("png", "csv", "parquet"))
     report(runs[:1], png=png, csv=csv, parquet=parquet, as_json=True)
     assert json.loads(capsys.readouterr().out) == json.loads((runs[0] / "summary.json").read_text(encoding="utf-8"))
     assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
@@ -52,7 +52,7 @@ def test_two_runs_are_compared(
     shown = capsys.readouterr().out
     assert "2 flights compared" in (tmp_path / "two.html").read_text(encoding="utf-8")
     assert f"1: {runs[0].name}, completed" in shown
-    assert "settling" not in shown  # a terminal has the errors alone
+    assert "settling" not in shown  # the terminal shows errors only
     assert shown.splitlines()[-1] == "report:  two.html"
     assert (runs[0] / "report.html").read_bytes() == before
     report(runs, as_json=True)
@@ -77,23 +77,23 @@ def test_a_file_that_cannot_be_written_is_one_sentence(runs: list[Path], option:
         report(runs[:1], **nowhere)
 
 
-def test_a_flight_that_never_began_has_a_summary_with_the_same_keys(runs: list[Path]) -> None:
-    unflown = summarise_unflown(find_scenario("osprey_gust"), "stuck")
-    assert unflown.keys() == json.loads((runs[0] / "summary.json").read_text(encoding="utf-8")).keys()
+def test_a_flight_without_samples_has_a_summary_with_the_same_keys(runs: list[Path]) -> None:
+    empty = empty_summary(find_scenario("osprey_gust"), "no progress")
+    assert empty.keys() == json.loads((runs[0] / "summary.json").read_text(encoding="utf-8")).keys()
 
 
 def test_latency_is_the_time_between_the_sending_of_y_and_of_its_u(tmp_path: Path) -> None:
-    sent = {"/y": {0: 1, 10: 11, 20: 21}, "/u": {0: 3, 20: 26}}  # ms, by stamp; y(10) was not answered
+    sent = {"/y": {0: 1, 10: 11, 20: 21}, "/u": {0: 3, 20: 26}}  # ms, by stamp; no u for y(10)
     with BagWriter(tmp_path / "run") as bag:
         for topic, instants in sent.items():
             channel = bag.add_topic(topic, JOINT_STATE, "")
             for stamp, at in instants.items():
                 message = vector(EPOCH + stamp * MS, ["q"], [1.0])
                 bag.write(channel, EPOCH + 99 * MS, EPOCH + at * MS, 1, message)
-    found = latency(tmp_path / "run")
-    assert found is not None
-    assert (found.stamp_ns - EPOCH).tolist() == [0, 20 * MS]
-    assert found["y_to_u"].tolist() == [2e-3, 5e-3]
+    latencies = latency(tmp_path / "run")
+    assert latencies is not None
+    assert (latencies.stamp_ns - EPOCH).tolist() == [0, 20 * MS]
+    assert latencies["y_to_u"].tolist() == [2e-3, 5e-3]
 
 
 def test_a_flight_in_one_process_has_no_latency(runs: list[Path]) -> None:

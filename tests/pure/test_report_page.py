@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report page in a browser: it draws without a complaint, soon, in light and dark, and a zoom shows all samples."""
+"""The report page in a browser: it draws without errors and fast, in light and dark, and a zoom shows all samples."""
 
 import base64
 import time
@@ -14,17 +14,17 @@ from tests.browser import CHROMIUM, Browser
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.page import write_page
+from flight_analysis.report.html import write_page
 from flight_analysis.report.recorded_flight import RecordedFlight
 from flight_analysis.report.summary import summarise
 from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here to open the page with")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 
-DRAWN = "Number(document.body?.dataset.drawn ?? 0)"  # counts up with each view of all pictures
+DRAWN = "Number(document.body?.dataset.drawn ?? 0)"  # counts the views of all figures
 PLOTS = "[...document.querySelectorAll('figure > div')]"
-SOON = 2.0  # s to all pictures, what a reader waits for without wondering; measured 0.9 s, twice that with four tests beside
+MAX_DRAW_TIME = 2.0  # s until all figures are drawn; measured 0.9 s, twice that beside four other tests
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def servo() -> RecordedFlight:
-    """Seven seconds with noise: commands from 2 s on, twice as many samples as are drawn at first."""
+    """Seven seconds with noise and commands from 2 s on: more samples than are drawn before a zoom."""
     scenario = find_scenario("osprey_servo").vary(flight={"duration": 7.0})
     return recorded("servo", scenario, simulate(scenario))
 
@@ -58,27 +58,27 @@ def open_page(browser: Browser, path: Path, scheme: str = "light") -> None:
 
 
 def zoom(browser: Browser, start: float, stop: float, plot: int = 0) -> None:
-    """Zoom one picture, as a drag of the mouse does, and wait for all."""
+    """Zoom one figure, as a drag of the mouse does, and wait for all figures."""
     before = browser.run(DRAWN)
     browser.run(f"Plotly.relayout({PLOTS}[{plot}], {{'xaxis.range': [{start}, {stop}]}}).then(() => 0)")
     browser.wait_for(f"{DRAWN} > {before}")
 
 
 def curve(browser: Browser, plot: int, name: str, row: int = 1) -> tuple[list[float], list[float]]:
-    """What is drawn of a curve: its instants and values."""
+    """Instants and values of a drawn curve."""
     axis = "y" if row == 1 else f"y{row}"
     found = f"{PLOTS}[{plot}]._fullData.find(trace => trace.name === '{name}' && trace.yaxis === '{axis}')"
     x, y = browser.run(f"(trace => [[...trace.x], [...trace.y]])({found})")
     return x, y
 
 
-def test_the_page_draws_all_pictures_without_a_complaint(browser: Browser, page: Path) -> None:
+def test_the_page_draws_all_figures_without_errors(browser: Browser, page: Path) -> None:
     open_page(browser, page)
     assert browser.complaints == []
     headings = browser.run("[...document.querySelectorAll('section h2')].map(heading => heading.textContent)")
     drawn = browser.run(f"{PLOTS}.map(plot => plot.querySelectorAll('.scatterlayer .trace, .barlayer .trace').length)")
     curves = dict(zip(headings, drawn, strict=True))
-    # Of each of four channels: y over y_m; two errors and the floor; command, actuator, and limits where there are any.
+    # For each of four channels: y over y_m; two errors and the noise floor; command, actuator and limits.
     assert curves["Output y over the reference y_m"] == 8
     assert curves["Tracking error e = y - y_m"] == 12
     assert curves["Input u and the actuators"] >= 8
@@ -88,7 +88,7 @@ def test_the_page_draws_all_pictures_without_a_complaint(browser: Browser, page:
     assert all(count > 0 for count in drawn)
 
 
-def test_a_zoom_shows_every_sample_in_all_pictures(browser: Browser, page: Path, servo: RecordedFlight) -> None:
+def test_a_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, servo: RecordedFlight) -> None:
     open_page(browser, page)
     y = servo.tape["y"]
     whole, _ = curve(browser, 0, "y")
@@ -116,9 +116,9 @@ def test_a_zoom_keeps_the_peaks_of_each_pixel(browser: Browser, tmp_path: Path, 
     values = np.zeros((count, 4))
     values[30_001, 0], values[31_003, 0] = 5.0, -4.0  # one sample each, between 60 s and 62.1 s
     stamps = np.arange(count, dtype=np.int64) * 2_000_000
-    still = Signal(stamps, servo.tape["y"].names, np.zeros((count, 4)))
+    zero = Signal(stamps, servo.tape["y"].names, np.zeros((count, 4)))
     path = tmp_path / "peaks.html"
-    write_page(path, [recorded("peaks", servo.scenario, Tape({"y": replace(still, values=values), "y_m": still}))])
+    write_page(path, [recorded("peaks", servo.scenario, Tape({"y": replace(zero, values=values), "y_m": zero}))])
     open_page(browser, path)
     for start, stop in ((0.0, 80.0), (50.0, 70.0), (60.0, 60.01)):
         zoom(browser, start, stop)
@@ -127,7 +127,7 @@ def test_a_zoom_keeps_the_peaks_of_each_pixel(browser: Browser, tmp_path: Path, 
         assert len(y) < 5000
 
 
-def test_the_dark_page_is_drawn_in_colours_of_its_own_and_changes_with_the_scheme(browser: Browser, page: Path) -> None:
+def test_the_dark_page_has_its_own_colours_and_follows_the_scheme(browser: Browser, page: Path) -> None:
     look = f"[getComputedStyle(document.body).backgroundColor, {PLOTS}[0].data[1].line.color, {PLOTS}[0].layout.font.color]"
     open_page(browser, page, "dark")
     dark = browser.run(look)
@@ -139,21 +139,21 @@ def test_the_dark_page_is_drawn_in_colours_of_its_own_and_changes_with_the_schem
     assert browser.complaints == []
 
 
-def test_a_page_prints_light_on_sheets_and_comes_back(browser: Browser, page: Path) -> None:
+def test_a_page_prints_in_light_colours_and_returns_to_the_screen(browser: Browser, page: Path) -> None:
     open_page(browser, page, "dark")
     zoom(browser, 2.0, 3.0)
-    sheets = base64.b64decode(browser.call("Page.printToPDF")["data"])
-    assert sheets.startswith(b"%PDF")
+    pdf = base64.b64decode(browser.call("Page.printToPDF")["data"])
+    assert pdf.startswith(b"%PDF")
     browser.wait_for(f"{DRAWN} === 3")
     assert browser.run(f"{PLOTS}[0].layout.xaxis.range") == [2.0, 3.0]
     assert browser.run(f"{PLOTS}[0].clientWidth") > 900
     assert browser.complaints == []
 
 
-def test_several_flights_are_drawn_over_each_other(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
+def test_several_flights_are_overlaid(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
     path = tmp_path / "comparison.html"
     bare = replace(servo.tape, signals={name: servo.tape[name] for name in ("y", "y_m", "u")})
-    write_page(path, [servo, recorded("seen from outside", servo.scenario, bare)])
+    write_page(path, [servo, recorded("without internals", servo.scenario, bare)])
     open_page(browser, path)
     assert browser.run(f"{PLOTS}.slice(0, 4).map(plot => plot.data.length)") == [12, 8, 8, 8]
     zoom(browser, 1.0, 2.0, plot=1)
@@ -166,8 +166,8 @@ def test_no_table_is_wider_than_the_page(browser: Browser, page: Path) -> None:
     assert browser.run("[...document.querySelectorAll('.tables > div')].every(table => table.scrollWidth <= table.clientWidth)")
 
 
-def test_ten_minutes_at_500_hz_are_there_soon(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
-    # White noise in y, u and the truth: nothing can be compressed. The best of three, for others work on the machine too.
+def test_ten_minutes_at_500_hz_are_drawn_in_time(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
+    # White noise in y, u and the truth hardly compresses. The best of three loads, for other processes share the host.
     count, random = 300_001, np.random.default_rng(1)
     stamps = np.arange(count, dtype=np.int64) * 2_000_000
     signals = {
@@ -176,13 +176,13 @@ def test_ten_minutes_at_500_hz_are_there_soon(browser: Browser, tmp_path: Path, 
     }
     path = tmp_path / "long.html"
     write_page(path, [recorded("long", servo.scenario, Tape(signals))])
-    taken = []
+    times = []
     for _ in range(3):
         open_page(browser, path)
-        taken.append(browser.run("performance.getEntriesByName('picture').at(-1).startTime / 1e3"))
-    assert min(taken) < SOON
+        times.append(browser.run("performance.getEntriesByName('figure').at(-1).startTime / 1e3"))
+    assert min(times) < MAX_DRAW_TIME
     begin = time.monotonic()
     zoom(browser, 300.0, 300.2)
-    assert time.monotonic() - begin < 2.0 * SOON
+    assert time.monotonic() - begin < 2.0 * MAX_DRAW_TIME
     x, _ = curve(browser, 0, "y")
     assert len([t for t in x if 300.0 <= t <= 300.2]) == 101

@@ -5,10 +5,10 @@ from setuptools import setup
 setup(
     name="flight_analysis",
     version="0.1.0",
-    description="Flights without ROS: the closed loop in one process, MCAP bag to tape, metrics, the report page.",
+    description="Flights without ROS: the closed loop in one process, metrics, gain design, the report page.",
     license="Apache-2.0",
     packages=["flight_analysis", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.report"],
-    package_data={"flight_analysis": ["report/page.*"]},
+    package_data={"flight_analysis": ["report/*.jinja", "report/page.js"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_analysis"]),
         ("share/flight_analysis", ["package.xml"]),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a flight: pure functions of a tape."""
+"""Metrics of a flight as pure functions of its tape: error, noise floor, ultimate bound, settling, saturation, ticks."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -16,71 +16,70 @@ from rise_di_controller.internals import Saturation
 
 Windows = Mapping[str, tuple[float, float]]
 
-SETTLE = 1.0
-"""s. What a gust, the edge of a command or an engagement leaves behind is counted to it for as long after its end."""
+SETTLING_DWELL = 1.0
+"""s. A transient lasts this long beyond its end. An error has settled once it stays in the band for this long."""
 
-BAND = 0.01
-"""Half-width of the band to settle into, as a share of the largest abs(y_m)."""
+SETTLING_BAND = 0.01
+"""Half-width of the settling band as a fraction of the largest abs(y_m)."""
 
-NOISE_BAND = 4.0
-"""Noise floors within which measured errors stay for SETTLE: of 500 samples of normal noise 97 % of the time."""
+MIN_BAND_NOISE_FLOORS = 4.0
+"""Least half-width of the settling band of a measured error, in noise floors. 500 samples of normal noise stay within 4 with a
+probability of 97 %."""
 
-TRUE, MEASURED = "true error", "measured error"
-"""What `known_error` may know."""
+TRUE_ERROR, MEASURED_ERROR = "true error", "measured error"
+"""Names that `best_error` returns."""
 
-PARTS = (
-    f"command: from an edge of a command to {SETTLE:g} s after its end; gust: from the entry of a gust to {SETTLE:g} s after"
-    f" its end; calm: the rest, but for {SETTLE:g} s after engagement"
+PARTS_LEGEND = (
+    f"command: from an edge of a command to {SETTLING_DWELL:g} s after its end; gust: from the entry of a gust to"
+    f" {SETTLING_DWELL:g} s after its end; undisturbed: all other times, except {SETTLING_DWELL:g} s after engagement"
 )
-"""What the parts of the tables mean, for people."""
-
-PART_NAMES = ("whole", "calm", "command", "gust")
+"""Legend of the tables: the parts of a flight. Their keys are "whole", "calm" (undisturbed), "command" and "gust"."""
 
 
 class Transient(NamedTuple):
-    """Something that throws the error off, from its first to its last instant in s of flight time."""
+    """An engagement, a command or a gust, from its first to its last instant in s of flight time."""
 
     kind: str  # "engagement", "command" or "gust"
     name: str  # of the commanded channel, or of the gust
     start: float
     stop: float
 
-    def concerns(self, channel: str) -> bool:
-        """Whether it is meant for a channel: a command for its own, all else for every one."""
+    def excites(self, channel: str) -> bool:
+        """Whether it excites a channel: a command excites its own channel, all else excites every channel."""
         return self.kind != "command" or self.name == channel
 
 
-class ErrorFigures(NamedTuple):
+class ErrorMetrics(NamedTuple):
     """Tracking error of one channel over some samples, in its unit."""
 
     rms: float
     max: float
 
 
-class InputFigures(NamedTuple):
-    """What one input did over some samples: in its unit about trim, and in its unit / s."""
+class InputMetrics(NamedTuple):
+    """One input over some samples: deviation from trim in its unit, rate in its unit / s."""
 
     rms: float
     max: float
     rate: float
 
 
-class TickFigures(NamedTuple):
-    """How regularly the controller ticked; times in s."""
+class TickMetrics(NamedTuple):
+    """Timing of the controller's ticks; times in s."""
 
     ticks: int
-    without_new_y: int  # periods of the controller in which it took no step: no new y had come, or the tick was missed
+    without_new_y: int  # periods without a step of the controller: no new y arrived, or the tick was missed
     period_mean: float
     period_p99: float
     period_max: float
-    jitter: float  # rms of how far the time between two ticks is from a whole number of periods
+    jitter: float  # rms deviation of the time between two ticks from a whole number of periods
     late_p99: float
     late_max: float
     age_p99: float
 
 
-class LatencyFigures(NamedTuple):
-    """How long after a y was sent the u that answers it was, in s."""
+class LatencyMetrics(NamedTuple):
+    """Time from sending a y to sending the u computed from it, in s."""
 
     median: float
     p99: float
@@ -88,18 +87,18 @@ class LatencyFigures(NamedTuple):
 
 
 def tracking_error(tape: Tape) -> Signal:
-    """Error e = y - y_m at every y whose stamp y_m has too or spans (linear between samples), shape (N, m), channels of y.
+    """Measured error e = y - y_m at each y inside the time range of y_m, shape (N, m), channels of y.
 
-    It is the error that the law sees: the sensors' noise is part of it.
+    y_m is interpolated linearly. The law sees this error: it includes the sensors' noise.
     """
     return _minus_reference(tape["y"], tape["y_m"])
 
 
 def true_error(tape: Tape) -> Signal | None:
-    """True error C x - y_m at every sample of `truth` that y_m has too or spans, shape (N, m), channels of y.
+    """True error C x - y_m at each sample of `truth` inside the time range of y_m, shape (N, m), channels of y.
 
-    It is the error that the aircraft makes, without the sensors' own, and also at samples that were lost. None where the tape
-    has no "x.output" in `truth` for each channel of y; only a simulation knows it.
+    It excludes the sensors' errors and includes samples that were lost. None unless `truth` has "x.output" for each channel of
+    y, as in a simulation.
     """
     if "truth" not in tape:
         return None
@@ -109,10 +108,10 @@ def true_error(tape: Tape) -> Signal | None:
     return _minus_reference(Signal(x.stamp_ns, names, np.column_stack([x[name] for name in names])), tape["y_m"])
 
 
-def known_error(tape: Tape) -> tuple[str, Signal]:
-    """The best error that a tape knows, after what it is called: TRUE, else MEASURED."""
+def best_error(tape: Tape) -> tuple[str, Signal]:
+    """Name and signal of the best error on a tape: the true error, or else the measured one."""
     error = true_error(tape)
-    return (MEASURED, tracking_error(tape)) if error is None else (TRUE, error)
+    return (MEASURED_ERROR, tracking_error(tape)) if error is None else (TRUE_ERROR, error)
 
 
 def _minus_reference(y: Signal, y_m: Signal) -> Signal:
@@ -120,18 +119,18 @@ def _minus_reference(y: Signal, y_m: Signal) -> Signal:
         return Signal(np.zeros(0, dtype=np.int64), y.names, np.zeros((0, len(y.names))))
     inside = (y.stamp_ns >= y_m.stamp_ns[0]) & (y.stamp_ns <= y_m.stamp_ns[-1])
     stamps = y.stamp_ns[inside]
-    # Relative to the first stamp float64 is exact; the epoch in ns is not.
+    # float64 represents stamps exactly relative to the first one, but not ns since the epoch.
     at, knots = (stamps - y_m.stamp_ns[0]).astype(float), (y_m.stamp_ns - y_m.stamp_ns[0]).astype(float)
     reference = np.column_stack([np.interp(at, knots, y_m[name]) for name in y.names])
     return Signal(stamps, y.names, y.values[inside] - reference)
 
 
 def noise_floor(tape: Tape) -> dict[str, float]:
-    """What no error of y can be told from, by channel, in its unit.
+    """Noise floor of y by channel, in its unit: a smaller error cannot be distinguished from noise.
 
-    The rms of "noise.channel" of `truth` where the tape knows it. Else of a white noise that moves y as it moves: with the
-    second differences d_k = y_(k+1) - 2 y_k + y_(k-1) its rms is median(abs(d)) / (0.6745 sqrt(6)), for d has 6 times its
-    variance and half of a normal distribution lies within 0.6745 of its own rms. At least one rounding of the largest y.
+    It is the rms of "noise.channel" of `truth` where the tape holds it. Otherwise it is estimated as white noise from second
+    differences d_k = y_(k+1) - 2 y_k + y_(k-1): rms = median(abs(d)) / (0.6745 sqrt(6)). d has 6 times the variance of the
+    noise, and half of a normal distribution lies within 0.6745 rms. The floor is at least the rounding of the largest y.
     """
     noise = tape["truth"].group("noise") if "truth" in tape else None
     floor = {}
@@ -147,7 +146,7 @@ def noise_floor(tape: Tape) -> dict[str, float]:
 
 
 def engagements(tape: Tape) -> list[Transient]:
-    """When the controller engaged, by the modes of `internals`."""
+    """Instants at which the controller engaged, from the modes in `internals`."""
     if "internals" not in tape:
         return []
     engaged = tape["internals"]["mode"] == Mode.ENGAGED
@@ -156,34 +155,34 @@ def engagements(tape: Tape) -> list[Transient]:
 
 
 def live_commands(tape: Tape) -> list[Transient]:
-    """Where a live command moved, by the samples of `u_m`: changes of a channel closer than SETTLE are one."""
+    """Changes of a live command, from `u_m`. Changes of one channel less than SETTLING_DWELL apart are one transient."""
     if "u_m" not in tape:
         return []
     t, u_m = tape.time("u_m"), tape["u_m"]
-    found: list[Transient] = []
+    commands: list[Transient] = []
     for name in u_m.names:
         moved = np.concatenate([u_m[name][:1] != 0.0, np.diff(u_m[name]) != 0.0])
         instants = t[moved]
-        stretches = np.split(instants, np.flatnonzero(np.diff(instants) > SETTLE) + 1)
-        found += [Transient("command", name, float(one[0]), float(one[-1])) for one in stretches if len(one)]
-    return sorted(found, key=lambda one: one.start)
+        groups = np.split(instants, np.flatnonzero(np.diff(instants) > SETTLING_DWELL) + 1)
+        commands += [Transient("command", name, float(group[0]), float(group[-1])) for group in groups if len(group)]
+    return sorted(commands, key=lambda command: command.start)
 
 
 def in_spans(t: FloatArray, spans: Iterable[tuple[float, float]], settle: float = 0.0) -> NDArray[np.bool_]:
-    """Which instants lie in a span or up to `settle` seconds after it, shape (N,)."""
+    """Mask of the instants inside a span or up to `settle` seconds after it, shape (N,)."""
     inside = np.zeros(len(t), dtype=bool)
     for start, stop in spans:
         inside |= (t >= start) & (t <= stop + settle)
     return inside
 
 
-def part_masks(t: FloatArray, transients: Sequence[Transient], settle: float = SETTLE) -> dict[str, NDArray[np.bool_]]:
-    """Which instants of shape (N,) belong to which of PART_NAMES.
+def part_masks(t: FloatArray, transients: Sequence[Transient], settle: float = SETTLING_DWELL) -> dict[str, NDArray[np.bool_]]:
+    """Masks of the instants t of shape (N,) by part of the flight: "whole", "calm", "command", "gust".
 
-    Those of a gust are no more those of a command, and those of an engagement, a command or a gust none of "calm".
+    An instant inside a gust and a command counts to the gust. "calm" is undisturbed: no engagement, command or gust.
     """
     inside = {
-        kind: in_spans(t, [(one.start, one.stop) for one in transients if one.kind == kind], settle)
+        kind: in_spans(t, [(transient.start, transient.stop) for transient in transients if transient.kind == kind], settle)
         for kind in ("engagement", "command", "gust")
     }
     return {
@@ -194,45 +193,50 @@ def part_masks(t: FloatArray, transients: Sequence[Transient], settle: float = S
     }
 
 
-def error_figures(errors: FloatArray) -> ErrorFigures:
+def error_metrics(errors: FloatArray) -> ErrorMetrics:
     """Root mean square sqrt(mean e^2) and max abs(e) of samples of shape (N,); NaN where N = 0."""
     if len(errors) == 0:
-        return ErrorFigures(float("nan"), float("nan"))
-    return ErrorFigures(float(np.sqrt(np.mean(errors**2))), float(np.max(np.abs(errors))))
+        return ErrorMetrics(float("nan"), float("nan"))
+    return ErrorMetrics(float(np.sqrt(np.mean(errors**2))), float(np.max(np.abs(errors))))
 
 
-def error_table(tape: Tape, transients: Sequence[Transient], settle: float = SETTLE) -> dict[str, dict[str, ErrorFigures]]:
-    """Figures of `known_error` by channel and part of the flight.
+def errors_by_part(
+    tape: Tape, transients: Sequence[Transient], settle: float = SETTLING_DWELL
+) -> dict[str, dict[str, ErrorMetrics]]:
+    """Metrics of `best_error` by channel and part of the flight.
 
-    The max of "calm" is the ultimate bound: the largest abs(e) once what each transient left has had `settle` s to fade.
+    The max of "calm" is the ultimate bound: the largest abs(e) at least `settle` s after the end of each transient.
     """
-    _, error = known_error(tape)
+    _, error = best_error(tape)
     masks = part_masks((error.stamp_ns - tape.start_ns) / 1e9, transients, settle)
-    return {name: {part: error_figures(error[name][mask]) for part, mask in masks.items()} for name in error.names}
+    return {name: {part: error_metrics(error[name][mask]) for part, mask in masks.items()} for name in error.names}
 
 
 def settling_bands(tape: Tape) -> dict[str, float]:
-    """Half-width of the band to settle into by channel, in its unit: BAND max abs(y_m), or of the error where y_m rests.
+    """Half-width of the settling band by channel, in its unit: SETTLING_BAND max abs(y_m), or max abs(e) where y_m is zero.
 
-    Where only the measured error is known, at least NOISE_BAND noise floors: in a narrower one no measured error stays.
+    The band of a measured error is at least MIN_BAND_NOISE_FLOORS noise floors wide, else noise alone leaves it.
     """
-    kind, error = known_error(tape)
-    floors = noise_floor(tape) if kind == MEASURED else {}
+    kind, error = best_error(tape)
+    floors = noise_floor(tape) if kind == MEASURED_ERROR else {}
 
     def largest(values: FloatArray) -> float:
         return float(np.max(np.abs(values), initial=0.0))
 
     return {
-        name: max(BAND * (largest(tape["y_m"][name]) or largest(error[name])), NOISE_BAND * floors.get(name, 0.0))
+        name: max(
+            SETTLING_BAND * (largest(tape["y_m"][name]) or largest(error[name])),
+            MIN_BAND_NOISE_FLOORS * floors.get(name, 0.0),
+        )
         for name in error.names
     }
 
 
-def settling_time(t: FloatArray, e: FloatArray, band: float, leaves: float, dwell: float = SETTLE) -> float | None:
-    """How long after t[0] abs(e) <= band began to hold for `dwell` s, or to the end of the samples; s.
+def settling_time(t: FloatArray, e: FloatArray, band: float, leaves: float, dwell: float = SETTLING_DWELL) -> float | None:
+    """Time from t[0] until abs(e) <= band holds for `dwell` s or to the last sample, s. Shapes (N,).
 
-    0 where abs(e) does not leave the band within `leaves` s: what comes later has another cause. None where it never came
-    back, or there is no sample. Shapes (N,).
+    0 where abs(e) stays in the band for the first `leaves` s: a later excursion has another cause. None where abs(e) does not
+    return to the band, or there is no sample.
     """
     if len(t) == 0:
         return None
@@ -246,55 +250,57 @@ def settling_time(t: FloatArray, e: FloatArray, band: float, leaves: float, dwel
     return float(stays[0] - t[0]) if len(stays) else None
 
 
-class Settled(NamedTuple):
-    """What came of a transient."""
+class Settling(NamedTuple):
+    """Settling after one transient, by each channel that it excites."""
 
     transient: Transient
-    until: dict[str, float]  # when the next one of a channel began, or the flight ended, s; for each channel that it concerns
-    time: dict[str, float | None]  # settling time, s; None: not before that
+    until: dict[str, float]  # start of the next transient of the channel, or end of the flight, s
+    time: dict[str, float | None]  # settling time, s; None: not settled by then
 
 
-def settled(tape: Tape, transients: Sequence[Transient]) -> list[Settled]:
-    """Settling time of `known_error` into `settling_bands` from the start of each transient on, for each channel it concerns.
+def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling]:
+    """Settling time of `best_error` into `settling_bands` from the start of each transient, for each channel that it excites.
 
-    It is judged up to the next transient that concerns the channel. Those that the flight did not come to are left out.
+    It is measured up to the next transient that excites the channel. Transients after the end of the flight are left out.
     """
-    _, error = known_error(tape)
+    _, error = best_error(tape)
     t, bands = (error.stamp_ns - tape.start_ns) / 1e9, settling_bands(tape)
     end = float(t[-1]) if len(t) else 0.0
-    found = []
-    for one in sorted((one for one in transients if one.start <= end), key=lambda one: one.start):
+    results = []
+    for transient in sorted((one for one in transients if one.start <= end), key=lambda one: one.start):
+        start, leaves = transient.start, transient.stop + SETTLING_DWELL - transient.start
         until, times = {}, {}
-        for name in filter(one.concerns, error.names):
-            later = [other.start for other in transients if other.concerns(name) and other.start > one.start]
-            until[name] = min([*later, end])
-            inside = (t >= one.start) & ((t < until[name]) | (until[name] == end))
-            times[name] = settling_time(t[inside], error[name][inside], bands[name], one.stop + SETTLE - one.start)
-        found.append(Settled(one, until, times))
-    return found
+        for name in filter(transient.excites, error.names):
+            until[name] = min([other.start for other in transients if other.excites(name) and other.start > start] + [end])
+            inside = (t >= start) & ((t < until[name]) | (until[name] == end))
+            times[name] = settling_time(t[inside], error[name][inside], bands[name], leaves)
+        results.append(Settling(transient, until, times))
+    return results
 
 
-def input_table(tape: Tape, transients: Sequence[Transient], settle: float = SETTLE) -> dict[str, dict[str, InputFigures]]:
+def inputs_by_part(
+    tape: Tape, transients: Sequence[Transient], settle: float = SETTLING_DWELL
+) -> dict[str, dict[str, InputMetrics]]:
     """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot).
 
-    mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps that end in the part. NaN without one.
+    mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps that end in the part; NaN without a step.
     """
     if "u" not in tape:
         return {}
     u, t = tape["u"], tape.time("u")
     masks = part_masks(t, transients, settle)
 
-    def figures(values: FloatArray, mask: NDArray[np.bool_]) -> InputFigures:
+    def metrics(values: FloatArray, mask: NDArray[np.bool_]) -> InputMetrics:
         steps = mask[1:]
         time = float(np.diff(t)[steps].sum())
         rate = float(np.abs(np.diff(values))[steps].sum()) / time if time > 0 else float("nan")
-        return InputFigures(*error_figures(values[mask]), rate)
+        return InputMetrics(*error_metrics(values[mask]), rate)
 
-    return {name: {part: figures(u[name], mask) for part, mask in masks.items()} for name in u.names}
+    return {name: {part: metrics(u[name], mask) for part, mask in masks.items()} for name in u.names}
 
 
-def limited_shares(tape: Tape) -> dict[str, dict[str, float]]:
-    """Share of the ticks in which an input was held back, by input and by what held it: "magnitude", "rate"."""
+def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
+    """Fraction of the ticks with a saturated input, by input and by kind of saturation: "magnitude", "rate"."""
     limited = tape["internals"].group("limited") if "internals" in tape else None
     if limited is None or len(limited.stamp_ns) == 0:
         return {}
@@ -303,10 +309,10 @@ def limited_shares(tape: Tape) -> dict[str, dict[str, float]]:
 
 
 def sign_switches(tape: Tape) -> dict[str, float]:
-    """How often the sign term changed its direction, by output, 1/s.
+    """Switching rate of the sign term by output, 1/s.
 
-    Changes of sign from one increment of Pi to the next that is not 0, over the time of the ticks. Where the controller's
-    `internals` are not known: changes of the sign of the measured error.
+    It counts changes of sign between successive nonzero increments of Pi, per time of the ticks. On a tape without
+    `internals` it counts changes of sign of the measured error.
     """
     if "internals" in tape:
         signal = tape["internals"].group("Pi")
@@ -324,10 +330,10 @@ def sign_switches(tape: Tape) -> dict[str, float]:
 def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Amplitude spectral density of each channel by Welch's method: frequencies in Hz, and values in unit / sqrt(Hz).
 
-    Over Hann windows of a tenth of the flight, half overlapping, each without its mean; a signal that misses a sample is held
-    over the gap. The square of the density, integrated over all frequencies, is the variance. Source: Welch 1967.
+    The Hann windows span a tenth of the flight, overlap by half, and have their mean removed. A missing sample repeats the one
+    before. The square of the density, integrated over all frequencies, is the variance. Source: Welch 1967.
     """
-    from scipy.signal import welch  # noqa: PLC0415 - half a second, which commands that draw nothing need not wait for
+    from scipy.signal import welch  # noqa: PLC0415 - loads in 0.5 s, and most commands draw no spectrum
 
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
     grid = np.arange(places[-1] + 1)
@@ -346,34 +352,33 @@ def tick_periods(tape: Tape) -> NDArray[np.int64]:
     return np.diff(internals.stamp_ns + np.round(internals["age"] * 1e9).astype(np.int64))
 
 
-def tick_figures(tape: Tape, period_ns: int) -> TickFigures | None:
-    """Figures of the controller's ticks from `internals`, None where there are fewer than two.
+def tick_metrics(tape: Tape, period_ns: int) -> TickMetrics | None:
+    """Metrics of the controller's ticks from `internals`; None for fewer than two ticks.
 
-    Only a tick with a new y is in `internals`, so a period without one is counted alike whether y did not come or the tick was
-    missed.
+    `internals` holds only ticks with a new y. A period without one therefore counts whether y or the tick was missing.
     """
     internals = tape["internals"]
     if len(internals.stamp_ns) < 2:
         return None
     periods = tick_periods(tape)
     elapsed = round(float(periods.sum()) / period_ns)
-    off = periods - period_ns * np.round(periods / period_ns)
-    return TickFigures(
+    deviation = periods - period_ns * np.round(periods / period_ns)
+    return TickMetrics(
         ticks=len(internals.stamp_ns),
         without_new_y=max(elapsed - len(periods), 0),
         period_mean=seconds(int(periods.mean())),
         period_p99=seconds(int(np.percentile(periods, 99))),
         period_max=seconds(int(periods.max())),
-        jitter=float(np.sqrt(np.mean(off**2))) / 1e9,
+        jitter=float(np.sqrt(np.mean(deviation**2))) / 1e9,
         late_p99=float(np.percentile(internals["late"], 99)),
         late_max=float(internals["late"].max()),
         age_p99=float(np.percentile(internals["age"], 99)),
     )
 
 
-def latency_figures(tape: Tape) -> LatencyFigures | None:
-    """Figures of the signal `latency`, None where the tape has none."""
+def latency_metrics(tape: Tape) -> LatencyMetrics | None:
+    """Metrics of the signal `latency`; None where the tape has none."""
     if "latency" not in tape or len(tape["latency"].stamp_ns) == 0:
         return None
     latency = tape["latency"].values[:, 0]
-    return LatencyFigures(float(np.median(latency)), float(np.percentile(latency, 99)), float(latency.max()))
+    return LatencyMetrics(float(np.median(latency)), float(np.percentile(latency, 99)), float(latency.max()))

@@ -3,7 +3,6 @@
 """The page of a campaign: figures first, then how the errors are spread, and what the swept gain does to them."""
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,10 @@ import numpy as np
 import plotly.graph_objects as go
 
 from flight_analysis.report.comparison import COLOURS
-from flight_analysis.report.page import Page, Section, page_html
-from flight_analysis.report.plotting import Samples, cell, framed, grid
-from flight_analysis.report.summary import PLAIN, Column, DisplayUnit, display_units
-from flight_analysis.report.tables import table
+from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
+from flight_analysis.report.plotting import SampleStore, set_layout, subplot, subplot_grid
+from flight_analysis.report.summary import NO_UNIT, Column, DisplayUnit, display_units
+from flight_analysis.report.tables import Table
 from flight_campaign.campaign import Definition
 from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
 from flight_core.vectors import FloatArray
@@ -30,14 +29,14 @@ def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cas
     units = display_units(definition.scenario())
     labels = _labels(definition)
     title = f"Campaign {definition.name}"
-    head = (
-        f"<h1>{escape(title)}</h1><p>{tallies[0].flights} aircraft, every entry of A and B within"
-        f" &plusmn;{100 * definition.uncertainty:g} % of the airframe, seed {definition.seed}; the airframe's own gusts, the"
+    text = (
+        f"{tallies[0].flights} aircraft, every entry of A and B within"
+        f" ±{100 * definition.uncertainty:g} % of the airframe, seed {definition.seed}; the airframe's own gusts, the"
         f" same noise for all; true errors, seen at the controller's ticks. Score: the sum over the channels of rms error in"
-        f" 10 mrad/s (p: 20) and 0.1 m/s; lost: a score above {LOSS_OF_TRACK_SCORE:g}.</p>"
+        f" 10 mrad/s (p: 20) and 0.1 m/s; lost: a score above {LOSS_OF_TRACK_SCORE:g}."
     )
-    shown = [_ends(labels, cases), *(_figures(label, one, units) for label, one in zip(labels, tallies, strict=True))]
-    shown.append(_worst(labels, cases))
+    tables = [_ends(labels, cases), *(_figures(label, one, units) for label, one in zip(labels, tallies, strict=True))]
+    tables.append(_worst(labels, cases))
     sections = [
         Section("Score", "share of the aircraft by score", _spread(labels, tallies, ["score"], {}), over_time=False),
         Section(
@@ -48,7 +47,7 @@ def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cas
         ),
         Section("Sweep", "what the factor does to the score", _sweep(definition, tallies), over_time=False),
     ]
-    page = Page(title, head, f'<div class="tables">{"".join(shown)}</div>', sections, Samples())
+    page = Page(title, [Line(text)], [TableGroup(tables)], sections, SampleStore())
     path.write_text(page_html(page), encoding="utf-8")
 
 
@@ -58,8 +57,8 @@ def _labels(definition: Definition) -> list[str]:
     return [f"{definition.sweep.parameter} x {factor:g}" for factor in definition.sweep.factors]
 
 
-def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> str:
-    columns = [Column(word, head, ()) for word in ("diverged", "lost") for head in ("aircraft", "%", "95 % interval")]
+def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
+    columns = [Column(word, head) for word in ("diverged", "lost") for head in ("aircraft", "%", "95 % interval")]
     rows = []
     for label, case in zip(labels, cases, strict=True):
         row = [label]
@@ -67,17 +66,17 @@ def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> str:
             of = case[word]
             row += [str(of["count"]), f"{100 * of['share']:.3g}", f"{100 * of['low']:.2g} to {100 * of['high']:.2g}"]
         rows.append(row)
-    return table("How they ended", columns, rows)
+    return Table("How they ended", columns, rows)
 
 
-def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> str:
-    columns = [Column("", head, ()) for head in ("mean", *SPREAD, "worst")]
+def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> Table:
+    columns = [Column("", head) for head in ("mean", *SPREAD, "worst")]
     rows = []
     for name, figure in tally.figures.items():
         said, factor = _said(name, units)
         values = (figure.mean, *(figure.quantile(share) for share in SPREAD.values()), figure.largest)
         rows.append([said, *(f"{value * factor:.3g}" for value in values)])
-    return table(label, columns, rows, "of those that did not diverge; slew: mean abs(u_dot)")
+    return Table(label, columns, rows, "of those that did not diverge; slew: mean abs(u_dot)")
 
 
 def _said(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
@@ -85,35 +84,35 @@ def _said(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
     kind, _, channel = name.partition(".")
     if not channel:
         return name, 1.0
-    shown = units.get(channel, PLAIN)
+    shown = units.get(channel, NO_UNIT)
     return f"{kind} {channel} ({shown.unit}{'/s' * (kind == 'slew')})", shown.factor
 
 
-def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> str:
-    columns = [Column("", head, ()) for head in ("aircraft", "score", "fly it again")]
+def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
+    columns = [Column("", head) for head in ("aircraft", "score", "fly it again")]
     rows = [
         [label, str(one["number"]), "diverged" if one["score"] is None else f"{one['score']:.3g}", one["command"]]
         for label, case in zip(labels, cases, strict=True)
         for one in case["fly_again"]
     ]
-    return table("The worst", columns, rows, "--lockstep in place of --in-process flies it over ROS 2 topics")
+    return Table("The worst", columns, rows, "--lockstep in place of --in-process flies it over ROS 2 topics")
 
 
 def _spread(
     labels: Sequence[str], tallies: Sequence[Tally], names: Sequence[str], units: Mapping[str, DisplayUnit]
 ) -> go.Figure:
     columns = min(len(names), 2)
-    figure = grid(len(names), columns, 190, vertical_spacing=0.2)
+    figure = subplot_grid(len(names), columns, 190, vertical_spacing=0.2)
     for place, name in enumerate(names):
         said, factor = _said(name, units)
         for label, tally, colour in zip(labels, tallies, COLOURS * len(labels), strict=False):
             x, y = _density(tally.figures.get(name, Figure()))
             line = go.Scatter(x=x * factor, y=100.0 * y, mode="lines", name=label, legendgroup=label, fill="tozeroy")
             line.update(line={"color": colour, "width": 1.4, "shape": "hvh"}, showlegend=place == 0 and len(labels) > 1)
-            figure.add_trace(line.update(hovertemplate="%{y:.3g} % around %{x:.3g}"), **cell(place, columns))
-        figure.update_xaxes(title_text=said, type="log", **cell(place, columns))
+            figure.add_trace(line.update(hovertemplate="%{y:.3g} % around %{x:.3g}"), **subplot(place, columns))
+        figure.update_xaxes(title_text=said, type="log", **subplot(place, columns))
     figure.update_yaxes(title_text="%", rangemode="tozero")
-    return framed(figure, 190, below=44)
+    return set_layout(figure, 190, below=44)
 
 
 def _density(figure: Figure) -> tuple[FloatArray, FloatArray]:
@@ -131,7 +130,7 @@ def _density(figure: Figure) -> tuple[FloatArray, FloatArray]:
 def _sweep(definition: Definition, tallies: Sequence[Tally]) -> go.Figure | None:
     if definition.sweep is None:
         return None
-    figure = grid(1, 1, 260)
+    figure = subplot_grid(1, 1, 260)
     scores = [tally.figures["score"] for tally in tallies]
     curves = {"mean": [one.mean for one in scores]}
     curves |= {label: [one.quantile(share) for one in scores] for label, share in SPREAD.items()}
@@ -141,4 +140,4 @@ def _sweep(definition: Definition, tallies: Sequence[Tally]) -> go.Figure | None
         figure.add_trace(go.Scatter(x=definition.sweep.factors, y=values, **look))
     figure.update_xaxes(title_text=f"{definition.sweep.parameter} times", type="log")
     figure.update_yaxes(title_text="score", rangemode="tozero")
-    return framed(figure, 260, below=44)
+    return set_layout(figure, 260, below=44)

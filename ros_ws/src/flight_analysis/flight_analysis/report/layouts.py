@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts of Foxglove and PlotJuggler for the runs of a scenario: the plots an engineer wants first.
+"""Layouts of Foxglove and PlotJuggler for the runs of a scenario.
 
-Foxglove knows a channel by its place in `position`, PlotJuggler by its name; so a layout fits the scenarios with the same
-channels in the same order.
+Foxglove addresses a channel by its index in `position`, PlotJuggler by its name. A layout therefore fits all scenarios with the
+same channels in the same order.
 """
 
 import json
@@ -19,7 +19,7 @@ COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b")
 COLUMNS = 2
 
 
-class Curve(NamedTuple):
+class Channel(NamedTuple):
     """A channel of a topic."""
 
     topic: str
@@ -30,11 +30,11 @@ class Plot(NamedTuple):
     """Curves over time in one pair of axes, all SI and radians."""
 
     title: str
-    curves: tuple[Curve, ...]
+    curves: tuple[Channel, ...]
 
 
 class Tab(NamedTuple):
-    """Plots that are seen together."""
+    """Plots on one screen."""
 
     title: str
     plots: tuple[Plot, ...]
@@ -53,14 +53,14 @@ def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
 
 
 def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
-    """The tabs: y over y_m and e by output, u with u_free, integral_e and Pi, how the controller ticked, the wind."""
+    """The tabs: y over y_m and e by output, u with u_free, integral_e and Pi, state and timing of the controller, the wind."""
     outputs, inputs, wind = channels["y_m"], channels["u"], [name for name in channels["truth"] if name.startswith("gust.")]
 
     def log(title: str, *names: str) -> Plot:
-        return Plot(title, tuple(Curve("internals", name) for name in names))
+        return Plot(title, tuple(Channel("internals", name) for name in names))
 
     return (
-        Tab("tracking", tuple(Plot(f"{name}: y, y_m", (Curve("y", name), Curve("y_m", name))) for name in outputs)),
+        Tab("tracking", tuple(Plot(f"{name}: y, y_m", (Channel("y", name), Channel("y_m", name))) for name in outputs)),
         Tab("error", tuple(log(f"e {name}", f"e.{name}") for name in outputs)),
         Tab("input", tuple(log(f"u {name}: u_free, u", f"u_free.{name}", f"u.{name}") for name in inputs)),
         Tab(
@@ -75,25 +75,25 @@ def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
                 log("dt (s)", "dt"),
             ),
         ),
-        Tab("wind", tuple(Plot(f"{name} (m/s)", (Curve("truth", name),)) for name in wind)),
+        Tab("wind", tuple(Plot(f"{name} (m/s)", (Channel("truth", name),)) for name in wind)),
     )
 
 
 def foxglove(channels: Mapping[str, Sequence[str]]) -> str:
-    """A layout as Foxglove and Lichtblick import it: JSON, a panel of tabs that hold Plot panels.
+    """A layout of Foxglove and Lichtblick: JSON, a Tab panel that holds Plot panels.
 
-    Paths are "/topic.position[place]". Time is that of the log, for flight time as in the stamps of lockstep is far from it.
+    Paths are "/topic.position[index]". The time axis is log time: stamps are flight time, which in lockstep is far from it.
     """
     panels: dict[str, Any] = {}
-    shown = []
+    tabs = []
     for tab in tabs_of(channels):
         names = []
         for number, plot in enumerate(tab.plots):
             names.append(f"Plot!{tab.title}{number}")
             panels[names[-1]] = _foxglove_plot(plot, channels)
         if names:
-            shown.append({"title": tab.title, "layout": _mosaic(names)})
-    panels["Tab!rise_di"] = {"activeTabIdx": 0, "tabs": shown}
+            tabs.append({"title": tab.title, "layout": _mosaic(names)})
+    panels["Tab!rise_di"] = {"activeTabIdx": 0, "tabs": tabs}
     layout = {
         "configById": panels,
         "globalVariables": {},
@@ -131,7 +131,7 @@ def _foxglove_plot(plot: Plot, channels: Mapping[str, Sequence[str]]) -> dict[st
 
 
 def _mosaic(names: Sequence[str]) -> Any:
-    """Panels in rows of COLUMNS, each split in two: the first and all others."""
+    """Panels in rows of COLUMNS as a binary tree: each node splits off its first panel."""
     rows = [_split(names[start : start + COLUMNS], "row") for start in range(0, len(names), COLUMNS)]
     return _split(rows, "column")
 
@@ -145,7 +145,7 @@ def _split(parts: Sequence[Any], direction: str) -> Any:
 
 
 def plotjuggler(channels: Mapping[str, Sequence[str]]) -> str:
-    """A layout as PlotJuggler loads it: XML, tabs of docked plots, curves named "/topic/channel/position"."""
+    """A layout of PlotJuggler: XML, tabs of docked plots, curves named "/topic/channel/position"."""
     root = ElementTree.Element("root")
     window = ElementTree.SubElement(root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"})
     for tab in tabs_of(channels):

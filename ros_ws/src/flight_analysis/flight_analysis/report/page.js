@@ -1,17 +1,17 @@
-// Draws the pictures of a report from what the page holds: a specification in each <figure>, plotly and all samples packed.
+// Draws the figures of a report: each <figure> holds a plotly specification; plotly itself and all samples are packed in the page.
 "use strict";
 
-const MARGIN = 0.5; // of the view, drawn on both sides of it so that there is something to pan into
-const SHEET = {width: 690, height: 0.72}; // pixels; and what becomes of the height, so that two pictures share a sheet
+const MARGIN = 0.5; // of the view, drawn on both sides of it for panning
+const SHEET = {width: 690, height: 0.72}; // pixels; scale of the height, so that two figures fit a sheet
 const DARK = JSON.parse(document.getElementById("dark").textContent);
 const scheme = matchMedia("(prefers-color-scheme: dark)");
 const figures = [...document.querySelectorAll("figure")].map(node => ({
   node, text: node.querySelector("script").textContent, inTime: "time" in node.dataset, plot: node.querySelector("div"), drawn: "",
 }));
-let range = null; // s, what all pictures over time show; null: all of it, as it was drawn
+let range = null; // s, time range of all figures over time; null: the whole flight
 let turn = 0;
 
-// ---- Packed content: base64 of a zlib stream, the bytes of items sorted by their place
+// ---- Packed content: base64 of a zlib stream of shuffled bytes (plotting.pack)
 
 async function unpack(id, width = 1) {
   const packed = await fetch("data:;base64," + document.getElementById(id).textContent);
@@ -35,7 +35,7 @@ function samples(id) {
   return kept.get(id);
 }
 
-// ---- What a view shows of them: all where they are few, else the smallest and largest of each bin, and the gaps
+// ---- Decimation of a view: all samples up to `most`, else minimum and maximum of each bin, and the gaps
 
 function firstAfter(t, instant) {
   let low = 0, high = t.length;
@@ -64,18 +64,18 @@ function view(t, v, [from, to], most) {
   return {x: places.map(k => t[k]), y: places.map(k => v[k])};
 }
 
-async function views(data) { // of the traces of which more is known than is drawn, by their place
-  const margin = MARGIN * (range[1] - range[0]), wide = [range[0] - margin, range[1] + margin], found = new Map();
-  for (const [place, {meta}] of data.entries())
-    if (meta) found.set(place, view(await samples(meta.t), await samples(meta.v), wide, meta.most));
-  return found;
+async function views(data) { // of the decimated traces, by index
+  const margin = MARGIN * (range[1] - range[0]), wide = [range[0] - margin, range[1] + margin], decimated = new Map();
+  for (const [index, {meta}] of data.entries())
+    if (meta) decimated.set(index, view(await samples(meta.t), await samples(meta.v), wide, meta.most));
+  return decimated;
 }
 
 // ---- Drawing
 
 const look = () => (scheme.matches ? "dark" : "light");
 
-const axes = layout => Object.keys(layout).filter(key => /^xaxis\d*$/.test(key)); // all over one time, but each has its range
+const axes = layout => Object.keys(layout).filter(key => /^xaxis\d*$/.test(key));
 
 function specification(figure, style) {
   return JSON.parse(style === "dark" ? figure.text.replace(/#[0-9a-f]{6}/g, colour => DARK[colour] ?? colour) : figure.text);
@@ -91,20 +91,20 @@ async function draw(figure, style) {
   if (figure.inTime) figure.plot.on("plotly_relayout", change => moved(figure, change));
 }
 
-async function follow(figure) { // a view of all others
-  const found = await views(figure.plot.data), all = [...found.values()];
+async function follow(figure) { // show the time range of the other figures
+  const decimated = await views(figure.plot.data), all = [...decimated.values()];
   const traces = {x: all.map(one => one.x), y: all.map(one => one.y)};
   const ranges = Object.fromEntries(axes(figure.plot.layout).map(axis => [`${axis}.range`, [...range]]));
-  await Plotly.update(figure.plot, traces, ranges, [...found.keys()]);
+  await Plotly.update(figure.plot, traces, ranges, [...decimated.keys()]);
 }
 
-function moved(figure, change) { // a zoom in time is one in all pictures
+function moved(figure, change) { // zoom all figures over time together
   if (!Object.keys(change).some(key => /^xaxis\d*\.(range|autorange)/.test(key))) return;
   range = [...figure.plot.layout.xaxis.range].map(Number);
   showAll();
 }
 
-async function showAll() { // those in sight first
+async function showAll() { // visible figures first
   const mine = ++turn, distance = ({node}) => {
     const {top, bottom} = node.getBoundingClientRect();
     return Math.max(top - innerHeight, -bottom, 0);
@@ -115,15 +115,15 @@ async function showAll() { // those in sight first
       if (figure.drawn.startsWith(style) && range && figure.inTime) await follow(figure);
       else await draw(figure, style);
       figure.drawn = wanted;
-      performance.mark("picture");
-      await new Promise(resume => setTimeout(resume)); // lets the reader scroll meanwhile
+      performance.mark("figure");
+      await new Promise(resume => setTimeout(resume)); // keep the page responsive
     }
-    if (mine !== turn) return; // another view is wanted by now
+    if (mine !== turn) return; // superseded by a later call
   }
   document.body.dataset.drawn = turn;
 }
 
-function print() { // on white, as wide as a sheet; at once, for the browser does not wait
+function print() { // light colours, width of a sheet; synchronous, for the browser does not wait
   for (const figure of figures) {
     const {data, layout} = specification(figure, "light"), shown = figure.plot.data ?? data;
     for (const [place, {x, y}] of shown.entries()) Object.assign(data[place], {x, y});
@@ -147,9 +147,9 @@ async function start() {
 }
 
 start().catch(error => {
-  const said = document.createElement("p");
-  said.className = "note";
-  said.textContent = `The pictures cannot be drawn: ${error}. They need a browser of 2023 or newer.`;
-  document.querySelector("h1").after(said);
+  const message = document.createElement("p");
+  message.className = "note";
+  message.textContent = `The figures cannot be drawn: ${error}. They need a browser of 2023 or newer.`;
+  document.querySelector("h1").after(message);
   throw error;
 });

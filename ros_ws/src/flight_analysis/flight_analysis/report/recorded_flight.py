@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded flight, as it is drawn, exported and compared."""
+"""A recorded flight: what figures, tables, exports and comparisons are made of."""
 
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ from flight_core.tape import Tape
 
 
 class RecordedFlight(NamedTuple):
-    """What was flown, under the name of its run."""
+    """A flight under the name of its run."""
 
     name: str
     scenario: Scenario

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The result of a flight in numbers: what `summary.json` and the tables hold."""
+"""Metrics of a flight as `summary.json` and the tables hold them, with the units and columns of the tables."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,46 +11,46 @@ import numpy as np
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import (
     Transient,
+    best_error,
     engagements,
-    error_table,
-    input_table,
-    known_error,
-    latency_figures,
-    limited_shares,
+    errors_by_part,
+    inputs_by_part,
+    latency_metrics,
     live_commands,
     noise_floor,
-    settled,
+    saturation_shares,
     settling_bands,
+    settling_times,
     sign_switches,
-    tick_figures,
+    tick_metrics,
 )
 from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape
 from flight_core.units import SI_PER_UNIT
 
-NONE = "-"  # where there is no figure
+NO_VALUE = "-"
 
 
 class DisplayUnit(NamedTuple):
-    """A unit for people: value_shown = value_SI * factor."""
+    """Unit of tables and figures: displayed value = SI value * factor."""
 
     unit: str
     factor: float
 
 
-PLAIN = DisplayUnit("", 1.0)
-"""That of a channel whose unit is not known: SI, and none is said."""
+NO_UNIT = DisplayUnit("", 1.0)
+"""For a channel of unknown unit: its SI value without a unit."""
 
 
-def titled(name: str, units: Mapping[str, DisplayUnit]) -> str:
+def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
     """The name of a channel with its unit."""
-    unit = units.get(name, PLAIN).unit
+    unit = units.get(name, NO_UNIT).unit
     return f"{name} ({unit})" if unit else name
 
 
 def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
-    """Units for tables and pictures by channel of y and u: angular rates in mrad/s, inputs as the airframe file has them."""
+    """Units of tables and figures by channel of y and u: angular rates in mrad/s, inputs as in the airframe file."""
     channels = scenario.aircraft.channels()
     units = {
         name: DisplayUnit("mrad/s", 1e3) if unit == "rad/s" else DisplayUnit(unit, 1.0 / SI_PER_UNIT[unit])
@@ -59,8 +59,8 @@ def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
     return units | {name: DisplayUnit(unit, 1.0 / SI_PER_UNIT[unit]) for name, unit in channels.inputs.items()}
 
 
-def commanded(scenario: Scenario) -> list[Transient]:
-    """The edges of the scenario's pulses, in the order of time."""
+def pulse_edges(scenario: Scenario) -> list[Transient]:
+    """Edges of the scenario's pulses as transients, in order of time."""
     profile = scenario.reference_model.profile()
     edges = [
         Transient("command", name, float(time), float(time + profile.rise))
@@ -72,37 +72,37 @@ def commanded(scenario: Scenario) -> list[Transient]:
 
 
 def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
-    """Engagements, commands and gusts: the scenario's commands up to the first live one, then those."""
+    """Engagements, commands and gusts. From the first live command on, live commands replace those of the scenario."""
     live = live_commands(tape)
     until = float(tape.time("u_m")[0]) if live else math.inf
     gusts = [Transient("gust", name, *window) for name, window in scenario.gust_windows().items()]
-    return [*engagements(tape), *(edge for edge in commanded(scenario) if edge.start < until), *live, *gusts]
+    return [*engagements(tape), *(edge for edge in pulse_edges(scenario) if edge.start < until), *live, *gusts]
 
 
 def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
-    """All figures of a flight, SI, ready for JSON: docs/interfaces.md, Figures, says what each key means."""
+    """All metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains each key."""
     for topic in ("y", "y_m"):
         require(topic in tape, "the log", f"no sample of {topic}", "a flight with y and y_m")
-    happened = transients(scenario, tape)
-    came_of = settled(tape, happened)
-    ticks = tick_figures(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
-    latency = latency_figures(tape)
-    summary = {
-        "scenario": scenario.name,
-        "outcome": outcome,
+    events = transients(scenario, tape)
+    ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
+    latency = latency_metrics(tape)
+    summary = empty_summary(scenario, outcome) | {
         "duration": float(tape.time("y")[-1]) if len(tape["y"].stamp_ns) else 0.0,
-        "error": known_error(tape)[0],
-        "errors": _errors(tape, happened),
-        "inputs": _inputs(tape, happened),
-        "transients": [one.transient._asdict() | {"until": one.until, "settling": one.time} for one in came_of],
+        "error": best_error(tape)[0],
+        "errors": _errors(tape, events),
+        "inputs": _inputs(tape, events),
+        "transients": [
+            settling.transient._asdict() | {"until": settling.until, "settling": settling.time}
+            for settling in settling_times(tape, events)
+        ],
         "ticks": None if ticks is None or not np.isfinite(ticks).all() else ticks._asdict(),
         "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
         "notes": list(tape.notes),
     }
-    return {key: _known(value) for key, value in summary.items()}
+    return {key: _nan_as_null(value) for key, value in summary.items()}
 
 
-def summarise_unflown(scenario: Scenario, outcome: str) -> dict[str, Any]:
+def empty_summary(scenario: Scenario, outcome: str) -> dict[str, Any]:
     """The summary of a flight that ended before its first sample."""
     return {
         "scenario": scenario.name,
@@ -118,108 +118,120 @@ def summarise_unflown(scenario: Scenario, outcome: str) -> dict[str, Any]:
     }
 
 
-def _errors(tape: Tape, happened: Sequence[Transient]) -> dict[str, Any]:
+def _errors(tape: Tape, events: Sequence[Transient]) -> dict[str, Any]:
     bands, floors, switches = settling_bands(tape), noise_floor(tape), sign_switches(tape)
     return {
-        channel: {part: figures._asdict() for part, figures in parts.items()}
+        channel: {part: metrics._asdict() for part, metrics in parts.items()}
         | {"bound": parts["calm"].max, "band": bands[channel], "floor": floors[channel]}
         | {"sign_switches": switches.get(channel)}
-        for channel, parts in error_table(tape, happened).items()
+        for channel, parts in errors_by_part(tape, events).items()
     }
 
 
-def _inputs(tape: Tape, happened: Sequence[Transient]) -> dict[str, Any]:
-    limited = limited_shares(tape)
+def _inputs(tape: Tape, events: Sequence[Transient]) -> dict[str, Any]:
+    saturation = saturation_shares(tape)
     return {
-        name: {part: figures._asdict() for part, figures in parts.items()} | {"limited": limited.get(name)}
-        for name, parts in input_table(tape, happened).items()
+        name: {part: metrics._asdict() for part, metrics in parts.items()} | {"limited": saturation.get(name)}
+        for name, parts in inputs_by_part(tape, events).items()
     }
 
 
-def _known(value: Any) -> Any:
-    # JSON has no NaN and no infinity: a part of the flight without a sample has no figure, nor has one with values beyond all.
+def _nan_as_null(value: Any) -> Any:
+    # JSON has no NaN and no infinity. A part of the flight without samples has NaN metrics, an overflow infinite ones.
     if isinstance(value, Mapping):
-        return {key: _known(one) for key, one in value.items()}
+        return {key: _nan_as_null(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_known(one) for one in value]
+        return [_nan_as_null(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class Column(NamedTuple):
-    """A column of a table for people: its head, above it what the columns share that have it, and the path of its figure."""
+    """A column of a table: its heading, the heading above it that neighbouring columns share, and the path of its metric."""
 
     group: str
     head: str
-    path: tuple[str, ...]
+    path: tuple[str, ...] = ()
     scaled: bool = True  # in the unit of its row
 
 
 ERROR_COLUMNS = (
     Column("rms", "whole", ("whole", "rms")),
-    Column("rms", "calm", ("calm", "rms")),
+    Column("rms", "undisturbed", ("calm", "rms")),
     Column("rms", "command", ("command", "rms")),
     Column("rms", "gust", ("gust", "rms")),
     Column("max", "command", ("command", "max")),
     Column("max", "gust", ("gust", "max")),
-    Column("", "bound", ("bound",)),
+    Column("ultimate", "bound", ("bound",)),
 )
-"""What every table of errors shows."""
+"""Columns of every table of errors."""
 
-SWITCHES = Column("", "switches (1/s)", ("sign_switches",), scaled=False)
-
-MORE_ERROR_COLUMNS = (Column("", "floor", ("floor",)), SWITCHES)
-"""What the report shows of them beside it."""
+NOISE_FLOOR_COLUMN = Column("noise", "floor", ("floor",))
+SWITCH_COLUMN = Column("switches", "(1/s)", ("sign_switches",), scaled=False)
 
 INPUT_COLUMNS = (
     Column("rms", "whole", ("whole", "rms")),
-    Column("rms", "calm", ("calm", "rms")),
+    Column("rms", "undisturbed", ("calm", "rms")),
     Column("rms", "command", ("command", "rms")),
     Column("rms", "gust", ("gust", "rms")),
     Column("", "max", ("whole", "max")),
     Column("rate", "whole", ("whole", "rate")),
-    Column("rate", "calm", ("calm", "rate")),
+    Column("rate", "undisturbed", ("calm", "rate")),
 )
-"""What every table of inputs shows, but for how long each was limited."""
+"""Columns of every table of inputs, before SATURATION_COLUMN."""
+
+SATURATION_COLUMN = Column("saturated", "%")
+SETTLING_COLUMNS = {kind: Column("settling (s)", kind) for kind in ("command", "gust")}
 
 
-def figure(summary: Mapping[str, Any], *path: str) -> float | None:
-    """A figure by its path in a summary; None where the summary has none there."""
-    found: Any = summary
+def metric(summary: Mapping[str, Any], *path: str) -> float | None:
+    """A metric by its path in a summary; None where the summary has none there."""
+    value: Any = summary
     for key in path:
-        found = found.get(key) if isinstance(found, Mapping) else None
-    return found if isinstance(found, float | int) else None
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return value if isinstance(value, float | int) else None
 
 
-def cell(value: float | None, factor: float = 1.0) -> str:
-    """A figure in three digits; NONE for none."""
-    return NONE if value is None else f"{value * factor:#.3g}".rstrip(".")
+def format_value(value: float | None, factor: float = 1.0) -> str:
+    """A value with three digits, or NO_VALUE."""
+    return NO_VALUE if value is None else f"{value * factor:#.3g}".rstrip(".")
 
 
-def table_rows(figures: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Rows for people of "errors" or "inputs" of a summary: the channel with its unit, then a cell a column."""
+def table_rows(channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
+    """Rows for "errors" or "inputs" of a summary: the channel with its unit, then a cell for each column."""
     return [
         [
-            titled(name, units),
-            *(cell(figure(of, *column.path), units.get(name, PLAIN).factor if column.scaled else 1.0) for column in columns),
+            channel_label(name, units),
+            *(
+                format_value(metric(metrics, *column.path), units.get(name, NO_UNIT).factor if column.scaled else 1.0)
+                for column in columns
+            ),
         ]
-        for name, of in figures.items()
+        for name, metrics in channels.items()
     ]
 
 
-def limited_cell(of: Mapping[str, Any]) -> str:
-    """How many ticks in a hundred an input was limited in, by its magnitude and by its rate."""
-    limited = of["limited"]
-    return NONE if limited is None else " / ".join(f"{100.0 * limited[kind]:.3g}" for kind in ("magnitude", "rate"))
+def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
+    """Rows for INPUT_COLUMNS and SATURATION_COLUMN: ticks with saturation in percent, by magnitude / by rate."""
+    rows = table_rows(summary["inputs"], INPUT_COLUMNS, units)
+    for row, metrics in zip(rows, summary["inputs"].values(), strict=True):
+        shares = metrics["limited"]
+        row.append(NO_VALUE if shares is None else " / ".join(f"{100 * shares[kind]:.3g}" for kind in ("magnitude", "rate")))
+    return rows
 
 
-def slowest(summary: Mapping[str, Any], channel: str, kind: str) -> str:
-    """The longest settling time of a channel after transients of a kind, s; "> x" where x s were too short to settle once."""
-    found: list[float] = []
-    too_short: list[float] = []
-    for one in summary["transients"]:
-        if one["kind"] == kind and channel in one["settling"]:
-            time = one["settling"][channel]
-            (too_short if time is None else found).append(one["until"][channel] - one["start"] if time is None else time)
-    if too_short:
-        return f"> {max([*too_short, *found]):.2f}"
-    return f"{max(found):.2f}" if found else NONE
+def slowest_settling(summary: Mapping[str, Any], channel: str, kind: str) -> str:
+    """The longest settling time of a channel after transients of a kind, s.
+
+    "> x" where the error did not settle after one of them; x is then the longest time, settled or not.
+    """
+    settled: list[float] = []
+    unsettled: list[float] = []
+    for transient in summary["transients"]:
+        if transient["kind"] == kind and channel in transient["settling"]:
+            if (time := transient["settling"][channel]) is None:
+                unsettled.append(transient["until"][channel] - transient["start"])
+            else:
+                settled.append(time)
+    if unsettled:
+        return f"> {max(unsettled + settled):.2f}"
+    return f"{max(settled):.2f}" if settled else NO_VALUE

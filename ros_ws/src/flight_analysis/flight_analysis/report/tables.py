@@ -1,170 +1,130 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of the report, as HTML: figures of one flight, or of several beside each other."""
+"""The tables of a flight's report page as data; page.html.jinja turns them into HTML."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
 from itertools import groupby, product
 from typing import Any, NamedTuple
 
-from flight_analysis.metrics import BAND, NOISE_BAND, PARTS, SETTLE, Windows
+from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, PARTS_LEGEND, SETTLING_BAND, SETTLING_DWELL, Windows
 from flight_analysis.report import figures
-from flight_analysis.report.comparison import ComparisonBlock, ComparisonRow
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
-    MORE_ERROR_COLUMNS,
+    NOISE_FLOOR_COLUMN,
+    SATURATION_COLUMN,
+    SETTLING_COLUMNS,
+    SWITCH_COLUMN,
     Column,
     DisplayUnit,
-    cell,
-    limited_cell,
-    slowest,
+    input_rows,
+    slowest_settling,
     table_rows,
 )
 from flight_core.tape import Tape
 from rise_di_controller.internals import Saturation
 
-READING = (
-    f"{PARTS}. bound: the largest error in calm. switches: of the sign term's direction. settling: until the error stays for"
-    f" {SETTLE:g} s within {BAND:.0%} of the largest y_m, or within {NOISE_BAND:g} floors where it is measured; the slowest"
+ERROR_LEGEND = (
+    f"{PARTS_LEGEND}. ultimate bound: the largest undisturbed error. switches: of the sign term's direction. settling: time"
+    f" until the error stays for {SETTLING_DWELL:g} s within {SETTLING_BAND:.0%} of the largest y_m, or within"
+    f" {MIN_BAND_NOISE_FLOORS:g} noise floors if it is measured; the slowest"
 )
-FLOOR_READING = ". floor: what no error can be told from, the noise of y or its rounding"
-INPUT_READING = "u about trim; rate: mean abs(u_dot), in the unit of the row a second"
-LIMITED_READING = "; limited: ticks held back by magnitude / by rate"
-ALIKE = 0.05  # share by which figures may differ and still be as good as each other
+NOISE_FLOOR_LEGEND = ". noise floor: of y; a smaller error cannot be distinguished from noise or rounding"
+INPUT_LEGEND = "u about trim; rate: mean abs(u_dot), in the unit of the row per second"
+SATURATION_LEGEND = "; saturated: ticks with saturation by magnitude / by rate"
+
+
+class Table(NamedTuple):
+    """A table whose first column holds the rows' names; `columns` are those after it."""
+
+    caption: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[str]]
+    legend: str = ""
+
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """Headings that neighbouring columns share, each with its number of columns."""
+        return [(group, len(list(columns))) for group, columns in groupby(self.columns, key=lambda column: column.group)]
+
+    @property
+    def group_starts(self) -> list[bool]:
+        """Whether each column starts a group; a column without a group does."""
+        groups = [column.group for column in self.columns]
+        return [not group or group != before for group, before in zip(groups, [None, *groups], strict=False)]
 
 
 class Event(NamedTuple):
-    """Something that happened in a flight, from its first to its last instant in s."""
+    """A gust, a failsafe mode or a saturation, from its first to its last instant in s."""
 
-    what: str
+    name: str
     start: float
     stop: float
-    how_much: str
+    extent: str
 
 
 def events(tape: Tape, gusts: Windows) -> list[Event]:
-    """Gusts, modes other than ENGAGED, and limits that the controller reached, one event each, by their first instant."""
+    """Gusts, modes other than ENGAGED, and saturations of each input, one event each, in order of their start."""
     found = []
-    marked = figures.gust_bands(tape, gusts) + figures.mode_bands(tape)
-    for label, group in groupby(marked, key=lambda band: band.label):
-        bands = list(group)
-        times = f", {len(bands)} times" if len(bands) > 1 else ""
-        found.append(Event(label, bands[0].start, bands[-1].stop, f"{sum(b.stop - b.start for b in bands):.2f} s{times}"))
+    intervals = figures.gust_intervals(tape, gusts) + figures.mode_intervals(tape)
+    for label, group in groupby(intervals, key=lambda interval: interval.label):
+        spans = [(interval.start, interval.stop) for interval in group]
+        times = f", {len(spans)} times" if len(spans) > 1 else ""
+        found.append(Event(label, spans[0][0], spans[-1][1], f"{sum(stop - start for start, stop in spans):.2f} s{times}"))
     if "internals" in tape:
         limited, t = tape["internals"].group("limited"), tape.time("internals")
-        for name, what in product(limited.names, (Saturation.MAGNITUDE, Saturation.RATE)):
-            hit = limited[name] == what
-            if hit.any():
-                first, last = t[hit][[0, -1]]
-                found.append(Event(f"{name} limited: {what.name.lower()}", first, last, f"{hit.sum()} of {len(hit)} ticks"))
+        for name, kind in product(limited.names, (Saturation.MAGNITUDE, Saturation.RATE)):
+            saturated = limited[name] == kind
+            if saturated.any():
+                first, last = t[saturated][[0, -1]]
+                extent = f"{saturated.sum()} of {len(saturated)} ticks"
+                found.append(Event(f"{name} saturated: {kind.name.lower()}", first, last, extent))
     return sorted(found, key=lambda event: event.start)
 
 
-def error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> str:
-    """Figures of the error, a row a channel."""
-    columns = ERROR_COLUMNS + MORE_ERROR_COLUMNS
+def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], happened: Sequence[Event]) -> list[Table]:
+    """Tables of the error, the inputs, the events and the ticks; a table without rows is left out."""
+    tables = (_error_table(summary, units), _input_table(summary, units), _event_table(happened), _tick_table(summary))
+    return [table for table in tables if table.rows]
+
+
+def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
+    columns = (*ERROR_COLUMNS, NOISE_FLOOR_COLUMN, SWITCH_COLUMN)
     rows = [
-        [*row, *(slowest(summary, channel, kind) for kind in ("command", "gust"))]
+        [*row, *(slowest_settling(summary, channel, kind) for kind in SETTLING_COLUMNS)]
         for channel, row in zip(summary["errors"], table_rows(summary["errors"], columns, units), strict=True)
     ]
-    settling = tuple(Column("settling (s)", head, ()) for head in ("command", "gust"))
-    return table(f"Tracking error ({summary['error']})", columns + settling, rows, READING + FLOOR_READING)
+    caption = f"Tracking error ({summary['error']})"
+    return Table(caption, (*columns, *SETTLING_COLUMNS.values()), rows, ERROR_LEGEND + NOISE_FLOOR_LEGEND)
 
 
-def input_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> str:
-    """Figures of the inputs, a row an input; empty where none is known."""
-    if not summary["inputs"]:
-        return ""
-    rows = [
-        [*row, limited_cell(of)]
-        for row, of in zip(table_rows(summary["inputs"], INPUT_COLUMNS, units), summary["inputs"].values(), strict=True)
-    ]
-    return table("Inputs", (*INPUT_COLUMNS, Column("limited", "%", ())), rows, INPUT_READING + LIMITED_READING)
+def _input_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
+    return Table("Inputs", (*INPUT_COLUMNS, SATURATION_COLUMN), input_rows(summary, units), INPUT_LEGEND + SATURATION_LEGEND)
 
 
-def event_table(happened: Sequence[Event]) -> str:
-    """What happened, a row an event; empty where nothing did."""
-    if not happened:
-        return ""
-    columns = [Column("", head, ()) for head in ("from (s)", "to (s)", "")]
-    rows = [(event.what, f"{event.start:.2f}", f"{event.stop:.2f}", event.how_much) for event in happened]
-    return table("What happened", columns, rows)
+def _event_table(happened: Sequence[Event]) -> Table:
+    columns = [Column("", head) for head in ("from (s)", "to (s)", "")]
+    return Table(
+        "Events", columns, [(event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent) for event in happened]
+    )
 
 
-def tick_table(summary: Mapping[str, Any]) -> str:
-    """Figures of the controller's time; empty where there are none."""
+def _tick_table(summary: Mapping[str, Any]) -> Table:
     ticks, latency = summary["ticks"], summary["latency"]
-    if ticks is None:
-        return ""
+    rows: list[tuple[str, str]] = []
 
     def ms(*values: float) -> str:
         return " / ".join(f"{value * 1e3:.3f}" for value in values)
 
-    rows = [
-        ("ticks", f"{ticks['ticks']}"),
-        ("periods without a new y", f"{ticks['without_new_y']}"),
-        ("period mean / p99 / max (ms)", ms(ticks["period_mean"], ticks["period_p99"], ticks["period_max"])),
-        ("jitter rms (ms)", ms(ticks["jitter"])),
-        ("after the deadline p99 / max (ms)", ms(ticks["late_p99"], ticks["late_max"])),
-        ("age of y p99 (ms)", ms(ticks["age_p99"])),
-    ]
-    if latency is not None:
-        rows.append(("y sent to u sent median / p99 / max (ms)", ms(*latency.values())))
-    return table("Ticks of the controller", [Column("", "", ())], rows)
-
-
-def compared_tables(blocks: Sequence[ComparisonBlock], dots: Sequence[str]) -> str:
-    """A table a block: the figure of each flight under its dot, from the second on with its ratio to the first."""
-    head = "".join(f'<th class="first">{dot}</th>{"<th></th>" * (k > 0)}' for k, dot in enumerate(dots))
-    return "".join(
-        _framed(
-            block.name,
-            f"<tr><th></th>{head}</tr>",
-            "".join(f"<tr><td>{escape(row.what)}</td>{_compared_cells(row)}</tr>" for row in block.rows),
-        )
-        for block in blocks
-    )
-
-
-def dot(colour: str, in_the_dark: str) -> str:
-    """The mark of a flight."""
-    return f'<span class="dot" style="background: {colour}; background: light-dark({colour}, {in_the_dark})"></span>'
-
-
-def _compared_cells(row: ComparisonRow) -> str:
-    cells = ""
-    for k, (text, ratio) in enumerate(zip(row.texts, row.ratios, strict=True)):
-        cells += f'<td class="first">{escape(text)}</td>'
-        if k > 0:
-            times = "" if ratio is None else f"&times;{cell(ratio) if ratio < 100.0 else f'{ratio:.0f}'}"
-            cells += f'<td class="{_verdict(ratio, row.judged)}">{times}</td>'
-    return cells
-
-
-def _verdict(ratio: float | None, judged: bool) -> str:
-    if ratio is None or not judged or abs(ratio - 1.0) < ALIKE:
-        return "same"
-    return "better" if ratio < 1.0 else "worse"
-
-
-def table(caption: str, columns: Sequence[Column], rows: Iterable[Sequence[str]], said: str = "") -> str:
-    """A table whose first column is the rows' names; neighbours of one group share a head."""
-    groups = [(group, len(list(of))) for group, of in groupby(columns, key=lambda column: column.group)]
-    firsts = {k for k, column in enumerate(columns) if k == 0 or not column.group or column.group != columns[k - 1].group}
-
-    def cells(texts: Sequence[str], tag: str) -> str:
-        marks = (' class="first"' if k in firsts else "" for k in range(len(texts)))
-        return "".join(f"<{tag}{mark}>{escape(text)}</{tag}>" for mark, text in zip(marks, texts, strict=True))
-
-    over = "".join(f'<th class="group" colspan="{count}">{escape(group)}</th>' for group, count in groups)
-    head = f"<tr><th></th>{over}</tr>" if any(group for group, _ in groups) else ""
-    if any(column.head for column in columns):
-        head += f"<tr><th></th>{cells([column.head for column in columns], 'th')}</tr>"
-    body = "".join(f"<tr><td>{escape(name)}</td>{cells(texts, 'td')}</tr>" for name, *texts in rows)
-    return _framed(caption, head, body, said)
-
-
-def _framed(caption: str, head: str, body: str, said: str = "") -> str:
-    hint = f'<p class="hint">{escape(said)}</p>' if said else ""
-    return f"<div><table><caption>{escape(caption)}</caption><thead>{head}</thead><tbody>{body}</tbody></table>{hint}</div>"
+    if ticks is not None:
+        rows = [
+            ("ticks", f"{ticks['ticks']}"),
+            ("periods without a new y", f"{ticks['without_new_y']}"),
+            ("period mean / p99 / max (ms)", ms(ticks["period_mean"], ticks["period_p99"], ticks["period_max"])),
+            ("jitter rms (ms)", ms(ticks["jitter"])),
+            ("after the deadline p99 / max (ms)", ms(ticks["late_p99"], ticks["late_max"])),
+            ("age of y p99 (ms)", ms(ticks["age_p99"])),
+        ]
+        if latency is not None:
+            rows.append(("y sent to u sent median / p99 / max (ms)", ms(*latency.values())))
+    return Table("Ticks of the controller", [Column("", "")], rows)

@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The report as one HTML page without network access: the tables of a flight and its figures, or a comparison of several."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import plotly.graph_objects as go
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from flight_analysis.report import comparison, figures, plotting, tables
+from flight_analysis.report.plotting import SampleStore, pack
+from flight_analysis.report.recorded_flight import RecordedFlight
+from flight_analysis.report.summary import display_units, format_value
+from flight_core.outcome import COMPLETED
+
+HERE = Path(__file__).parent
+
+
+class Line(NamedTuple):
+    """A line under the title: the colour and label of a flight, its outcome, and text; each may be empty."""
+
+    text: str
+    outcome: str = ""
+    label: str = ""
+    colour: str = ""
+
+
+class TableGroup(NamedTuple):
+    """Tables beside each other. With `colours`, those of the flights, they are comparison tables."""
+
+    tables: Sequence[tables.Table] | Sequence[comparison.ComparisonTable]
+    title: str = ""
+    legend: str = ""
+    colours: Sequence[str] = ()
+
+
+class Section(NamedTuple):
+    """A figure with its heading; left out without a figure."""
+
+    title: str
+    hint: str
+    figure: go.Figure | None
+    over_time: bool = True  # all figures over time are zoomed together
+
+
+class Page(NamedTuple):
+    """Content of a page."""
+
+    title: str
+    lines: Sequence[Line]
+    tables: Sequence[TableGroup]
+    sections: Sequence[Section]
+    samples: SampleStore
+    notes: Sequence[str] = ()
+
+
+def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
+    """Write the page of a flight, or the comparison of several."""
+    page = _flight_page(flights[0]) if len(flights) == 1 else _comparison_page(flights)
+    path.write_text(page_html(page), encoding="utf-8")
+
+
+def _flight_page(flight: RecordedFlight) -> Page:
+    units, gusts = display_units(flight.scenario), flight.scenario.gust_windows()
+    context = figures.plot_context(flight.tape, units, gusts)
+    return Page(
+        f"Flight {flight.name}",
+        [Line(f"{_description(flight)}.", flight.summary["outcome"])],
+        [TableGroup(tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts)))],
+        _sections(flight, context),
+        context.samples,
+        flight.summary["notes"],
+    )
+
+
+def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
+    context, colours = comparison.plot_context(flights), comparison.colours(flights)
+    lines = []
+    for (label, colour), flight in zip(colours.items(), flights, strict=True):
+        text = f"{flight.scenario.name}: {_description(flight)} ({flight.summary['error']})"
+        lines.append(Line(text, flight.summary["outcome"], label, colour))
+    palette = list(colours.values())
+    groups = [
+        TableGroup(comparison.error_tables(flights), "Tracking error", tables.ERROR_LEGEND, palette),
+        TableGroup(comparison.input_tables(flights), "Inputs", tables.INPUT_LEGEND, palette),
+        TableGroup(comparison.tick_tables(flights), "Time", "", palette),
+    ]
+    sections = [
+        Section("Output y over the reference y_m", "", comparison.tracking_figure(context, flights)),
+        Section("Tracking error e = y - y_m", "", comparison.error_figure(context, flights)),
+        Section("Input u", "", comparison.input_figure(context, flights)),
+        Section("Spectrum of u", "", comparison.spectrum_figure(context, flights), over_time=False),
+        Section("Timing of the ticks", "", comparison.timing_figure(flights), over_time=False),
+    ]
+    return Page(f"{len(flights)} flights compared", lines, groups, sections, context.samples)
+
+
+def _description(flight: RecordedFlight) -> str:
+    controller = flight.scenario.controller
+    return f"{flight.summary['duration']:.1f} s flown at {controller.rate:g} Hz with the {controller.sampled_sign()[1]}"
+
+
+def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Section]:
+    floors = {name: metrics["floor"] for name, metrics in flight.summary["errors"].items()}
+    limits = figures.input_limits(flight.scenario, flight.tape)
+    return [
+        Section("Output y over the reference y_m", "", figures.tracking_figure(context)),
+        Section(
+            "Tracking error e = y - y_m",
+            "The noise floor is drawn where it is wide enough to see.",
+            figures.error_figure(context, floors),
+        ),
+        Section(
+            "Input u and the actuators",
+            "Limits are in view where u comes near them. Marks above each row: the controller saturated the input.",
+            figures.input_figure(context, limits),
+        ),
+        Section("Wind", "along the body axes of trim", figures.wind_figure(context)),
+        Section("States", "SI where no unit is given", figures.state_figure(context)),
+        Section(
+            "Integrals of the law",
+            "of e, in SI times s; Pi, of the sign term, in scaled inputs",
+            figures.integral_figure(context),
+        ),
+        Section("Error of the sensors", "y less the true output", figures.sensor_figure(context)),
+        Section(
+            "Spectrum of u", "amplitude spectral density", figures.spectrum_figure(context, flight.period_ns), over_time=False
+        ),
+        Section(
+            "Ticks of the controller",
+            "late: after its deadline; age: of y at the tick; dt: as integrated",
+            figures.tick_figure(context),
+        ),
+        Section("Timing of the ticks", "", figures.timing_figure(context, flight.period_ns), over_time=False),
+    ]
+
+
+def page_html(page: Page) -> str:
+    """The page as HTML, with plotly, the script and all samples inside."""
+    environment = Environment(
+        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"script_json": script_json, "ratio": format_ratio}
+    return environment.get_template("page.html.jinja").render(
+        page=page,
+        completed=COMPLETED,
+        dark=plotting.DARK | figures.DARK | comparison.DARK,
+        library=pack(get_plotlyjs().encode()),
+        script=Markup((HERE / "page.js").read_text(encoding="utf-8")),  # noqa: S704 - our own file
+    )
+
+
+def script_json(value: Any) -> Markup:
+    """JSON that cannot end the script element around it: "<" occurs only in strings, where it is escaped."""
+    text = value.to_json() if isinstance(value, go.Figure) else json.dumps(value)
+    return Markup(str(text).replace("<", "\\u003c"))  # noqa: S704
+
+
+def format_ratio(ratio: float | None) -> Markup:
+    """A ratio with three digits, or as a whole number from 100 on."""
+    if ratio is None:
+        return Markup()
+    return Markup("&times;{}").format(format_value(ratio) if ratio < 100.0 else f"{ratio:.0f}")
