@@ -328,7 +328,7 @@ def test_an_invalid_transition_does_not_end_the_node(start: Start, osprey_gust: 
     client = peer_node.node.create_client(ChangeState, "controller/change_state")
     peer_node.until(client.service_is_ready)
     client.call_async(ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE)))
-    peer_node.until(lambda: any("request refused" in line for line in process.lines), each=lambda: peer_node.send(0.01))
+    peer_node.until(lambda: any("request rejected" in line for line in process.lines), each=lambda: peer_node.send(0.01))
     count = len(peer_node.received["u"])
     peer_node.until(lambda: len(peer_node.received["u"]) > count + 20, each=lambda: peer_node.send(0.01))
 
@@ -344,7 +344,7 @@ def _check_that_unfitting_peers_are_named(start: Start, osprey_gust: Scenario, p
     process.wait_for("/u: /peer publishes std_msgs/msg/Float64MultiArray, expected sensor_msgs/msg/JointState")
     recorder = start("flight_recorder.main", "--ros-args", "--params-file", str(osprey_gust.path))
     peer_node.node.create_publisher(JointState, "truth", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-    recorder.wait_for("/truth: quality of service of /peer does not fit")
+    recorder.wait_for("/truth: /peer publishes with incompatible quality of service")
 
 
 def test_the_rate_is_kept_over_seconds(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
