@@ -52,7 +52,7 @@ def test_a_node_without_its_peer_says_so_keeps_waiting_and_ends_cleanly(
     package: str, waits_for: str, number: signal.Signals, start: Start, osprey_gust: Scenario
 ) -> None:
     node = start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path))
-    node.wait_for(f"waiting for {waits_for}: no publisher there")
+    node.wait_for(f"waiting for {waits_for}: no publisher")
     assert node.popen.poll() is None
     node.popen.send_signal(number)
     assert node.end(5.0) == 0

@@ -118,7 +118,7 @@ def test_a_domain_in_which_somebody_publishes_the_topic_is_refused(run: Path, st
         assert process.end() == 2
     (said,) = process.lines
     assert said.startswith(
-        f"error: ROS_DOMAIN_ID {domain}: found 1 publishers of /y already, expected nobody there: set ROS_DOMAIN"
+        f"error: ROS_DOMAIN_ID {domain}: found 1 publishers of /y already, expected no publisher: set ROS_DOMAIN"
     )
 
 

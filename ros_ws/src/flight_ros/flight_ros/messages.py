@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Named vectors as messages: sensor_msgs/JointState with name = channels, position = values, stamp = the sample's instant.
 
-Channels do not change during a flight. So a message is laid out once, and each sample then only changes the stamp and the
-values inside those bytes: several times faster than the middleware's own serialisation, and repeatable to the byte, which that
-one is not: it leaves what was in memory between two strings.
+The channels are constant during a flight. So the bytes of a message are laid out once, and each sample changes only its stamp
+and its values. This is several times faster than the serialisation of the middleware. It is also repeatable to the byte: the
+middleware leaves uninitialised memory between two strings.
 """
 
 import math
@@ -22,9 +22,9 @@ from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from flight_ros.rclpy_private import DeserializationError
 
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
-STAMP = struct.Struct("<iI")  # seconds and nanoseconds, right behind the encapsulation
+STAMP = struct.Struct("<iI")  # seconds and nanoseconds; they follow the encapsulation
 STAMP_PLACE = len(ENCAPSULATION)
-COUNT = struct.Struct("<I")  # of a sequence or a string, in front of it
+COUNT = struct.Struct("<I")  # length of a sequence or a string, before its elements
 NO_CHANNELS: FloatArray = np.zeros(0)
 
 
@@ -39,18 +39,18 @@ def to_message(stamp_ns: int, names: Sequence[str], values: FloatArray, frame_id
 
 
 def from_message(message: JointState, wanted: Sequence[str]) -> StampedVector:
-    """The wanted channels of a message. Raises ChannelError where names, lengths or values do not fit."""
+    """The wanted channels of a message. Raises ChannelError for invalid names, lengths or values."""
     stamp = message.header.stamp
     value = select(wanted, message.name, message.position)
     return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, _instance(message.header.frame_id))
 
 
 class Encoder:
-    """Samples of one publisher as the bytes of a message; without names: vectors without channels.
+    """Encodes the samples of one publisher as the bytes of a message.
 
-    In lockstep the latter say that there is no sample at an instant. Layout by CDR (OMG Common Object Request Broker
-    Architecture, 9.3): each value stands at a multiple of its size behind the encapsulation, with zeros in between. With a
-    `authenticator` each message is signed, behind `frame_id`.
+    Without names the message is a vector without channels: in lockstep, no sample exists at that instant. Layout: CDR (OMG
+    Common Object Request Broker Architecture, 9.3). The offset of each value from the encapsulation is a multiple of its size;
+    padding bytes are 0. With an `authenticator` each message carries its authentication code behind `frame_id`.
     """
 
     def __init__(self, names: Sequence[str], frame_id: str, authenticator: MessageAuthenticator | None = None) -> None:
@@ -64,9 +64,9 @@ class Encoder:
         self._add_count(len(names))
         if names:
             self._align(8)
-        self.place = len(self._bytes)  # of the values
+        self.place = len(self._bytes)  # offset of the values
         self._values = slice(self.place, self.place + 8 * len(names))
-        self._bytes += bytes(8 * len(names) + 2 * COUNT.size)  # and no velocity, no effort
+        self._bytes += bytes(8 * len(names) + 2 * COUNT.size)  # an empty velocity and an empty effort follow
 
     def _align(self, size: int) -> None:
         self._bytes += bytes(-(len(self._bytes) - len(ENCAPSULATION)) % size)
@@ -81,7 +81,7 @@ class Encoder:
         self._bytes += encoded
 
     def encode(self, stamp_ns: int, values: FloatArray) -> bytes:
-        """One sample, values in the order of the names."""
+        """The message of one sample; values in the order of the names."""
         STAMP.pack_into(self._bytes, STAMP_PLACE, *divmod(stamp_ns, NANOSECONDS))
         self._bytes[self._values] = values.tobytes()
         message = bytes(self._bytes)
@@ -91,12 +91,12 @@ class Encoder:
 
 
 class Decoder:
-    """Bytes of one topic as samples: the wanted channels, by name. With an `authenticator`: only signed, new ones."""
+    """Decodes the wanted channels of the messages of one topic. An `authenticator` accepts only authentic, new ones."""
 
     def __init__(self, wanted: Sequence[str], authenticator: MessageAuthenticator | None = None) -> None:
         self._wanted = list(wanted)
         self._authenticator = authenticator
-        self._fixed = b""  # what does not change between the samples of the last sender
+        self._fixed = b""  # the constant bytes of the last publisher's messages
         self._names: list[str] = []
         self._order: list[int] = []
         self._place = 0
@@ -104,7 +104,7 @@ class Decoder:
         self._sender = ""
 
     def decode(self, raw: bytes) -> StampedVector | None:
-        """The sample, None for a vector without channels. Raises ChannelError where it cannot be used."""
+        """The sample; None for a vector without channels. Raises ChannelError for an invalid message."""
         if self._authenticator is None:
             return self._decode(raw)
         self._authenticator.check(raw)
@@ -118,11 +118,11 @@ class Decoder:
             if not message.name and not message.position:
                 return None
             sample = from_message(message, self._wanted)
-            self._learn(message, raw)
+            self._learn_layout(message, raw)
             return sample
         seconds, nanoseconds = STAMP.unpack_from(raw, STAMP_PLACE)
         value = np.frombuffer(raw, "<f8", len(self._names), self._place)[self._order]
-        if not math.isfinite(value.sum()) and not np.isfinite(value).all():  # a sum of finite values may overflow
+        if not math.isfinite(value.sum()) and not np.isfinite(value).all():  # the sum of finite values can overflow
             raise ChannelError("finite", f"{', '.join(self._wanted)} = {value.tolist()} is not finite")
         return StampedVector(seconds * NANOSECONDS + nanoseconds, value, self._sender)
 
@@ -130,11 +130,11 @@ class Decoder:
         mac, end = self._mac, self._place + 8 * len(self._names)
         return raw[:STAMP_PLACE] + raw[STAMP_PLACE + STAMP.size : mac.start] + raw[mac.stop : self._place] + raw[end:]
 
-    def _learn(self, message: JointState, raw: bytes) -> None:
+    def _learn_layout(self, message: JointState, raw: bytes) -> None:
         encoder = Encoder(message.name, message.header.frame_id)
         stamp = message.header.stamp
         if encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position)) != raw:
-            return  # it holds more than a named vector; it is read the long way
+            return  # more than a named vector: the middleware decodes it each time
         self._names, self._place, self._mac = list(message.name), encoder.place, mac_slice(raw)
         self._sender = _instance(message.header.frame_id)
         self._order = [self._names.index(name) for name in self._wanted]
@@ -142,18 +142,18 @@ class Decoder:
 
 
 def _instance(frame_id: str) -> str:
-    """The publisher's instance, without the code that it signs with."""
+    """The instance of the publisher, without the message authentication code."""
     return frame_id.partition(MARK)[0]
 
 
 def stamp_of(raw: bytes) -> int:
-    """The instant that a message with nothing in front of its stamp belongs to, ns."""
+    """The stamp of a message that begins with it, ns."""
     seconds, nanoseconds = STAMP.unpack_from(raw, STAMP_PLACE)
     return int(seconds) * NANOSECONDS + int(nanoseconds)
 
 
 def instant(stamp_ns: int) -> bytes:
-    """An instant as a message that holds nothing else: rosgraph_msgs/Clock, builtin_interfaces/Time."""
+    """A message that contains an instant alone: rosgraph_msgs/Clock, builtin_interfaces/Time."""
     return ENCAPSULATION + STAMP.pack(*divmod(stamp_ns, NANOSECONDS))
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS parameters as a validated set: what was given is checked as a whole, then every parameter is declared and described."""
+"""ROS parameters of a node as a validated set. The overrides are validated as a whole; then each parameter is declared."""
 
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -12,19 +12,19 @@ from rclpy.parameter import Parameter
 from flight_core.parameters import Parameters, flatten, nest
 
 P = TypeVar("P", bound=Parameters)
-NOT_OURS = ("use_sim_time", "start_type_description_service", "qos_overrides")
+ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
 
 def read_parameters(node: Node, schema: type[P], tunable: frozenset[str]) -> P:
-    """Validate the overrides of a node made with automatically_declare_parameters_from_overrides.
+    """Validate the overrides of a node created with automatically_declare_parameters_from_overrides. Raises ParameterError.
 
-    Afterwards every parameter of the set is declared, with its description; read-only unless `tunable`. Raises ParameterError.
+    Then every parameter of the set is declared with its description, read-only unless it is in `tunable`.
     """
-    parameters = schema.validate_mapping(nest(_given(node)), node.get_name())
-    descriptions = dict(_descriptions(schema))
+    parameters = schema.validate_mapping(nest(_overrides(node)), node.get_name())
+    descriptions = {name: field.description or "" for name, field in schema.model_fields.items()}
     for name, value in flatten(parameters.model_dump()):
         group = name.split(".")[0]
-        # dynamic_typing: the set decides about types, and takes an integer where a number is meant
+        # dynamic_typing: the set validates the types and accepts an integer as a float
         descriptor = ParameterDescriptor(
             description=descriptions.get(group, ""), read_only=group not in tunable, dynamic_typing=True
         )
@@ -33,28 +33,25 @@ def read_parameters(node: Node, schema: type[P], tunable: frozenset[str]) -> P:
         elif value != ():
             node.declare_parameter(name, value, descriptor)
     for name in tunable:
-        if not node.has_parameter(name):  # an optional one that was not given, but may be in flight
+        if not node.has_parameter(name):  # an optional parameter without an override, which may be set in flight
             node.declare_parameter(name, None, ParameterDescriptor(description=descriptions.get(name, ""), dynamic_typing=True))
     return parameters
 
 
 def changed(node: Node, parameters: P, changes: list[Parameter]) -> P:
-    """The set with some parameters changed, checked as a whole. Raises ParameterError."""
-    ours = {change.name: _plain(change.value) for change in changes if change.name.split(".")[0] not in NOT_OURS}
-    return type(parameters).validate_mapping(nest(_given(node) | ours), node.get_name())
+    """The set with some parameters changed, validated as a whole. Raises ParameterError."""
+    values = {change.name: _as_list(change.value) for change in changes if change.name.split(".")[0] not in ROS_PARAMETERS}
+    return type(parameters).validate_mapping(nest(_overrides(node) | values), node.get_name())
 
 
-def _given(node: Node) -> dict[str, Any]:
+def _overrides(node: Node) -> dict[str, Any]:
     return {
-        name: _plain(parameter.value)
+        name: _as_list(parameter.value)
         for name, parameter in node.get_parameters_by_prefix("").items()
-        if name.split(".")[0] not in NOT_OURS and parameter.value is not None
+        if name.split(".")[0] not in ROS_PARAMETERS and parameter.value is not None
     }
 
 
-def _plain(value: Any) -> Any:
+def _as_list(value: Any) -> Any:
+    """A sequence as a list; any other value unchanged."""
     return value if isinstance(value, str | bytes | Mapping) or not hasattr(value, "__iter__") else list(value)
-
-
-def _descriptions(schema: type[Parameters]) -> list[tuple[str, str]]:
-    return [(name, field.description or "") for name, field in schema.model_fields.items()]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sends the messages of a log again, with their timing."""
+"""Player: publishes the messages of a log again, with their timing."""
 
 import os
 import time
@@ -20,36 +20,35 @@ from flight_ros.flight_node import ACKNOWLEDGE_TIMEOUT
 from flight_ros.messages import STAMP, STAMP_PLACE, instant
 from flight_ros.topics import CLOCK, LOCKSTEP
 
-DISCOVERY = 1.0  # s, for somebody who is there to be found
-MATCHING = 0.5  # s, for listeners to be found by the publishers
+DISCOVERY_TIME = 1.0  # s, to discover other publishers
+MATCHING_TIME = 0.5  # s, to discover the subscribers
 
 CLOCK_PERIOD_NS = 10_000_000
 """ns of the log between two samples of `/clock`."""
 
-SHOWN_EVERY_NS = 100_000_000
-
+PROGRESS_PERIOD_NS = 100_000_000
 
 Outgoing = tuple[int, str, bytes, bool]
-"""The instant of the log at which a message is due, ns; its topic; its bytes; whether they begin with a stamp to be moved."""
+"""A message: its instant in the log, ns; its topic; its bytes; whether they begin with a stamp."""
 
 
 class Player:
-    """Publishers on the topics of a log and on `/clock`. A context manager, so that the middleware is always shut down.
+    """Publishers on the topics of a log and on `/clock`. A context manager that shuts down the middleware.
 
-    `shared` are topics on which others may publish too. Raises ParameterError where somebody publishes on any other of them,
-    or a message type is not installed.
+    `shared` are topics that may have other publishers. Raises ParameterError if any other topic has one, or if a message type
+    is not installed.
     """
 
     def __init__(self, types: Mapping[str, str], shared: Collection[str]) -> None:
         kinds = {topic: _message_type(topic, name) for topic, name in types.items()}
         transport.prepare()
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C is for the command to handle
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # the command handles Ctrl-C
         self._node = rclpy.create_node("player", start_parameter_services=False, enable_rosout=False)
         try:
-            self._require_alone([topic for topic in (*types, CLOCK.name) if topic not in shared])
+            self._require_no_publishers([topic for topic in (*types, CLOCK.name) if topic not in shared])
             self._publishers = {topic: self._node.create_publisher(kind, topic, LOCKSTEP) for topic, kind in kinds.items()}
             self._clock = self._node.create_publisher(CLOCK.type, CLOCK.name, LOCKSTEP)
-            time.sleep(MATCHING)
+            time.sleep(MATCHING_TIME)
         except BaseException:
             self.__exit__(None, None, None)
             raise
@@ -61,26 +60,25 @@ class Player:
         self._node.destroy_node()
         rclpy.try_shutdown()
 
-    def _require_alone(self, topics: list[str]) -> None:
-        end_ns = time.monotonic_ns() + nanoseconds(DISCOVERY)
+    def _require_no_publishers(self, topics: list[str]) -> None:
+        end_ns = time.monotonic_ns() + nanoseconds(DISCOVERY_TIME)
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         while time.monotonic_ns() < end_ns:
             for topic in topics:
                 count = self._node.count_publishers(topic)
-                expected = "nobody there: set ROS_DOMAIN_ID to a domain of its own, or choose other --topics"
+                expected = "no publisher: set ROS_DOMAIN_ID to an unused domain, or choose other --topics"
                 require(count == 0, f"ROS_DOMAIN_ID {domain}", f"{count} publishers of {topic} already", expected)
             time.sleep(IDLE_POLL_PERIOD)
 
     def play(
         self, messages: Iterable[Outgoing], rate: float, *, stamps_now: bool, progress: Callable[[int], None] | None = None
     ) -> None:
-        """Send all messages, the first one at once, each of the others at its distance from it over `rate`.
+        """Publish all messages, the first one immediately, each other one at its time since the first one over `rate`.
 
-        Deadlines are absolute, on the monotonic clock. With `stamps_now` a stamp becomes as old, against the system clock, as
-        it was against the instant at which its message was due, over `rate`. `progress` is told the instant of the log in ns
-        ten times a second.
+        Deadlines are absolute on the monotonic clock. `stamps_now` moves the stamps: the age of a message against the system
+        clock becomes its age in the log over `rate`. `progress` is called with the instant of the log, ns, ten times a second.
         """
-        begin_ns = begin_system_ns = first_ns = clock_ns = shown_ns = 0
+        begin_ns = begin_system_ns = first_ns = clock_ns = progress_ns = 0
         for due_ns, topic, message, stamped in messages:
             if begin_ns == 0:
                 begin_ns, begin_system_ns = time.monotonic_ns(), time.time_ns()
@@ -89,12 +87,12 @@ class Player:
                 _sleep_until(begin_ns + round((clock_ns - first_ns) / rate))
                 self._clock.publish(instant(clock_ns))
                 clock_ns += CLOCK_PERIOD_NS
-                if progress is not None and time.monotonic_ns() >= shown_ns:
-                    shown_ns = time.monotonic_ns() + SHOWN_EVERY_NS
+                if progress is not None and time.monotonic_ns() >= progress_ns:
+                    progress_ns = time.monotonic_ns() + PROGRESS_PERIOD_NS
                     progress(due_ns)
             _sleep_until(begin_ns + round((due_ns - first_ns) / rate))
-            fresh = stamps_now and stamped
-            self._publishers[topic].publish(_restamped(message, begin_system_ns, first_ns, rate) if fresh else message)
+            restamp = stamps_now and stamped
+            self._publishers[topic].publish(_restamped(message, begin_system_ns, first_ns, rate) if restamp else message)
         for publisher in self._publishers.values():
             publisher.wait_for_all_acked(ACKNOWLEDGE_TIMEOUT)
 
@@ -102,9 +100,11 @@ class Player:
 def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
     seconds, nanosecond = STAMP.unpack_from(data, STAMP_PLACE)
     since_ns = seconds * NANOSECONDS + nanosecond - first_ns
-    fresh = bytearray(data)
-    STAMP.pack_into(fresh, STAMP_PLACE, *divmod(begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate)), NANOSECONDS))
-    return bytes(fresh)
+    message = bytearray(data)
+    STAMP.pack_into(
+        message, STAMP_PLACE, *divmod(begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate)), NANOSECONDS)
+    )
+    return bytes(message)
 
 
 def _sleep_until(deadline_ns: int) -> None:

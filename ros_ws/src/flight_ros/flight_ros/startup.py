@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The start of a node's process: it joins the others first and loads what it flies with then.
+"""Start of a node's process: an early DDS participant starts discovery while the modules of the node are imported.
 
-The others need a fifth of a second to find a process, and it needs as long to load NumPy and pydantic: both at a time, so that
-a node that was killed is back the sooner. Hence this module loads rclpy and little else.
+Discovery takes 0.2 s, and so does the import of NumPy and pydantic. Both run at the same time, so that a node restarts sooner.
+For this reason this module imports rclpy and little else.
 """
 
 import gc
@@ -22,28 +22,28 @@ from flight_ros.rclpy_private import Participant, create_participant
 
 
 def start_nodes(*nodes: str, early: bool = True) -> None:
-    """Run nodes, each "module:class", as `flight_ros.event_loop.run` does; stopped before that, it leaves with status 0 too.
+    """Run nodes, each "module:class", by `flight_ros.event_loop.run`. A signal during the start ends with exit status 0 too.
 
-    `early`: join the others before the nodes are loaded.
+    `early`: create a DDS participant before the imports.
     """
-    gc.disable()  # `run` enables it: a tenth of the way there is collections that find nothing
+    gc.disable()  # `run` enables it; collections during the imports find nothing and take a tenth of the time
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _leave)
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # else each start looks for some in all that is installed
-    early_participant = _join() if early else None
+        signal.signal(number, _exit)
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # no search for plugins in all installed packages
+    early_participant = _create_early_participant() if early else None
     run = resolve_name("flight_ros.event_loop:run")
     make_nodes = [resolve_name(node) for node in nodes]
     run(*make_nodes, early_participant=early_participant)
 
 
-def _join() -> Participant | None:
-    """A node without topics, hidden as its name begins with _ (ROS 2 design, topic and service names)."""
-    with suppress(Exception):  # `run` meets it again, and has the sentence for it
+def _create_early_participant() -> Participant | None:
+    """A node without topics. It is hidden, as its name begins with _ (ROS 2 design, topic and service names)."""
+    with suppress(Exception):  # the same exception occurs in `run`, which reports it
         transport.prepare()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         return create_participant(f"_start_{os.getpid()}", get_default_context())
     return None
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
-    os._exit(0)  # nothing is open yet that would have to be closed
+def _exit(number: int, frame: FrameType | None) -> None:
+    os._exit(0)  # there is nothing to close yet

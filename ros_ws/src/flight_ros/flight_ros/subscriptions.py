@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Subscriptions that are read at the tick: the newest samples, whatever the sender's rate, and no executor between.
+"""Polled subscriptions: a tick takes the newest messages at any rate of the publisher, without an executor.
 
-A tick takes what has arrived (about 1 us when nothing has); a storm of messages costs no callbacks, and a clock that is set
-back stops nothing.
+Polling takes about 1 us if there is no message. A flood of messages causes no callbacks, and a clock that is set back has no
+effect.
 """
 
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from flight_ros.topics import Topic
 
 
 class _NeverExecuted(CallbackGroup):
-    """Keeps its members out of every executor's wait set."""
+    """Keeps its subscriptions out of the wait set of every executor."""
 
     def can_execute(self, entity: Any) -> bool:
         return False
@@ -30,16 +30,16 @@ class _NeverExecuted(CallbackGroup):
 
 
 class ReceivedMessage(NamedTuple):
-    """A message (or its bytes) and what the middleware says of it; times in ns of the system clock."""
+    """A message (or its bytes) and its metadata; times in ns of the system clock."""
 
     message: Any
     sent_ns: int
     received_ns: int
-    sequence: int  # counts up by one a message of the publisher: a gap is a loss
+    sequence: int  # of the publisher, increases by one for each message: a gap is a loss
 
 
 class PolledSubscription:
-    """One subscription, read with `take`."""
+    """A subscription that is polled by `take`."""
 
     def __init__(self, node: Node, topic: Topic, qos: QoSProfile, *, raw: bool = False) -> None:
         self.topic = topic
@@ -47,10 +47,10 @@ class PolledSubscription:
         self.entity = node.create_subscription(
             topic.type, topic.name, lambda _: None, qos, callback_group=_NeverExecuted(), raw=raw
         )
-        self.name = str(self.entity.topic_name)  # in full
+        self.name = str(self.entity.topic_name)  # the full name
 
     def take(self, most: int | None = None) -> list[ReceivedMessage]:
-        """The messages that have arrived since the last call, oldest first, at most so many, else the queue's depth of them."""
+        """The messages since the last call, oldest first, at most `most`, by default the depth of the queue."""
         return [
             ReceivedMessage(
                 message, info["source_timestamp"], info["received_timestamp"], info["publication_sequence_number"] or 0

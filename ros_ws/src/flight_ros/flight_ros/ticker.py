@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fixed rate on the monotonic clock with absolute deadlines: no drift, and no stop while the system clock is set back."""
+"""Ticker: a fixed rate on the monotonic clock with absolute deadlines, without drift and independent of the system clock."""
 
 import time
 from contextlib import suppress
@@ -8,31 +8,29 @@ from pathlib import Path
 from typing import NamedTuple
 
 TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
-SPIN_TIME = (
-    2.5e-4  # s, by which a thread is awake before its deadline to watch the clock for the rest: waking takes 20 to 250 us
-)
-MAX_SPIN_FRACTION = 0.2  # of a period, and so of a core, that the watch takes at most
+SPIN_TIME = 2.5e-4  # s of busy-wait before a deadline: the wake-up of a sleeping thread takes 20 to 250 us
+MAX_SPIN_FRACTION = 0.2  # maximum of the busy-wait, as a fraction of the period and so of a core
 
 
 def disable_timer_slack() -> None:
-    """Have the main thread woken at its deadlines, not up to 50 us later, which Linux does to save power. Needs no privilege.
+    """Set the timer slack of the main thread to its minimum. By default Linux delays a wake-up by up to 50 us to save power.
 
-    Source: prctl(2), PR_SET_TIMERSLACK. Threads of real-time priority have no slack anyway.
+    Source: prctl(2), PR_SET_TIMERSLACK. No privilege is needed. Threads of real-time priority have no timer slack.
     """
-    with suppress(OSError):  # no /proc, or not to be written: ticks are that much later
+    with suppress(OSError):  # /proc is missing or read-only: ticks keep the slack
         TIMER_SLACK.write_text("1", encoding="utf-8")
 
 
 class Tick(NamedTuple):
-    """A deadline that has come."""
+    """A deadline that has passed."""
 
-    number: int  # counts periods since the start; missed ones are skipped
-    previous: int  # number of the tick before, 0 at the first
+    number: int  # of periods since the start; an overrun skips the missed ones
+    previous: int  # number of the previous tick, 0 at the first
     late_ns: int  # how long after the deadline the tick began
 
     @property
     def missed(self) -> int:
-        """Periods skipped since the previous tick."""
+        """Periods missed since the previous tick by an overrun."""
         return max(self.number - self.previous - 1, 0)
 
 
@@ -41,7 +39,7 @@ class Ticker:
 
     def __init__(self, period_ns: int, start_ns: int) -> None:
         self.period_ns = period_ns
-        self._ahead = min(SPIN_TIME, MAX_SPIN_FRACTION * period_ns / 1e9)  # s
+        self._spin_time = min(SPIN_TIME, MAX_SPIN_FRACTION * period_ns / 1e9)  # s
         self._start_ns = start_ns
         self._last = -1
 
@@ -50,15 +48,15 @@ class Ticker:
         return (self._start_ns + (self._last + 1) * self.period_ns - time.monotonic_ns()) / 1e9
 
     def wait(self, most: float) -> None:
-        """Sleep until the next deadline, but at most so many s; watch the clock for the last of it."""
+        """Sleep until the next deadline, at most `most` s. The last part before the deadline is a busy-wait."""
         pause = self.remaining()
-        if pause > self._ahead:
-            time.sleep(min(pause - self._ahead, most))
-        while 0.0 < self.remaining() <= self._ahead:
+        if pause > self._spin_time:
+            time.sleep(min(pause - self._spin_time, most))
+        while 0.0 < self.remaining() <= self._spin_time:
             pass
 
     def due(self) -> Tick | None:
-        """The newest deadline that has come and was not yet returned, else None."""
+        """The newest deadline that has passed and was not returned yet, else None."""
         number, late_ns = divmod(time.monotonic_ns() - self._start_ns, self.period_ns)
         if number <= self._last:
             return None

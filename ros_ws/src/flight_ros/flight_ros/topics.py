@@ -14,22 +14,20 @@ from sensor_msgs.msg import JointState
 
 from flight_core.rates import NANOSECONDS
 
-# Publishers are reliable and keep their last samples, so that a recorder that is matched a moment late, or held up, loses
-# nothing. The depth covers two seconds at 1 kHz, as that of the recorder does; see `publisher_qos`.
+# Publishers are reliable and keep their last samples, so that a recorder that is matched late or delayed loses none. The depth
+# is two seconds at 1 kHz, as that of the recorder; see `publisher_qos`.
 PUBLISH = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Control loops want the newest samples and never a retransmission. The depth covers the samples between two ticks
-# that are needed to bring y_m to the stamp of y, and those of a stranger at 10 kHz beside them: a u that these had displaced
-# would be lost.
+# Control loops use the newest samples and no retransmissions. The depth covers the samples of y_m between two ticks, from which
+# y_m is aligned to the stamp of y, and those of a conflicting publisher at 10 kHz, which would otherwise displace a u.
 NEWEST_SAMPLES = QoSProfile(depth=128, reliability=ReliabilityPolicy.BEST_EFFORT)
-# In lockstep every sample counts, from the first one on, whoever is matched late. The depth is for speed: with a history that
-# is full, Fast DDS asks for an acknowledgement of each sample.
+# A lockstep flight needs every sample from the first one on, also of a subscriber that is matched late. The depth is for speed:
+# with a full history, Fast DDS requests an acknowledgement of each sample.
 LOCKSTEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Nothing is ever sent with it: the middleware itself says when the process behind it no longer lives. Long enough for one
-# that a busy machine leaves waiting, short enough to end the others within two seconds.
+# No messages are sent with it: the middleware reports the loss of liveliness. The lease is long enough for a process on a busy
+# host, and short enough to end the other nodes within two seconds.
 LIVELINESS = QoSProfile(depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=1.0))
 RECORD = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# For topics that others publish, whose kept samples cannot be counted on; where one of them offers less, the recorder asks for
-# less.
+# For topics of other publishers, which may not keep samples. If a publisher offers less, the recorder requests less.
 RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 
 # A late subscriber gets the last state of each node. The queue of a subscriber holds the states of many nodes.
@@ -40,9 +38,9 @@ HISTORY_NS = 2 * NANOSECONDS
 
 
 def publisher_qos(period_ns: int) -> QoSProfile:
-    """PUBLISH at a rate: it keeps what it publisher_qos in the last two seconds.
+    """PUBLISH at a rate, with a history of two seconds.
 
-    More would hold a flight back when a recorder comes: it is sent at once, by the threads that send what is new.
+    A longer history would delay the flight when a recorder joins: the threads that send new samples send the history at once.
     """
     return QoSProfile(
         depth=min(max(HISTORY_NS // period_ns, 1), PUBLISH.depth),
@@ -52,7 +50,7 @@ def publisher_qos(period_ns: int) -> QoSProfile:
 
 
 class NodeState(StrEnum):
-    """What a node publishes on `node_state`: its loop begins; the aircraft has flown a lockstep flight to its end."""
+    """State of a node on `node_state`. READY: its event loop begins. COMPLETED: the aircraft has completed a lockstep flight."""
 
     READY = "ready"
     COMPLETED = "completed"
@@ -63,7 +61,7 @@ class Topic(NamedTuple):
 
     name: str
     type: type
-    foreign: bool = False  # publisher_qos by others than this stack's nodes
+    foreign: bool = False  # published by other nodes than those of this stack
 
 
 Y = Topic("y", JointState)

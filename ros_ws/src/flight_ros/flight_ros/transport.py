@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The middleware's transport: loopback only, unless the user names a profile of his own.
+"""Transport of the middleware: loopback only, unless the user configures a profile.
 
-Fast DDS falls back to all interfaces, silently, when it cannot read its profile; so the file is checked before rclpy starts
-and the sockets after.
+Fast DDS silently falls back to all interfaces if it cannot read its profile. So the file is checked before rclpy starts and the
+sockets afterwards.
 """
 
 import os
@@ -17,7 +17,7 @@ LOOPBACK_PROFILE = Path(str(files("flight_ros"))) / "loopback.xml"
 
 
 def environment() -> dict[str, str]:
-    """Variables that put a process on the loopback transport; empty where the user has named a profile of his own."""
+    """Environment variables that select the loopback transport; empty if the user has configured a profile."""
     if PROFILE_VARIABLE in os.environ:
         return {}
     # SYSTEM_DEFAULT leaves discovery to the profile; LOCALHOST would add shared memory to it.
@@ -25,19 +25,19 @@ def environment() -> dict[str, str]:
 
 
 def prepare() -> None:
-    """Set the environment before rclpy starts. Raises ParameterError where the named profile cannot be read as XML."""
+    """Set the environment before rclpy starts. Raises ParameterError if the profile cannot be read as XML."""
     os.environ.update(environment())
     profile = os.environ[PROFILE_VARIABLE]
     try:
-        ElementTree.parse(profile)  # noqa: S314 - the user's own configuration file, not foreign input
+        ElementTree.parse(profile)  # noqa: S314 - a configuration file of the user, not foreign input
     except (OSError, ElementTree.ParseError) as error:
-        from flight_core.parameters import ParameterError  # noqa: PLC0415 - loads pydantic, see flight_ros.startup
+        from flight_core.parameters import ParameterError  # noqa: PLC0415 - imports pydantic, see flight_ros.startup
 
         raise ParameterError(f"{PROFILE_VARIABLE}: {profile} cannot be read ({error}), expected a Fast DDS profile") from None
 
 
 def open_to_network() -> list[str]:
-    """UDP sockets of this process that listen on all interfaces although the loopback profile is in force; should be none."""
+    """UDP sockets of this process on all interfaces in spite of the loopback profile; there should be none."""
     if os.environ.get(PROFILE_VARIABLE) != str(LOOPBACK_PROFILE):
         return []
     import psutil  # noqa: PLC0415 - see flight_ros.startup
