@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The log: what independent readers find in it, and what ours reads from it, from a damaged one, and from those of others."""
+"""Writing and reading bags: with independent readers, truncated and damaged files, bags of other recorders."""
 
 import shutil
 from collections.abc import Sequence
@@ -49,15 +49,15 @@ def run(recorded: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def cut(run: Path, share: float) -> None:
-    """As a recorder that was killed leaves it: a part of the file, and no metadata.yaml."""
+def truncate(run: Path, fraction: float) -> None:
+    """Leave what a killed recorder leaves: the beginning of the file, and no metadata.yaml."""
     file = run / "run_0.mcap"
-    whole = file.read_bytes()
-    file.write_bytes(whole[: int(len(whole) * share)])
+    content = file.read_bytes()
+    file.write_bytes(content[: int(len(content) * fraction)])
     (run / "metadata.yaml").unlink()
 
 
-def test_a_tape_comes_back_to_the_last_bit(tape: Tape, recorded: Path) -> None:
+def test_a_written_tape_is_read_back_bit_by_bit(tape: Tape, recorded: Path) -> None:
     back = read_run(recorded).tape
     assert set(back.signals) == set(tape.signals)
     assert back.notes == ()
@@ -67,11 +67,11 @@ def test_a_tape_comes_back_to_the_last_bit(tape: Tape, recorded: Path) -> None:
         assert back[name].values.tobytes() == signal.values.tobytes()
 
 
-def test_the_scenario_comes_back_as_it_was(recorded: Path, osprey_gust: Scenario) -> None:
+def test_the_scenario_is_stored_unchanged(recorded: Path, osprey_gust: Scenario) -> None:
     assert read_run(recorded).scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
 
 
-def test_what_is_enclosed_comes_back_as_it_was(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_attachments_and_metadata_are_stored_unchanged(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
     attached, metadata = tmp_path / "airframe.yaml", tmp_path / "metadata.yaml"
     attached.write_bytes(b"A: [[1.0]]\n\xc3\xa9")
     metadata.write_text("host: {cores: '2', kernel: '6.1 #1'}\nversions: {}\n", encoding="utf-8")
@@ -85,7 +85,7 @@ def test_what_is_enclosed_comes_back_as_it_was(tape: Tape, osprey_gust: Scenario
 
 
 @pytest.mark.parametrize("text", ["host: 3\n", "- a\n", "host: {cores: 2}\n"])
-def test_metadata_that_are_no_strings_are_refused(text: str, tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_metadata_other_than_strings_are_rejected(text: str, tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
     metadata = tmp_path / "metadata.yaml"
     metadata.write_text(text, encoding="utf-8")
     with pytest.raises(ParameterError, match="expected a mapping of mappings of strings"):
@@ -126,9 +126,9 @@ def test_the_file_is_a_ros2_profile_with_installed_definitions_and_hashes(record
         assert any(record.name == "rosbag2" for record in reader.iter_metadata())
 
 
-@pytest.mark.parametrize("share", [0.4, 0.55, 0.6, 0.75, 0.9])
-def test_a_file_without_an_end_is_read_up_to_its_last_whole_chunk(share: float, tape: Tape, run: Path) -> None:
-    cut(run, share)
+@pytest.mark.parametrize("fraction", [0.4, 0.55, 0.6, 0.75, 0.9])
+def test_a_truncated_file_is_read_up_to_its_last_complete_chunk(fraction: float, tape: Tape, run: Path) -> None:
+    truncate(run, fraction)
     back = read_run(run).tape
     assert 0 < len(back["y"].stamp_ns) <= len(tape["y"].stamp_ns)
     assert (back["y"].values == tape["y"].values[: len(back["y"].stamp_ns)]).all()
@@ -137,10 +137,10 @@ def test_a_file_without_an_end_is_read_up_to_its_last_whole_chunk(share: float, 
     assert back.notes[1] == f"metadata.yaml is missing: rise-di repair {run}"
 
 
-def test_a_cut_file_says_how_much_is_missing_where_anything_knows(tape: Tape, run: Path) -> None:
+def test_the_note_on_a_truncated_file_gives_the_missing_time_by_metadata_yaml(tape: Tape, run: Path) -> None:
     file = run / "run_0.mcap"
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    back = read_run(run).tape  # metadata.yaml knows when the last message came
+    back = read_run(run).tape  # metadata.yaml holds the time of the last message
     missing = (tape["truth"].stamp_ns[-1] - back["truth"].stamp_ns[-1]) / NANOSECONDS
     assert missing > 0.1
     assert f"{missing:.3f} s are missing after it" in back.notes[0]
@@ -165,14 +165,14 @@ def test_a_damaged_chunk_is_left_out_and_all_others_are_read(number: int, tape: 
     assert len(kept) < len(stamps)
 
 
-def test_a_file_with_changed_bytes_gives_true_samples_or_is_refused(tape: Tape, recorded: Path, tmp_path: Path) -> None:
+def test_a_file_with_changed_bytes_gives_recorded_samples_or_is_rejected(tape: Tape, recorded: Path, tmp_path: Path) -> None:
     file, generator = tmp_path / "run_0.mcap", np.random.default_rng(1)
-    whole, read = (recorded / "run_0.mcap").read_bytes(), 0
-    true = set(zip(tape["y"].stamp_ns.tolist(), map(bytes, tape["y"].values), strict=True))
+    content, read = (recorded / "run_0.mcap").read_bytes(), 0
+    samples = set(zip(tape["y"].stamp_ns.tolist(), map(bytes, tape["y"].values), strict=True))
     for _ in range(60):
-        damaged = bytearray(whole)
-        for place in generator.integers(0, len(whole), 3):
-            damaged[place] ^= 1 << generator.integers(0, 8)
+        damaged = bytearray(content)
+        for position in generator.integers(0, len(content), 3):
+            damaged[position] ^= 1 << generator.integers(0, 8)
         file.write_bytes(damaged)
         try:
             back = read_run(file).tape
@@ -180,11 +180,11 @@ def test_a_file_with_changed_bytes_gives_true_samples_or_is_refused(tape: Tape, 
             continue
         if "y" in back:
             read += 1
-            assert set(zip(back["y"].stamp_ns.tolist(), map(bytes, back["y"].values), strict=True)) <= true
-    assert read > 10  # of 60: the samples lie in two chunks, one of which three changed bytes spare now and then
+            assert set(zip(back["y"].stamp_ns.tolist(), map(bytes, back["y"].values), strict=True)) <= samples
+    assert read > 10  # of 60: the samples are in two chunks, and three changed bytes sometimes leave one of them intact
 
 
-def test_a_file_that_grows_while_it_is_read_is_read_as_it_was_at_first(tmp_path: Path) -> None:
+def test_a_file_that_grows_while_it_is_read_is_read_up_to_its_first_size(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
     for number, message in enumerate(SAMPLES):
@@ -196,13 +196,12 @@ def test_a_file_that_grows_while_it_is_read_is_read_as_it_was_at_first(tmp_path:
     for number, message in enumerate(SAMPLES):
         bag.write(channel, number, number, number, message)
     bag.close()
-    found = [first, *records]
-    assert sum(isinstance(one, Message) for one in found) == len(SAMPLES)
+    assert sum(isinstance(one, Message) for one in (first, *records)) == len(SAMPLES)
     assert not scan.complete
     assert scan.damaged == 0
 
 
-def test_two_logs_in_a_folder_are_refused(run: Path) -> None:
+def test_two_bags_in_a_folder_are_rejected(run: Path) -> None:
     (run / "copy.mcap").write_bytes((run / "run_0.mcap").read_bytes())
     with pytest.raises(ParameterError, match=r"run: found 2 \.mcap files that are not parts of one bag, expected one bag"):
         read_run(run)
@@ -214,12 +213,12 @@ def test_a_tape_whose_first_signal_has_no_sample_is_written(tape: Tape, osprey_g
     assert list(read_run(tmp_path / "run").tape.signals) == ["u"]
 
 
-def test_a_folder_without_a_log_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_a_bag_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"found no \.mcap file"):
         read_run(tmp_path)
 
 
-def test_definitions_hold_all_that_they_refer_to() -> None:
+def test_definitions_include_all_referenced_types() -> None:
     text = definition("sensor_msgs/msg/JointState").text
     assert [line.removeprefix("MSG: ") for line in text.splitlines() if line.startswith("MSG: ")] == [
         "builtin_interfaces/Time",
@@ -236,16 +235,16 @@ def test_stamps_of_signals_may_differ_in_number(recorded: Path) -> None:
     assert np.diff(back["u"].stamp_ns).tolist() == [10_000_000] * 200
 
 
-# Bags of others
+# Bags of other recorders
 
 
 def record(
-    folder: Path, topics: dict[str, list[bytes]], storage: StoragePlugin, packed: CompressionMode = CompressionMode.NONE
+    folder: Path, topics: dict[str, list[bytes]], storage: StoragePlugin, compression: CompressionMode = CompressionMode.NONE
 ) -> None:
-    """A bag written by rosbags, one message of each topic after the other, 1 ms apart; with a topic of another type in it."""
+    """Write a bag with rosbags: the messages of each topic 1 ms apart, and a topic of another type."""
     writer = Writer(folder, version=9, storage_plugin=storage)
-    if packed is not CompressionMode.NONE:
-        writer.set_compression(packed, CompressionFormat.ZSTD)
+    if compression is not CompressionMode.NONE:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
         connections = {topic: writer.add_connection(topic, JOINT_STATE, typestore=STORE) for topic in topics}
         other = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=STORE)
@@ -260,9 +259,9 @@ SAMPLES = [vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k)) for k in range(50)]
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)
-@pytest.mark.parametrize("packed", [CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE])
-def test_bags_of_other_recorders_are_read(storage: StoragePlugin, packed: CompressionMode, tmp_path: Path) -> None:
-    record(tmp_path / "bag", {"/y": SAMPLES}, storage, packed)
+@pytest.mark.parametrize("compression", [CompressionMode.NONE, CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_bags_of_other_recorders_are_read(storage: StoragePlugin, compression: CompressionMode, tmp_path: Path) -> None:
+    record(tmp_path / "bag", {"/y": SAMPLES}, storage, compression)
     back = read_run(tmp_path / "bag").tape
     assert list(back.signals) == ["y"]
     assert back.notes == ()
@@ -285,7 +284,7 @@ def test_a_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
     assert back["y"]["V"].tolist() == [-float(k) for k in range(48)]
 
 
-def test_two_aircraft_in_one_bag_are_told_apart_by_their_namespace(tmp_path: Path) -> None:
+def test_two_aircraft_in_one_bag_are_selected_by_their_namespace(tmp_path: Path) -> None:
     topics = {"/one/y": SAMPLES, "/fleet/two/y": SAMPLES[:7], "/fleet/two/gps/speed": SAMPLES[:3], "/one/u": SAMPLES[:5]}
     record(tmp_path / "bag", topics, StoragePlugin.MCAP)
     with pytest.raises(
@@ -302,7 +301,7 @@ def test_two_aircraft_in_one_bag_are_told_apart_by_their_namespace(tmp_path: Pat
     assert {name: len(signal.stamp_ns) for name, signal in two.signals.items()} == {"y": 7, "gps/speed": 3}
 
 
-def test_an_aircraft_at_the_root_does_not_hold_those_in_namespaces(tmp_path: Path) -> None:
+def test_an_aircraft_at_the_root_excludes_those_in_namespaces(tmp_path: Path) -> None:
     record(tmp_path / "bag", {"/y": SAMPLES, "/two/y": SAMPLES[:7], "/arm/joints": SAMPLES[:2]}, StoragePlugin.MCAP)
     assert set(read_run(tmp_path / "bag", "/").tape.signals) == {"y", "arm/joints"}
     assert set(read_run(tmp_path / "bag", "two").tape.signals) == {"y"}
@@ -313,50 +312,50 @@ def test_one_aircraft_in_a_namespace_needs_no_name(tmp_path: Path) -> None:
     assert set(read_run(tmp_path / "bag").tape.signals) == {"y"}
 
 
-def test_a_bag_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_a_folder_with_only_a_metadata_yaml_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}\n", encoding="utf-8")
     with pytest.raises(ParameterError, match="expected a bag of rosbag2"):
         read_run(tmp_path)
 
 
-# Messages as vectors: all at once gives what one by one does
+# Decoding messages together gives the same as decoding them one by one
 
 
 def one_by_one(messages: Sequence[bytes]) -> list[tuple[tuple[str, ...], int, bytes]]:
-    found = []
+    samples = []
     for message in messages:
         one: Any = STORE.deserialize_cdr(message, JOINT_STATE)
         if one.name:
             stamp = one.header.stamp.sec * NANOSECONDS + one.header.stamp.nanosec
-            found.append((tuple(one.name), stamp, one.position.tobytes()))
-    return sorted(found)
+            samples.append((tuple(one.name), stamp, one.position.tobytes()))
+    return sorted(samples)
 
 
 MIXTURES = {
     "a change of sender": [*SAMPLES[:5], *(vector(k, ("q", "V"), (k, 1.0), "/another#1") for k in range(5)), *SAMPLES[5:9]],
-    "samples that do not come": [SAMPLES[0], vector(1, (), ()), SAMPLES[1], vector(2, (), ())],
+    "missing samples": [SAMPLES[0], vector(1, (), ()), SAMPLES[1], vector(2, (), ())],
     "other channels of the same length": [SAMPLES[0], vector(3, ("V", "q"), (1.0, 2.0)), SAMPLES[1]],
     "velocities": [vector(k, ("q",), (k,), velocity=(1.0,)) for k in range(3)],
-    "values that are all alike": [vector(k, ("q", "V", "p"), (0.0, 0.0, 0.0)) for k in range(3)] + [SAMPLES[3]],
+    "equal values": [vector(k, ("q", "V", "p"), (0.0, 0.0, 0.0)) for k in range(3)] + [SAMPLES[3]],
     "before 1970 and not finite": [vector(-5 * NANOSECONDS, ("q",), (np.nan,)), vector(1, ("q",), (np.inf,))],
-    "none at all": [],
+    "no messages": [],
 }
 
 
 @pytest.mark.parametrize("messages", MIXTURES.values(), ids=MIXTURES)
-def test_messages_read_at_once_are_what_they_are_one_by_one(messages: list[bytes]) -> None:
+def test_messages_decoded_together_equal_those_decoded_one_by_one(messages: list[bytes]) -> None:
     decode = decoder("/y", JOINT_STATE)
     assert decode is not None
-    found = [
+    decoded = [
         (samples.names, int(stamp), values.tobytes())
         for part in (messages[:4], messages[4:])
         for samples in decode(part).samples
         for stamp, values in zip(samples.stamp_ns, samples.values, strict=True)
     ]
-    assert sorted(found) == one_by_one(messages)
+    assert sorted(decoded) == one_by_one(messages)
 
 
-def test_what_is_no_named_vector_has_no_decoder_and_what_is_malformed_is_counted() -> None:
+def test_other_types_have_no_decoder_and_malformed_messages_are_counted() -> None:
     assert decoder("/rosout", "rcl_interfaces/msg/Log") is None
     decode = decoder("/y", JOINT_STATE)
     assert decode is not None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A disk that runs full under a log: it is finished all the same, or stays readable to its last whole chunk."""
+"""A full disk: the log is finished from the reserve, or stays readable up to its last complete chunk."""
 
 import errno
 import os
@@ -36,7 +36,7 @@ GENERATOR = np.random.default_rng(1)
 
 
 def write(bag: BagWriter, channel: BagChannel, count: int) -> None:
-    """So many messages of 40 noisy channels, which do not compress; a chunk each tenth of them, as at 1 kHz and 0.1 s."""
+    """Write messages of 40 noisy channels, which do not compress; every tenth ends a chunk, as at 1 kHz and 0.1 s."""
     for _ in range(count):
         stamp_ns = 1_000_000 * (channel.messages + 1)
         bag.write(
@@ -51,7 +51,7 @@ def write_until_full(bag: BagWriter, channel: BagChannel) -> None:
         write(bag, channel, 1)
 
 
-def test_a_log_on_a_disk_that_runs_full_is_finished_and_nothing_is_lost(disk: Path) -> None:
+def test_a_log_on_a_full_disk_is_finished_without_loss(disk: Path) -> None:
     bag = BagWriter(disk / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
     write_until_full(bag, channel)
@@ -63,13 +63,13 @@ def test_a_log_on_a_disk_that_runs_full_is_finished_and_nothing_is_lost(disk: Pa
     assert read_run(disk / "run").tape.notes == ()
 
 
-def test_the_room_held_for_the_end_is_used_by_nothing_else_before(disk: Path) -> None:
+def test_the_end_of_the_file_has_a_reserve_until_it_is_closed(disk: Path) -> None:
     with BagWriter(disk / "run"):
         assert SIZE - free_bytes(disk) >= END_BYTES
-    assert SIZE - free_bytes(disk) < 50_000  # given back; a file without messages and metadata.yaml are left
+    assert SIZE - free_bytes(disk) < 50_000  # freed; a file without messages and metadata.yaml remain
 
 
-def test_a_disk_that_somebody_else_fills_leaves_the_log_finished(disk: Path) -> None:
+def test_a_log_is_finished_when_another_process_fills_the_disk(disk: Path) -> None:
     bag = BagWriter(disk / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
     write(bag, channel, 300)
@@ -80,12 +80,12 @@ def test_a_disk_that_somebody_else_fills_leaves_the_log_finished(disk: Path) -> 
         assert reader.message_count == channel.messages >= 300
 
 
-def test_without_any_room_the_log_stays_readable_to_its_last_whole_chunk(disk: Path) -> None:
+def test_a_log_without_a_reserve_stays_readable_to_its_last_complete_chunk(disk: Path) -> None:
     bag = BagWriter(disk / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
     write_until_full(bag, channel)
     written = channel.messages
-    fill(disk / "other")  # somebody takes what was given up
+    fill(disk / "other")  # another process takes the freed reserve
     with pytest.raises(OSError, match="No space left"):
         write(bag, channel, 10_000)
     with pytest.raises(OSError, match="No space left"):
@@ -96,7 +96,7 @@ def test_without_any_room_the_log_stays_readable_to_its_last_whole_chunk(disk: P
     assert "run_0.mcap is truncated: read up to its last complete chunk" in back.notes[0]
 
 
-def test_a_fault_of_the_disk_is_not_taken_for_a_full_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_input_output_error_is_not_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = ReservedFile(tmp_path / "file")
 
     def fails(descriptor: int, data: bytes) -> int:
@@ -118,7 +118,7 @@ def test_short_writes_are_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (tmp_path / "file").read_bytes() == b"0123456789"
 
 
-def test_a_flight_in_one_process_that_finds_no_space_is_one_sentence(disk: Path, osprey_gust: Scenario) -> None:
+def test_a_flight_in_one_process_on_a_full_disk_is_one_sentence(disk: Path, osprey_gust: Scenario) -> None:
     fill(disk / "other")
     with pytest.raises(ParameterError, match=r"disk/run cannot be written \(No space left on device\)"):
         write_run(simulate(osprey_gust.vary(flight={"duration": 0.1})), disk / "run", LogAttachments(osprey_gust.path))

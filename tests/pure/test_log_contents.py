@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a log holds beside its messages: enough to understand the flight, and to fly it again, from the file alone."""
+"""The attachments, metadata and provenance of a log: they suffice to repeat the flight from the file alone."""
 
 import os
 import shlex
@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tests.conftest import REPOSITORY
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import SCHEMAS, ParameterOverrides, Scenario, load_scenario
@@ -23,58 +24,58 @@ from flight_bringup.graph import AIRCRAFT, ONE_PROCESS, RECORDER, parameter_over
 from flight_bringup.scenarios import find_scenario, scenarios
 from flight_core.parameters import ParameterError
 from flight_log.bag import LogAttachments, read_metadata_records
-from flight_log.provenance import provenance, revision
+from flight_log.provenance import STACK, provenance, revision
 from flight_log.tape_reader import RecordedRun, read_run
 from flight_log.tape_writer import write_run
 
 
 @pytest.fixture(scope="module")
-def flown(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
-    """A flight in one process with another duration than its scenario file's, read back."""
-    scenario, run = osprey_gust.vary(flight={"duration": 0.5}), tmp_path_factory.mktemp("flown")
+def recorded(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
+    """A flight in one process, read back. Its duration differs from the scenario file's."""
+    scenario, run = osprey_gust.vary(flight={"duration": 0.5}), tmp_path_factory.mktemp("recorded")
     write_run(simulate(scenario), run, attachments_for(scenario, run))
     return read_run(run)
 
 
 def stored(files: LogAttachments | RecordedRun, name: str, folder: Path) -> Path:
-    """A file that goes with a log, as a file."""
+    """An attachment as a file."""
     if isinstance(files, RecordedRun):
         (folder / name).write_bytes(next(one.content for one in files.attachments if one.name == name))
         return folder / name
     return next(path for path in files.files if path.name == name)
 
 
-def told_to_recorder(scenario: Scenario, run: Path, *, one_process: bool) -> LogAttachments:
-    node, before = (ONE_PROCESS, "recorder:") if one_process else (RECORDER, "")
-    told: ParameterOverrides = parameter_overrides(node, scenario, run, 0.0, lockstep=True)
-    attach, metadata = told[f"{before}attach"], told[f"{before}metadata_file"]
+def recorder_attachments(scenario: Scenario, run: Path, *, one_process: bool) -> LogAttachments:
+    node, prefix = (ONE_PROCESS, "recorder:") if one_process else (RECORDER, "")
+    overrides: ParameterOverrides = parameter_overrides(node, scenario, run, 0.0, lockstep=True)
+    attach, metadata = overrides[f"{prefix}attach"], overrides[f"{prefix}metadata_file"]
     assert isinstance(attach, list)
     return LogAttachments(scenario.path, tuple(map(Path, attach)), Path(str(metadata)))
 
 
-def test_the_parameters_in_a_log_are_a_scenario_that_is_the_same_flight(
-    flown: RecordedRun, osprey_gust: Scenario, tmp_path: Path
+def test_the_parameters_in_a_log_are_a_scenario_of_the_same_flight(
+    recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    again = load_scenario(stored(flown, "parameters.yaml", tmp_path))
-    assert again.flight.duration == 0.5  # as flown, not as in the file
+    again = load_scenario(stored(recorded, "parameters.yaml", tmp_path))
+    assert again.flight.duration == 0.5  # that of the flight, not of the file
     for name in SCHEMAS:
         if name != "flight":
             assert getattr(again, name) == getattr(osprey_gust, name)
-    assert flown.scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
+    assert recorded.scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
 
 
 @pytest.mark.parametrize("name", scenarios())
-def test_every_scenario_comes_back_from_its_parameters(name: str, tmp_path: Path) -> None:
+def test_every_scenario_is_restored_from_its_parameters(name: str, tmp_path: Path) -> None:
     scenario = find_scenario(name)
     again = load_scenario(stored(attachments_for(scenario, tmp_path), "parameters.yaml", tmp_path))
     for section in SCHEMAS:
         assert getattr(again, section) == getattr(scenario, section)
 
 
-def test_what_the_nodes_are_told_is_in_the_parameters(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_the_parameters_include_the_overrides_of_the_nodes(osprey_gust: Scenario, tmp_path: Path) -> None:
     for one_process in (False, True):
         again = load_scenario(
-            stored(told_to_recorder(osprey_gust, tmp_path, one_process=one_process), "parameters.yaml", tmp_path)
+            stored(recorder_attachments(osprey_gust, tmp_path, one_process=one_process), "parameters.yaml", tmp_path)
         )
         assert again.aircraft.lockstep
         assert again.reference_model.lockstep
@@ -84,21 +85,21 @@ def test_what_the_nodes_are_told_is_in_the_parameters(osprey_gust: Scenario, tmp
         assert again.recorder.directory == str(tmp_path)
 
 
-def test_nothing_is_made_for_a_node_that_is_not_the_recorder(osprey_gust: Scenario, tmp_path: Path) -> None:
-    told = parameter_overrides(AIRCRAFT, osprey_gust, tmp_path, 12.5, lockstep=False)
-    assert told == {"lockstep": False, "start_time": 12.5}
+def test_no_file_is_written_for_a_node_other_than_the_recorder(osprey_gust: Scenario, tmp_path: Path) -> None:
+    overrides = parameter_overrides(AIRCRAFT, osprey_gust, tmp_path, 12.5, lockstep=False)
+    assert overrides == {"lockstep": False, "start_time": 12.5}
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_airframe_in_a_log_is_the_one_that_flew(flown: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:
-    assert load_airframe(str(stored(flown, "airframe.yaml", tmp_path))) == load_airframe("osprey")
-    drawn = osprey_gust.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.1, "seed": 7}})
-    again = load_airframe(str(stored(attachments_for(drawn, tmp_path), "airframe.yaml", tmp_path)))
-    assert again.A == drawn.aircraft.sampled_airframe().A
+def test_the_airframe_in_a_log_is_the_one_that_flew(recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:
+    assert load_airframe(str(stored(recorded, "airframe.yaml", tmp_path))) == load_airframe("osprey")
+    sampled = osprey_gust.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.1, "seed": 7}})
+    again = load_airframe(str(stored(attachments_for(sampled, tmp_path), "airframe.yaml", tmp_path)))
+    assert again.A == sampled.aircraft.sampled_airframe().A
     assert not np.array_equal(again.matrix_a(), load_airframe("osprey").matrix_a())
 
 
-def test_limits_that_are_infinite_stay_so(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_infinite_limits_are_stored(osprey_gust: Scenario, tmp_path: Path) -> None:
     varied = osprey_gust.vary(
         aircraft={"actuators": {"lower": [-0.5, float("-inf"), -0.4, -0.3], "upper": [0.5, 1.0, 0.4, 0.3]}}
     )
@@ -106,41 +107,45 @@ def test_limits_that_are_infinite_stay_so(osprey_gust: Scenario, tmp_path: Path)
     assert again.aircraft.actuators.lower[1] == float("-inf")
 
 
-def test_the_metadata_say_with_what_and_where_it_flew(flown: RecordedRun) -> None:
-    assert flown.metadata["rise_di_versions"]["numpy"] == version("numpy")
-    assert flown.metadata["rise_di_versions"]["flight_recorder"] == version("flight_recorder")
-    assert flown.metadata["rise_di_flight"]["command"] == shlex.join(sys.argv)
-    assert flown.metadata["rise_di_flight"]["start"].endswith("+00:00")
-    assert flown.metadata["rise_di_host"]["kernel"] == os.uname().release
-    assert flown.metadata["rise_di_host"]["cores"] == str(os.cpu_count())
+def test_the_metadata_hold_versions_command_and_host(recorded: RecordedRun) -> None:
+    assert recorded.metadata["rise_di_versions"]["numpy"] == version("numpy")
+    assert recorded.metadata["rise_di_versions"]["flight_recorder"] == version("flight_recorder")
+    assert recorded.metadata["rise_di_flight"]["command"] == shlex.join(sys.argv)
+    assert recorded.metadata["rise_di_flight"]["start"].endswith("+00:00")
+    assert recorded.metadata["rise_di_host"]["kernel"] == os.uname().release
+    assert recorded.metadata["rise_di_host"]["cores"] == str(os.cpu_count())
 
 
-def test_the_name_of_the_machine_stays_out_of_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_versions_cover_all_packages_of_the_stack() -> None:
+    assert set(STACK) == {path.parent.name for path in (REPOSITORY / "ros_ws" / "src").glob("*/package.xml")}
+
+
+def test_the_host_name_is_not_in_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["rise-di", "fly"])
     assert socket.gethostname() not in yaml.safe_dump(provenance()).split()
 
 
-def test_the_metadata_of_a_flight_over_topics_are_those_in_one_process(osprey_gust: Scenario, tmp_path: Path) -> None:
-    over_topics = told_to_recorder(osprey_gust, tmp_path, one_process=False).metadata
+def test_the_metadata_of_a_flight_over_topics_equal_those_in_one_process(osprey_gust: Scenario, tmp_path: Path) -> None:
+    over_topics = recorder_attachments(osprey_gust, tmp_path, one_process=False).metadata
     assert over_topics is not None
     assert read_metadata_records(over_topics)["rise_di_host"] == provenance()["rise_di_host"]
     assert set(read_metadata_records(over_topics)) == set(provenance())
 
 
-def test_a_revision_is_that_of_the_checkout_with_a_mark_where_it_was_changed(tmp_path: Path) -> None:
+def test_the_revision_is_the_commit_and_marks_local_changes(tmp_path: Path) -> None:
     git = shutil.which("git")
     if git is None:
         pytest.skip("no git here")
     source = tmp_path / "source.py"
     source.write_text("a = 1\n", encoding="utf-8")
-    assert revision(source) == {}  # no checkout
+    assert revision(source) == {}  # not in a checkout
 
     def run(*words: str) -> str:
-        identity = ("-c", "user.name=someone", "-c", "user.email=someone@example.com")
+        identity = ("-c", "user.name=tester", "-c", "user.email=tester@example.com")
         return subprocess.run([git, "-C", str(tmp_path), *identity, *words], check=True, capture_output=True, text=True).stdout
 
     run("init")
-    assert revision(source) == {}  # a file that is not of the checkout around it
+    assert revision(source) == {}  # an untracked file inside a checkout
     run("add", "source.py")
     run("commit", "-m", "first")
     assert revision(source) == {"commit": run("rev-parse", "HEAD").strip(), "dirty": "false"}
@@ -148,7 +153,7 @@ def test_a_revision_is_that_of_the_checkout_with_a_mark_where_it_was_changed(tmp
     assert revision(source)["dirty"] == "true"
 
 
-def test_a_machine_without_git_has_no_revision(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_without_git_has_no_revision(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     assert revision(Path(__file__)) == {}
 

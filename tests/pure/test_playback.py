@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A log as messages to be sent again: which, in which order, and when."""
+"""Playback schedule of a log: the messages, their order and their due times."""
 
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ def test_every_message_of_a_flight_in_one_process_is_due_at_its_stamp(run: Path)
     assert (playback.t(due[0]), playback.t(due[-1])) == (0.0, 1.0)
 
 
-def test_topics_are_chosen_by_full_or_last_name_and_the_beginning_by_flight_time(run: Path) -> None:
+def test_topics_are_selected_by_full_or_last_name_and_the_start_by_flight_time(run: Path) -> None:
     playback = read_playback(run, ["y", "/u"], start=0.5)
     assert list(playback.types) == ["/u", "/y"]
     assert len(playback.messages) == 251 + 51
@@ -59,12 +59,12 @@ def test_topics_are_chosen_by_full_or_last_name_and_the_beginning_by_flight_time
         ([], 1.5, r"start: found 1.5 s, expected a flight time before the end of the log, 1 s"),
     ],
 )
-def test_what_the_log_does_not_hold_is_refused(topics: list[str], start: float, sentence: str, run: Path) -> None:
+def test_a_topic_or_start_outside_the_log_is_rejected(topics: list[str], start: float, sentence: str, run: Path) -> None:
     with pytest.raises(ParameterError, match=sentence):
         read_playback(run, topics, start)
 
 
-def test_a_log_without_messages_is_refused(tmp_path: Path) -> None:
+def test_a_log_without_messages_is_rejected(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "run") as bag:
         bag.add_topic("/y", JOINT_STATE, "")
     with pytest.raises(ParameterError, match="found no message, expected a recorded flight"):
@@ -72,7 +72,7 @@ def test_a_log_without_messages_is_refused(tmp_path: Path) -> None:
 
 
 def bag_of(folder: Path, sent: list[tuple[str, int, int, float]]) -> Path:
-    """A log of (topic, sent, stamp, value), received in this order; `truth` has the channel t."""
+    """A log of (topic, time of sending, stamp, value) in the order of receipt. `truth` has the channel t."""
     types: dict[str, Any] = STORE.types
     with BagWriter(folder) as bag:
         channels = {topic: bag.add_topic(topic, JOINT_STATE, "") for topic in dict.fromkeys(one[0] for one in sent)}
@@ -97,7 +97,7 @@ def test_in_real_time_a_message_is_due_when_it_was_sent_not_when_it_was_received
 
 
 def test_in_lockstep_a_message_is_due_at_its_stamp_but_not_before_those_sent_before_it(tmp_path: Path) -> None:
-    # The machine sent all of it within 3 ms; the second y comes 20 ms late, and the log of its node is in the machine's time.
+    # The host sent all of it within 3 ms; the second y is 20 ms late, and /other carries the host's time.
     sent = [
         ("/truth", EPOCH + MS, 0, 0.0),
         ("/y", EPOCH + 2 * MS, 0, 0.1),
@@ -111,11 +111,11 @@ def test_in_lockstep_a_message_is_due_at_its_stamp_but_not_before_those_sent_bef
         ("/y", 0, True),
         ("/truth", 30 * MS, True),
         ("/y", 30 * MS, True),
-        ("/other", 30 * MS, False),  # a stamp that cannot be moved with the others
+        ("/other", 30 * MS, False),  # a stamp on the other time scale is not shifted
     ]
 
 
-def test_a_clock_in_the_log_is_not_played_and_what_all_nodes_share_only_where_it_is_asked_for(tmp_path: Path) -> None:
+def test_the_clock_is_not_played_and_shared_topics_only_by_name(tmp_path: Path) -> None:
     topics = ("/clock", "/y", "/diagnostics", "/rosout")
     bag = bag_of(tmp_path / "run", [(topic, EPOCH + k * MS, EPOCH + k * MS, 0.0) for k, topic in enumerate(topics)])
     assert list(read_playback(bag).types) == ["/y"]
@@ -136,5 +136,5 @@ def test_a_clock_in_the_log_is_not_played_and_what_all_nodes_share_only_where_it
         ("std_msgs/msg/Empty", False),
     ],
 )
-def test_a_stamp_is_found_where_a_type_begins_with_one(type_name: str, expected: bool) -> None:
+def test_types_that_begin_with_a_stamp_are_recognised(type_name: str, expected: bool) -> None:
     assert begins_with_stamp(definition(type_name).text) is expected

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A damaged log made whole: what is kept, what is said, and that an intact one is left alone."""
+"""Repair of truncated and damaged logs: the kept messages, the printed result, intact logs."""
 
 import fcntl
 import os
@@ -44,21 +44,21 @@ def run(recorded: Path, tmp_path: Path) -> Path:
 
 
 def state(folder: Path) -> dict[str, tuple[bytes, int]]:
-    """Content and time of change of every file."""
+    """Content and modification time of every file."""
     return {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
 
 
-def cut(run: Path, share: float) -> bytes:
-    """As a recorder that was killed leaves it: a part of the file, which is returned, and no metadata.yaml."""
+def truncate(run: Path, fraction: float) -> bytes:
+    """Leave what a killed recorder leaves: the beginning of the file, which is returned, and no metadata.yaml."""
     file = run / "run_0.mcap"
-    whole = file.read_bytes()
-    file.write_bytes(whole[: int(len(whole) * share)])
+    content = file.read_bytes()
+    file.write_bytes(content[: int(len(content) * fraction)])
     (run / "metadata.yaml").unlink()
     return file.read_bytes()
 
 
 def last(run: Path) -> float:
-    """Flight time of the last sample of all."""
+    """Flight time of the last sample on any topic."""
     tape = read_run(run).tape
     return float(max(tape.time(name)[-1] for name in tape.signals))
 
@@ -67,23 +67,23 @@ def messages(run: Path) -> list[tuple[str, int, bytes]]:
     """All messages as rosbags reads them."""
     with AnyReader([run]) as reader:
         assert sum(one.msgcount for one in reader.connections) == reader.message_count
-        found = [(one.topic, stamp_ns, data) for one, stamp_ns, data in reader.messages()]
+        read = [(one.topic, stamp_ns, data) for one, stamp_ns, data in reader.messages()]
         for one, _, data in reader.messages():
             reader.deserialize(data, one.msgtype)
-    return found
+    return read
 
 
-@pytest.mark.parametrize("share", [0.35, 0.6, 0.9, 0.999])
-def test_a_cut_log_becomes_one_that_rosbags_reads_in_full(share: float, recorded: Path, run: Path) -> None:
-    before = cut(run, share)
+@pytest.mark.parametrize("fraction", [0.35, 0.6, 0.9, 0.999])
+def test_a_repaired_truncated_log_is_read_in_full_by_rosbags(fraction: float, recorded: Path, run: Path) -> None:
+    before = truncate(run, fraction)
     readable = read_run(run)
     done = repair(run)
     assert done.files[0].damaged == run / "run_0.mcap.damaged"
     assert done.files[0].damaged.read_bytes() == before
-    found = messages(run)
-    assert len(found) == done.files[0].kept > 0
+    read = messages(run)
+    assert len(read) == done.files[0].kept > 0
     every = messages(recorded)
-    assert found == every[: len(found)]
+    assert read == every[: len(read)]
     after = read_run(run)
     assert after.tape.notes == ()
     assert after.tape.time("truth")[-1] == readable.tape.time("truth")[-1]
@@ -93,11 +93,11 @@ def test_a_cut_log_becomes_one_that_rosbags_reads_in_full(share: float, recorded
         summary = make_reader(stream).get_summary()
     assert summary is not None
     assert summary.statistics is not None
-    assert summary.statistics.message_count == len(found)
+    assert summary.statistics.message_count == len(read)
     assert not list(run.glob("*.new"))
 
 
-def test_an_intact_log_is_left_alone(run: Path) -> None:
+def test_an_intact_log_is_unchanged(run: Path) -> None:
     before = state(run)
     done = repair(run)
     assert not done.wrote_metadata
@@ -105,7 +105,7 @@ def test_an_intact_log_is_left_alone(run: Path) -> None:
 
 
 def test_a_repaired_log_is_intact(run: Path) -> None:
-    cut(run, 0.5)
+    truncate(run, 0.5)
     repair(run)
     before = state(run)
     assert not repair(run).wrote_metadata
@@ -113,7 +113,7 @@ def test_a_repaired_log_is_intact(run: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [None, "", "rosbag2_bagfile_information: 3\n", "{"])
-def test_metadata_that_are_missing_or_damaged_are_written_as_they_were(content: str | None, recorded: Path, run: Path) -> None:
+def test_a_missing_or_damaged_metadata_yaml_is_restored(content: str | None, recorded: Path, run: Path) -> None:
     (run / "metadata.yaml").unlink()
     if content is not None:
         (run / "metadata.yaml").write_text(content, encoding="utf-8")
@@ -125,7 +125,7 @@ def test_metadata_that_are_missing_or_damaged_are_written_as_they_were(content: 
     assert (run / "metadata.yaml").read_text("utf-8") == (recorded / "metadata.yaml").read_text("utf-8")
 
 
-def test_damage_inside_takes_no_more_than_its_chunk(recorded: Path, run: Path) -> None:
+def test_damage_inside_loses_only_its_chunk(recorded: Path, run: Path) -> None:
     file = run / "run_0.mcap"
     with file.open("rb") as stream:
         summary = make_reader(stream).get_summary()
@@ -141,8 +141,8 @@ def test_damage_inside_takes_no_more_than_its_chunk(recorded: Path, run: Path) -
     assert all(chunk.message_start_time <= stamp_ns <= chunk.message_end_time for _, stamp_ns, _ in every - kept)
 
 
-def test_a_log_that_is_being_recorded_is_not_touched(run: Path) -> None:
-    cut(run, 0.5)
+def test_a_log_that_is_being_recorded_is_unchanged(run: Path) -> None:
+    truncate(run, 0.5)
     before = state(run)
     with (run / "run_0.mcap").open("ab") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
@@ -151,8 +151,8 @@ def test_a_log_that_is_being_recorded_is_not_touched(run: Path) -> None:
     assert state(run) == before
 
 
-def test_a_repair_that_fails_half_way_changes_nothing(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cut(run, 0.5)
+def test_a_failed_repair_changes_nothing(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    truncate(run, 0.5)
     before = state(run)
 
     def full(descriptor: int) -> None:
@@ -165,7 +165,7 @@ def test_a_repair_that_fails_half_way_changes_nothing(run: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize("size", [0, 30, 500])
-def test_a_log_without_a_message_is_refused_and_left(size: int, run: Path) -> None:
+def test_a_log_without_a_message_is_rejected_and_unchanged(size: int, run: Path) -> None:
     file = run / "run_0.mcap"
     file.write_bytes(file.read_bytes()[:size])
     before = state(run)
@@ -174,13 +174,13 @@ def test_a_log_without_a_message_is_refused_and_left(size: int, run: Path) -> No
     assert state(run) == before
 
 
-def test_changed_bytes_never_end_in_a_traceback_or_in_messages_that_never_were(recorded: Path, run: Path) -> None:
+def test_changed_bytes_never_cause_a_traceback_or_false_messages(recorded: Path, run: Path) -> None:
     file, generator = run / "run_0.mcap", np.random.default_rng(2)
-    whole, every, repaired = file.read_bytes(), set(messages(recorded)), 0
+    content, every, repaired = file.read_bytes(), set(messages(recorded)), 0
     for _ in range(40):
-        damaged = bytearray(whole)
-        for place in generator.integers(0, len(whole), 3):
-            damaged[place] ^= 1 << generator.integers(0, 8)
+        damaged = bytearray(content)
+        for position in generator.integers(0, len(content), 3):
+            damaged[position] ^= 1 << generator.integers(0, 8)
         file.write_bytes(damaged)
         try:
             done = repair(run)
@@ -193,35 +193,35 @@ def test_changed_bytes_never_end_in_a_traceback_or_in_messages_that_never_were(r
     assert repaired > 10
 
 
-def test_an_earlier_damaged_file_is_kept_too(run: Path) -> None:
-    first = cut(run, 0.9)
+def test_a_second_repair_keeps_the_first_damaged_file(run: Path) -> None:
+    first = truncate(run, 0.9)
     repair(run)
-    second = cut(run, 0.5)
+    second = truncate(run, 0.5)
     repair(run)
     assert (run / "run_0.mcap.damaged").read_bytes() == first
     assert (run / "run_0.mcap.damaged-2").read_bytes() == second
 
 
-def test_the_command_says_what_was_kept_and_how_much_is_missing(run: Path) -> None:
+def test_the_command_prints_the_kept_messages_and_the_missing_time(run: Path) -> None:
     def command() -> str:
-        shown = subprocess.run(
+        result = subprocess.run(
             [sys.executable, "-m", "flight_cli.cli", "repair", "run"],
             cwd=run.parent,
             capture_output=True,
             text=True,
             check=True,
         )
-        return shown.stdout
+        return result.stdout
 
     assert command() == "run is intact: nothing to repair\n"
     metadata = (run / "metadata.yaml").read_bytes()
-    cut(run, 0.5)
+    truncate(run, 0.5)
     end = last(run)
     kept = r"run_0.mcap had a truncated end: (\d+) messages kept; the damaged file is run_0.mcap.damaged\n"
-    said = rf"metadata.yaml written; the log ends at t = {end:.3f} s of the {DURATION:g} s of the scenario\n"
-    assert re.fullmatch(kept + said, command())
-    cut(run, 0.5)
-    (run / "metadata.yaml").write_bytes(metadata)  # which knows when the last message came
+    written = rf"metadata.yaml written; the log ends at t = {end:.3f} s of the {DURATION:g} s of the scenario\n"
+    assert re.fullmatch(kept + written, command())
+    truncate(run, 0.5)
+    (run / "metadata.yaml").write_bytes(metadata)  # it holds the time of the last message
     end = last(run)
     assert f"{DURATION - end:.3f} s are missing at its end" in command()
     information = yaml.safe_load((run / "metadata.yaml").read_text("utf-8"))["rosbag2_bagfile_information"]
