@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded flight computed again: equal to the last bit whatever happened in it, and one bit elsewhere is found."""
+"""Replay of recorded flights: equal to the last bit through failsafes and lost samples, and a single changed bit is found."""
 
 import contextlib
 import csv
@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from typer.testing import CliRunner, Result
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.closed_loop.replay import OPEN_LOOP, Replayed, replay, vary
+from flight_analysis.closed_loop.replay import OPEN_LOOP, ReplayResult, replay, vary
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.gain_selection import with_feedforward
@@ -41,7 +41,7 @@ from rise_di_controller.params import ControllerParameters
 app = application([*COMMANDS])
 
 MS = 1_000_000
-EPOCH = 1_790_000_000_000_000_000  # stamps of a flight in real time, where float64 no longer knows the nanoseconds
+EPOCH = 1_790_000_000_000_000_000  # ns, a stamp in real time, which float64 does not resolve to 1 ns
 GUST = find_scenario("osprey_gust").vary(
     flight={"duration": 4.0}, aircraft={"gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}}
 )
@@ -65,19 +65,19 @@ SCENARIOS = {
 }
 
 
-def equal(result: Replayed) -> bool:
+def equal(result: ReplayResult) -> bool:
     return result.equal() and bool(result.checked.all())
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_every_bit_of_a_flight_comes_again(name: str) -> None:
+def test_a_replay_equals_the_flight_in_every_bit(name: str) -> None:
     scenario = SCENARIOS[name]
     tape = simulate(scenario)
     result = replay(tape, scenario.controller)
     assert equal(result), result.first()
     assert len(result.number) == len(tape["internals"].stamp_ns) > 100
     assert result.notes == ()
-    # the flights do what they are named after
+    # each scenario does what its name says
     log = tape["internals"]
     if "limits" in name:
         assert set(log.group("limited").values.ravel()) == {0.0, 1.0, 2.0}
@@ -87,22 +87,22 @@ def test_every_bit_of_a_flight_comes_again(name: str) -> None:
     assert bool(log.group("u_ff").values.any()) is ("feedforward" in name)
 
 
-# What else can happen to a controller in real time
+# Events of real time: late and lost samples, restarts, parameter changes
 
 
 class Tick(NamedTuple):
-    """What happens before one tick and at it."""
+    """Events before a tick and at it."""
 
-    y_age: int | None = 2  # ms, of the y that has come; None where none has
+    y_age: int | None = 2  # ms, of the y that arrived; None without one
     y_m_age: int | None = 0
     late: int = 0  # us
     active: bool = True
-    event: str = ""  # "configured": anew; "replaced": by another controller
-    changes: tuple[Mapping[str, Any], ...] = ()  # of the parameters, one after the other
+    event: str = ""  # "configured" again, or "replaced" by another controller
+    changes: tuple[Mapping[str, Any], ...] = ()  # of the parameters, in order
 
 
 def driven(parameters: ControllerParameters, ticks: Sequence[Tick], start_ns: int = EPOCH) -> Tape:
-    """The tape of a controller among such events."""
+    """The tape of a controller that meets these events."""
     outputs, controller = parameters.outputs, Controller(parameters)
     rows: dict[str, list[tuple[int, FloatArray]]] = {"y": [], "y_m": [], "u": [], "internals": []}
     for k, tick in enumerate(ticks):
@@ -123,10 +123,10 @@ def driven(parameters: ControllerParameters, ticks: Sequence[Tick], start_ns: in
         for change in tick.changes:
             parameters = vary(parameters, change)
             controller.retune(parameters)
-        commanded = controller.tick(now_ns, tick.late * 1000, active=tick.active)
-        if commanded is not None:
-            rows["u"].append((commanded.stamp_ns, commanded.u))
-            rows["internals"].append((commanded.stamp_ns, commanded.internals))
+        output = controller.tick(now_ns, tick.late * 1000, active=tick.active)
+        if output is not None:
+            rows["u"].append((output.stamp_ns, output.u))
+            rows["internals"].append((output.stamp_ns, output.internals))
     names = {"y": outputs, "y_m": outputs, "u": parameters.inputs, "internals": controller.names}
     return Tape({name: signal(names[name], samples) for name, samples in rows.items() if samples}, start_ns)
 
@@ -148,7 +148,7 @@ QUICK = {"max_age": 0.03, "hold": 0.02, "ramp": 0.03}
 
 @settings(deadline=None)
 @given(ticks=TICKS, hold=st.booleans(), with_feedforward=st.booleans())
-def test_whatever_comes_late_or_not_at_all_every_bit_comes_again(ticks: list[Tick], hold: bool, with_feedforward: bool) -> None:
+def test_a_replay_equals_a_flight_with_late_and_lost_samples(ticks: list[Tick], hold: bool, with_feedforward: bool) -> None:
     changes = QUICK | {"on_deactivate": "hold" if hold else "trim", "slew": [0.3] * 4}
     parameters = vary(LEADING if with_feedforward else GUST.controller, changes)
     tape = driven(parameters, [FLY, FLY, *ticks])
@@ -160,7 +160,7 @@ def test_whatever_comes_late_or_not_at_all_every_bit_comes_again(ticks: list[Tic
     ("events", "modes"),
     [
         ([LOST_Y] * 40 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.TRIM, Mode.ENGAGED]),
-        ([LOST_Y_M] * 12 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]),  # y is fresh, and yet not used
+        ([LOST_Y_M] * 12 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]),  # y is fresh but unused
         ([OFF] * 4 + [FLY] * 3, [Mode.ENGAGED, Mode.INACTIVE, Mode.ENGAGED]),
         (
             [Tick(y_age=None, active=False)] * 5 + [LOST_Y] * 2 + [FLY] * 3,
@@ -169,29 +169,29 @@ def test_whatever_comes_late_or_not_at_all_every_bit_comes_again(ticks: list[Tic
         (
             [LOST_Y] * 5 + [Tick(y_age=20, y_m_age=20)] * 3,
             [Mode.ENGAGED, Mode.HOLD, Mode.ENGAGED],
-        ),  # its stamp is the older one
+        ),  # its stamp is older
         ([Tick(event="configured")] + [FLY] * 3, [Mode.ENGAGED]),
         ([Tick(late=8000), LOST_Y, LOST_Y, FLY], [Mode.ENGAGED]),  # dt of 38 ms
     ],
-    ids=["y lost", "y_m lost", "deactivated", "activated without y", "engaged by a late y", "configured anew", "late"],
+    ids=["y lost", "y_m lost", "deactivated", "activated without y", "engaged by a late y", "configured again", "late"],
 )
-def test_modes_come_again(events: list[Tick], modes: list[Mode]) -> None:
+def test_a_replay_passes_the_same_modes(events: list[Tick], modes: list[Mode]) -> None:
     parameters = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
     tape = driven(parameters, [FLY] * 20 + events)
     result = replay(tape, parameters)
     assert equal(result), result.first()
-    found = result.recorded[:, result.names.index("mode")].tolist()
-    assert [mode for k, mode in enumerate(found) if k == 0 or found[k - 1] != mode] == modes
+    recorded = result.recorded[:, result.names.index("mode")].tolist()
+    assert [mode for k, mode in enumerate(recorded) if k == 0 or recorded[k - 1] != mode] == modes
 
 
-def test_another_controller_that_takes_over_is_said() -> None:
+def test_a_second_controller_in_a_log_is_noted() -> None:
     tape = driven(GUST.controller, [FLY] * 20 + [Tick(event="replaced")] + [FLY] * 20)
     result = replay(tape, GUST.controller)
     assert result.first() is None
     assert result.notes == ("another controller begins at t = 0.22 s",)
 
 
-# What is found
+# Differences
 
 
 def flipped(value: float) -> float:
@@ -212,10 +212,10 @@ def test_one_bit_of_one_gain_is_found(name: str, channel: int) -> None:
         replay(tape, scenario.controller, vary(scenario.controller, {"Lambda": gains})),
     ):
         assert not result.equal()
-        assert result.other_parameters.all()  # known from the first tick on, even where rounding hides the bit from all of u
+        assert result.other_parameters.all()  # from the first tick on, even where rounding hides the bit in all of u
         first = result.first()
         if scenario.controller.outputs[channel] == "V":
-            continue  # where Lambda e is 1e-3 of what u is made of, and its last bit may be in no u at all
+            continue  # Lambda e is 1e-3 of u there, and its last bit may change no u
         assert first is not None
         assert first.ulps is not None
         assert first.ulps > 0
@@ -251,12 +251,12 @@ def test_one_bit_of_one_sample_is_found_and_only_there(topic: str, channels: lis
         first = result.first()
         assert first is not None
         assert (first.number, first.t) == (101, 1.0)
-        assert first.ulps == 1 or topic == "y" or channel == "y.r"  # one of y is more in u
-        # and in the tick behind it, which starts from the state in the log
+        assert first.ulps == 1 or topic == "y" or channel == "y.r"  # a bit of y is more in u
+        # The next tick starts from the logged state.
         assert result.number[result.different().any(axis=1)].max() <= 102
 
 
-def test_the_difference_between_two_numbers_is_counted_in_those_between_them() -> None:
+def test_differences_are_counted_in_units_in_the_last_place() -> None:
     for recorded, computed, ulps in (
         (1.0, math.nextafter(1.0, 2), 1),
         (-5e-324, 5e-324, 2),
@@ -265,17 +265,17 @@ def test_the_difference_between_two_numbers_is_counted_in_those_between_them() -
     ):
         yes = np.ones(1, dtype=bool)
         pair = np.array([[recorded]]), np.array([[computed]])
-        result = Replayed(("u.a",), np.ones(1, dtype=np.int64), np.zeros(1), *pair, yes, ~yes, ())
+        result = ReplayResult(("u.a",), np.ones(1, dtype=np.int64), np.zeros(1), *pair, yes, ~yes, ())
         first = result.first()
-        assert first is not None  # a zero with another sign is another number, too
+        assert first is not None  # zeros of different sign differ
         assert first.ulps == ulps
 
 
-# What is not in the log
+# Incomplete logs
 
 
 def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
-    """The tape without some samples of `internals`, by number, and of `u` with them."""
+    """The tape with those samples of `internals` and `u` whose numbers `keep` accepts."""
     kept = np.asarray(keep(tape["internals"]["number"]), dtype=bool)
     signals = dict(tape.signals)
     for name in ("internals", "u"):
@@ -284,35 +284,35 @@ def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
 
 
 @pytest.mark.parametrize("name", ["osprey_gust", "feedforward"])
-def test_a_log_without_its_beginning_is_checked_from_its_first_tick_on(name: str) -> None:
+def test_a_log_without_its_beginning_is_checked_after_its_first_tick(name: str) -> None:
     scenario = SCENARIOS[name]
     result = replay(without(simulate(scenario), lambda number: number > 100), scenario.controller)
     assert result.first() is None
     assert result.checked.tolist() == [False] + [True] * 300
     assert result.notes == (
-        "the log begins with sample 101 of internals: those before it are not in it",
-        "1 ticks not checked, for the log does not hold the state before them",
+        "the log begins with sample 101 of internals: earlier ones are missing",
+        "1 ticks not checked: the log does not hold the state before them",
     )
 
 
 @pytest.mark.parametrize("name", ["osprey_gust", "feedforward"])
-def test_behind_a_gap_one_bit_of_one_gain_is_still_found(name: str) -> None:
+def test_one_bit_of_one_gain_is_found_after_a_gap(name: str) -> None:
     scenario = SCENARIOS[name].vary(reference_model={"pulses": BUSY})
     tape = without(simulate(scenario), lambda number: (number < 60) | (number > 70))
     result = replay(tape, scenario.controller)
     assert result.first() is None
     assert (~result.checked).sum() == 1
-    assert "11 samples of internals are not in the log: a gap before t = 0.70 s" in result.notes
+    assert "11 samples of internals are missing: a gap before t = 0.70 s" in result.notes
     gains = list(scenario.controller.beta)
     assert replay(tape, vary(scenario.controller, {"beta": [flipped(gains[0]), *gains[1:]]})).first() is not None
 
 
-def test_a_gap_in_which_the_inputs_were_lost_is_gone_over_at_the_next_engagement() -> None:
+def test_after_a_gap_in_which_the_failsafe_began_checks_resume_at_the_next_engagement() -> None:
     parameters = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
     tape = driven(parameters, [FLY] * 20 + [LOST_Y] * 20 + [FLY] * 20 + [LOST_Y] * 20)
     whole = replay(tape, parameters)
     first_held = int(whole.number[whole.recorded[:, 0] != Mode.ENGAGED][0])
-    # when they were lost is then not known
+    # Without this sample the log does not tell when the failsafe began.
     result = replay(without(tape, lambda number: number != first_held), parameters)
     assert result.first() is None
     unchecked = result.number[~result.checked]
@@ -324,7 +324,7 @@ def test_a_gap_in_which_the_inputs_were_lost_is_gone_over_at_the_next_engagement
 
 @settings(deadline=None, max_examples=50)
 @given(ticks=TICKS, lost=st.sets(st.integers(1, 60)), leading=st.booleans())
-def test_whatever_is_lost_of_a_log_nothing_differs(ticks: list[Tick], lost: set[int], leading: bool) -> None:
+def test_lost_samples_of_a_log_cause_no_differences(ticks: list[Tick], lost: set[int], leading: bool) -> None:
     parameters = vary(LEADING if leading else GUST.controller, QUICK)
     tape = without(driven(parameters, [FLY, FLY, *ticks]), lambda number: ~np.isin(number, list(lost)))
     if len(tape["internals"].stamp_ns):
@@ -334,7 +334,7 @@ def test_whatever_is_lost_of_a_log_nothing_differs(ticks: list[Tick], lost: set[
 # Parameters changed in flight
 
 
-def test_gains_changed_in_flight_differ_from_the_tick_of_the_change_on() -> None:
+def test_gains_changed_in_flight_differ_from_the_tick_of_the_change() -> None:
     tuned = {"k_g": 2.0, "Lambda": [3.0, 4.0, 2.0, 1.0], "upper": [0.02] * 4}
     tape = driven(GUST.controller, [FLY] * 30 + [Tick(changes=(tuned,))] + [FLY] * 30)
     result = replay(tape, GUST.controller)
@@ -342,13 +342,13 @@ def test_gains_changed_in_flight_differ_from_the_tick_of_the_change_on() -> None
     assert first is not None
     assert first.number == 30
     assert (~result.other_parameters).tolist() == [True] * 29 + [False] * 31
-    # and where the log holds the change, every bit comes again
+    # With the change from the log every bit is equal.
     result = replay(tape, GUST.controller, changes=[tuned])
     assert equal(result), result.first()
     assert result.notes == ("parameters changed before tick 30: Lambda, k_g, upper",)
 
 
-def test_gains_changed_one_by_one_come_again_each_with_its_own_rounding() -> None:
+def test_a_replay_applies_successive_gain_changes_one_by_one() -> None:
     changes: list[dict[str, Any]] = [
         {"k_g": 2.0},
         {"Lambda": [3.0, 4.0, 2.0, 1.0]},
@@ -360,7 +360,7 @@ def test_gains_changed_one_by_one_come_again_each_with_its_own_rounding() -> Non
     result = replay(driven(GUST.controller, ticks + [FLY] * 5), GUST.controller, changes=changes)
     assert equal(result), result.first()
     assert [note.split(": ")[1] for note in result.notes] == ["Lambda, k_g", "slew", "k_g"]
-    # a change that the log lost is not made up for
+    # A change that is missing in the log is not guessed.
     lost = replay(driven(GUST.controller, ticks), GUST.controller, changes=changes[2:])
     assert not lost.equal()
     assert lost.notes == ()
@@ -369,7 +369,7 @@ def test_gains_changed_one_by_one_come_again_each_with_its_own_rounding() -> Non
 # Open loop
 
 
-def test_other_gains_on_the_recorded_inputs_give_what_the_controller_gives_on_them() -> None:
+def test_an_open_loop_equals_the_controller_on_the_recorded_inputs() -> None:
     others = vary(GUST.controller, {"Lambda": [3.0, 3.0, 3.0, 1.0], "beta": [20.0, 20.0, 8.0, 6.0], "upper": [0.01] * 4})
     tape = simulate(GUST)
     controller, us = Controller(others), []
@@ -377,15 +377,15 @@ def test_other_gains_on_the_recorded_inputs_give_what_the_controller_gives_on_th
         order = [tape["y"].names.index(name) for name in others.outputs]
         controller.take_y(StampedVector(stamp_ns, y[order]), stamp_ns)
         controller.take_y_m(StampedVector(stamp_ns, tape["y_m"].values[number][order]), stamp_ns)
-        if stamp_ns % controller.period_ns == 0 and (commanded := controller.tick(stamp_ns)) is not None:
-            us.append(commanded.u)
+        if stamp_ns % controller.period_ns == 0 and (output := controller.tick(stamp_ns)) is not None:
+            us.append(output.u)
     result = replay(tape, GUST.controller, others)
     assert result.group(result.computed, "u").values.tobytes() == np.array(us).tobytes()
     assert result.notes == (OPEN_LOOP,)
     assert np.abs(result.group(result.computed, "u").values - result.group(result.recorded, "u").values).max() > 1e-3
 
 
-def test_an_open_loop_goes_on_over_gaps_and_through_lost_inputs() -> None:
+def test_an_open_loop_continues_over_gaps_and_lost_inputs() -> None:
     parameters = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
     tape = driven(parameters, [FLY] * 20 + [LOST_Y] * 20 + [FLY] * 20)
     tape = without(tape, lambda number: (number > 5) & (number != 15))
@@ -393,10 +393,10 @@ def test_an_open_loop_goes_on_over_gaps_and_through_lost_inputs() -> None:
     assert result.checked.all()
     assert np.isfinite(result.computed).all()
     u = result.group(result.computed, "u").values
-    assert (u[0] == result.group(result.recorded, "u").values[0]).all()  # it begins where the recorded u is
+    assert (u[0] == result.group(result.recorded, "u").values[0]).all()  # starts at the recorded u
 
 
-# What is refused
+# Errors
 
 
 def test_a_log_of_other_channels_is_refused() -> None:
@@ -414,7 +414,7 @@ def test_a_log_of_other_channels_is_refused() -> None:
         replay(tape, GUST.controller, other)
 
 
-def test_parameters_are_varied_by_dotted_name_and_checked_as_a_whole() -> None:
+def test_parameters_are_varied_by_dotted_name_and_validated() -> None:
     assert vary(SERVO.controller, {"upper": None}).upper is None
     assert vary(LEADING, {"feedforward": None}).feedforward is None
     leads = vary(LEADING, {"feedforward.lead": [0.0] * 4}).feedforward
@@ -426,14 +426,14 @@ def test_parameters_are_varied_by_dotted_name_and_checked_as_a_whole() -> None:
         vary(SERVO.controller, {"kg": 1.0})
 
 
-def test_parameters_that_stay_what_they_are_leave_every_bit_as_it_is() -> None:
-    # a retune solves for Pi, which rounds
+def test_a_change_to_the_same_value_changes_no_bit() -> None:
+    # A bumpless change solves for Pi, which rounds.
     set_again = driven(GUST.controller, [FLY] * 20 + [Tick(changes=({"k_g": 1.0},))] + [FLY] * 20)
     left_alone = driven(GUST.controller, [FLY] * 41)
     assert set_again["internals"].values.tobytes() == left_alone["internals"].values.tobytes()
 
 
-def test_what_flies_has_a_number_of_its_own() -> None:
+def test_each_parameter_set_has_its_own_digest() -> None:
     digest = GUST.controller.digest()
     assert 0 <= digest < 2**48
     assert int(float(digest)) == digest
@@ -452,7 +452,7 @@ def test_what_flies_has_a_number_of_its_own() -> None:
 
 
 def scenario_file(folder: Path, **sections: Mapping[str, Any]) -> Path:
-    """The default scenario with a busy manoeuvre of 2 s, and with changes."""
+    """The default scenario with changes and commands on all channels, 2 s."""
     tree = yaml.safe_load(GUST.path.read_text(encoding="utf-8"))
     tree["/**/flight"]["ros__parameters"]["duration"] = 2.0
     tree["/**/reference_model"]["ros__parameters"]["pulses"] = BUSY
@@ -539,7 +539,7 @@ def test_other_gains_are_shown_beside_what_was_recorded(run: Path, tmp_path: Pat
         ("controller.Lambda=[1", "--set 'controller.Lambda=[1': not valid YAML"),
     ],
 )
-def test_a_setting_that_is_none_is_one_sentence(setting: str, sentence: str, run: Path) -> None:
+def test_an_invalid_setting_is_one_sentence(setting: str, sentence: str, run: Path) -> None:
     shown = command(str(run), "--set", setting)
     assert isinstance(shown.exception, ParameterError)
     assert str(shown.exception).startswith(sentence)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop in one process: the accuracy that the law promises, and how it falls with the sampling period."""
+"""The closed loop in one process: its tracking error, and the order of the error in the sampling period."""
 
 from collections.abc import Callable
 from functools import cache
@@ -13,7 +13,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import tracking_error
 from flight_core.vectors import FloatArray
 
-SHOWN = np.array([1e3, 1.0, 1e3, 1e3])  # q, V, p, r in mrad/s and m/s
+DISPLAY_FACTORS = np.array([1e3, 1.0, 1e3, 1e3])  # q, V, p, r in mrad/s and m/s
 ABOVE_SLEW = [29.4, 22.5, 10.2, 7.8]  # 30 deg/s, 15, 60, 130 %/s: above the slew of the ideal control in the gusts
 BELOW_SLEW = [14.7, 22.5, 6.8, 3.6]  # 15 deg/s, 15, 40, 60 %/s: below it
 
@@ -36,19 +36,19 @@ def rms(osprey_gust: Scenario) -> Rms:
         )
         error = tracking_error(simulate(scenario))
         assert error.names == ("q", "V", "p", "r")
-        figures: FloatArray = np.sqrt(np.mean(error.values**2, axis=0)) * SHOWN
-        return figures
+        errors: FloatArray = np.sqrt(np.mean(error.values**2, axis=0)) * DISPLAY_FACTORS
+        return errors
 
     return fly
 
 
 def test_error_in_the_gusts_with_beta_above_the_slew_of_the_ideal_control(rms: Rms) -> None:
-    # Theorem 1 asks for beta above the disturbance's rate: then the gust costs next to nothing.
+    # Theorem 1 requires beta above the rate of the disturbance. The gust then adds almost no error.
     assert (rms() <= [0.25, 0.0005, 0.26, 0.15]).all(), rms()
 
 
 def test_error_in_the_gusts_with_beta_below_the_slew_of_the_ideal_control(rms: Rms) -> None:
-    # Ten times worse in q and 250 times in V: beta is the limit, as (29) says.
+    # The error is ten times larger in q and 250 times in V: beta violates (29).
     assert (rms(below_slew=True) <= [2.5, 0.035, 0.26, 0.22]).all(), rms(below_slew=True)
     assert (rms(below_slew=True) > rms())[:2].all()
 
@@ -58,17 +58,17 @@ def test_error_in_calm_air(rms: Rms) -> None:
 
 
 def test_implicit_sign_halving_dt_divides_the_error_by_four(rms: Rms) -> None:
-    # Second order. 30 s hold all commands on q, V and p, and most of r's.
+    # Second order. The first 30 s have all commands on q, V and p, and most of those on r.
     ratio = rms(gusts=False, duration=30.0) / rms(gusts=False, rate=200.0, duration=30.0)
     assert ratio == pytest.approx(4.0, rel=0.1)
 
 
 def test_literal_sign_halving_dt_halves_the_error(rms: Rms) -> None:
-    # First order, and chaotic in detail: the ratio of two limit cycles scatters by some 15 %.
+    # First order. The limit cycles are chaotic: the ratio scatters by some 15 %.
     coarse = rms(gusts=False, sign="literal", rate=200.0, duration=20.0)
     fine = rms(gusts=False, sign="literal", rate=500.0, duration=20.0)
     assert coarse / fine == pytest.approx(2.5, rel=0.3)
-    # and far above the implicit sign, which needs no other parameter than the size of Omega's diagonal
+    # The error is far above that of the implicit sign, which only needs the size of Omega's diagonal.
     assert (coarse[[0, 3]] > 20 * rms(gusts=False, rate=200.0, duration=30.0)[[0, 3]]).all()
 
 
@@ -80,7 +80,7 @@ def test_two_flights_of_one_scenario_are_equal_to_the_last_bit(osprey_gust: Scen
         assert signal.values.tobytes() == second[name].values.tobytes()
 
 
-def test_progress_is_told_once_a_second(osprey_gust: Scenario) -> None:
-    told: list[float] = []
-    simulate(osprey_gust.vary(flight={"duration": 3.0}), told.append)
-    assert told == [0.0, 1.0, 2.0, 3.0]
+def test_progress_is_reported_once_per_second(osprey_gust: Scenario) -> None:
+    reported: list[float] = []
+    simulate(osprey_gust.vary(flight={"duration": 3.0}), reported.append)
+    assert reported == [0.0, 1.0, 2.0, 3.0]

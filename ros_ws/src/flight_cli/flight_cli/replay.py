@@ -12,7 +12,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from flight_analysis.closed_loop.replay import OPEN_LOOP, Difference, Replayed, recorded_parameters, vary
+from flight_analysis.closed_loop.replay import OPEN_LOOP, Difference, ReplayResult, recorded_parameters, vary
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
 from flight_cli.output import new_table
@@ -67,7 +67,7 @@ def _parse_setting(text: str) -> tuple[str, Any]:
     return key, parse_yaml(value, f"--set {text!r}", "a value")
 
 
-def _parameter_notes(result: Replayed, *, open_loop: bool) -> list[str]:
+def _parameter_notes(result: ReplayResult, *, open_loop: bool) -> list[str]:
     """A note for ticks that flew with other parameters than those of the log."""
     rows = np.flatnonzero(result.other_parameters)
     if open_loop or len(rows) == 0:
@@ -78,7 +78,7 @@ def _parameter_notes(result: Replayed, *, open_loop: bool) -> list[str]:
     return [f"{since}, flew with other parameters than the log holds: {why}"]
 
 
-def _show(result: Replayed, notes: tuple[str, ...], inputs: tuple[str, ...], *, open_loop: bool) -> None:
+def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...], *, open_loop: bool) -> None:
     console = Console(soft_wrap=True, highlight=False)
     first, checked, ticks = result.first(), int(result.checked.sum()), len(result.number)
     of = f"{checked} ticks" if checked == ticks else f"{checked} of {ticks} ticks checked"
@@ -109,7 +109,7 @@ def _format_difference(first: Difference) -> str:
     return f"{first.computed - first.recorded:+.3g}, {first.ulps} ULP"
 
 
-def _count_by_group(result: Replayed) -> dict[str, int]:
+def _count_by_group(result: ReplayResult) -> dict[str, int]:
     """Number of ticks in which each group of channels differs."""
     different = result.different()
     groups: dict[str, list[int]] = {}
@@ -119,7 +119,7 @@ def _count_by_group(result: Replayed) -> dict[str, int]:
     return {name: count for name, count in counts.most_common() if count}
 
 
-def _u_figures(result: Replayed, inputs: tuple[str, ...]) -> dict[str, dict[str, float]]:
+def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[str, float]]:
     """Difference of u by input, in its unit: rms, largest, its time, and the rms of the recorded u."""
     known = np.isfinite(result.computed).all(axis=1)
     recorded, computed = result.group(result.recorded[known], "u"), result.group(result.computed[known], "u")
@@ -132,7 +132,7 @@ def _u_figures(result: Replayed, inputs: tuple[str, ...]) -> dict[str, dict[str,
     return figures
 
 
-def _as_json(result: Replayed, notes: tuple[str, ...], inputs: tuple[str, ...], settings: list[str]) -> dict[str, Any]:
+def _as_json(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...], settings: list[str]) -> dict[str, Any]:
     first = result.first()
     return {
         "open_loop": bool(settings),
@@ -154,7 +154,7 @@ def _first_as_json(first: Difference) -> dict[str, Any]:
     return first._asdict() | {"computed": computed, "ulps": first.ulps}
 
 
-def _write_csv(path: Path, result: Replayed, inputs: tuple[str, ...]) -> None:
+def _write_csv(path: Path, result: ReplayResult, inputs: tuple[str, ...]) -> None:
     """One row a tick: number, t, then each input as recorded and as computed, in digits that restore every bit."""
     columns = [result.names.index(f"u.{name}") for name in inputs]
     with writing("--csv", path, "the path of a file"), path.open("w", newline="", encoding="utf-8") as stream:

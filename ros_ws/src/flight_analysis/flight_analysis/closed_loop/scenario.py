@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A scenario: the validated parameters of every node that one file holds, checked against each other."""
+"""A scenario: one file with the parameters of every node, validated section by section and against each other."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,11 +19,11 @@ from reference_model.params import ReferenceModelParameters
 from rise_di_controller.params import ControllerParameters
 
 ParameterOverrides = dict[str, str | float | bool | list[str]]
-"""Parameters of one node, by name, over those of its section in the scenario."""
+"""Parameters of one node by name that replace those of its section in the scenario."""
 
 
 class FlightParameters(Parameters):
-    """What whoever runs the scenario needs to know."""
+    """How to run the scenario."""
 
     duration: Annotated[float, Field(gt=0, le=1e6)] = Field(description="how long to fly, s")
     lockstep: bool = Field(default=False, description="fly as fast as the machine allows, in lockstep, instead of real time")
@@ -31,7 +31,7 @@ class FlightParameters(Parameters):
 
 @dataclass(frozen=True)
 class Scenario:
-    """One scenario file, read and checked."""
+    """One scenario file, read and validated."""
 
     name: str
     path: Path
@@ -42,9 +42,9 @@ class Scenario:
     recorder: RecorderParameters
 
     def vary(self, **sections: Mapping[str, Any]) -> "Scenario":
-        """Replace some parameters of some sections, as in scenario.vary(controller={"rate": 200.0}).
+        """A copy with some parameters replaced, as in scenario.vary(controller={"rate": 200.0}).
 
-        Everything is checked again. Raises ParameterError.
+        The copy is validated. Raises ParameterError.
         """
         changed: dict[str, Any] = {
             name: SCHEMAS[name].validate_mapping(getattr(self, name).model_dump() | changes, name)
@@ -55,7 +55,7 @@ class Scenario:
         return varied
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
-        """From when to when each gust blows, s: entry to entry + 2 H / V0."""
+        """Start and stop of each gust, s: entry and entry + 2 H / V0."""
         speed = self.aircraft.channels().speed
         return {name: (gust.start, gust.start + 2.0 * gust.length / speed) for name, gust in self.aircraft.gusts.items()}
 
@@ -70,7 +70,7 @@ SCHEMAS: dict[str, type[Parameters]] = {
 
 
 def load_scenario(path: Path) -> Scenario:
-    """Read a scenario file and check each section alone and all of them together. Raises ParameterError with one sentence."""
+    """Read a scenario file and validate it. Raises ParameterError with one sentence."""
     sections = read_sections(path, tuple(SCHEMAS))
     checked = {name: schema.validate_mapping(sections[name], name) for name, schema in SCHEMAS.items()}
     scenario = Scenario(name=path.stem, path=path, **checked)  # type: ignore[arg-type]  # SCHEMAS says which type each has
@@ -78,30 +78,30 @@ def load_scenario(path: Path) -> Scenario:
     return scenario
 
 
-def scenario_yaml(scenario: Scenario, told: Mapping[str, Mapping[str, Any]] | None = None) -> str:
-    """A scenario as the text of a file with every parameter in it, those by default too, but for what `told` says otherwise.
+def scenario_yaml(scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]] | None = None) -> str:
+    """The text of a scenario file with every parameter, defaults included. `overrides` replace parameters by section.
 
-    What is none or empty is left out: it is so by default.
+    A parameter that is None or empty is left out, for that is its default.
     """
     sections = {}
     for name, schema in SCHEMAS.items():
-        given: Parameters = getattr(scenario, name)
-        flown = schema.validate_mapping(given.model_dump() | dict((told or {}).get(name, {})), name)
-        # The instant of t = 0 is not known before all nodes run; `truth` says it.
-        sections[f"/**/{name}"] = {"ros__parameters": _plain(flown.model_dump(exclude={"start_time"}))}
+        section: Parameters = getattr(scenario, name)
+        merged = schema.validate_mapping(section.model_dump() | dict((overrides or {}).get(name, {})), name)
+        # The start time is known only once all nodes run; `truth` holds it.
+        sections[f"/**/{name}"] = {"ros__parameters": _yaml_values(merged.model_dump(exclude={"start_time"}))}
     return yaml.safe_dump(sections, sort_keys=False, default_flow_style=None, width=128)
 
 
-def _plain(values: Any) -> Any:
-    """Values as YAML knows them, without those that stand for nothing: None, and empty texts, lists and mappings."""
+def _yaml_values(values: Any) -> Any:
+    """Values with lists for tuples, and without None and empty texts, lists and mappings."""
     if isinstance(values, Mapping):
-        plain = {key: _plain(value) for key, value in values.items()}
-        return {key: value for key, value in plain.items() if value not in (None, "", [], {})}
-    return [_plain(value) for value in values] if isinstance(values, tuple) else values
+        converted = {key: _yaml_values(value) for key, value in values.items()}
+        return {key: value for key, value in converted.items() if value not in (None, "", [], {})}
+    return [_yaml_values(value) for value in values] if isinstance(values, tuple) else values
 
 
 def check_together(scenario: Scenario) -> None:
-    """Check the sections of a scenario against each other. Raises ParameterError."""
+    """Check the channels and rates of the sections against each other. Raises ParameterError."""
     channels = scenario.aircraft.channels()
     controller, reference = scenario.controller, scenario.reference_model
     for key, found, expected in (

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop in one process, without ROS: the parts that the nodes fly, in the order in which the topics flow."""
+"""The closed loop in one process, without ROS: the code of the nodes, called in the order of the data flow."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,8 +17,8 @@ from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
 
 
-class _Track:
-    """Grows one signal of a tape."""
+class _SignalBuilder:
+    """Collects the samples of one signal of a tape."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = tuple(names)
@@ -26,55 +26,55 @@ class _Track:
         self.rows: list[FloatArray] = []
 
     def add(self, stamp_ns: int, row: FloatArray) -> None:
-        self.stamps.append(stamp_ns)  # before the row: an interrupt between the two leaves a stamp too many
+        self.stamps.append(stamp_ns)  # first: an interrupt before the next line leaves a stamp without a row
         self.rows.append(row)
 
-    def signal(self) -> Signal:
+    def build(self) -> Signal:
         values = np.array(self.rows) if self.rows else np.zeros((0, len(self.names)))
         return Signal(np.array(self.stamps[: len(values)], dtype=np.int64), self.names, values)
 
 
 def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None) -> Tape:
-    """Fly a scenario and return its tape; `progress` is told the flight time once a simulated second.
+    """Fly a scenario and return its tape. `progress` is called with the flight time once per simulated second.
 
-    At each instant: the aircraft's y that arrives, the reference's y_m, then the controller's u, which the aircraft holds until
-    the next. A sample that was lost is not on the tape; one that came late is, at the instant it belongs to. A flight that
-    diverges or is interrupted (Ctrl-C) ends there: the tape holds what was flown, its `outcome` says why.
+    Order at each instant: y of the aircraft, y_m of the reference model, u of the controller. The aircraft holds u until the
+    next one. A lost sample of y is not on the tape; a delayed one has its own stamp. A flight that diverges or is interrupted
+    (Ctrl-C) ends early: the tape holds the samples so far, and its `outcome` the reason.
     """
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     reference, controller = Reference(scenario.reference_model), Controller(scenario.controller)
-    tracks = {
-        "y": _Track(tuple(scenario.aircraft.channels().outputs)),
-        "y_m": _Track(scenario.reference_model.outputs),
-        "u": _Track(inputs),
-        "internals": _Track(controller.names),
+    signals = {
+        "y": _SignalBuilder(tuple(scenario.aircraft.channels().outputs)),
+        "y_m": _SignalBuilder(scenario.reference_model.outputs),
+        "u": _SignalBuilder(inputs),
+        "internals": _SignalBuilder(controller.names),
     }
     outcome, t_ns = COMPLETED, 0
     try:
         aircraft = Simulator(scenario.aircraft)
-        tracks["truth"] = _Track(aircraft.truth_names)
+        signals["truth"] = _SignalBuilder(aircraft.truth_names)
         base_ns = math.gcd(aircraft.period_ns, reference.period_ns)
         u = np.zeros(len(inputs))
         for t_ns in range(0, nanoseconds(scenario.flight.duration) + 1, base_ns):
             if t_ns % aircraft.period_ns == 0:
                 for sample in aircraft.sample(t_ns // aircraft.period_ns, u):
-                    tracks["y"].add(sample.stamp_ns, sample.value)
+                    signals["y"].add(sample.stamp_ns, sample.value)
                     controller.take_y(StampedVector(sample.stamp_ns, select(outputs, aircraft.outputs, sample.value)), t_ns)
-                tracks["truth"].add(t_ns, aircraft.truth())
+                signals["truth"].add(t_ns, aircraft.truth())
             if t_ns % reference.period_ns == 0:
                 y_m = reference.sample(t_ns // reference.period_ns)
-                tracks["y_m"].add(t_ns, y_m)
+                signals["y_m"].add(t_ns, y_m)
                 controller.take_y_m(StampedVector(t_ns, select(outputs, scenario.reference_model.outputs, y_m)), t_ns)
-            if t_ns % controller.period_ns == 0 and (commanded := controller.tick(t_ns)) is not None:
-                u = select(aircraft.inputs, inputs, commanded.u)
-                tracks["u"].add(commanded.stamp_ns, commanded.u)
-                tracks["internals"].add(commanded.stamp_ns, commanded.internals)
+            if t_ns % controller.period_ns == 0 and (output := controller.tick(t_ns)) is not None:
+                u = select(aircraft.inputs, inputs, output.u)
+                signals["u"].add(output.stamp_ns, output.u)
+                signals["internals"].add(output.stamp_ns, output.internals)
             if progress is not None and t_ns % 1_000_000_000 == 0:
                 progress(seconds(t_ns))
     except KeyboardInterrupt:
         outcome = INTERRUPTED
     except FlightEnded as error:
         outcome = str(error)
-    except ChannelError as error:  # commands or noise beyond any number
+    except ChannelError as error:  # commands or noise overflow
         outcome = f"ended at t = {seconds(t_ns):.2f} s: {error}"
-    return Tape({name: track.signal() for name, track in tracks.items()}, outcome=outcome)
+    return Tape({name: signal.build() for name, signal in signals.items()}, outcome=outcome)
