@@ -6,8 +6,9 @@ from flight_ros.startup import start_nodes
 
 
 def main() -> None:
-    """Its entry point."""
-    # It takes what publishers have kept: while it also loads, that holds the flight back by 20 to 70 ms, else by 10 to 35.
+    """Run the recorder."""
+    # Not early: a matched recorder receives the history of all publishers. That delays a flight by 10 to 35 ms, and by 20 to
+    # 70 ms while the recorder also loads its modules.
     start_nodes("flight_recorder.node:RecorderNode", early=False)
 
 

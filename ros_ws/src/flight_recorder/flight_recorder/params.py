@@ -12,16 +12,18 @@ OptionalNames = Annotated[tuple[str, ...], BeforeValidator(as_tuple)]
 
 
 class RecorderParameters(NodeParameters):
-    """All parameters of the recorder's node."""
+    """Parameters of the recorder's node."""
 
-    rate: Annotated[float, Field(ge=5, le=1000)] = Field(description="how often the topics are emptied to the file, Hz")
-    directory: str = Field(default="", description="the folder of the bag; empty makes runs/<UTC stamp>-recording")
-    topics: OptionalNames = Field(default=(), description="further topics to record, whatever their type")
+    rate: Annotated[float, Field(ge=5, le=1000)] = Field(
+        description="rate at which received messages are written to the file, Hz"
+    )
+    directory: str = Field(default="", description="folder of the bag; empty: runs/<UTC stamp>-recording")
+    topics: OptionalNames = Field(default=(), description="further topics to record, of any type")
     min_free: NonNegative = Field(
-        default=100.0, description="free space of the disk below which recording ends, MB (1e6 bytes); 0 does not look"
+        default=100.0, description="free disk space below which recording ends, MB (1e6 bytes); 0 disables the check"
     )
-    attach: OptionalNames = Field(default=(), description="further files to store inside the log")
+    attach: OptionalNames = Field(default=(), description="further files to attach to the log")
     metadata_file: str = Field(
-        default="", description="a YAML file of named sets of strings to store inside the log as its metadata"
+        default="", description="YAML file of named sets of strings; each becomes a metadata record of the log"
     )
-    scenario_file: str = Field(default="", description="a scenario file to store inside the log")
+    scenario_file: str = Field(default="", description="scenario file to attach to the log")

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Quality of service (QoS) of recorded topics: the strongest compatible profile, and rosbag2's text of offered profiles."""
+"""Quality of service (QoS) of recorded topics: the strongest compatible profile, and rosbag2's form of offered profiles."""
 
 from collections.abc import Sequence
 
-import yaml
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -25,9 +24,9 @@ def strongest_compatible(offered: Sequence[QoSProfile]) -> QoSProfile:
     )
 
 
-def qos_yaml(offered: Sequence[QoSProfile]) -> str:
-    """Profiles as rosbag2 stores them, a YAML list."""
-    return yaml.safe_dump([_as_mapping(one) for one in offered], sort_keys=False)
+def rosbag2_profiles(offered: Sequence[QoSProfile]) -> list[dict[str, object]]:
+    """Profiles as rosbag2 stores them."""
+    return [_as_mapping(one) for one in offered]
 
 
 def _as_mapping(qos: QoSProfile) -> dict[str, object]:
