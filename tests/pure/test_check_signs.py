@@ -73,7 +73,7 @@ def test_through_a_map_of_the_right_signs_omega_is_that_of_the_airframe() -> Non
 
 @pytest.mark.parametrize("channel", INPUTS)
 @pytest.mark.parametrize("name", MAPS)
-def test_an_input_with_the_wrong_sign_turns_its_own_d_alone(name: str, channel: str) -> None:
+def test_an_input_with_the_wrong_sign_changes_its_own_d_only(name: str, channel: str) -> None:
     row, k = load_map(name).inputs[channel], INPUTS.index(channel)
     span = sum(row.range)  # the sign turns about the middle, so that trim stays inside the range
     flipped = changed(name, "inputs", channel, sign=-row.sign, offset=row.offset + row.sign * row.scale * span)
@@ -84,7 +84,7 @@ def test_an_input_with_the_wrong_sign_turns_its_own_d_alone(name: str, channel: 
 
 
 @pytest.mark.parametrize("channel", OUTPUTS)
-def test_two_wrong_signs_that_cancel_in_d_are_no_less_wrong(channel: str) -> None:
+def test_two_wrong_signs_that_cancel_in_d_are_still_a_contradiction(channel: str) -> None:
     k = OUTPUTS.index(channel)
     flipped = changed("ardupilot", "outputs", channel, sign=-load_map("ardupilot").outputs[channel].sign)
     row = flipped.inputs[INPUTS[k]]
@@ -92,7 +92,7 @@ def test_two_wrong_signs_that_cancel_in_d_are_no_less_wrong(channel: str) -> Non
     content["inputs"][INPUTS[k]] |= {"sign": -row.sign}
     found = check(ChannelMap.validate_mapping(content, "map"), omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1))
     assert [one.D for one in found.channels] == [1, 1, 1, 1]
-    assert f"outputs.{channel} of the map ardupilot comes with the wrong sign" in found.contradictions[0]
+    assert f"outputs.{channel} of the map ardupilot has the wrong sign" in found.contradictions[0]
 
 
 def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> No
     ],
     ids=lambda one: " ".join(one) if isinstance(one, tuple) else "",
 )
-def test_an_autopilot_is_flown_in_real_time_and_by_a_map_alone(options: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
+def test_options_that_contradict_a_bridge_are_refused(options: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
     shown = CliRunner().invoke(app, ["fly", "osprey_gust", *options, "--runs", str(tmp_path)])
     assert isinstance(shown.exception, ParameterError)
     assert str(shown.exception).startswith(sentence)
@@ -153,7 +153,7 @@ def test_an_excited_flight_gives_omega_back() -> None:
     assert estimate(y, u, OUTPUTS, INPUTS).Omega == pytest.approx(Omega, rel=0.1, abs=0.5)  # slopes over 0.05 s of 1 / (2 1/s)
 
 
-def test_noise_makes_it_unsure_not_wrong() -> None:
+def test_noise_makes_the_estimate_uncertain_but_not_wrong() -> None:
     """Ten times the noise of osprey_servo: of the strong channels it is sure, and of no sign is it sure and wrong."""
     Omega = np.diag([50.0, -80.0, 1.0, -0.1])
     y, u = excited(Omega, noise=0.02)
@@ -176,7 +176,7 @@ def test_a_recorded_flight_of_the_osprey_shows_the_signs_of_its_omega() -> None:
     assert "the recorded flight has r_dot rise with rudder" in found.contradictions[0]
 
 
-def test_a_flight_in_which_an_input_never_moves_says_nothing_of_it() -> None:
+def test_a_log_with_a_constant_input_or_too_few_samples_is_refused() -> None:
     y, u = excited(np.eye(4), noise=0.0)
     still = Signal(u.stamp_ns, u.names, u.values * np.array([1.0, 1.0, 0.0, 1.0]))
     with pytest.raises(ParameterError, match=r"u\.rudder of the log: found a value that never changes"):

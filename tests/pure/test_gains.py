@@ -125,7 +125,7 @@ def test_a_gain_that_22_does_not_allow_is_refused() -> None:
         (True, (3.0, 1.0, 3.0, 2.0), 32.6, 400.0, (400.0,) * 4, 1333.0),
     ],
 )
-def test_the_literal_conditions_ask_the_osprey_for_bandwidths_no_servo_has(
+def test_the_literal_conditions_need_bandwidths_of_the_osprey_beyond_any_servo(
     scaled: bool, Lambda: tuple[float, ...], rho: float, k_g: float, bandwidths: tuple[float, ...], k_d3: float
 ) -> None:
     # Measured before this project, in the units of the file (degrees and percent); three digits, so 1 %.
@@ -162,7 +162,7 @@ def test_n_d_is_minus_D_U_v_dot() -> None:
 # The ideal control
 
 
-def test_the_ideal_control_of_the_osprey_slews_as_measured_before(osprey: Study) -> None:
+def test_the_slew_of_the_ideal_control_of_the_osprey_is_that_of_earlier_measurements(osprey: Study) -> None:
     # deg/s and %/s; measured with steps for commands, where these have edges of 0.1 s: thrust and rudder in calm air are
     # slower (36 and 9.3 with steps), the gusts are the same
     shown = np.degrees([1.0, 0.0, 1.0, 1.0]) + np.array([0.0, 100.0, 0.0, 0.0])
@@ -171,18 +171,18 @@ def test_the_ideal_control_of_the_osprey_slews_as_measured_before(osprey: Study)
     np.testing.assert_allclose((osprey.slew_undisturbed * shown)[[1, 3]], [32.2, 7.35], rtol=0.01)
 
 
-def test_the_ideal_control_is_what_a_tight_loop_settles_to(osprey_gust: Scenario) -> None:
+def test_u_of_a_loop_with_small_error_is_the_ideal_control(osprey_gust: Scenario) -> None:
     # The rate of u of the flown law is the reference: the implicit sign holds e below 1e-3, so u is u* but for sampling.
     short = osprey_gust.vary(flight={"duration": 4.0})
     airframe = load_airframe("osprey")
     found = selection.study_airframe(airframe, selection.manoeuvre(short, airframe), samples=0)
     u = simulate(short)["u"]
-    flown = np.array([np.max(np.abs(np.diff(u[name]) / 0.01)) for name in airframe.inputs])
+    slew = np.array([np.max(np.abs(np.diff(u[name]) / 0.01)) for name in airframe.inputs])
     # 3 %: differences over a period average the corners of the reference's acceleration; the first input moves most
-    assert flown[0] == pytest.approx(found.slew[0], rel=0.03)
+    assert slew[0] == pytest.approx(found.slew[0], rel=0.03)
 
 
-def test_uncertain_airframes_keep_what_is_kinematic() -> None:
+def test_uncertain_airframes_have_the_published_kinematic_rows() -> None:
     airframe = load_airframe("osprey")
     A, B = nominal_and_sampled(airframe, 0.3, 50, seed=1)
     for state in ("theta", "phi"):
@@ -204,11 +204,11 @@ def test_an_airframe_with_an_unstable_zero_is_refused(osprey_gust: Scenario) -> 
 # The engineering procedure
 
 
-def test_the_engineering_gains_of_the_osprey_are_about_those_that_flew_best(selected: selection.Selection) -> None:
+def test_the_engineering_gains_of_the_osprey_are_close_to_those_tuned_by_hand(selected: selection.Selection) -> None:
     controller = selected.engineering.controller
     params = controller.law()
     assert controller.outputs == ("q", "p", "r", "V")  # the slowest last, as (22) wants it
-    # Chosen by hand and flown: K = (18, 18, 9, 2). The shares are those gains, rounded: 2 %.
+    # Chosen by hand and flown: K = (18, 18, 9, 2). The crossover lag products are those of these gains, rounded: 2 %.
     np.testing.assert_allclose(params.K, [18.0, 18.0, 9.0, 2.0], rtol=0.02)
     np.testing.assert_allclose(params.Lambda, [5.0, 5.0, 3.0, 0.5], rtol=0.25)  # a quarter of K, by hand up to a third
     np.testing.assert_allclose(params.eps * params.K / params.beta, 2.75 * np.array([0.035, 0.035, 0.035, 0.115]))  # T_eps
@@ -219,7 +219,7 @@ def test_the_engineering_gains_of_the_osprey_are_about_those_that_flew_best(sele
     assert selected.engineering.delay_margin == pytest.approx(0.045, abs=0.003)
 
 
-def test_what_theorem_1_asks_of_the_osprey_does_not_fly_behind_servos(selected: selection.Selection) -> None:
+def test_the_gains_of_theorem_1_are_unstable_on_the_osprey_with_servos(selected: selection.Selection) -> None:
     literal = selected.theorem
     assert not gain_conditions.failing(literal.theorem)
     assert literal.delay_margin == 0.0
@@ -228,7 +228,7 @@ def test_what_theorem_1_asks_of_the_osprey_does_not_fly_behind_servos(selected: 
     assert "k_g, step 2" in names(selected.engineering.failing, literal.controller.outputs)
 
 
-def test_a_channel_too_slow_for_22_gets_inputs_of_less_response() -> None:
+def test_a_channel_too_slow_for_22_gets_a_smaller_input_scale() -> None:
     loop = Loop(np.array([0.02, 1.0]), 0.0, 0.01)
     bandwidth = gain_conditions.bandwidths(loop, np.array([0.63, 0.23]))
     found = gain_conditions.engineering_gains(bandwidth, np.array([1.0, 1.0]), 1.25, np.array([np.inf, np.inf]))
@@ -304,17 +304,17 @@ def test_a_swapped_pairing_is_refused_with_the_one_that_fits() -> None:
         selection.require_channels(Omega, channels)
 
 
-def test_a_pairing_without_a_minor_is_refused_with_one_that_has_them() -> None:
+def test_a_pairing_with_a_zero_minor_is_refused_with_one_that_has_a_decomposition() -> None:
     Omega, channels = osprey_channels(("thrust", "elevator", "aileron", "rudder"))
     with pytest.raises(ParameterError, match=r"no D, for leading minor 1 is zero, expected another pairing: q-elevator"):
         selection.require_channels(Omega, channels)
 
 
-def test_the_pairing_that_a_refusal_proposes_can_be_selected_for(osprey_gust: Scenario) -> None:
+def test_gains_can_be_selected_for_the_pairing_that_a_refusal_proposes(osprey_gust: Scenario) -> None:
     airframe = load_airframe("aerosonde_first_edition_lateral")
-    flown = selection.manoeuvre(osprey_gust.vary(flight={"duration": 1.0}), airframe)
-    assert flown.reference.outputs == ("p", "r")
-    found = selection.study_airframe(airframe, flown, samples=3)
+    manoeuvre = selection.manoeuvre(osprey_gust.vary(flight={"duration": 1.0}), airframe)
+    assert manoeuvre.reference.outputs == ("p", "r")
+    found = selection.study_airframe(airframe, manoeuvre, samples=3)
     with pytest.raises(ParameterError, match="expected another pairing: p-rudder, r-aileron"):
         selection.select_gains(found, SERVOS)
     answer = selection.select_gains(found, SERVOS._replace(inputs=("rudder", "aileron"))).engineering
@@ -324,7 +324,7 @@ def test_the_pairing_that_a_refusal_proposes_can_be_selected_for(osprey_gust: Sc
 # The linear loop
 
 
-def c_2(airframe_loop: Loop, T_eps: FloatArray, K: FloatArray, Lambda: FloatArray) -> tuple[LinearPlant, LawParams]:
+def osprey_loop(airframe_loop: Loop, T_eps: FloatArray, K: FloatArray, Lambda: FloatArray) -> tuple[LinearPlant, LawParams]:
     """The osprey with given gains in the order q, V, p, r."""
     airframe = load_airframe("osprey")
     A, B, C = airframe.matrix_a() + airframe.matrix_gravity(), airframe.matrix_b(), airframe.matrix_c()
@@ -346,7 +346,7 @@ def test_delay_margins_of_the_osprey_are_those_of_an_independent_prototype(
     factor: float, K: tuple[float, ...], Lambda: tuple[float, ...], margin: float
 ) -> None:
     loop = Loop(np.array([0.02, 0.1, 0.02, 0.02]), 0.0, 0.01)
-    plant, params = c_2(loop, factor * loop.total, np.array(K), np.array(Lambda))
+    plant, params = osprey_loop(loop, factor * loop.total, np.array(K), np.array(Lambda))
     assert gain_conditions.delay_margin(plant, params, loop) == pytest.approx(
         margin, abs=0.001
     )  # given as 45, 64, 61 and 30 to 31 ms
@@ -359,7 +359,7 @@ def scalar(omega: float, T_eps: float) -> LawParams:
 
 
 def grows(params: LawParams, omega: float, lag: float, delay: float) -> bool:
-    """Whether y_dot = omega u_a behind a servo and a delay grows under `law.step`; u delayed by whole quarter milliseconds.
+    """Whether y of y_dot = omega u_a behind a servo and a delay diverges under `law.step`; u delayed by whole quarter milliseconds.
 
     Between these instants plant and servo are solved exactly. e stays within 1e-3 eps, inside the width of the sign.
     """
@@ -410,7 +410,7 @@ def test_a_softened_sign_narrower_than_the_lag_of_the_loop_is_unstable() -> None
 
 def test_delay_that_the_loop_has_already_counts_against_the_margin() -> None:
     loop = Loop(np.array([0.02, 0.1, 0.02, 0.02]), 0.0, 0.01)
-    plant, params = c_2(loop, 3.0 * loop.total, np.array([18.0, 2.0, 18.0, 9.0]), np.array([5.0, 0.5, 5.0, 3.0]))
+    plant, params = osprey_loop(loop, 3.0 * loop.total, np.array([18.0, 2.0, 18.0, 9.0]), np.array([5.0, 0.5, 5.0, 3.0]))
     free = gain_conditions.delay_margin(plant, params, loop)
     spent = gain_conditions.delay_margin(plant, params, loop._replace(delay=0.013))
     assert spent == pytest.approx(free - 0.013, abs=2e-4)
@@ -437,10 +437,10 @@ def command() -> typer.Typer:
 
 
 def test_the_command_names_the_conditions_that_a_scenario_fails() -> None:
-    shown = CliRunner().invoke(command(), ["gains", "osprey", "--check", "--samples", "2", "--scenario", "osprey_servo"])
-    assert shown.exit_code == 1
-    assert "beta above slew of q: found 14.7, expected at least 22.8" in shown.stdout
-    assert "beta in units of y / s^2" in " ".join(shown.stdout.split())
+    result = CliRunner().invoke(command(), ["gains", "osprey", "--check", "--samples", "2", "--scenario", "osprey_servo"])
+    assert result.exit_code == 1
+    assert "beta above slew of q: found 14.7, expected at least 22.8" in result.stdout
+    assert "beta in units of y / s^2" in " ".join(result.stdout.split())
 
 
 def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
@@ -458,19 +458,19 @@ def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
         "--write",
         str(path),
     ]
-    shown = CliRunner().invoke(command(), arguments)
-    assert shown.exit_code == 0, shown.output
-    told = json.loads(shown.stdout)
+    result = CliRunner().invoke(command(), arguments)
+    assert result.exit_code == 0, result.output
+    output = json.loads(result.stdout)
     section = yaml.safe_load(path.read_text(encoding="utf-8"))["/**/controller"]["ros__parameters"]
     assert ControllerParameters.validate_mapping(section, "controller").outputs == ("q", "p", "r", "V")
-    assert told["engineering"]["controller"]["k_g"] == pytest.approx(section["k_g"], rel=1e-5)
-    assert told["theorem"]["delay_margin"] == 0.0
+    assert output["engineering"]["controller"]["k_g"] == pytest.approx(section["k_g"], rel=1e-5)
+    assert output["theorem"]["delay_margin"] == 0.0
 
 
-def test_a_lag_that_is_no_number_is_refused() -> None:
-    shown = CliRunner().invoke(command(), ["gains", "osprey", "--lag", "fast"])
-    assert isinstance(shown.exception, ParameterError)
-    assert str(shown.exception) == "--lag: found 'fast', expected seconds separated by commas"
+def test_a_lag_that_is_not_a_number_is_refused() -> None:
+    result = CliRunner().invoke(command(), ["gains", "osprey", "--lag", "fast"])
+    assert isinstance(result.exception, ParameterError)
+    assert str(result.exception) == "--lag: found 'fast', expected seconds separated by commas"
 
 
 @pytest.mark.parametrize(
@@ -483,13 +483,13 @@ def test_a_lag_that_is_no_number_is_refused() -> None:
         ("--lag", "nan", "--lag: found nan, expected seconds, 0 or more"),
     ],
 )
-def test_a_loop_that_cannot_be_is_refused(option: str, value: str, expected: str) -> None:
-    shown = CliRunner().invoke(command(), ["gains", "osprey", option, value])
-    assert isinstance(shown.exception, ParameterError)
-    assert str(shown.exception) == expected
+def test_an_invalid_loop_is_refused(option: str, value: str, expected: str) -> None:
+    result = CliRunner().invoke(command(), ["gains", "osprey", option, value])
+    assert isinstance(result.exception, ParameterError)
+    assert str(result.exception) == expected
 
 
-def test_a_least_eigenvalue_of_zero_is_no_decay() -> None:
+def test_a_smallest_eigenvalue_of_zero_is_no_decay() -> None:
     condition = Condition("V2_dot", None, 0.0, 0.0, strict=True)
     assert not condition.holds
     assert condition._replace(found=1e-9).holds
@@ -497,11 +497,11 @@ def test_a_least_eigenvalue_of_zero_is_no_decay() -> None:
 
 
 def test_the_command_lists_the_airframes() -> None:
-    shown = CliRunner().invoke(command(), ["airframes", "--json"])
-    told = {one["name"]: one for one in json.loads(shown.stdout)}
-    assert told["osprey"]["D"] == [1, 1, 1, 1]
-    assert told["f16_lateral"]["for_D_I"] == "flip aileron, rudder"
-    assert (told["osprey"]["controllable"], told["osprey"]["integrated"]) == (True, ["theta", "phi"])
+    result = CliRunner().invoke(command(), ["airframes", "--json"])
+    listed = {one["name"]: one for one in json.loads(result.stdout)}
+    assert listed["osprey"]["D"] == [1, 1, 1, 1]
+    assert listed["f16_lateral"]["for_D_I"] == "flip aileron, rudder"
+    assert (listed["osprey"]["controllable"], listed["osprey"]["integrated"]) == (True, ["theta", "phi"])
     printed = CliRunner(env={"COLUMNS": "80"}).invoke(command(), ["airframes"]).stdout
     assert "Outside the theorem: none" in printed
     assert "marginal: phi, theta integrate the outputs and need an outer loop" in printed
@@ -510,7 +510,7 @@ def test_the_command_lists_the_airframes() -> None:
 
 
 def test_a_manoeuvre_leaves_out_what_an_airframe_does_not_have(osprey_gust: Scenario) -> None:
-    flown: Manoeuvre = selection.manoeuvre(osprey_gust, load_airframe("f16_longitudinal"))
-    assert set(flown.reference.outputs) == {"q", "V"}
-    assert flown.reference.coordinated_turn is None
-    assert not flown.gusts
+    manoeuvre: Manoeuvre = selection.manoeuvre(osprey_gust, load_airframe("f16_longitudinal"))
+    assert set(manoeuvre.reference.outputs) == {"q", "V"}
+    assert manoeuvre.reference.coordinated_turn is None
+    assert not manoeuvre.gusts

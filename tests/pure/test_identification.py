@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification by step tests: systems whose answer is known in closed form, then an aircraft of JSBSim from end to end."""
+"""Identification by step tests: systems with a response in closed form, then an aircraft of JSBSim from end to end."""
 
 import math
 import subprocess
@@ -62,7 +62,7 @@ def lagged(Omega: FloatArray, lag: FloatArray) -> Fly:
     coupled=st.floats(-0.5, 0.5),
     lag=st.lists(st.floats(0.01, 0.1), min_size=2, max_size=2),
 )
-def test_a_linear_system_gives_back_its_omega_and_its_lags(
+def test_omega_and_lags_of_a_linear_system_are_identified(
     Omega: list[float], signs: list[float], coupled: float, lag: list[float]
 ) -> None:
     # The last chord begins 0.5 - 0.025 s after the step: what is left of the lag there is exp(-4.75) = 0.9 % of the slope,
@@ -75,7 +75,7 @@ def test_a_linear_system_gives_back_its_omega_and_its_lags(
     assert found.rejected == ()
 
 
-def test_a_damped_rate_shows_its_first_slope() -> None:
+def test_the_tangent_of_a_damped_rate_is_its_initial_slope() -> None:
     # y = b/a (1 - exp(-a t)): the first chord of s = 25 ms has the slope b (1 - exp(-a s)) / (a s) and, at its middle, no lag.
     a, b = 8.0, -5.0
     t = DT * np.arange(101)
@@ -87,7 +87,7 @@ def test_a_damped_rate_shows_its_first_slope() -> None:
 
 
 def test_the_first_maximum_of_the_slope_counts() -> None:
-    # A slope of 1 that fades, and one of -50 that comes after it, as when the aircraft answers to its own change of path.
+    # A slope of 1 that decays, then one of -50, as from the aircraft's change of path.
     t = DT * np.arange(2001)
     y = np.sin(t) * (t < 6.0) - 50.0 * np.maximum(t - 6.0, 0.0)
     found = steepest_tangent(y, DT)
@@ -95,11 +95,11 @@ def test_the_first_maximum_of_the_slope_counts() -> None:
     assert found.slope == pytest.approx(1.0, rel=1e-3)
 
 
-def test_nothing_that_moves_has_no_tangent() -> None:
+def test_a_constant_response_has_no_tangent() -> None:
     assert steepest_tangent(np.zeros(101), DT) is None
 
 
-def test_drift_and_all_that_is_even_drop_out() -> None:
+def test_drift_and_even_parts_of_the_response_cancel() -> None:
     known, lag = np.diag([3.0, -2.0]), np.array([0.05, 0.02])
     straight = lagged(known, lag)
 
@@ -113,7 +113,7 @@ def test_drift_and_all_that_is_even_drop_out() -> None:
     assert found.lag == pytest.approx(clean.lag, abs=1e-9)
 
 
-def test_of_a_dead_zone_the_largest_step_counts() -> None:
+def test_the_largest_step_determines_omega_behind_a_dead_zone() -> None:
     # Half a dead zone of 0.06 hides the step of 0.05 and takes 30 % of that of 0.2: the slope seen is 0.7 of the true one.
     straight = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
 
@@ -127,18 +127,18 @@ def test_of_a_dead_zone_the_largest_step_counts() -> None:
 
 
 def test_steps_stay_inside_the_stops() -> None:
-    asked: list[float] = []
+    steps: list[float] = []
     straight = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
 
     def fly(u: FloatArray, duration: float) -> FloatArray:
-        asked.append(float(np.max(np.abs(u))))
+        steps.append(float(np.max(np.abs(u))))
         return straight(u, duration)
 
     step_responses(fly, -WIDE, np.array([0.1, 10.0]), ("q", "p"), ("elevator", "aileron"), DT)
-    assert sorted(set(asked)) == pytest.approx([0.05, 0.09, 0.1, 0.2])
+    assert sorted(set(steps)) == pytest.approx([0.05, 0.09, 0.1, 0.2])
 
 
-def test_a_step_that_ends_the_flight_is_left_out_and_told() -> None:
+def test_a_step_that_ends_the_flight_is_rejected_with_its_reason() -> None:
     straight = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
 
     def fragile(u: FloatArray, duration: float) -> FloatArray:
@@ -151,8 +151,8 @@ def test_a_step_that_ends_the_flight_is_left_out_and_told() -> None:
     assert found.rejected == ("elevator by 0.2: gave up at t = 0.10 s", "aileron by 0.2: gave up at t = 0.10 s")
 
 
-def test_an_output_that_answers_to_nothing_ends_the_identification() -> None:
-    with pytest.raises(FlightEnded, match=r"^p does not answer to aileron: .*p does not move"):
+def test_an_output_without_response_ends_the_identification() -> None:
+    with pytest.raises(FlightEnded, match=r"^p does not respond to aileron: .*p does not move"):
         step_responses(lagged(np.diag([3.0, 0.0]), np.full(2, 0.02)), -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
 
 
@@ -160,7 +160,7 @@ def test_an_output_that_answers_to_nothing_ends_the_identification() -> None:
 
 
 @pytest.mark.parametrize(("speed", "authority"), [(30.0, 0.8), (150.0, 2.5), (250.0, 0.4)])
-def test_the_commanded_airspeed_asks_for_a_third_of_the_throttle(speed: float, authority: float) -> None:
+def test_the_commanded_airspeed_needs_a_third_of_the_throttle(speed: float, authority: float) -> None:
     # The filter's answer to a step, 2 m/s (1 - (1 + w t) exp(-w t)), is steepest at t = 1/w: 2 m/s w / e. The pulse's edge of
     # 0.1 s rounds that off by less than 1 %.
     params = ReferenceModelParameters.validate_mapping(reference_parameters(speed, authority), "reference_model")
@@ -173,7 +173,7 @@ def test_the_commanded_airspeed_asks_for_a_third_of_the_throttle(speed: float, a
 
 
 @pytest.mark.parametrize(("altitude", "keys"), [(100.0, {"wind"}), (500.0, {"wind", "sigma"}), (3000.0, {"sigma"})])
-def test_moderate_turbulence_is_stated_as_its_altitude_asks(altitude: float, keys: set[str]) -> None:
+def test_moderate_turbulence_has_the_parameters_of_its_altitude(altitude: float, keys: set[str]) -> None:
     assert set(moderate_turbulence(altitude)) == {"altitude", "seed"} | keys
     section = {"airframe": "jsbsim:c172p", "speed": 46.3, "altitude": altitude, "rate": 200.0, "step": 0.005}
     find_scenario("jsbsim_c172p").vary(aircraft=section | {"turbulence": moderate_turbulence(altitude)})  # is accepted
@@ -198,7 +198,7 @@ def test_signs_and_pairing_of_an_aircraft_are_found(cessna: IdentifiedAircraft) 
     assert cessna.failure == ""
 
 
-def test_the_scenario_that_ships_is_what_the_command_writes(cessna: IdentifiedAircraft) -> None:
+def test_the_shipped_scenario_is_what_the_command_writes(cessna: IdentifiedAircraft) -> None:
     # Numbers in the file have six digits; other machines may round the last ones of a flight differently.
     shipped = yaml.safe_load(find_scenario("jsbsim_c172p").path.read_text(encoding="utf-8"))
     written = yaml.safe_load(cessna.text)
@@ -239,7 +239,9 @@ def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
         ("jsbsim:dr1", 3, "error: jsbsim:dr1 does not trim at 46 m/s and 900 m: its model needs the property "),
     ],
 )
-def test_what_cannot_be_identified_ends_in_one_sentence(airframe: str, status: int, sentence: str, tmp_path: Path) -> None:
+def test_an_airframe_that_cannot_be_identified_gives_one_sentence(
+    airframe: str, status: int, sentence: str, tmp_path: Path
+) -> None:
     done = rise_di(airframe, "--speed", "46", "--altitude", "900", cwd=tmp_path)
     assert done.returncode == status
     assert done.stderr.startswith(sentence)
@@ -247,7 +249,7 @@ def test_what_cannot_be_identified_ends_in_one_sentence(airframe: str, status: i
     assert not list(tmp_path.iterdir())
 
 
-def test_no_file_is_written_over_unless_it_is_named(tmp_path: Path) -> None:
+def test_a_file_is_overwritten_only_if_it_is_named(tmp_path: Path) -> None:
     (tmp_path / "jsbsim_c172p.yaml").write_text("mine\n", encoding="utf-8")
     done = rise_di("jsbsim:c172p", "--speed", "46", "--altitude", "900", cwd=tmp_path)
     assert done.returncode == 2

@@ -37,7 +37,7 @@ PERIODS = (0.02, 0.01, 0.005, 0.0025)
 TOO_SMALL = 0.05  # times beta: 0.25 and 0.15, where (29), (30) ask for 1.7 and 1.7
 
 
-def flown(dt: float, duration: float, **gains: Any) -> tuple[Example, LawParams, Evidence]:
+def fly_example(dt: float, duration: float, **gains: Any) -> tuple[Example, LawParams, Evidence]:
     """The example under changed gains."""
     case = example(dt, duration)
     params = case.params._replace(**gains)
@@ -68,7 +68,7 @@ def tail(signal: np.ndarray[Any, Any], t: np.ndarray[Any, Any], after: float) ->
 def test_the_rise_of_V2_is_a_sampling_term_of_first_order() -> None:
     # Where e crosses zero between two ticks, s is wrong for one of them: V2 gains at most 2 dt sum beta_i abs(r_i) there.
     # Measured 5.4, 5.4, 2.2 and 1.4 thousandths, that is 0.27 to 0.56 times dt, of a V2 that falls by 3.
-    rises = [largest_rise(flown(dt, 6.0)[2].V2) for dt in PERIODS]
+    rises = [largest_rise(fly_example(dt, 6.0)[2].V2) for dt in PERIODS]
     assert all(rise < 1.0 * dt for rise, dt in zip(rises, PERIODS, strict=True))
     assert rises[-1] < rises[0] / 2.0
 
@@ -77,7 +77,7 @@ def test_V2_falls_by_the_integral_of_its_quadratic_form_up_to_sampling() -> None
     # Measured 0.14, 0.090, 0.064 and 0.037 of a fall of 3: one derivation of V2_dot, another of V2, none of them the law's.
     worst = []
     for dt in PERIODS:
-        case, params, found = flown(dt, 6.0)
+        case, params, found = fly_example(dt, 6.0)
         z = np.hstack([found.e, found.r])
         fallen = integral(np.einsum("ki,ij,kj->k", z, decay_matrix(case.plant, params), z), found.t)
         worst.append(float(np.max(np.abs(found.V2 - found.V2[0] + fallen))))
@@ -86,8 +86,8 @@ def test_V2_falls_by_the_integral_of_its_quadratic_form_up_to_sampling() -> None
 
 
 def test_e_and_r_settle_on_a_band_of_second_order_where_the_conditions_hold() -> None:
-    # The disturbance and the reference never rest, yet halving dt quarters both: measured 4.0 times each.
-    cases = [flown(dt, 12.0)[2] for dt in PERIODS]
+    # The disturbance and the reference are persistent, yet halving dt quarters both: measured 4.0 times each.
+    cases = [fly_example(dt, 12.0)[2] for dt in PERIODS]
     for name in ("e", "r"):
         bands = [tail(getattr(case, name), case.t, 8.0) for case in cases]
         assert bands[-1] < 1e-4
@@ -95,7 +95,7 @@ def test_e_and_r_settle_on_a_band_of_second_order_where_the_conditions_hold() ->
 
 
 def test_r_is_the_error_filtered_by_Lambda() -> None:
-    _, params, found = flown(0.0025, 6.0)
+    _, params, found = fly_example(0.0025, 6.0)
     r = np.gradient(found.e, found.t, axis=0) + params.Lambda * found.e  # (4), e_dot by another route than the evidence's
     settled = found.t > 0.1  # at engagement e_dot turns within a tick
     # second differences at 2.5 ms differ by less than 1 %; Lambda wrong by a tenth makes 5 % and more
@@ -115,7 +115,7 @@ def test_the_constant_of_lemma_2_is_the_hand_worked_one() -> None:
 
 
 def test_P_stays_positive_with_the_constant_of_lemma_2() -> None:
-    case, params, found = flown(0.005, 12.0)
+    case, params, found = fly_example(0.005, 12.0)
     assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() > 0.9  # measured 0.93: steps 2 and 3 of the theorem hold
     zeta_b = lemma_2(case.plant, found, params)
     flight = fly(case.plant, case.y_m, 0.005, params, case.x_0)
@@ -125,8 +125,8 @@ def test_P_stays_positive_with_the_constant_of_lemma_2() -> None:
 
 
 def test_with_beta_too_small_P_falls_below_every_constant_and_e_stays() -> None:
-    case, params, good = flown(0.01, 60.0)
-    _, weak, bad = flown(0.01, 60.0, beta=TOO_SMALL * params.beta)
+    case, params, good = fly_example(0.01, 60.0)
+    _, weak, bad = fly_example(0.01, 60.0, beta=TOO_SMALL * params.beta)
     assert tail(good.e, good.t, 20.0) < 1e-3  # measured 3.3e-4
     assert tail(bad.e, bad.t, 20.0) > 0.25  # measured 0.31
     assert bad.P[-1] < -lemma_2(case.plant, good, params)  # the constant that carries the good gains: -9.1 against 5.4
@@ -137,8 +137,8 @@ def test_with_beta_too_small_P_falls_below_every_constant_and_e_stays() -> None:
 
 
 def test_with_beta_too_small_V2_still_falls_so_that_its_fall_alone_proves_nothing() -> None:
-    _, params, _ = flown(0.01, 1.0)
-    _, _, bad = flown(0.01, 30.0, beta=TOO_SMALL * params.beta)
+    _, params, _ = fly_example(0.01, 1.0)
+    _, _, bad = fly_example(0.01, 30.0, beta=TOO_SMALL * params.beta)
     assert largest_rise(bad.V2) == 0.0
     assert tail(bad.V1, bad.t, 20.0) > 0.05
 
@@ -146,7 +146,7 @@ def test_with_beta_too_small_V2_still_falls_so_that_its_fall_alone_proves_nothin
 def test_with_K_too_small_V2_rises_at_every_period() -> None:
     # K below G in (16): Q has the eigenvalue -7.0, V2 climbs by 3.0, 3.0 and 3.1, which is no sampling term.
     for dt in (0.01, 0.005, 0.0025):
-        case, params, found = flown(dt, 20.0, K=np.array([1.2, 1.1]), Lambda=np.array([4.0, 4.0]))
+        case, params, found = fly_example(dt, 20.0, K=np.array([1.2, 1.1]), Lambda=np.array([4.0, 4.0]))
         assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() < -6.0
         assert largest_rise(found.V2) > 2.5
         assert tail(found.e, found.t, 15.0) < 1e-3  # the conditions are sufficient, not necessary
@@ -154,8 +154,8 @@ def test_with_K_too_small_V2_rises_at_every_period() -> None:
 
 def test_the_literal_sign_lets_V2_rise_by_a_chatter_that_fades_with_the_period() -> None:
     # It reverses at every tick at rest, so its sampling term adds up over the flight: measured 0.86, 0.43 and 0.20 in 6 s.
-    rises = [largest_rise(flown(dt, 6.0, sign=Sign.LITERAL)[2].V2) for dt in PERIODS[1:]]
-    implicit = [largest_rise(flown(dt, 6.0)[2].V2) for dt in PERIODS[1:]]
+    rises = [largest_rise(fly_example(dt, 6.0, sign=Sign.LITERAL)[2].V2) for dt in PERIODS[1:]]
+    implicit = [largest_rise(fly_example(dt, 6.0)[2].V2) for dt in PERIODS[1:]]
     assert all(1.5 < before / after < 3.0 for before, after in pairwise(rises))
     assert all(literal > 50.0 * quiet for literal, quiet in zip(rises, implicit, strict=True))
 

@@ -30,8 +30,8 @@ from flight_core.parameters import ParameterError, require
 CONDITION_FAILS = 1
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
-    "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 periods, delay), rad: times 57.3 it"
-    " is the phase in deg that the lag costs at the crossover",
+    "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 periods, delay), rad: times 57.3"
+    " it is the phase in deg that the lag costs at the crossover",
     "softening": "width of the softened sign in time, beside the lag of the loop: narrower than that the loop is unstable",
     "response": "how much one unit of scaled input changes y_dot, abs(Omega_ii) input_scale; bandwidth = K x response",
 }

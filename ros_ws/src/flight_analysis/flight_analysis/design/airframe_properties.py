@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the theorem asks of an airframe, checked on its matrices: Remark 1 and Assumptions 1 and 3 as a table.
+"""The theorem's assumptions on an airframe, checked on its matrices: Remark 1 and Assumptions 1 and 3 as a table.
 
-Assumption 2 (f is C1, f and f_dot bounded) needs no check here: gusts and sine terms are C1 and bounded by the file's
-schema, and their rates are bounded as long as the angular rates are.
+Assumption 2 (f is C1, f and f_dot bounded) has no check here: the file's schema bounds gusts and sine terms, which are C1, and
+their rates are bounded if the angular rates are.
 """
 
 from enum import StrEnum
@@ -28,48 +28,48 @@ from rise_di_controller.feedforward import ZERO_REAL_PART
 ComplexArray = NDArray[np.complex128]
 
 MAX_FINITE_ZERO = 1e4
-"""1/s. Zeros beyond it are the pencil's infinite ones: they are double, so rounding may bring them in, but to no less than
-about 1e7 (the inverse root of 2e-16). The fastest finite one in the library is 7.2."""
+"""1/s. Larger zeros are the pencil's infinite ones. They are double, so rounding may make them finite, but not less than about
+1e7 (the inverse root of 2e-16). The largest finite one in the library is 7.2."""
 
 RANK_TOLERANCE = 1e-9
-"""Singular values below this part of the largest are zero: rounding leaves 1e-15, published figures have five digits."""
+"""Singular values below this fraction of the largest one are zero: rounding gives 1e-15, published data have five digits."""
 
 
 class ZeroDynamics(StrEnum):
-    """Where the invariant zeros lie: what Assumption 3 comes down to."""
+    """Location of the invariant zeros, the criterion of Assumption 3."""
 
     STABLE = "stable"  # all in the open left half plane
-    MARGINAL = "marginal"  # some on the imaginary axis: angles that integrate the rates, to be bounded by an outer loop
+    MARGINAL = "marginal"  # some on the imaginary axis: angles that integrate the rates; an outer loop has to bound them
     UNSTABLE = "unstable"  # one in the right half plane: outside the theorem
 
 
 class AirframeFacts(NamedTuple):
-    """What the theorem asks of an airframe, in SI: a row of the table."""
+    """The theorem's assumptions on one airframe, in SI: a row of the table."""
 
     name: str
     n: int
     m: int
     poles: ComplexArray  # (n,) eigenvalues of A, 1/s
-    zeros: ComplexArray  # finite invariant zeros of (A, B, C), 1/s: n - m of them where Omega is nonsingular
+    zeros: ComplexArray  # finite invariant zeros of (A, B, C), 1/s: n - m of them if Omega is nonsingular
     Omega: FloatArray  # (m, m) C B
     minors: FloatArray  # (m,) leading minors of Omega
-    D: FloatArray | None  # (m,) diagonal of D, None where a minor is zero or nearly so
-    coupling: float | None  # max abs(U - I) in inputs of unit response, None with D
+    D: FloatArray | None  # (m,) diagonal of D, None if a minor is (nearly) zero
+    coupling: float | None  # max abs(U - I) in inputs of unit response, None if D is None
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]
     pairing: Pairing | None  # the smallest change that gives D = I
     zero_dynamics: ZeroDynamics
     controllable: bool  # Assumption 1
-    integrated: tuple[str, ...]  # states that integrate outputs and nothing else: a zero at the origin each
+    integrated: tuple[str, ...]  # states that integrate outputs only: each gives a zero at the origin
 
     @property
     def in_theorem(self) -> bool:
-        """Whether what can be checked holds: Assumption 1, D exists (10)-(11), no zero in the right half plane."""
+        """Whether all checks hold: Assumption 1, D exists (10)-(11), no zero in the right half plane."""
         return self.controllable and self.D is not None and self.zero_dynamics is not ZeroDynamics.UNSTABLE
 
     @property
     def remedy(self) -> str:
-        """What gives D = I, for people: "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none"."""
+        """Change that gives D = I, as text: "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none"."""
         if self.pairing is None:
             return "none"
         outputs, inputs, input_signs, _ = self.pairing
@@ -81,10 +81,10 @@ class AirframeFacts(NamedTuple):
 
 
 def airframe_facts(airframe: Airframe) -> AirframeFacts:
-    """Check what the theorem asks of an airframe: poles, zeros, Omega = C B with its D, Assumptions 1 and 3; SI.
+    """Poles, zeros, Omega = C B with its D, and Assumptions 1 and 3 of an airframe; SI.
 
     Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu, Zergeroglu. Zeros are of the linear
-    part (A, B, C): f, where the file has one, is left out. A published A may have gravity in it.
+    part (A, B, C): f is left out. A published A may contain gravity.
     """
     A, B, C = airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_c()
     Omega, hidden = C @ B, np.logical_not(C.any(axis=0))
@@ -115,15 +115,15 @@ def airframe_facts(airframe: Airframe) -> AirframeFacts:
 
 
 def library() -> list[AirframeFacts]:
-    """Facts of every airframe of the library, by name. Raises ParameterError for a file that does not fit."""
+    """Facts of every airframe of the library, by name. Raises ParameterError for an invalid file."""
     return [airframe_facts(load_airframe(file.stem)) for file in sorted(LIBRARY.glob("*.yaml"))]
 
 
 def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
     """Finite s, 1/s, at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank, by real part.
 
-    Shapes: A (n, n), B (n, m), C (m, n); n - m zeros where C B is nonsingular. They are the poles of what is left of the
-    aircraft when y is held at zero. Source: H. H. Rosenbrock, "State-Space and Multivariable Theory", 1970.
+    Shapes: A (n, n), B (n, m), C (m, n); n - m zeros if C B is nonsingular. They are the poles of the zero dynamics, the
+    motion of the aircraft with y = 0. Source: H. H. Rosenbrock, "State-Space and Multivariable Theory", 1970.
     """
     n, m = B.shape
     pencil = np.block([[A, B], [C, np.zeros((m, m))]])
@@ -134,7 +134,7 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Where the zeros lie, 1/s, shape (n - m,): right half plane, imaginary axis (within ZERO_REAL_PART) or left half plane."""
+    """Half plane of the zeros, 1/s, shape (n - m,); within ZERO_REAL_PART they are on the imaginary axis."""
     rightmost = float(np.max(zeros.real, initial=-np.inf))
     if rightmost > ZERO_REAL_PART:
         return ZeroDynamics.UNSTABLE

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From an aircraft that nothing is published about to a scenario that flies it: step tests, signs, lags, gains.
+"""Identification of an unknown aircraft: step tests, signs, lags and gains, written as a scenario that flies it.
 
-`identify` asks of the aircraft no more than to be flown: each input is stepped, and the steepest tangent of its own output
-gives its column of Omega and its lag. The rest is the engineering procedure of `rise-di gains`, with one thing measured in
-flight, the slew of the inputs. No number here belongs to one aircraft.
+`identify` only needs to fly the aircraft. It steps each input; the steepest tangent of the paired output gives the column of
+Omega and the lag of that input. The gains are those of the engineering procedure of `rise-di gains`, with the slew of the
+inputs measured in flight. No number in this module is specific to an aircraft.
 """
 
 import math
@@ -34,9 +34,9 @@ from flight_analysis.design.gain_selection import (
     require_channels,
     select_gains,
     study_airframe,
-    yaml_flow,
+    yaml_template,
 )
-from flight_analysis.metrics import error_metrics, best_error
+from flight_analysis.metrics import best_error, error_metrics
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.rates import divide, nanoseconds
 from flight_core.tape import Tape
@@ -50,47 +50,47 @@ from rise_di_controller.params import ControllerParameters
 # The step tests
 
 SIZES = (0.05, 0.1, 0.2)
-"""Steps, in normalised commands: the small ones stay linear, the large ones get over a hysteresis and use up a rate limit."""
+"""Steps, in normalised commands: the small ones stay linear, the large ones exceed a hysteresis and reach a rate limit."""
 
-MAX_STEP_FRACTION = 0.9  # of the way to a stop is the largest step, where 0.2 would be beyond it
-WINDOWS = {"V": 10.0}  # s: engines and propellers take seconds to spin up
-WINDOW = 0.5  # s, of a body rate
-SPAN = 0.025  # s over which a slope is taken
-TANGENT_CUTOFF = 0.7  # a slope that has fallen to this part of the largest so far is past the steepest tangent
+MAX_STEP_FRACTION = 0.9  # upper bound of a step, as a fraction of the distance to the end stop
+WINDOWS = {"V": 10.0}  # s, length of a response: engines and propellers need seconds to spin up
+WINDOW = 0.5  # s, the same for body rates
+SPAN = 0.025  # s, length of a chord
+TANGENT_CUTOFF = 0.7  # the search ends when the slope has fallen to this fraction of the largest one so far
 
 RATE, CONTROL_RATE, STEP = 200.0, 100.0, 0.005  # Hz, Hz, s: of y, of the law, of the integration
 SOFTENING = 2.75  # 1, width of the softened sign in total lags, that of osprey_servo
-SAMPLES = 5  # uncertain aircraft around the one found: no more than its largest response is wanted of them
-DELAY = 0.006  # s, topics: a tick finds y at most 5 ms old, u waits at most 5 ms; half of both, and the way
+SAMPLES = 5  # uncertain aircraft around the identified one: only the largest response of them is used
+DELAY = 0.006  # s, topics: y is at most 5 ms old at a tick, u waits at most 5 ms; half of both, and 1 ms of transport
 
 Fly = Callable[[FloatArray, float], FloatArray]
-"""(u held from trim on, shape (m,); duration in s) -> y every `dt` from t = 0 on, shape (N + 1, m), deviations from trim."""
+"""(constant u from trim, shape (m,); duration in s) -> y every `dt` from t = 0, shape (N + 1, m), deviations from trim."""
 
 
 class Tangent(NamedTuple):
-    """The steepest chord of a step response, which stands for its tangent: y = slope (t - lag)."""
+    """The steepest chord of a step response, an estimate of its steepest tangent: y = slope (t - lag)."""
 
     slope: float
     lag: float  # s
-    first: int  # the samples that it joins
+    first: int  # samples at its ends
     last: int
 
 
 class Responses(NamedTuple):
-    """What the step tests show, outputs and inputs in their canonical order, output i driven by input i."""
+    """Result of the step tests, outputs and inputs in their canonical order, output i driven by input i."""
 
     Omega: FloatArray  # (m, m) effective C B: slopes of y per unit of u
     lag: FloatArray  # (m,) s, of each input's own output
-    size: FloatArray  # (m,) of the step whose tangent counted
-    spread: FloatArray  # (m,) the smallest slope of all sizes beside the largest: 1 is linear
-    rejected: tuple[str, ...]  # steps that show nothing, and why
+    size: FloatArray  # (m,) of the step with the steepest tangent
+    spread: FloatArray  # (m,) smallest slope of all sizes / largest one: 1 is linear
+    rejected: tuple[str, ...]  # steps without a result, with the reason
 
 
 def steepest_tangent(y: FloatArray, dt: float) -> Tangent | None:
-    """The steepest tangent of a unit step response, y of shape (N,) every dt; None where nothing moves.
+    """The steepest tangent of a unit step response, y of shape (N,) every dt; None if y is constant.
 
-    A chord joins samples 25 ms apart. The first maximum of its slope counts, which is passed when the slope has fallen to 0.7
-    of it. A response y_dot = slope (1 - exp(-t / lag)) gives back its slope and lag, but for exp(-t / lag) at the end.
+    A chord joins samples 25 ms apart. The result is the chord at the first maximum of the slope: the search ends when the slope
+    has fallen to 0.7 of it. For y_dot = slope (1 - exp(-t / lag)) it gives slope and lag, up to exp(-t / lag) at the end.
     Source: the process reaction curve of J. G. Ziegler, N. B. Nichols, Trans. ASME 64, 1942.
     """
     count = max(round(SPAN / dt), 1)
@@ -113,12 +113,12 @@ def step_responses(
     dt: float,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Responses:
-    """Step each input both ways, by several sizes, and read Omega and the lags from the tangents of its own output.
+    """Step each input in both directions, by several sizes, and take Omega and the lags from the tangents of its output.
 
-    What counts is the odd part, (y(+s) - y(-s)) / 2s: trim that drifts, and whatever is even, drop out. Of all sizes the
-    steepest gives the column, Omega_ij = y_i / (t - lag) at the middle of the chord of j, since too large an Omega costs
-    little and too small a one stability; the longest lag counts, for the same reason. Raises FlightEnded where an output
-    answers to no step.
+    The response is the odd part, (y(+s) - y(-s)) / 2s: a drift of the trim and all even parts cancel. The steepest response of
+    all sizes gives the column, Omega_ij = y_i / (t - lag) at the middle of the chord of j, and the longest lag is used: too
+    large an Omega or lag costs little performance, too small a one costs stability. Raises FlightEnded if an output does not
+    respond to any step.
 
     Arguments: `lower`, `upper` the end stops of u from trim, (m,); `dt` that of `fly`.
     """
@@ -127,7 +127,7 @@ def step_responses(
     rejected: list[str] = []
     for j, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
         progress(f"steps of {name}")
-        seen: list[tuple[Tangent, float, FloatArray]] = []
+        responses: list[tuple[Tangent, float, FloatArray]] = []
         for step in sorted({min(one, MAX_STEP_FRACTION * float(min(-lower[j], upper[j]))) for one in SIZES}):
             u = step * np.eye(m)[j]
             try:
@@ -135,27 +135,27 @@ def step_responses(
             except FlightEnded as error:
                 rejected.append(f"{name} by {step:.3g}: {error}")
                 continue
-            found = steepest_tangent(y[:, j], dt)
-            if found is None:
+            chord = steepest_tangent(y[:, j], dt)
+            if chord is None:
                 rejected.append(f"{name} by {step:.3g}: {output} does not move")
                 continue
-            middle = (found.first + found.last) / 2.0 * dt
-            seen.append((found, step, (y[found.first] + y[found.last]) / 2.0 / (middle - found.lag)))
-        if not seen:
-            raise FlightEnded(f"{output} does not answer to {name}: {'; '.join(rejected)}")
-        steepest, size[j], Omega[:, j] = max(seen, key=lambda one: abs(one[0].slope))
-        lag[j] = max(one.lag for one, *_ in seen)
-        spread[j] = min(abs(one.slope) for one, *_ in seen) / abs(steepest.slope)
+            middle = (chord.first + chord.last) / 2.0 * dt
+            responses.append((chord, step, (y[chord.first] + y[chord.last]) / 2.0 / (middle - chord.lag)))
+        if not responses:
+            raise FlightEnded(f"{output} does not respond to {name}: {'; '.join(rejected)}")
+        steepest, size[j], Omega[:, j] = max(responses, key=lambda one: abs(one[0].slope))
+        lag[j] = max(one.lag for one, *_ in responses)
+        spread[j] = min(abs(one.slope) for one, *_ in responses) / abs(steepest.slope)
     return Responses(Omega, lag, size, spread, tuple(rejected))
 
 
 # The manoeuvre: one rule for all aircraft
 
-Q, P, FASTER = 0.05, 0.15, 2.0  # rad/s, rad/s, m/s: heights of the pulses
-HEIGHTS = {"q": Q, "V": FASTER, "p": P, "r": Q}  # and sizes of the outputs, for what a coupling is beside
+PULSE_Q, PULSE_P, PULSE_V = 0.05, 0.15, 2.0  # rad/s, rad/s, m/s: heights of the pulses
+HEIGHTS = {"q": PULSE_Q, "V": PULSE_V, "p": PULSE_P, "r": PULSE_Q}  # also the units of the outputs in the coupling
 NATURAL_FREQUENCY = {"q": 4.0, "V": 1.2, "p": 5.0, "r": 4.0}  # rad/s, as in osprey_gust
 DAMPING = {"q": 0.9, "V": 1.0, "p": 0.9, "r": 0.9}
-AUTHORITY_FRACTION = 1.0 / 3.0  # of the throttle's authority goes into the commanded V; the rest is for climbs, turns and gusts
+AUTHORITY_FRACTION = 1.0 / 3.0  # of the throttle's authority for the commanded V; the rest is for climbs, turns and gusts
 DURATION = 60.0  # s
 GUST_SPEED, GUST_LENGTH = 5.0, 30.48  # m/s down, and m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
 GUST_START = 50.0  # s
@@ -165,15 +165,15 @@ MODERATE_WIND, MODERATE_SIGMA = 15.4, 3.05  # m/s, of moderate turbulence: 30 kt
 def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
     """Parameters of the reference model for an aircraft of a trim speed (m/s) and an authority of its throttle (m/s^2).
 
-        q   0.05 rad/s, or 1 g / speed where that is less, up and down for 1 s each: the path is as it was after each pair
-        V   2 m/s more for 20 s; its filter asks for 2 m/s omega / e at most, a third of the authority, omega up to 1.2 rad/s
+        q   0.05 rad/s, or 1 g / speed if that is less, up and down for 1 s each: each pair restores the flight path
+        V   2 m/s more for 20 s; its filter needs at most 2 m/s omega / e, a third of the authority, omega up to 1.2 rad/s
         p   0.15 rad/s right and left for 1 s each: banks of 9 degrees
         r   the coordinated turn g/V0 sin(bank)
 
-    The rest is that of osprey_gust. Banks are short because q of a coordinated turn is not commanded: the nose sinks in them.
+    The rest is that of osprey_gust. Banks are short because q of a coordinated turn is not commanded: the nose drops in them.
     """
-    q = min(Q, GRAVITY / speed)
-    slow = min(NATURAL_FREQUENCY["V"], AUTHORITY_FRACTION * authority * math.e / FASTER)
+    q, p = min(PULSE_Q, GRAVITY / speed), PULSE_P
+    slow = min(NATURAL_FREQUENCY["V"], AUTHORITY_FRACTION * authority * math.e / PULSE_V)
     return {
         "rate": RATE,
         "outputs": list(OUTPUTS),
@@ -184,8 +184,8 @@ def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
         "rise": 0.1,
         "pulses": {
             "q": {"start": [2.0, 4.0, 40.0, 42.0], "stop": [3.0, 5.0, 41.0, 43.0], "value": [q, -q, -q, q]},
-            "V": {"start": [10.0], "stop": [30.0], "value": [FASTER]},
-            "p": {"start": [12.0, 14.0, 18.0, 20.0], "stop": [13.0, 15.0, 19.0, 21.0], "value": [P, -P, -P, P]},
+            "V": {"start": [10.0], "stop": [30.0], "value": [PULSE_V]},
+            "p": {"start": [12.0, 14.0, 18.0, 20.0], "stop": [13.0, 15.0, 19.0, 21.0], "value": [p, -p, -p, p]},
         },
         "coordinated_turn": {"bank_rate": "p", "turn_rate": "r", "speed": speed},
     }
@@ -201,11 +201,11 @@ def moderate_turbulence(altitude: float) -> dict[str, Any]:
     return values
 
 
-# The whole of it
+# Identification
 
 
 class ManoeuvreResult(NamedTuple):
-    """A flight of the manoeuvre in one process."""
+    """Result of a simulation of the manoeuvre in one process."""
 
     outcome: str
     rms: dict[str, float]  # of the error by output, SI
@@ -213,7 +213,7 @@ class ManoeuvreResult(NamedTuple):
 
 
 class IdentifiedAircraft(NamedTuple):
-    """An aircraft, identified, and the scenario that flies it."""
+    """An identified aircraft, and the scenario that flies it."""
 
     condition: FlightCondition
     trim: Trim
@@ -221,7 +221,7 @@ class IdentifiedAircraft(NamedTuple):
     coupling: float  # max abs(U - I), inputs of unit response, outputs in units of the manoeuvre
     selection: Selection
     text: str  # of the scenario file
-    sideslip_zero: float  # 1/s, of sideslip with p and r held: positive, and Assumption 3 does not hold
+    sideslip_zero: float  # 1/s, of sideslip with p and r held; Assumption 3 does not hold if it is positive
     flights: dict[str, ManoeuvreResult]  # "calm", "gust", "turbulence"
 
     @property
@@ -231,77 +231,77 @@ class IdentifiedAircraft(NamedTuple):
         return tuple(controller.D[controller.inputs.index(name)] for name in INPUTS)
 
     def scenario(self) -> Scenario:
-        """What the scenario file holds."""
+        """The content of the scenario file."""
         return _load(self.text)
 
     @property
     def failure(self) -> str:
-        """Why it does not fly the manoeuvre; empty where it does: each flight to its end, calm with less error than command."""
+        """Reason of a failure, or "": every flight completes, and in calm air each error is below its command."""
         for title, one in self.flights.items():
             if one.outcome != COMPLETED:
                 return f"{title}: {one.outcome}"
-        lost = [name for name, value in self.flights["calm"].rms.items() if not value < HEIGHTS[name]]
-        return f"calm: the error of {', '.join(lost)} is larger than the command" if lost else ""
+        too_large = [name for name, value in self.flights["calm"].rms.items() if not value < HEIGHTS[name]]
+        return f"calm: the error of {', '.join(too_large)} is larger than the command" if too_large else ""
 
 
 def identify(name: str, speed: float, altitude: float, progress: Callable[[str], None] = lambda _: None) -> IdentifiedAircraft:
     """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s, altitude in m.
 
-    1. Trim, tried in another process first. 2. Step tests: `responses`. 3. The pairing, outputs scaled by the manoeuvre's
-    sizes, and D from the minors. 4. Gains by the engineering procedure, the aircraft taken for y_dot = Omega u behind its lags:
-    whatever else there is counts to f. 5. Moderate turbulence flown with K and Lambda alone: the slew of that u takes the place
-    of the ideal control's, and gives beta. 6. The result flown: calm, with a gust, in turbulence.
+    1. Trim, first in another process. 2. Step tests: `step_responses`. 3. The pairing, with outputs in units of the manoeuvre,
+    and D from the minors. 4. Gains by the engineering procedure for y_dot = Omega u behind the lags; all other terms count as
+    f. 5. A simulation in moderate turbulence with K and Lambda alone: the slew of its u replaces that of the ideal control,
+    and gives beta. 6. Simulations of the result: in calm air, with a gust, in turbulence.
 
-    Raises FlightEnded where the aircraft does not trim or does not answer, ParameterError where its outputs and inputs cannot
-    be paired.
+    Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its outputs and inputs cannot be
+    paired.
     """
-    point = FlightCondition(name, speed, altitude, nanoseconds(STEP))
+    condition = FlightCondition(name, speed, altitude, nanoseconds(STEP))
     progress("trim")
-    trim = _vehicle(point).trim
+    trim = _vehicle(condition).trim
 
     def fly(u: FloatArray, duration: float) -> FloatArray:
-        vehicle = _vehicle(point)
+        vehicle = _vehicle(condition)
         rows = [vehicle.y()]
-        for k in range(divide(nanoseconds(duration), point.step_ns, "step", "the step test")):
-            vehicle.advance(k * point.step_ns, u, point.step_ns)
+        for k in range(divide(nanoseconds(duration), condition.step_ns, "step", "the step test")):
+            vehicle.advance(k * condition.step_ns, u, condition.step_ns)
             rows.append(vehicle.y())
         return np.array(rows)
 
     outputs, inputs = tuple(OUTPUTS), tuple(INPUTS)
-    found = step_responses(fly, trim.lower, trim.upper, outputs, inputs, STEP, progress)
+    measured = step_responses(fly, trim.lower, trim.upper, outputs, inputs, STEP, progress)
     throttle = inputs.index("throttle")
-    authority = abs(found.Omega[throttle, throttle]) * min(-trim.lower[throttle], trim.upper[throttle])
+    authority = abs(measured.Omega[throttle, throttle]) * min(-trim.lower[throttle], trim.upper[throttle])
     commands = reference_parameters(speed, float(authority))
-    scaled = found.Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
+    scaled = measured.Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
     require_channels(scaled, ChannelPairing(outputs, inputs))
-    studied = _study(point, found.Omega, commands)
-    setting = _setting(trim, found.lag)
+    studied = _study(condition, measured.Omega, commands)
+    setting = _setting(trim, measured.lag)
 
     def scenario_text(selection: Selection) -> str:
-        return _text(point, trim, found, commands, selection)
+        return _text(condition, trim, measured, commands, selection)
 
     progress("slew of the inputs")
     first = select_gains(studied, setting)
     turbulent = _load(scenario_text(first)).vary(aircraft={"turbulence": moderate_turbulence(altitude)})
     tape = simulate(without_beta(turbulent))
-    chosen = select_gains(studied._replace(slew=_slew(tape, found.lag)), setting)
+    chosen = select_gains(studied._replace(slew=_slew(tape, measured.lag)), setting)
     text = scenario_text(chosen)
     flights = fly_all(_load(text), progress)
-    return IdentifiedAircraft(point, trim, found, coupling(scaled), chosen, text, sideslip_zero(point), flights)
+    return IdentifiedAircraft(condition, trim, measured, coupling(scaled), chosen, text, sideslip_zero(condition), flights)
 
 
 def fly_all(scenario: Scenario, progress: Callable[[str], None] = lambda _: None) -> dict[str, ManoeuvreResult]:
     """Fly a scenario of `identify` three times: "calm", with its "gust", and in moderate "turbulence" without the gust."""
-    air = moderate_turbulence(scenario.aircraft.flight_condition().altitude)
+    turbulence = moderate_turbulence(scenario.aircraft.flight_condition().altitude)
     flights = {}
-    for title, changes in (("calm", {"gusts": {}}), ("gust", {}), ("turbulence", {"gusts": {}, "turbulence": air})):
+    for title, changes in (("calm", {"gusts": {}}), ("gust", {}), ("turbulence", {"gusts": {}, "turbulence": turbulence})):
         progress(f"flight: {title}")
-        flights[title] = flown(simulate(scenario.vary(aircraft=changes)))
+        flights[title] = manoeuvre_result(simulate(scenario.vary(aircraft=changes)))
     return flights
 
 
-def flown(tape: Tape) -> ManoeuvreResult:
-    """Figures of a tape: rms errors and the largest commands."""
+def manoeuvre_result(tape: Tape) -> ManoeuvreResult:
+    """Rms errors and the largest commands of a tape."""
     _, error = best_error(tape)
     rms = {name: error_metrics(error[name]).rms for name in error.names}
     largest = {name: float(np.max(np.abs(tape["u"][name]), initial=0.0)) for name in tape["u"].names}
@@ -309,36 +309,36 @@ def flown(tape: Tape) -> ManoeuvreResult:
 
 
 def without_beta(scenario: Scenario) -> Scenario:
-    """The same scenario with (almost) no beta, which leaves a PI with the same K and Lambda."""
+    """The same scenario with a negligible beta: a PI controller with the same K and Lambda."""
     return scenario.vary(controller={"beta": [1e-9] * len(scenario.controller.beta)})
 
 
-def _vehicle(point: FlightCondition) -> JsbsimModel:
+def _vehicle(condition: FlightCondition) -> JsbsimModel:
     none = np.zeros(len(AXES))
-    return JsbsimModel(point, Actuators(), WindModel(Gusts(none, none, none + 1.0), None))
+    return JsbsimModel(condition, Actuators(), WindModel(Gusts(none, none, none + 1.0), None))
 
 
-def _study(point: FlightCondition, Omega: FloatArray, commands: Mapping[str, Any]) -> Study:
-    """y_dot = Omega u along the manoeuvre, as the gain procedures take it."""
+def _study(condition: FlightCondition, Omega: FloatArray, commands: Mapping[str, Any]) -> Study:
+    """The study of y_dot = Omega u along the manoeuvre, input of the gain procedures."""
     airframe = Airframe.validate_mapping(
         {
-            "name": point.title,
+            "name": condition.title,
             "source": "step tests in JSBSim",
-            "speed": point.speed,
+            "speed": condition.speed,
             "states": dict(OUTPUTS),
             "inputs": {name: {"unit": "1", "positive": one.positive} for name, one in INPUTS.items()},
             "outputs": list(OUTPUTS),
             "A": np.zeros_like(Omega).tolist(),
             "B": Omega.tolist(),
         },
-        f"airframe {point.title}",
+        f"airframe {condition.title}",
     )
     manoeuvre = Manoeuvre(ReferenceModelParameters.validate_mapping(commands, "reference_model"), {}, DURATION)
     return study_airframe(airframe, manoeuvre, samples=SAMPLES)
 
 
 def _setting(trim: Trim, lag: FloatArray) -> LoopSetting:
-    """The loop that the gains are for. What the procedure selects stands here as ones."""
+    """The loop that the gains are selected for. The parameters to be selected are 1."""
     inputs = list(INPUTS)
     ones = [1.0] * len(inputs)
     base = ControllerParameters.validate_mapping(
@@ -352,7 +352,7 @@ def _setting(trim: Trim, lag: FloatArray) -> LoopSetting:
 
 
 def _slew(tape: Tape, lag: FloatArray) -> FloatArray:
-    """Largest mean slew of each input over the lag of its loop, shape (m,), 1/s: what is faster, no loop could follow."""
+    """Largest mean slew of each input over the lag of its loop, shape (m,), 1/s: no loop follows a faster one."""
     period = 1.0 / CONTROL_RATE
     slew = np.zeros(len(INPUTS))
     for j, (name, total) in enumerate(zip(INPUTS, total_lag(lag, DELAY, period), strict=True)):
@@ -368,55 +368,75 @@ def _load(text: str) -> Scenario:
         return load_scenario(path)
 
 
-def _text(point: FlightCondition, trim: Trim, found: Responses, commands: Mapping[str, Any], selection: Selection) -> str:
-    """The scenario file."""
-    filters, pulses = commands["second_order"], commands["pulses"]
-    trimmed = ", ".join(f"{name} {value:.3g}" for name, value in zip(INPUTS, trim.commands, strict=True))
-    diagonal = ", ".join(
-        f"{output} by {name} {value:.3g}" for output, name, value in zip(OUTPUTS, INPUTS, np.diag(found.Omega), strict=True)
-    )
-    shown_pulses = "\n".join(f"      {name}: {yaml_flow(one)}" for name, one in pulses.items())
-    return f"""# SPDX-FileCopyrightText: RISE-DI contributors
+SCENARIO_YAML = yaml_template("""\
+# SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 #
-# JSBSim's {point.name} at {point.speed:.6g} m/s and {point.altitude:.6g} m: commands on every channel, a gust from above.
-# Written by: rise-di identify {point.title} --speed {point.speed:.6g} --altitude {point.altitude:.6g}
-# Commands in trim: {trimmed}.
-# Steepest response, in rad/s^2 and m/s^2 per unit of command: {diagonal}.
+# JSBSim's {{ condition.name }} at {{ condition.speed | digits(6) }} m/s and {{ condition.altitude | digits(6) }} m: \
+commands on every channel, a gust from above.
+# Written by: rise-di identify {{ condition.title }} --speed {{ condition.speed | digits(6) }} \
+--altitude {{ condition.altitude | digits(6) }}
+# Commands in trim: {% for name in inputs %}{{ name }} {{ trim.commands[loop.index0] | digits(3) }}\
+{{ ", " if not loop.last }}{% endfor %}.
+# Steepest response, in rad/s^2 and m/s^2 per unit of command: {% for name in outputs %}{{ name }} by \
+{{ inputs[loop.index0] }} {{ Omega[loop.index0, loop.index0] | digits(3) }}{{ ", " if not loop.last }}{% endfor %}.
 
 /**/flight:
   ros__parameters:
-    duration: {yaml_flow(DURATION)}             # s
+    duration: {{ duration | flow }}             # s
 
 /**/aircraft:
   ros__parameters:
-    airframe: {point.title}
-    speed: {yaml_flow(point.speed)}  # m/s, true airspeed in trim
-    altitude: {yaml_flow(point.altitude)}  # m, above sea level
-    rate: {yaml_flow(RATE)}                # Hz, y and truth
-    step: {yaml_flow(STEP)}                # s, of JSBSim
+    airframe: {{ condition.title }}
+    speed: {{ condition.speed | flow }}  # m/s, true airspeed in trim
+    altitude: {{ condition.altitude | flow }}  # m, above sea level
+    rate: {{ rate | flow }}                # Hz, y and truth
+    step: {{ step | flow }}                # s, of JSBSim
     gusts:                     # 1-cosine; entry in s, peak speed in m/s (down), distance H to the peak in m
-      vertical: {yaml_flow({"start": GUST_START, "speed": GUST_SPEED, "length": GUST_LENGTH})}
-    # turbulence: {yaml_flow(moderate_turbulence(point.altitude))}  # moderate, to fly in instead
+      vertical: {{ gust | flow }}
+    # turbulence: {{ turbulence | flow }}  # moderate, to fly in instead
     actuators:                 # elevator, throttle, aileron, rudder: deviations of the normalised commands from trim
-      lower: {yaml_flow(trim.lower.tolist())}
-      upper: {yaml_flow(trim.upper.tolist())}
+      lower: {{ trim.lower.tolist() | flow }}
+      upper: {{ trim.upper.tolist() | flow }}
 
 /**/reference_model:
   ros__parameters:
-    rate: {yaml_flow(RATE)}                # Hz
-    outputs: {yaml_flow(commands["outputs"])}
+    rate: {{ rate | flow }}                # Hz
+    outputs: {{ commands.outputs | flow }}
     second_order:
-      natural_frequency: {yaml_flow(filters["natural_frequency"])}  # rad/s; that of V asks for a third of the throttle's authority
-      damping: {yaml_flow(filters["damping"])}
-    rise: {yaml_flow(commands["rise"])}                  # s, edge of a pulse: bounds u_m_dot
+      natural_frequency: {{ commands.second_order.natural_frequency | flow }}  \
+# rad/s; that of V asks for a third of the throttle's authority
+      damping: {{ commands.second_order.damping | flow }}
+    rise: {{ commands.rise | flow }}                  # s, edge of a pulse: bounds u_m_dot
     pulses:                    # s, s, and rad/s or m/s
-{shown_pulses}
-    coordinated_turn: {yaml_flow(commands["coordinated_turn"])}  # r += g/V0 sin(bank commanded)
+{% for name, pulse in commands.pulses.items() %}
+      {{ name }}: {{ pulse | flow }}
+{% endfor %}
+    coordinated_turn: {{ commands.coordinated_turn | flow }}  # r += g/V0 sin(bank commanded)
 
 # Omega and the lags are those of step tests; the slew behind beta is that of u with K and Lambda alone in moderate turbulence.
-{as_yaml(selection)}
+{{ controller }}
 /**/recorder:
   ros__parameters:
     rate: 100.0                # Hz, how often the topics are emptied
-"""
+""")
+
+
+def _text(
+    condition: FlightCondition, trim: Trim, measured: Responses, commands: Mapping[str, Any], selection: Selection
+) -> str:
+    """The scenario file."""
+    return SCENARIO_YAML.render(
+        condition=condition,
+        trim=trim,
+        inputs=list(INPUTS),
+        outputs=list(OUTPUTS),
+        Omega=measured.Omega,
+        duration=DURATION,
+        rate=RATE,
+        step=STEP,
+        gust={"start": GUST_START, "speed": GUST_SPEED, "length": GUST_LENGTH},
+        turbulence=moderate_turbulence(condition.altitude),
+        commands=commands,
+        controller=as_yaml(selection),
+    )

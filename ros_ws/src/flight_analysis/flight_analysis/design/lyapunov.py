@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's Lyapunov functions along a flight whose plant is known: evidence for the theorem, never part of the law.
+"""The paper's Lyapunov functions along a flight of a known plant: evidence for the theorem, not part of the law.
 
-Everything is in the law's channel order and its scaled inputs v (u = input_scale v), so that Omega = C B is the matrix
-that the law acts through. Time derivatives are central differences over the samples of a flight: at a sample, where
-y_dot jumps with u, that is the mean of both sides. They are exact up to terms that vanish with the sampling period.
+All quantities are in the law's channel order and its scaled inputs v (u = input_scale v), with Omega = C B in these inputs.
+Time derivatives are central differences over the samples of a flight. At a sample, y_dot jumps with u; the difference is then
+the mean of both sides. They are exact up to terms that vanish with the sampling period.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ class KnownPlant(NamedTuple):
 
 
 class FlightSamples(NamedTuple):
-    """What the evidence needs of a flight, at N >= 3 ticks of the law; the first is the engagement."""
+    """Signals of a flight at N >= 3 ticks of the law, input of `evidence`; the first tick is the engagement."""
 
     t: FloatArray  # (N,) s
     x: FloatArray  # (N, n)
@@ -48,7 +48,7 @@ class Evidence(NamedTuple):
     e: FloatArray  # (N, m), equation (3)
     e_dot: FloatArray  # (N, m)
     r: FloatArray  # (N, m), equation (4)
-    N_d: FloatArray  # (N, m), equation (17) with every reference term in it
+    N_d: FloatArray  # (N, m), equation (17) with all reference terms
     L: FloatArray  # (N,), equation (46)
     V1: FloatArray  # (N,), equation (31)
     P: FloatArray  # (N,), equation (47)
@@ -56,10 +56,10 @@ class Evidence(NamedTuple):
 
 
 def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples]:
-    """KnownPlant and flight of a scenario's tape at the ticks of the law, in its channel order and scaled inputs.
+    """Plant and samples of a scenario's tape at the ticks of the law, in its channel order and scaled inputs.
 
-    Raises ValueError where a tick has no sample of `truth` or `y_m` at its stamp. The tape may come from the simulation in
-    one process or from a bag whose clock is exact.
+    Raises ValueError if a tick has no sample of `truth` or `y_m` with its stamp. The tape is that of a simulation in
+    one process or of a bag with an exact clock.
     """
     airframe, aircraft = scenario.aircraft.load()
     controller = scenario.controller
@@ -67,9 +67,9 @@ def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples
     inputs = [list(airframe.inputs).index(name) for name in controller.inputs]
     stamps = tape["internals"].stamp_ns
     ticks = {name: np.flatnonzero(np.isin(tape[name].stamp_ns, stamps)) for name in ("truth", "y_m")}
-    for name, found in ticks.items():
-        if len(found) != len(stamps):
-            raise ValueError(f"{name}: samples at {len(found)} of {len(stamps)} ticks of the law")
+    for name, indices in ticks.items():
+        if len(indices) != len(stamps):
+            raise ValueError(f"{name}: samples at {len(indices)} of {len(stamps)} ticks of the law")
     plant = KnownPlant(
         aircraft.A,
         aircraft.B[:, inputs] * controller.law().input_scale,
@@ -83,9 +83,9 @@ def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples
 
 
 def fly(plant: KnownPlant, y_m: FloatArray, dt: float, params: LawParams, x_0: FloatArray) -> FlightSamples:
-    """The plant under the law from x_0, engaged at t = 0, one tick and one Runge-Kutta step each dt, v held in between.
+    """The plant under the law from x_0, engaged at t = 0: one tick and one Runge-Kutta step per dt, v held between ticks.
 
-    Arguments: `y_m` the reference at the ticks, shape (N, m); `dt` in s; `params` with input_scale 1, since B takes v;
+    Arguments: `y_m` the reference at the ticks, shape (N, m); `dt` in s; `params` with input_scale 1, since B acts on v;
     `x_0` shape (n,).
     """
 
@@ -108,14 +108,14 @@ def evidence(plant: KnownPlant, flight: FlightSamples, params: LawParams, zeta_b
     """The signals of the proof along a flight, with Omega = C B = S D U (11) and M = S^-1.
 
         e = C x - y_m (3),  r = e_dot + Lambda e (4)
-        N_d = M (C A (x_dot - C^+ e_dot) + C f_dot - y_m_ddot)            (17), the reference term of (18) moved into it
+        N_d = M (C A (x_dot - C^+ e_dot) + C f_dot - y_m_ddot)            (17), with the reference term of (18)
         V1 = (e'e + r'M r) / 2                                            (31)
         L = r' (N_d - D U D Pi_dot)                                       (46), beta Sgn(e) being Pi_dot by (21)
         P = zeta_b - integral_0^t L  (trapezoid),  V2 = V1 + P            (47), (48)
 
-    C^+ is the pseudo-inverse: C^+ e_dot is the part of x_dot that the outputs show beyond the reference. P >= 0 is what
-    Lemma 2 claims for the zeta_b of `lemma_2`; with the default 0, P and V2 are known up to a constant.
-    Shapes as in the fields. Raises what `decompose` raises where Omega has no such decomposition.
+    C^+ is the pseudo-inverse: C^+ e_dot is the part of x_dot that appears in e_dot. Lemma 2 claims P >= 0 for the zeta_b of
+    `lemma_2`; with the default 0, P and V2 are known up to a constant. Shapes as in the fields. Raises DecompositionError if
+    Omega has no such decomposition.
     """
     S, D, U = decompose(plant.C @ plant.B)
     M = np.linalg.inv(S)
@@ -139,9 +139,9 @@ def evidence(plant: KnownPlant, flight: FlightSamples, params: LawParams, zeta_b
 def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
     """Q of V2_dot = -z' Q z along every flight of the continuous law, z = [e; r], symmetric, shape (2m, 2m).
 
-    z' Q z = e' Lambda e - r' N~ + r' D U D K r with N~ = G (r - Lambda e) + e, G = M (C A C^+ + Lambda). Neither beta nor
-    N_d is in it. Steps 2 and 3 of Theorem 1 are sufficient for Q > 0, which is what they are for: k_g large against N~,
-    k_d large against the off-diagonal entries of U. Source: (24), (31), (46)-(48).
+    z' Q z = e' Lambda e - r' N~ + r' D U D K r with N~ = G (r - Lambda e) + e, G = M (C A C^+ + Lambda). Q contains
+    neither beta nor N_d. Steps 2 and 3 of Theorem 1 are sufficient for Q > 0: k_g is large against N~, and k_d against the
+    off-diagonal entries of U. Source: (24), (31), (46)-(48).
     """
     S, D, U = decompose(plant.C @ plant.B)
     m = len(D)
@@ -151,24 +151,24 @@ def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
     return np.asarray((Q + Q.T) / 2.0)
 
 
-def lemma_2(plant: KnownPlant, flown: Evidence, params: LawParams) -> float:
+def lemma_2(plant: KnownPlant, signals: Evidence, params: LawParams) -> float:
     """The constant zeta_b of (47) that Lemma 2 gives for a flight: P >= 0 then follows from (29), (30).
 
-        zeta_i = max_t abs(N_d,i) + sum_(j>i) abs(U_ij) beta_j            what beta_i has to beat in (29), (30)
+        zeta_i = max_t abs(N_d,i) + sum_(j>i) abs(U_ij) beta_j            lower bound of beta_i in (29), (30)
         gamma_2,i = Lambda_i (beta_i / zeta_i - 1)                        the largest that (29), (30) allow
-        gamma_1,i = max_t (integral abs(e_dot_i) - gamma_2,i integral abs(e_i) - abs(e_i))    the least for (40)
+        gamma_1,i = max_t (integral abs(e_dot_i) - gamma_2,i integral abs(e_i) - abs(e_i))    the smallest for (40)
         zeta_b = sum_i beta_i abs(e_i(0)) + gamma_1,i zeta_i
 
-    Raises ValueError naming the channel where beta_i < zeta_i: then no gamma_2 >= 0 meets (29), (30).
+    Raises ValueError with the channel if beta_i < zeta_i: then no gamma_2 >= 0 meets (29), (30).
     """
     U = decompose(plant.C @ plant.B).U
-    zeta = np.max(np.abs(flown.N_d), axis=0) + np.triu(np.abs(U), 1) @ params.beta
-    for i, (found, needed) in enumerate(zip(params.beta, zeta, strict=True)):
-        if found < needed:
-            raise ValueError(f"beta[{i}]: found {found:.3g}, expected at least {needed:.3g} for (29), (30)")
+    zeta = np.max(np.abs(signals.N_d), axis=0) + np.triu(np.abs(U), 1) @ params.beta
+    for i, (beta, bound) in enumerate(zip(params.beta, zeta, strict=True)):
+        if beta < bound:
+            raise ValueError(f"beta[{i}]: found {beta:.3g}, expected at least {bound:.3g} for (29), (30)")
     gamma_2 = params.Lambda * (params.beta / zeta - 1.0)
-    size = np.abs(flown.e)
-    slack = integral(np.abs(flown.e_dot), flown.t) - gamma_2 * integral(size, flown.t) - size
+    size = np.abs(signals.e)
+    slack = integral(np.abs(signals.e_dot), signals.t) - gamma_2 * integral(size, signals.t) - size
     return float(params.beta @ size[0] + np.max(slack, axis=0) @ zeta)
 
 
@@ -178,12 +178,12 @@ def integral(signal: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def largest_rise(signal: FloatArray) -> float:
-    """How far a signal of shape (N,) climbs above any earlier value of it: max_(j<k) (s_k - s_j), 0 where it never does."""
+    """Largest rise of a signal of shape (N,) above an earlier value: max_(j<k) (s_k - s_j), 0 if it never rises."""
     return float(np.max(signal - np.minimum.accumulate(signal)))
 
 
 class Example(NamedTuple):
-    """A flight to be flown by `fly`."""
+    """A flight for `fly`."""
 
     plant: KnownPlant
     y_m: FloatArray  # (N, m) at the ticks
@@ -192,10 +192,10 @@ class Example(NamedTuple):
 
 
 def example(dt: float, duration: float) -> Example:
-    """Four states, two inputs, Omega = S D U with D = diag(1, -1) and a full U, a disturbance and a reference that never rest.
+    """Four states, two inputs, Omega = S D U with D = diag(1, -1) and a full U, a persistent disturbance and reference.
 
-    Well conditioned (M between 0.8 and 1.3, zeros -1.48 and -1.02) and flown with gains that meet the conditions of
-    Theorem 1 on this flight: `decay` is positive definite and `lemma_2` finds a constant. Times in s.
+    It is well conditioned (M between 0.8 and 1.3, zeros -1.48 and -1.02). Its gains meet the conditions of Theorem 1 on this
+    flight: `decay_matrix` is positive definite and `lemma_2` finds a constant. Times in s.
     """
     D, U = np.array([1.0, -1.0]), np.array([[1.0, 0.4], [0.0, 1.0]])
     S = np.array([[1.2, 0.2], [0.2, 0.9]])

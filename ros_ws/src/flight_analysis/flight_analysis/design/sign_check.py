@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""D of the controller beside what a channel map, and a recorded flight, do with the signs."""
+"""Sign check: D of the controller against the signs of a channel map, an airframe and a recorded flight."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -22,15 +22,15 @@ class Channel(NamedTuple):
 
     output: str
     input: str
-    effect: float  # Omega_ii as the controller sees it, SI
-    D: int  # that follows from the airframe and the map
+    effect: float  # Omega_ii of the controller's channels, SI
+    D: int  # of the airframe and the map
     D_controller: int
-    measured: float | None  # Omega_ii by a recorded flight
-    ratio: float | None  # beside its standard error
+    measured: float | None  # Omega_ii of a recorded flight
+    ratio: float | None  # abs(measured) / its standard error
 
 
 class SignCheck(NamedTuple):
-    """What the check found."""
+    """Result of the check."""
 
     channels: tuple[Channel, ...]
     contradictions: tuple[str, ...]  # sentences
@@ -38,14 +38,14 @@ class SignCheck(NamedTuple):
 
 
 def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
-    """Raise ParameterError where a map contradicts the D of a scenario's controller, by the scenario's airframe."""
-    checked = check_scenario(channel_map, scenario, load_airframe(scenario.aircraft.airframe), None)
-    if checked.contradictions:
-        raise ParameterError("; ".join(checked.contradictions))
+    """Raise ParameterError if a map contradicts the D of a scenario's controller, for the scenario's airframe."""
+    contradictions = check_scenario(channel_map, scenario, load_airframe(scenario.aircraft.airframe), None).contradictions
+    if contradictions:
+        raise ParameterError("; ".join(contradictions))
 
 
 def check_scenario(channel_map: ChannelMap, scenario: Scenario, frame: Airframe, bag: Path | None) -> SignCheck:
-    """Check a channel map against a scenario's controller, by an airframe and, where there is one, a recorded flight."""
+    """Check a channel map against a scenario's controller, for an airframe and optionally a recorded flight."""
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     for key, found, expected in (
         (f"map {channel_map.name}: outputs", tuple(channel_map.outputs), outputs),
@@ -81,34 +81,34 @@ def check(
     """D of diag(output signs) Omega diag(input signs) against the controller's, and against a recorded flight.
 
     Arguments: Omega = C B of the airframe, (m, m), in the map's order; the channels and D in the controller's. Raises
-    ParameterError where the map does not fit the airframe, or Omega has no D.
+    ParameterError if the map does not fit the airframe, or if Omega has no D.
     """
     rows, columns = (
         [list(part).index(one) for one in names]
         for part, names in ((channel_map.outputs, outputs), (channel_map.inputs, inputs))
     )
-    seen = through(channel_map, Omega)[np.ix_(rows, columns)]
-    follows = [int(sign) for sign in signs(seen)]
+    mapped = through(channel_map, Omega)[np.ix_(rows, columns)]
+    D_mapped = [int(sign) for sign in signs(mapped)]
     sentences = [
-        f"outputs.{name} of the map {channel_map.name} comes with the wrong sign:"
+        f"outputs.{name} of the map {channel_map.name} has the wrong sign:"
         f" {motion_as_channel_grows(channel_map.outputs[name])} as it grows"
         for name, sign in zip(channel_map.outputs, output_signs(channel_map), strict=True)
         if sign < 0
     ]
     channels = []
     for i, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
-        found = None if measured is None else float(measured.Omega[i, i])
+        effect = None if measured is None else float(measured.Omega[i, i])
         ratio = None if measured is None else float(measured.ratio[i, i])
-        channels.append(Channel(output, name, float(seen[i, i]), follows[i], D[i], found, ratio))
-        if follows[i] != D[i]:
+        channels.append(Channel(output, name, float(mapped[i, i]), D_mapped[i], D[i], effect, ratio))
+        if D_mapped[i] != D[i]:
             sentences.append(
-                f"with the map {channel_map.name} D of {output} and {name} is {follows[i]:+d}, the controller has {D[i]:+d}:"
+                f"with the map {channel_map.name} D of {output} and {name} is {D_mapped[i]:+d}, the controller has {D[i]:+d}:"
                 f" a positive {name} makes the aircraft {motion_as_channel_grows(channel_map.inputs[name])}"
             )
-        if found is not None and ratio is not None and ratio >= MIN_ERROR_RATIO and found * seen[i, i] < 0.0:
+        if effect is not None and ratio is not None and ratio >= MIN_ERROR_RATIO and effect * mapped[i, i] < 0.0:
             sentences.append(
-                f"the recorded flight has {output}_dot {'rise' if found > 0.0 else 'fall'} with {name}"
-                f" ({found:.3g}, {ratio:.0f} standard errors), the map {channel_map.name} says the opposite"
+                f"the recorded flight has {output}_dot {'rise' if effect > 0.0 else 'fall'} with {name}"
+                f" ({effect:.3g}, {ratio:.0f} standard errors), the map {channel_map.name} has the opposite sign"
             )
     return SignCheck(tuple(channels), tuple(sentences), 0 if measured is None else measured.intervals)
 
@@ -123,6 +123,6 @@ OPPOSITE = {
 
 
 def motion_as_channel_grows(row: OutputRow | InputRow) -> str:
-    """What the aircraft does as the channel, not the raw value, grows."""
+    """Motion of the aircraft as the channel, not the raw value, grows."""
     both = OPPOSITE | {after: before for before, after in OPPOSITE.items()}
     return row.positive if row.sign > 0 else both[row.positive]
