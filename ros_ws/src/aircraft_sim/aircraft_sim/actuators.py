@@ -17,8 +17,8 @@ class Actuators(NamedTuple):
     upper: Array | None = None  # (m,) upper end stop, deviation from trim, inf = none
     rate: Array | None = None  # (m,) largest rate, units of u / s, inf = none
     dead_zone: Array | None = None  # (m,) half-width, 0 = none
-    stuck_at: Array | None = None  # (m,) s of flight time, inf = never
-    lost_at: Array | None = None  # (m,) s of flight time, inf = never
+    stuck_at: Array | None = None  # (m,) when it gets stuck, s of flight time, inf = never
+    lost_at: Array | None = None  # (m,) when it loses its effect, s of flight time, inf = never
 
 
 def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:

@@ -101,9 +101,8 @@ class AircraftNode(FlightNode[AircraftParameters]):
 
     def _take_u(self, now_ns: int) -> bool:
         received_any = False
-        for received in self._u_subscription.take(
-            1 if self.parameters.lockstep else None
-        ):  # in lockstep there is one u for each y
+        limit = 1 if self.parameters.lockstep else None  # in lockstep there is one u for each y
+        for received in self._u_subscription.take(limit):
             try:
                 sample = self._decoder.decode(received.message)
                 if sample is not None and not self.parameters.lockstep:

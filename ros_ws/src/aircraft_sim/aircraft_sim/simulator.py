@@ -47,12 +47,11 @@ class StateSpaceModel:
     """
 
     def __init__(self, parameters: AircraftParameters) -> None:
-        airframe, _ = parameters.load()
         self._plant = parameters.plant()
         self._state = plant.initial_state(self._plant)
         self._block_ns = 0
         self._block = plant.forcing(0, BLOCK, self._plant)
-        self.truth_names = truth.names(airframe)
+        self.truth_names = truth.names(parameters.sampled_airframe())
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """See FlightDynamicsModel."""
