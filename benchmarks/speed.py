@@ -37,6 +37,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from flight_analysis.closed_loop.scenario import scenario_yaml
+from flight_bringup.clients import FlightMonitor
 from flight_bringup.graph import CONTROLLER
 from flight_bringup.processes import FlightProcesses
 from flight_bringup.scenarios import find_scenario
@@ -373,7 +374,11 @@ def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
         yield Row("flight", "node that only spins", _use([child.popen.pid], 3.0)[0], "node that only spins")
     path = folder / "flown.yaml"
     path.write_text(scenario_yaml(scenario), encoding="utf-8")
-    with FlightProcesses(find_scenario(str(path)), run, lambda: None, lockstep=False, one_process=False) as flight:
+    scenario = find_scenario(str(path))
+    with (
+        FlightMonitor(scenario.controller.outputs, lockstep=True) as monitor,  # without a subscription to internals
+        FlightProcesses(scenario, run, monitor, lockstep=False, one_process=False) as flight,
+    ):
         time.sleep(max(flight.start_time - time.time(), 0.0) + WARM_UP)
         processes = flight.processes
         for process, figures in zip(processes, _use([one.popen.pid for one in processes], seconds), strict=True):

@@ -1,28 +1,96 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""As much of `launch` and `launch_ros` as the launch files use, for machines without them: it notes what it is given.
+"""Stand-in for the parts of `launch` and `launch_ros` that the launch files use, on machines without them. It runs nothing.
 
-Names and arguments are those of launch 3.4.3 and launch_ros 0.26.6 (branch jazzy); an argument that they do not have is a
-TypeError here too. It runs nothing.
+Names and arguments are those of launch 3.4.3 and launch_ros 0.26.6 (branch jazzy); any other argument is a TypeError.
 """
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any
 
+from flight_ros.transport import PROFILE_VARIABLE
+
+
+class Event:
+    """Base of events."""
+
 
 class LaunchContext:
-    """The values of the arguments."""
+    """The values of the arguments, the events, and the ROS node of the launch. It is its own asyncio loop."""
 
     def __init__(self, **arguments: str) -> None:
         self.launch_configurations = dict(arguments)
         self.is_shutdown = False
+        self.events: list[Event] = []
+        self.ros_node = RosNode()
+
+    @property
+    def asyncio_loop(self) -> "LaunchContext":
+        """The loop."""
+        return self
+
+    def call_soon_threadsafe(self, callback: Callable[..., None], *arguments: Any) -> None:
+        """Call at once."""
+        callback(*arguments)
+
+    def emit_event_sync(self, event: Event) -> None:
+        """Keep the event for `handle`."""
+        self.events.append(event)
+
+    def handle(self, actions: Sequence[Any]) -> list[Any]:
+        """The actions that follow from the kept events, given all actions so far. Unregisters handlers that handle once."""
+        follow: list[Any] = []
+        events, self.events = self.events, []
+        for event in events:
+            for action in actions:
+                handler = action.event_handler if isinstance(action, RegisterEventHandler) else None
+                if handler is not None and not handler.handled and handler.matcher(event):
+                    handler.handled = handler.handle_once
+                    for function in handler.entities:
+                        follow += function.function(self) or []
+        return follow
+
+
+class RosNode:
+    """The rclpy node of the launch process."""
+
+    def __init__(self) -> None:
+        self.subscriptions: dict[str, Callable[[Any], None]] = {}
+        self.timers: list[float] = []
+
+    def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
+        """Keep the callback by the topic."""
+        self.subscriptions[topic] = callback
+
+    def create_timer(self, period: float, callback: Callable[[], None]) -> None:
+        """Keep the period."""
+        self.timers.append(period)
+
+
+def get_ros_node(context: LaunchContext) -> RosNode:
+    """The node. It needs the transport profile in the environment."""
+    assert PROFILE_VARIABLE in os.environ
+    return context.ros_node
+
+
+def prefix_namespace(base_ns: str | None, ns: str | None) -> str | None:
+    """`ns` below `base_ns`, unless `ns` is absolute."""
+    if ns is None or not base_ns:
+        return base_ns if ns is None else ns
+    return ns if ns.startswith("/") else f"{base_ns.rstrip('/')}/{ns}".rstrip("/")
+
+
+def make_namespace_absolute(ns: str | None) -> str | None:
+    """`ns` with a slash in front."""
+    return ns if ns is None or ns.startswith("/") else f"/{ns}"
 
 
 @dataclass(eq=False)
 class LaunchDescription:
-    """What a launch file describes."""
+    """The entities of a launch file."""
 
     entities: Sequence[Any]
 
@@ -62,38 +130,48 @@ class DeclareLaunchArgument(Action):
 
 @dataclass(eq=False)
 class OpaqueFunction(Action):
-    """A function that makes actions once the arguments are known."""
+    """A function that returns actions."""
 
-    function: Callable[[LaunchContext], list[Action]]
+    function: Callable[[LaunchContext], list[Action] | None]
 
 
-@dataclass(eq=False)
+@dataclass
 class LogInfo(Action):
-    """Something to be said."""
+    """A log message."""
 
     msg: str
 
 
 @dataclass(eq=False)
 class Shutdown(Action):
-    """The end of all."""
+    """The end of the launch."""
 
     reason: str
 
 
 @dataclass(eq=False)
 class TimerAction(Action):
-    """Actions after a while, s."""
+    """Actions after a period, s."""
 
     period: float
     actions: Sequence[Action]
 
 
+@dataclass(eq=False, kw_only=True)
+class EventHandler:
+    """Actions that follow an event."""
+
+    matcher: Callable[[Event], bool]
+    entities: Sequence[Any]
+    handle_once: bool = False
+    handled: bool = field(default=False, init=False)
+
+
 @dataclass(eq=False)
 class RegisterEventHandler(Action):
-    """A handler from now on."""
+    """Registers a handler."""
 
-    event_handler: "OnProcessIO"
+    event_handler: EventHandler
 
 
 @dataclass(eq=False, kw_only=True)
@@ -119,32 +197,16 @@ class Node(Action):
     on_exit: Callable[[Any, LaunchContext], Any] | None = None
 
 
-@dataclass(eq=False, kw_only=True)
-class OnProcessIO:
-    """What follows what a process says."""
-
-    target_action: Action
-    on_stdout: Callable[[Any], Any]
-    on_stderr: Callable[[Any], Any]
-
-
 @dataclass
-class ProcessIO:
-    """A process has said something."""
-
-    text: bytes
-
-
-@dataclass
-class ProcessExited:
+class ProcessExited(Event):
     """A process has ended."""
 
     process_name: str
     returncode: int
 
 
-WHERE: dict[str, tuple[type, ...]] = {
-    "launch": (LaunchContext, LaunchDescription),
+MODULES: dict[str, tuple[Any, ...]] = {
+    "launch": (Event, EventHandler, LaunchContext, LaunchDescription),
     "launch.action": (Action,),
     "launch.actions": (
         DeclareLaunchArgument,
@@ -155,20 +217,21 @@ WHERE: dict[str, tuple[type, ...]] = {
         Shutdown,
         TimerAction,
     ),
-    "launch.event_handlers": (OnProcessIO,),
     "launch.events": (),
-    "launch.events.process": (ProcessExited, ProcessIO),
+    "launch.events.process": (ProcessExited,),
     "launch.substitutions": (LaunchConfiguration,),
     "launch_ros": (),
     "launch_ros.actions": (Node,),
+    "launch_ros.ros_adapters": (get_ros_node,),
     "launch_ros.substitutions": (ExecutableInPackage,),
+    "launch_ros.utilities": (make_namespace_absolute, prefix_namespace),
 }
 
 
 def modules() -> dict[str, ModuleType]:
     """The modules by their names."""
-    made = {name: ModuleType(name) for name in WHERE}
-    for name, kinds in WHERE.items():
-        for kind in kinds:
-            setattr(made[name], kind.__name__, kind)
-    return made
+    stand_ins = {name: ModuleType(name) for name in MODULES}
+    for name, members in MODULES.items():
+        for member in members:
+            setattr(stand_ins[name], member.__name__, member)
+    return stand_ins

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch files, as far as they can be checked without `launch`, which is not on PyPI.
+"""The launch files with a stand-in for `launch`, which is not on PyPI (tests/launch_stand_in.py).
 
-With a stand-in that notes what it is given (tests/launch_stand_in.py): which arguments there are, which processes start when,
-with which parameters, and what their end does.
+Checked: the arguments, the start order of the processes by their `node_state`, their parameters, and the effect of their end.
 """
 
 import importlib.util
+import os
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 import typer
 import yaml
+from diagnostic_msgs.msg import KeyValue
 from tests import launch_stand_in as stand_in
 from tests.conftest import REPOSITORY
 from tests.launch_stand_in import (
@@ -23,10 +25,10 @@ from tests.launch_stand_in import (
     ExecuteProcess,
     LaunchConfiguration,
     LaunchContext,
+    LogInfo,
     Node,
     OpaqueFunction,
     ProcessExited,
-    ProcessIO,
     RegisterEventHandler,
     Shutdown,
     TimerAction,
@@ -38,8 +40,10 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError, Parameters
 from flight_core.scenario import read_sections
-from flight_log.bag import Enclosed
+from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
+from flight_ros.topics import NodeState
+from flight_ros.transport import DISCOVERY_VARIABLE, PROFILE_VARIABLE
 
 app = application([*COMMANDS])
 
@@ -50,12 +54,15 @@ NODES: dict[str, type[Parameters]] = {
     "bridge": BridgeParameters,
 }
 SHARED = "flight_bringup.launch.stages"
-READY = ProcessIO(b"[INFO] [12.5] [one.controller]: ready\n")
+PID = 0  # of a process of this launch
 
 
 @pytest.fixture(autouse=True)
 def launch(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The stand-in in the place of launch, also for what the launch files share."""
+    """The stand-in in the place of launch, also for the shared code of the launch files."""
+    for name in (PROFILE_VARIABLE, DISCOVERY_VARIABLE):
+        monkeypatch.setenv(name, "")  # restored afterwards
+        monkeypatch.delenv(name)
     for name, module in stand_in.modules().items():
         monkeypatch.setitem(sys.modules, name, module)
     monkeypatch.delitem(sys.modules, SHARED, raising=False)
@@ -63,8 +70,18 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     sys.modules.pop(SHARED, None)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def process() -> Iterator[None]:
+    """A process of this launch."""
+    global PID  # noqa: PLW0603 - one process for all tests
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        PID = child.pid
+        yield
+        child.terminate()
+
+
 def described(name: str) -> Sequence[Any]:
-    """What a launch file describes."""
+    """The entities of a launch file."""
     path = next(file for file in FILES if file.name == f"{name}.launch.py")
     spec = importlib.util.spec_from_file_location(f"{name}_launch", path)
     assert spec is not None
@@ -75,15 +92,17 @@ def described(name: str) -> Sequence[Any]:
     return entities
 
 
-def started(name: str, **given: object) -> tuple[list[Any], LaunchContext]:
-    """The actions of a launch with arguments, and its context; those not given have their default."""
+def started(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
+    """The actions of a launch with arguments, and its context. `pushed` is the namespace of a launch file that includes it."""
     entities = described(name)
     declared = {one.name: one.default_value for one in entities if isinstance(one, DeclareLaunchArgument)}
     assert given.keys() <= declared.keys()
     context = LaunchContext(**{key: value for key, value in declared.items() if value is not None})
     context.launch_configurations.update({key: str(value) for key, value in given.items()})
+    if pushed:
+        context.launch_configurations["ros_namespace"] = pushed
     (function,) = [one.function for one in entities if isinstance(one, OpaqueFunction)]
-    return list(function(context)), context
+    return list(function(context) or ()), context
 
 
 def nodes(actions: Sequence[Any]) -> dict[str, Node]:
@@ -91,29 +110,29 @@ def nodes(actions: Sequence[Any]) -> dict[str, Node]:
     return {one.executable: one for one in actions if isinstance(one, Node)}
 
 
-def told(node: Node) -> dict[str, Any]:
-    """What a node is told beside its section of the scenario."""
-    found: dict[str, Any] = node.parameters[1]
-    return found
+def overrides(node: Node) -> dict[str, Any]:
+    """The parameters of a node beside its section of the scenario."""
+    values: dict[str, Any] = node.parameters[1]
+    return values
 
 
-def say(actions: Sequence[Any], node: Any, event: ProcessIO) -> list[Any]:
-    """The actions that follow what a node says."""
-    follow: list[Any] = []
-    for one in actions:
-        if isinstance(one, RegisterEventHandler) and one.event_handler.target_action is node:
-            follow += one.event_handler.on_stdout(event) or []
-    return follow
+def publish(
+    actions: Sequence[Any], context: LaunchContext, key: str, state: str = "ready", topic: str = "/node_state"
+) -> list[Any]:
+    """The actions that follow a message on `node_state`."""
+    context.ros_node.subscriptions[topic](KeyValue(key=key, value=state))
+    return context.handle(actions)
 
 
-def all_ready(actions: Sequence[Any]) -> list[Any]:
-    """What follows when all nodes are ready; nothing before that, and nothing twice."""
-    *others, last = nodes(actions).values()
-    for one in others:
-        assert say(actions, one, READY) == []
-        assert say(actions, one, READY) == []
-    follow = say(actions, last, READY)
-    assert say(actions, last, READY) == []
+def all_ready(actions: Sequence[Any], context: LaunchContext, namespace: str = "") -> list[Any]:
+    """The actions once all nodes are ready; none before, and none for a second message."""
+    topic = f"{namespace}/node_state"
+    *others, last = (f"{namespace}/{name}#{PID}" for name in nodes(actions))
+    for key in others:
+        assert publish(actions, context, key, topic=topic) == []
+        assert publish(actions, context, key, topic=topic) == []
+    follow = publish(actions, context, last, topic=topic)
+    assert publish(actions, context, last, topic=topic) == []
     return follow
 
 
@@ -125,7 +144,7 @@ def ends(actions: Sequence[Any]) -> bool:
 def short(osprey_gust: Scenario, tmp_path: Path) -> Path:
     """A recorded flight of half a second."""
     tape = simulate(osprey_gust.vary(flight={"duration": 0.5}))
-    return write_run(tape, tmp_path / "log", Enclosed(osprey_gust.path)).parent
+    return write_run(tape, tmp_path / "log", LogAttachments(osprey_gust.path)).parent
 
 
 CASES: tuple[tuple[str, dict[str, str], tuple[str, ...], tuple[str, ...]], ...] = (
@@ -167,7 +186,7 @@ def test_nodes_start_in_order_with_parameters_that_they_have(
 ) -> None:
     log = {"run": str(short)} if name == "replay" else {}
     actions, context = started(name, **given, **log, runs=tmp_path / "runs")
-    follow = all_ready(actions)
+    follow = all_ready(actions, context)
     assert tuple(nodes(actions)) == first
     assert tuple(nodes(follow)) == then
     assert context.launch_configurations["launch-prefix"].endswith("setpriv --pdeathsig TERM")
@@ -188,7 +207,7 @@ def test_the_end_of_any_node_ends_the_launch_with_an_error(
 ) -> None:
     log = {"run": str(short)} if name == "replay" else {}
     actions, context = started(name, **given, **log, runs=tmp_path / "runs")
-    for executable, node in {**nodes(actions), **nodes(all_ready(actions))}.items():
+    for executable, node in {**nodes(actions), **nodes(all_ready(actions, context))}.items():
         assert node.on_exit is not None
         for status in (0, 3, -9):
             context.is_shutdown = False
@@ -198,33 +217,74 @@ def test_the_end_of_any_node_ends_the_launch_with_an_error(
             assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
 
 
-def test_a_flight_ends_after_its_duration_and_in_lockstep_when_it_is_flown(tmp_path: Path) -> None:
-    follow = all_ready(started("fly", duration=5, runs=tmp_path)[0])
+def test_a_node_of_another_flight_does_not_start_the_second_stage(tmp_path: Path) -> None:
+    actions, context = started("fly", runs=tmp_path)
+    for key in (f"/controller#{os.getpid()}", f"/controller#{os.getppid()}", "/controller#0", "/controller", "/controller#x"):
+        assert publish(actions, context, key) == []
+    for key in (f"/two/controller#{PID}", f"/my_controller#{PID}", "", "#"):
+        assert publish(actions, context, key) == []
+    assert publish(actions, context, f"/recorder#{PID}") == []
+    assert publish(actions, context, f"/controller#{PID}", "starting") == []
+    assert nodes(publish(actions, context, f"/controller#{PID}"))
+
+
+@pytest.mark.parametrize(
+    ("namespace", "pushed", "full"),
+    [("one", "", "/one"), ("one", "/fleet", "/fleet/one"), ("/one", "fleet", "/one"), ("", "fleet", "/fleet")],
+)
+def test_the_states_of_a_flight_are_those_in_its_namespace(namespace: str, pushed: str, full: str, tmp_path: Path) -> None:
+    actions, context = started("fly", pushed, namespace=namespace, runs=tmp_path)
+    assert publish(actions, context, f"/controller#{PID}", topic=f"{full}/node_state") == []
+    assert nodes(all_ready(actions, context, full))
+
+
+def test_no_line_of_the_output_starts_a_stage(tmp_path: Path) -> None:
+    actions, context = started("fly", runs=tmp_path)
+    matchers = [one.event_handler.matcher for one in actions if isinstance(one, RegisterEventHandler)]
+    assert matchers
+    assert not any(matcher(ProcessExited("[INFO] [12.5] [controller]: ready", 0)) for matcher in matchers)
+    assert set(context.ros_node.subscriptions) == {"/node_state"}
+
+
+def test_a_node_that_is_not_ready_in_time_is_named(tmp_path: Path) -> None:
+    actions, context = started("fly", runs=tmp_path)
+    (timer,) = [one for one in actions if isinstance(one, TimerAction)]
+    (warn,) = timer.actions
+    assert isinstance(warn, OpaqueFunction)
+    assert publish(actions, context, f"/recorder#{PID}") == []
+    assert warn.function(context) == [LogInfo("timed out waiting for controller: not ready after 20 s")]
+    assert publish(actions, context, f"/controller#{PID}")
+    assert warn.function(context) == []
+
+
+def test_a_flight_ends_after_its_duration_and_in_lockstep_when_the_aircraft_completes_it(tmp_path: Path) -> None:
+    follow = all_ready(*started("fly", duration=5, runs=tmp_path))
     (timer,) = [one for one in follow if isinstance(one, TimerAction)]
-    assert timer.period == pytest.approx(5.5, abs=0.4)  # and the half second in which nodes find each other
+    assert timer.period == pytest.approx(5.5, abs=0.4)  # and the half second in which nodes discover each other
     assert ends(timer.actions)
-    assert {"start_time"} == told(nodes(follow)["reference_model"]).keys() - {"lockstep"}
+    assert {"start_time"} == overrides(nodes(follow)["reference_model"]).keys() - {"lockstep"}
 
-    follow = all_ready(started("fly", lockstep="true", duration=5, runs=tmp_path)[0])
-    aircraft = nodes(follow)["aircraft"]
-    assert told(aircraft)["duration"] == 5.0
+    actions, context = started("fly", lockstep="true", duration=5, runs=tmp_path)
+    follow = all_ready(actions, context)
+    assert overrides(nodes(follow)["aircraft"])["duration"] == 5.0
     assert not [one for one in follow if isinstance(one, TimerAction)]
-    assert not say(follow, aircraft, READY)
-    assert ends(say(follow, aircraft, ProcessIO(b"[INFO] [1.0] [aircraft]: flown to its end at t = 5 s\n")))
+    for key, state in ((f"/aircraft#{PID}", NodeState.READY), (f"/controller#{PID}", NodeState.COMPLETED)):
+        assert not publish(follow, context, key, state)
+    assert ends(publish(follow, context, f"/aircraft#{PID}", NodeState.COMPLETED))
 
 
-def test_a_bridge_sends_nothing_unless_it_is_told_to_and_its_topics_are_recorded(tmp_path: Path) -> None:
-    actions, _ = started("bridge", map="ardupilot", runs=tmp_path)
-    bridge = told(nodes(all_ready(actions))["bridge"])
+def test_a_bridge_is_a_dry_run_by_default_and_its_topics_are_recorded(tmp_path: Path) -> None:
+    actions, context = started("bridge", map="ardupilot", runs=tmp_path)
+    bridge = overrides(nodes(all_ready(actions, context))["bridge"])
     assert bridge == {"map": str(LIBRARY / "ardupilot.yaml"), "dry_run": True}
-    recorder = told(nodes(actions)["recorder"])
+    recorder = overrides(nodes(actions)["recorder"])
     assert set(load_map("ardupilot").topics) <= set(recorder["topics"])
     assert "bridge/would_send" in recorder["topics"]
     assert bridge["map"] in recorder["attach"]
-    follow = all_ready(started("bridge", map="ardupilot", dry_run="false", runs=tmp_path)[0])
-    assert told(nodes(follow)["bridge"])["dry_run"] is False
+    follow = all_ready(*started("bridge", map="ardupilot", dry_run="false", runs=tmp_path))
+    assert overrides(nodes(follow)["bridge"])["dry_run"] is False
     assert not [one for one in follow if isinstance(one, TimerAction)]  # until Ctrl-C
-    follow = all_ready(started("bridge", map="ardupilot", duration=5, runs=tmp_path)[0])
+    follow = all_ready(*started("bridge", map="ardupilot", duration=5, runs=tmp_path))
     (timer,) = [one for one in follow if isinstance(one, TimerAction)]
     assert ends(timer.actions)
 
@@ -239,14 +299,15 @@ def test_a_bridge_with_a_flipped_sign_is_refused_before_anything_starts(tmp_path
 
 
 def player(actions: Sequence[Any]) -> ExecuteProcess:
-    (found,) = [one for one in actions if isinstance(one, ExecuteProcess)]
-    return found
+    (process,) = [one for one in actions if isinstance(one, ExecuteProcess)]
+    return process
 
 
 def options(process: ExecuteProcess) -> dict[str, Any]:
-    """What `rise-di play` makes of its command line."""
+    """The options of `rise-di play` on its command line."""
     executable, command, *words = process.cmd
-    assert executable == ExecutableInPackage(package="flight_bringup", executable="rise-di")
+    assert executable == ExecutableInPackage(package="flight_cli", executable="rise-di")
+    assert (INSTALLED / executable.package / "lib" / executable.package / executable.executable).is_file()
     group = typer.main.get_command(app)
     assert isinstance(group, typer.core.TyperGroup)
     with group.commands[command].make_context(command, [*words]) as context:
@@ -256,37 +317,37 @@ def options(process: ExecuteProcess) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("given", "topics"),
     [
-        ({}, "/truth,/y,/y_m"),  # the controller says u and internals itself
+        ({}, "/truth,/y,/y_m"),  # the controller publishes u and internals
         ({"controller": "false", "aircraft": "true"}, "/internals,/u,/y_m"),
         ({"controller": "false", "reference_model": "true"}, "/internals,/truth,/u,/y"),
         ({"map": "ardupilot"}, "/truth,/y_m"),  # y is the bridge's
-        ({"namespace": "one"}, "/internals,/truth,/u,/y,/y_m"),  # a flight without one: nobody in it says these
+        ({"namespace": "one"}, "/internals,/truth,/u,/y,/y_m"),  # a flight without one: no node publishes these
         ({"topics": "y,y_m"}, "y,y_m"),
     ],
     ids=str,
 )
-def test_what_no_node_says_itself_is_played(given: dict[str, str], topics: str, short: Path, osprey_gust: Scenario) -> None:
-    actions, _ = started("replay", run=short, scenario=osprey_gust.path, **given)
-    found = options(player(all_ready(actions)))
-    assert found["topics"] == topics
-    assert found["run"] == short
-    assert (found["rate"], found["start"], found["loop"], str(found["stamps"])) == (1.0, 0.0, False, "now")
+def test_topics_without_a_publisher_are_played(given: dict[str, str], topics: str, short: Path, osprey_gust: Scenario) -> None:
+    actions, context = started("replay", run=short, scenario=osprey_gust.path, **given)
+    values = options(player(all_ready(actions, context, "/one" if "namespace" in given else "")))
+    assert values["topics"] == topics
+    assert values["run"] == short
+    assert (values["rate"], values["start"], values["loop"], str(values["stamps"])) == (1.0, 0.0, False, "now")
 
 
 def test_playing_follows_the_arguments_and_the_end_of_the_log_is_the_end(short: Path, tmp_path: Path) -> None:
     given = {"rate": "2", "start": "0.1", "loop": "true", "lockstep": "true", "recorder": "true"}
     actions, context = started("replay", run=short, runs=tmp_path, **given)
-    assert told(nodes(actions)["controller"]) == {"lockstep": True, "y_rate": 500.0}
-    process = player(all_ready(actions))
-    found = options(process)
-    assert (found["rate"], found["start"], found["loop"], str(found["stamps"])) == (2.0, 0.1, True, "recorded")
+    assert overrides(nodes(actions)["controller"]) == {"lockstep": True, "y_rate": 500.0}
+    process = player(all_ready(actions, context))
+    values = options(process)
+    assert (values["rate"], values["start"], values["loop"], str(values["stamps"])) == (2.0, 0.1, True, "recorded")
     assert process.on_exit is not None
     assert ends(process.on_exit(ProcessExited("play-3", 0), context))
     with pytest.raises(RuntimeError, match="play-3 ended before the flight did"):
         process.on_exit(ProcessExited("play-3", 2), context)
 
 
-def test_a_log_is_played_to_nobody_at_once(short: Path) -> None:
+def test_without_nodes_the_log_is_played_at_once(short: Path) -> None:
     actions, context = started("replay", run=short, controller="false")
     process = player(actions)
     assert options(process)["topics"] == "/internals,/truth,/u,/y,/y_m"

@@ -24,7 +24,10 @@ EXECUTABLES = {
 }
 
 # The keys of rosdep (rosdep/python.yaml of ros/rosdistro); a ROS package is its own key.
-KEYS = {name: f"python3-{name}" for name in ("matplotlib", "numpy", "psutil", "pydantic", "rich", "scipy", "typer", "yaml")}
+KEYS = {
+    name: f"python3-{name}" for name in ("jinja2", "matplotlib", "numpy", "psutil", "pydantic", "rich", "scipy", "typer", "yaml")
+}
+KEYS["markupsafe"] = "python3-jinja2"  # which depends on it
 # Those that have none, or (rosbags) one that calls pip alone, which Ubuntu 24.04 refuses for its own Python.
 WITHOUT_KEY = {
     "cma",

@@ -7,7 +7,7 @@ from setuptools import setup
 setup(
     name="flight_bringup",
     version="0.1.0",
-    description="Scenarios, launch files and the rise-di command of the RISE-DI flight stack.",
+    description="Scenarios, launch files, process runner and service clients of the RISE-DI flight stack.",
     license="Apache-2.0",
     packages=["flight_bringup", "flight_bringup.launch"],
     data_files=[

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scenarios, launch files and the rise-di command of the RISE-DI flight stack."""
+"""Scenarios, launch files, process runner and service clients of the RISE-DI flight stack."""

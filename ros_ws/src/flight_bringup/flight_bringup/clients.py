@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the command line needs of ROS: a monitor of a running flight, a player of a log, the four nodes in one process."""
+"""ROS clients of the command line: a monitor of a running flight, a client of controller and bridge, a player of a log."""
 
 import os
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
 import rclpy
@@ -21,83 +21,34 @@ from flight_ros import transport
 from flight_ros.messages import Decoder, stamp_of
 from flight_ros.player import Player
 from flight_ros.subscriptions import PolledSubscription
-from flight_ros.topics import INTERNALS, LOCKSTEP, NEWEST_SAMPLES, RECORDED, Y_M, U, Y
+from flight_ros.topics import INTERNALS, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, RECORDED, STATES, Y_M, NodeState, U, Y
 from rise_di_controller.guard import Mode
+
+__all__ = ["ControllerStatus", "EngagementClient", "FlightMonitor", "Player"]
 
 MODES = {float(mode): mode.name for mode in Mode}
 
+SERVICE_TIMEOUT = 10.0  # s
+
+AT_REST = 20
+"""So many equal samples of u in a row: it has reached trim."""
+
 
 class ControllerStatus(NamedTuple):
-    """The newest of the controller's internals."""
+    """One sample of the controller's internals."""
 
     mode: str
     e: FloatArray
 
 
-class FlightMonitor:
-    """Listens to `internals`. A context manager, so that the middleware is always shut down."""
+class _Client:
+    """A node in the default context. A context manager, so that the middleware always shuts down."""
 
-    def __init__(self, outputs: tuple[str, ...], *, lockstep: bool) -> None:
+    def __init__(self, name: str, namespace: str = "") -> None:
         transport.prepare()
-        # Ctrl-C is for the runner to handle, not for rclpy.
+        # The command handles SIGINT, not rclpy.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("monitor", start_parameter_services=False)
-        # In lockstep every listener costs time, so it listens to the recorder alone.
-        self._inbox = None if lockstep else PolledSubscription(self._node, INTERNALS, NEWEST_SAMPLES, raw=True)
-        self._recorded_subscription = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
-        self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
-
-    def __enter__(self) -> "FlightMonitor":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._node.destroy_node()
-        rclpy.try_shutdown()
-
-    def newest(self) -> ControllerStatus | None:
-        """The newest sample since the last call, None where none has come."""
-        seen = None
-        for received in self._inbox.take() if self._inbox is not None else ():
-            try:
-                sample = self._decoder.decode(received.message)
-            except ChannelError:
-                continue
-            if sample is not None:
-                seen = ControllerStatus(MODES.get(sample.value[0], "?"), sample.value[1:])
-        return seen
-
-    def recorded(self) -> float | None:
-        """The flight time up to which a lockstep flight is in its log, s; None where that has not changed."""
-        recorded = None
-        for received in self._recorded_subscription.take():
-            recorded = seconds(stamp_of(received.message))
-        return recorded
-
-    def require_free_domain(self) -> None:
-        """Raise ParameterError where an aircraft or a reference model is already there, which would fly into this flight."""
-        for topic in (Y, Y_M):
-            count = self._node.count_publishers(topic.name)
-            domain = os.environ.get("ROS_DOMAIN_ID", "0")
-            found = f"{count} publishers of {topic.name} already"
-            require(count == 0, f"ROS_DOMAIN_ID {domain}", found, "a domain of its own for each flight: set ROS_DOMAIN_ID")
-
-
-PATIENCE = 10.0
-"""s, for a node to answer, and for u to come to rest."""
-
-AT_REST = 20
-"""Samples of u alike in a row: it no longer goes to trim."""
-
-
-class EngagementClient:
-    """Takes an autopilot over through a running bridge, and gives it back. A context manager, as the monitor is."""
-
-    def __init__(self, namespace: str) -> None:
-        transport.prepare()
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("engage", namespace=namespace, start_parameter_services=False)
-        self._u: list[tuple[float, ...]] = []
-        self._inbox = PolledSubscription(self._node, U, NEWEST_SAMPLES, raw=True)
+        self._node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False)
 
     def __enter__(self) -> Self:
         return self
@@ -106,60 +57,105 @@ class EngagementClient:
         self._node.destroy_node()
         rclpy.try_shutdown()
 
-    def take_over(self) -> str:
-        """The controller to trim, the bridge engaged, the controller active; why the bridge refused, empty where not."""
+
+class FlightMonitor(_Client):
+    """Monitors a flight: the states of its nodes, the controller's internals, in lockstep the progress of the log."""
+
+    def __init__(self, outputs: tuple[str, ...], *, lockstep: bool) -> None:
+        super().__init__("monitor")
+        # Each subscription slows a lockstep flight down.
+        self._internals = None if lockstep else PolledSubscription(self._node, INTERNALS, NEWEST_SAMPLES, raw=True)
+        self._recorded = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
+        self._node_state = PolledSubscription(self._node, NODE_STATE, STATES)
+        self._states: dict[str, str] = {}  # by process
+        self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
+
+    def is_ready(self, node: str, pid: int) -> bool:
+        """Whether the loop of a node runs. The process id tells it from a node of that name in another flight."""
+        for received in self._node_state.take():
+            self._states[received.message.key] = received.message.value
+        return self._states.get(f"/{node}#{pid}") in {NodeState.READY, NodeState.COMPLETED}
+
+    def newest(self) -> ControllerStatus | None:
+        """The newest sample since the last call, None without one."""
+        status = None
+        for received in self._internals.take() if self._internals is not None else ():
+            try:
+                sample = self._decoder.decode(received.message)
+            except ChannelError:
+                continue
+            if sample is not None:
+                status = ControllerStatus(MODES.get(sample.value[0], "?"), sample.value[1:])
+        return status
+
+    def recorded(self) -> float | None:
+        """The flight time up to which the log of a lockstep flight is complete, s; None without a change."""
+        messages = self._recorded.take()
+        return seconds(stamp_of(messages[-1].message)) if messages else None
+
+    def require_free_domain(self) -> None:
+        """Raise ParameterError where the domain already has an aircraft or a reference model."""
+        for topic in (Y, Y_M):
+            count = self._node.count_publishers(topic.name)
+            domain = os.environ.get("ROS_DOMAIN_ID", "0")
+            found = f"{count} publishers of {topic.name} already"
+            require(count == 0, f"ROS_DOMAIN_ID {domain}", found, "a domain of its own for each flight: set ROS_DOMAIN_ID")
+
+
+class EngagementClient(_Client):
+    """Engages and disengages a running bridge without a jump of u (bumpless transfer)."""
+
+    def __init__(self, namespace: str) -> None:
+        super().__init__("engage", namespace)
+        self._u: list[tuple[float, ...]] = []
+        self._u_subscription = PolledSubscription(self._node, U, NEWEST_SAMPLES, raw=True)
+
+    def engage(self) -> str:
+        """Bring u to trim, engage the bridge, activate the controller. Returns the bridge's reason to refuse, or ""."""
         state = self._call(GetState, "controller/get_state", GetState.Request()).current_state.id
-        if state == State.PRIMARY_STATE_ACTIVE:
-            self._change(Transition.TRANSITION_DEACTIVATE)
+        active = state == State.PRIMARY_STATE_ACTIVE
+        if active:
+            self._change_state(Transition.TRANSITION_DEACTIVATE)
         try:
             self._u.clear()
-            self._until(self._at_rest, "u does not come to rest, expected the controller's u to go to trim")
-            refusal = self._engage(on=True)
+            self._spin_until(self._at_rest, f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim")
+            refusal = self._set_engaged(engaged=True)
         except ParameterError:
-            self._restore(state)
+            if active:
+                self._change_state(Transition.TRANSITION_ACTIVATE)
             raise
-        if refusal:
-            self._restore(state)
-        else:
-            self._change(Transition.TRANSITION_ACTIVATE)
+        if active or not refusal:
+            self._change_state(Transition.TRANSITION_ACTIVATE)
         return refusal
 
-    def give_back(self) -> str:
-        """The bridge disengaged; why it refused, empty where not."""
-        return self._engage(on=False)
+    def disengage(self) -> str:
+        """Disengage the bridge. Returns its reason to refuse, or ""."""
+        return self._set_engaged(engaged=False)
 
-    def _restore(self, state: int) -> None:
-        if state == State.PRIMARY_STATE_ACTIVE:
-            self._change(Transition.TRANSITION_ACTIVATE)
+    def _set_engaged(self, *, engaged: bool) -> str:
+        return str(self._call(SetBool, "bridge/engage", SetBool.Request(data=engaged)).message)
 
-    def _engage(self, *, on: bool) -> str:
-        return str(self._call(SetBool, "bridge/engage", SetBool.Request(data=on)).message)
-
-    def _change(self, transition: int) -> None:
+    def _change_state(self, transition: int) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
-        done = self._call(ChangeState, "controller/change_state", request).success
-        require(done, "controller", "a lifecycle transition that fails", "a controller that is configured; see its log")
+        success = self._call(ChangeState, "controller/change_state", request).success
+        require(success, "controller", "a failed lifecycle transition", "a configured controller; see its log")
 
     def _at_rest(self) -> bool:
-        for received in self._inbox.take():
+        for received in self._u_subscription.take():
             self._u.append(tuple(deserialize_message(received.message, U.type).position))
         return len(self._u) >= AT_REST and len(set(self._u[-AT_REST:])) == 1
 
     def _call(self, kind: Any, name: str, request: Any) -> Any:
         client = self._node.create_client(kind, name)
-        self._until(client.service_is_ready, f"nobody offers {client.srv_name}, expected a flight with a bridge in this domain")
+        service = f"service {client.srv_name}"
+        self._spin_until(client.service_is_ready, f"{service} not available, expected a flight with a bridge in this domain")
         future = client.call_async(request)
-        self._until(future.done, f"{client.srv_name} does not answer, expected it within {PATIENCE:g} s")
+        self._spin_until(future.done, f"{service}: no response, expected one within {SERVICE_TIMEOUT:g} s")
         return future.result()
 
-    def _until(self, condition: Callable[[], bool], sentence: str) -> None:
-        deadline = time.monotonic() + PATIENCE
+    def _spin_until(self, condition: Callable[[], bool], message: str) -> None:
+        deadline = time.monotonic() + SERVICE_TIMEOUT
         while not condition():
             if time.monotonic() > deadline:
-                raise ParameterError(sentence)
+                raise ParameterError(message)
             rclpy.spin_once(self._node, timeout_sec=0.02)
-
-
-def player(types: Mapping[str, str], shared: Collection[str]) -> Player:
-    """A player of topics, by their names with their types; see flight_ros.player. Raises ParameterError."""
-    return Player(types, shared)

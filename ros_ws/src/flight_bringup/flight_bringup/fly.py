@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.run_folder import enclosed
+from flight_analysis.report.run_folder import attachments_for
 from flight_analysis.report.summary import display_units
 from flight_bringup.graph import Autopilot
 from flight_bringup.processes import FlightProcesses
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 POLL_PERIOD = 0.05  # s, of the progress bar
 
 STALL_TIMEOUT = 40.0
-"""s. A lockstep flight in which nothing moves for as long ends; a peer that is gone ends it within two seconds."""
+"""s. A lockstep flight without progress for so long ends; lost contact with a node ends it within two seconds."""
 
-Progress = Callable[[float, str], None]  # flight time in s, and what to show beside it
+Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
 
 
 @contextmanager
 def _signals_as_interrupt() -> Iterator[None]:
-    # SIGINT too: a shell starts background commands with it ignored, and then Python leaves it so.
+    # SIGINT too: a shell starts background commands with SIGINT ignored, and Python then leaves it so.
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
@@ -55,71 +55,65 @@ def fly_over_topics(
 ) -> str:
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
-    In real time, or in `lockstep` as fast as the machine allows; `one_process` holds all nodes in one process, for lockstep
-    alone; `autopilot` flies in the aircraft's place, in real time alone. "completed", "interrupted" (Ctrl-C or SIGTERM), or a
-    sentence naming the process that ended early.
+    Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one process, in lockstep only.
+    `autopilot` flies in the aircraft's place, in real time only. Outcomes: "completed", "interrupted" (Ctrl-C or SIGTERM), or a
+    sentence that names the process that ended early.
     """
-    from flight_bringup.clients import FlightMonitor  # noqa: PLC0415 - loads rclpy, which no other command needs
+    from flight_bringup.clients import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     try:
         with (
             _signals_as_interrupt(),
             FlightMonitor(scenario.controller.outputs, lockstep=lockstep) as monitor,
             FlightProcesses(
-                scenario,
-                run,
-                before_start=monitor.require_free_domain,
-                lockstep=lockstep,
-                one_process=one_process,
-                autopilot=autopilot,
-            ) as flight,
+                scenario, run, monitor, lockstep=lockstep, one_process=one_process, autopilot=autopilot
+            ) as processes,
         ):
             follow = _follow_lockstep if lockstep else _follow_real_time
-            return follow(scenario, flight, monitor, progress)
+            return follow(scenario, processes, monitor, progress)
     except KeyboardInterrupt:
         return INTERRUPTED
 
 
-def _follow_real_time(scenario: Scenario, flight: FlightProcesses, monitor: "FlightMonitor", progress: Progress) -> str:
+def _follow_real_time(scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", progress: Progress) -> str:
     units, outputs = display_units(scenario), scenario.controller.outputs
-    shown = "starting"
-    while (t := time.time() - flight.start_time) < scenario.flight.duration:
-        if (sentence := flight.ended_early()) is not None:
-            return sentence
-        if (seen := monitor.newest()) is not None:
-            errors = ", ".join(f"{name} {value * units[name].factor:+.2f}" for name, value in zip(outputs, seen.e, strict=True))
-            shown = f"{seen.mode}  e: {errors}"
-        progress(max(t, 0.0), shown)
+    text = "starting"
+    while (t := time.time() - processes.start_time) < scenario.flight.duration:
+        if (reason := processes.ended_early()) is not None:
+            return reason
+        if (status := monitor.newest()) is not None:
+            errors = (f"{name} {e * units[name].factor:+.2f}" for name, e in zip(outputs, status.e, strict=True))
+            text = f"{status.mode}  e: {', '.join(errors)}"
+        progress(max(t, 0.0), text)
         time.sleep(POLL_PERIOD)
     return COMPLETED
 
 
-def _follow_lockstep(scenario: Scenario, flight: FlightProcesses, monitor: "FlightMonitor", progress: Progress) -> str:
-    """The real-time factor shown is that since the first instant in the log."""
-    end = scenario.flight.duration
-    flown, first, moved, shown = 0.0, 0.0, time.monotonic(), "lockstep, starting"
-    begin = moved
-    # The last instant is the last whole period of the aircraft.
-    while flown < end - 1.0 / scenario.aircraft.rate:
-        if (sentence := flight.ended_early()) is not None:
-            return sentence
+def _follow_lockstep(scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", progress: Progress) -> str:
+    """The real-time factor counts from the first instant in the log. The flight ends when the log is complete."""
+    end = scenario.flight.duration - 1.0 / scenario.aircraft.rate  # the last instant is the aircraft's last whole period
+    t, last_change, text = 0.0, time.monotonic(), "lockstep, starting"
+    first: tuple[float, float] | None = None  # monotonic and flight time, s
+    while t < end:
+        if (reason := processes.ended_early()) is not None:
+            return reason
         now = time.monotonic()
         if (recorded := monitor.recorded()) is not None:
-            if moved == begin:
-                begin, first = now, recorded
-            flown, moved = recorded, now
-            if now > begin:
-                shown = f"lockstep, {(flown - first) / (now - begin):.1f} times real time"
-        elif now > moved + STALL_TIMEOUT:
-            return f"stuck at t = {flown:g} s: nothing has moved for {STALL_TIMEOUT:g} s"
-        progress(flown, shown)
+            t, last_change = recorded, now
+            if first is None:
+                first = now, t
+            else:
+                text = f"lockstep, {(t - first[1]) / (now - first[0]):.1f} times real time"
+        elif now > last_change + STALL_TIMEOUT:
+            return f"no progress for {STALL_TIMEOUT:g} s at t = {t:g} s"
+        progress(t, text)
         time.sleep(POLL_PERIOD)
     return COMPLETED
 
 
 def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
-    """Fly in one process without ROS, as fast as it goes, and write the bag into `run`. Returns the outcome."""
+    """Fly in one process without ROS, as fast as the machine allows, and write the bag into `run`. Returns the outcome."""
     with _signals_as_interrupt():
         tape = simulate(scenario, lambda t: progress(t, "in one process"))
-    write_run(tape, run, enclosed(scenario, run))
+    write_run(tape, run, attachments_for(scenario, run))
     return tape.outcome

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of a flight: which nodes there are and what each is told. The launch file and the runner both read it here."""
+"""The graph of a flight: its nodes, their start order, their parameter overrides. Launch files and process runner share it."""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 from autopilot_bridge.params import ChannelMap, find_map, load_map
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
-from flight_analysis.report.run_folder import enclosed
-from flight_log.bag import Enclosed
+from flight_analysis.report.run_folder import attachments_for
 
 
 class NodeSpec(NamedTuple):
@@ -31,18 +30,18 @@ REFERENCE_MODEL = NodeSpec("reference_model", "reference_model")
 CONTROLLER = NodeSpec("rise_di_controller", "controller")
 BRIDGE = NodeSpec("autopilot_bridge", "bridge")
 
-# All four as objects in one process, for lockstep; each reads its own section of the scenario.
+# All four nodes in one process, for lockstep. Each reads its own section of the scenario.
 ONE_PROCESS = NodeSpec("flight_bringup", "one_process")
 
-# These start first, and say that they are ready before the others start: the whole flight is then in the log, and the
-# aircraft is never without its controller. The recorder ends last.
-FIRST = (RECORDER, CONTROLLER)
-THEN = (AIRCRAFT, REFERENCE_MODEL)
-BRIDGED = (BRIDGE, REFERENCE_MODEL)  # with an autopilot in the aircraft's place
+# The second stage starts once every node of the first is ready: the log then holds the whole flight, and the aircraft always
+# has a controller.
+FIRST_STAGE = (RECORDER, CONTROLLER)
+SECOND_STAGE = (AIRCRAFT, REFERENCE_MODEL)
+SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
 WOULD_SEND = "bridge/would_send"
 
-# What each node says of a flight; the bridge also what its map sends to the autopilot.
+# The bridge also publishes the messages of its channel map.
 PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
     {
         AIRCRAFT: ("y", "truth"),
@@ -53,20 +52,17 @@ PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
     }
 )
 
-READY = "]: ready"  # what a node says in its log when its loop begins
-FLOWN = "]: flown to its end"  # what the aircraft says at the end of a lockstep flight
-
 
 class Autopilot(NamedTuple):
-    """What flies in the aircraft's place."""
+    """An autopilot in the aircraft's place."""
 
     channel_map: ChannelMap
-    path: Path  # of the map
-    dry_run: bool  # say what would be sent, and send nothing
+    map_path: Path
+    dry_run: bool  # publish on WOULD_SEND what the map would send, and send nothing
 
     @property
     def topics(self) -> list[str]:
-        """What is recorded of it: the autopilot's own topics, and what the bridge makes of u for them."""
+        """The topics to record: those of the map, and WOULD_SEND."""
         return [*self.channel_map.topics, WOULD_SEND]
 
 
@@ -76,68 +72,59 @@ def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
 
 
 def start_lead(startup: float) -> float:
-    """Time to leave from starting the second two nodes to t = 0, s, given how long the first two took to be ready.
+    """Time from the start of the second stage to t = 0, s, given the time until the first stage was ready.
 
-    As long again, half of that for a machine that got busier, and half a second for the nodes to find each other.
+    The second stage gets half as long again as the first one took. The nodes get half a second to discover each other.
     """
     return 0.5 + 1.5 * startup
 
 
-def parameters(
-    node: NodeSpec, scenario: Scenario, run: Path, start_time: float, *, lockstep: bool, autopilot: Autopilot | None = None
+def parameter_overrides(
+    spec: NodeSpec, scenario: Scenario, run: Path, start_time: float, *, lockstep: bool, autopilot: Autopilot | None = None
 ) -> ParameterOverrides:
-    """What a process is told beside its section of the scenario file, by name; "node:name" where it holds several nodes.
+    """The parameters of a process beside its section of the scenario file; "node:name" where it holds several nodes.
 
-    In real time those that start last are told the instant of t = 0. In lockstep the aircraft is told at which instants it
-    waits for u and where the flight ends, and the controller how often y comes. The recorder is told what to store inside the
-    log, which is made in the folder of the run. With an autopilot in the aircraft's place the bridge is told its map, and the
-    recorder the topics of the autopilot.
+    Real time: the nodes with a t = 0 get its instant. Lockstep: the aircraft gets the rate of u and the duration, the
+    controller the rate of y. The recorder gets the files to attach to the log; this function writes them into the folder of the
+    run. With an autopilot the bridge gets the channel map, and the recorder the topics of the autopilot.
     """
-    if node is BRIDGE:
-        return {} if autopilot is None else {"map": str(autopilot.path), "dry_run": autopilot.dry_run}
-    together = node is ONE_PROCESS
-    told_by = {one: _told(one, scenario, run, lockstep=lockstep, together=together) for one in (*FIRST, *THEN)}
-    if node in (RECORDER, ONE_PROCESS):
-        further = () if autopilot is None else (autopilot.path,)
+    if spec is BRIDGE:
+        return {} if autopilot is None else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
+    one_process = spec is ONE_PROCESS
+    overrides: dict[NodeSpec, ParameterOverrides] = {node: {"lockstep": lockstep} for node in (*FIRST_STAGE, *SECOND_STAGE)}
+    overrides[RECORDER]["directory"] = str(run)
+    if lockstep:
+        overrides[AIRCRAFT] |= {
+            "control_rate": scenario.controller.rate,
+            "duration": scenario.flight.duration,
+            "recorded": not one_process,  # a recorder in the same process never lags
+        }
+        overrides[CONTROLLER]["y_rate"] = scenario.aircraft.rate
+    if spec in (RECORDER, ONE_PROCESS):
         if autopilot is not None:
-            told_by[RECORDER]["topics"] = [*scenario.recorder.topics, *autopilot.topics]
-        told_by[RECORDER] |= _stored(enclosed(scenario, run, {one.executable: told for one, told in told_by.items()}, further))
-    if together:
-        return {f"{one.executable}:{name}": value for one, told in told_by.items() for name, value in told.items()}
-    return told_by[node] | ({"start_time": start_time} if node in THEN and not lockstep else {})
+            overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *autopilot.topics]
+        maps = () if autopilot is None else (autopilot.map_path,)
+        files = attachments_for(scenario, run, {node.executable: values for node, values in overrides.items()}, maps)
+        overrides[RECORDER] |= {
+            "scenario_file": str(files.scenario),
+            "attach": [str(path) for path in files.files],
+            "metadata_file": str(files.metadata),
+        }
+    if one_process:
+        return {f"{node.executable}:{name}": value for node, values in overrides.items() for name, value in values.items()}
+    return overrides[spec] | ({"start_time": start_time} if spec in SECOND_STAGE and not lockstep else {})
 
 
-def to_play(
-    known: Collection[str], nodes: Collection[NodeSpec], namespace: str = "", autopilot: Autopilot | None = None
+def replayed_topics(
+    recorded: Collection[str], nodes: Collection[NodeSpec], namespace: str = "", autopilot: Autopilot | None = None
 ) -> list[str]:
-    """Which of the topics of a log are played to nodes: those that none of the nodes says itself; full names, in order.
+    """Those of the recorded topics that none of the nodes publishes; full names, in order.
 
-    `known` are the topics of the log by their full names, `namespace` is that of the nodes. With a bridge among the nodes what
-    its map sends is left out too.
+    `namespace` is that of the nodes. A bridge among the nodes also publishes the messages of its channel map.
     """
-    within = f"/{namespace.strip('/')}/".replace("//", "/")
-    said = {within + name for node in nodes for name in PUBLISHED_TOPICS[node]}
+    prefix = f"/{namespace.strip('/')}/".replace("//", "/")
+    published = {prefix + name for node in nodes for name in PUBLISHED_TOPICS[node]}
     if BRIDGE in nodes and autopilot is not None:
         sent = (message.topic for message in autopilot.channel_map.messages.values())
-        said |= {topic if topic.startswith("/") else within + topic for topic in sent}
-    return sorted(set(known) - said)
-
-
-def _told(node: NodeSpec, scenario: Scenario, run: Path, *, lockstep: bool, together: bool) -> ParameterOverrides:
-    told: ParameterOverrides = {"lockstep": lockstep}
-    if node is RECORDER:
-        told["directory"] = str(run)
-    if node is AIRCRAFT and lockstep:
-        told |= {"control_rate": scenario.controller.rate, "duration": scenario.flight.duration}
-        told["recorded"] = not together  # a log in the same process is never behind
-    if node is CONTROLLER and lockstep:
-        told["y_rate"] = scenario.aircraft.rate
-    return told
-
-
-def _stored(files: Enclosed) -> ParameterOverrides:
-    return {
-        "scenario_file": str(files.scenario),
-        "attach": [str(path) for path in files.attached],
-        "metadata_file": str(files.metadata),
-    }
+        published |= {topic if topic.startswith("/") else prefix + topic for topic in sent}
+    return sorted(set(recorded) - published)

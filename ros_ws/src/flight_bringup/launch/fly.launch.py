@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_gust.
 
-The same graph and the same scenario file as `rise-di fly`. The flight begins once recorder and controller are ready and ends
-after the scenario's duration, in lockstep as soon as that is flown. It ends early, with exit status 1, when any of its nodes
-does.
+The same graph and the same scenario file as `rise-di fly`. The flight begins once recorder and controller are ready. It ends
+after the scenario's duration, in lockstep when the aircraft completes it. It ends early with exit status 1 when a node ends.
 """
 
 import math
@@ -15,27 +14,29 @@ from pathlib import Path
 import yaml
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, TimerAction
+from launch_ros.actions import Node
 
 from flight_analysis.report.run_folder import new_run
-from flight_bringup.graph import AIRCRAFT, FIRST, FLOWN, THEN, NodeSpec, parameters, start_lead
+from flight_bringup.graph import AIRCRAFT, FIRST_STAGE, SECOND_STAGE, NodeSpec, parameter_overrides, start_lead
 from flight_bringup.launch.stages import (
     BOOLEAN,
+    argument,
+    complete,
     end_with_launch,
-    flown,
-    in_order,
+    flight_node,
     namespace_argument,
-    node,
+    on_state,
     runs_argument,
     scenario_argument,
-    text,
-    when_said,
+    start_in_stages,
 )
 from flight_bringup.scenarios import find_scenario
+from flight_ros.topics import NodeState
 from launch import LaunchContext, LaunchDescription
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The arguments, and the flight that they describe."""
+    """The arguments and the flight."""
     return LaunchDescription(
         [
             scenario_argument("osprey_gust"),
@@ -54,24 +55,23 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _fly(context: LaunchContext) -> list[Action]:
-    scenario = find_scenario(text(context, "scenario"))
-    if duration := text(context, "duration"):
+    scenario = find_scenario(argument(context, "scenario"))
+    if duration := argument(context, "duration"):
         scenario = scenario.vary(flight={"duration": yaml.safe_load(duration)})
-    asked = text(context, "lockstep")
-    lockstep = asked == "true" if asked else scenario.flight.lockstep
-    run = new_run(scenario, Path(text(context, "runs")))
+    lockstep = scenario.flight.lockstep if (value := argument(context, "lockstep")) == "" else value == "true"
+    run = new_run(scenario, Path(argument(context, "runs")))
     end_with_launch(context)
 
-    def told(spec: NodeSpec, start_time: float = math.inf) -> dict[str, object]:
-        return parameters(spec, scenario, run, start_time, lockstep=lockstep)
+    def node(spec: NodeSpec, start_time: float = math.inf) -> Node:
+        return flight_node(spec, scenario, parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep))
 
-    def take_off(startup: float) -> Sequence[Action]:
+    def second_stage(startup: float) -> Sequence[Action]:
         lead = start_lead(startup)
         start_time = round(time.time() + lead, 3)
-        others = {spec: node(spec, scenario, told(spec, start_time)) for spec in THEN}
-        end: Action = TimerAction(period=lead + scenario.flight.duration, actions=flown(run))
         if lockstep:
-            end = when_said(others[AIRCRAFT], FLOWN, lambda: flown(run))
-        return [end, *others.values()]
+            end: Action = on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))
+        else:
+            end = TimerAction(period=lead + scenario.flight.duration, actions=complete(run))
+        return [end, *(node(spec, start_time) for spec in SECOND_STAGE)]
 
-    return in_order({spec: node(spec, scenario, told(spec)) for spec in FIRST}, take_off)
+    return start_in_stages(context, {spec: node(spec) for spec in FIRST_STAGE}, second_stage)

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Play a recorded flight on a full ROS 2, with nodes against it: ros2 launch flight_bringup replay.launch.py run:=runs/latest.
 
-As `rise-di play` does: the topics of the log with their timing, and /clock with its time. Of the topics those are played that
-none of the nodes says itself, so that a controller answers the recorded y and y_m with a u of its own. Playing begins once all
-nodes are ready, and ends with the log; early, with exit status 1, when any of the nodes does.
+As `rise-di play`: the topics of the log with their timing, and /clock with the time of the log. It plays the topics that none
+of the nodes publishes, so a controller answers the recorded y and y_m with its own u. Playing begins once all nodes are ready
+and ends with the log. It ends early with exit status 1 when a node ends.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ from pathlib import Path
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, LogInfo, OpaqueFunction, Shutdown
 from launch.events.process import ProcessExited
+from launch_ros.actions import Node
 from launch_ros.substitutions import ExecutableInPackage
 
 from autopilot_bridge.params import maps
@@ -25,45 +26,45 @@ from flight_bringup.graph import (
     REFERENCE_MODEL,
     NodeSpec,
     find_autopilot,
-    parameters,
-    to_play,
+    parameter_overrides,
+    replayed_topics,
 )
 from flight_bringup.launch.stages import (
     BOOLEAN,
+    argument,
+    complete,
     end_with_launch,
-    flown,
-    in_order,
+    fail_on_exit,
+    flight_node,
     namespace_argument,
-    node,
-    require_flown,
     runs_argument,
     scenario_argument,
-    text,
+    start_in_stages,
 )
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import require
 from flight_log.playback import read_playback
 from launch import LaunchContext, LaunchDescription
 
-CHOSEN = (RECORDER, CONTROLLER, REFERENCE_MODEL, AIRCRAFT)
-"""Nodes that run against the log where the argument of their name says so."""
+OPTIONAL = (RECORDER, CONTROLLER, REFERENCE_MODEL, AIRCRAFT)
+"""Nodes that run when the argument of their name is true."""
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The arguments, and what is played to whom."""
-    chosen = [
+    """The arguments, the player and the nodes."""
+    optional = [
         DeclareLaunchArgument(
             spec.executable,
             default_value=str(spec is CONTROLLER).lower(),
             choices=BOOLEAN,
-            description=f"run the {spec.executable} with it",
+            description=f"run the {spec.executable}",
         )
-        for spec in CHOSEN
+        for spec in OPTIONAL
     ]
     return LaunchDescription(
         [
             DeclareLaunchArgument("run", description="folder of a run, or an MCAP file"),
-            *chosen,
+            *optional,
             DeclareLaunchArgument(
                 "map",
                 default_value="",
@@ -73,23 +74,23 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "topics",
                 default_value="",
-                description="which topics of the log, as in y,y_m; empty plays all that none of the nodes says itself",
+                description="which topics of the log, as in y,y_m; empty plays all that none of the nodes publishes",
             ),
-            DeclareLaunchArgument("rate", default_value="1.0", description="how many times as fast"),
+            DeclareLaunchArgument("rate", default_value="1.0", description="speed, as a multiple of real time"),
             DeclareLaunchArgument("start", default_value="0.0", description="flight time of the log to begin at, s"),
             DeclareLaunchArgument(
-                "loop", default_value="false", choices=BOOLEAN, description="begin again at the end, until Ctrl-C"
+                "loop", default_value="false", choices=BOOLEAN, description="start again at the end, until Ctrl-C"
             ),
             DeclareLaunchArgument(
                 "lockstep",
                 default_value="false",
                 choices=BOOLEAN,
-                description="of a log of lockstep: keep its stamps, and have the controller answer each y with the same bytes",
+                description="for a lockstep log: keep its stamps; the controller answers each y with the same bytes",
             ),
-            scenario_argument("", "; empty takes the one inside the log"),
+            scenario_argument("", "; empty: the one in the log"),
             runs_argument(),
             namespace_argument(
-                "namespace of all nodes: that of the flight in the log, whose topics are played by their full names"
+                "namespace of all nodes; it must be that of the flight in the log, whose topics keep their full names"
             ),
             OpaqueFunction(function=_play),
         ]
@@ -97,35 +98,35 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _play(context: LaunchContext) -> list[Action]:
-    log, namespace = Path(text(context, "run")), text(context, "namespace")
-    lockstep = text(context, "lockstep") == "true"
-    autopilot = find_autopilot(text(context, "map"), dry_run=True) if text(context, "map") else None
-    nodes = [spec for spec in CHOSEN if text(context, spec.executable) == "true"] + [BRIDGE] * (autopilot is not None)
-    alone = {RECORDER, CONTROLLER}
-    others = [spec.executable for spec in nodes if spec not in alone]
+    log, namespace = Path(argument(context, "run")), argument(context, "namespace")
+    lockstep = argument(context, "lockstep") == "true"
+    autopilot = find_autopilot(argument(context, "map"), dry_run=True) if argument(context, "map") else None
+    nodes = [spec for spec in OPTIONAL if argument(context, spec.executable) == "true"] + [BRIDGE] * (autopilot is not None)
+    others = [spec.executable for spec in nodes if spec not in (RECORDER, CONTROLLER)]
     require(not (lockstep and others), "lockstep", f"true with {', '.join(others)}", "controller and recorder alone")
-    named = text(context, "scenario")
-    known = read_playback(log).types
-    asked = text(context, "topics") or ",".join(to_play(known, nodes, namespace, autopilot))
+    recorded = read_playback(log).types
+    topics = argument(context, "topics") or ",".join(replayed_topics(recorded, nodes, namespace, autopilot))
     end_with_launch(context)
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action] | None:
         if event.returncode != 0:
-            require_flown(event, context)
-        return flown(run, "played to its end") if RECORDER in nodes else [Shutdown(reason="played to its end")]
+            fail_on_exit(event, context)
+        return complete(run, "playback completed") if RECORDER in nodes else [Shutdown(reason="playback completed")]
 
-    rise_di = ExecutableInPackage(package="flight_bringup", executable="rise-di")
-    loop = ["--loop"] if text(context, "loop") == "true" else []
+    rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
+    loop = ["--loop"] if argument(context, "loop") == "true" else []
     stamps = ["--stamps", "recorded" if lockstep else "now"]
-    options = ["--topics", asked, "--rate", text(context, "rate"), "--start", text(context, "start"), *stamps, *loop]
+    options = ["--topics", topics, "--rate", argument(context, "rate"), "--start", argument(context, "start"), *stamps, *loop]
     player = ExecuteProcess(cmd=[rise_di, "play", str(log), *options], name="play", output="screen", on_exit=end)
     if not nodes:
         return [player]
-    scenario = find_scenario(named) if named else recorded_scenario(log, namespace or None)
-    run = new_run(scenario, Path(text(context, "runs"))) if RECORDER in nodes else Path()
+    name = argument(context, "scenario")
+    scenario = find_scenario(name) if name else recorded_scenario(log, namespace or None)
+    run = new_run(scenario, Path(argument(context, "runs"))) if RECORDER in nodes else Path()
 
-    def told(spec: NodeSpec) -> dict[str, object]:
-        return parameters(spec, scenario, run, 0.0, lockstep=lockstep, autopilot=autopilot)
+    def node(spec: NodeSpec) -> Node:
+        overrides = parameter_overrides(spec, scenario, run, 0.0, lockstep=lockstep, autopilot=autopilot)
+        return flight_node(spec, scenario, overrides)
 
-    playing = [LogInfo(msg=f"playing {asked}"), player]
-    return in_order({spec: node(spec, scenario, told(spec)) for spec in nodes}, lambda startup: playing)
+    second_stage = [LogInfo(msg=f"playing {topics}"), player]
+    return start_in_stages(context, {spec: node(spec) for spec in nodes}, lambda startup: second_stage)

@@ -21,8 +21,8 @@ def engage(
     """
     from flight_bringup.clients import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
-    with EngagementClient(namespace) as engager:
-        refusal = engager.give_back() if off else engager.take_over()
+    with EngagementClient(namespace) as client:
+        refusal = client.disengage() if off else client.engage()
     if refusal:
         print(f"error: not {'disengaged' if off else 'engaged'}: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)

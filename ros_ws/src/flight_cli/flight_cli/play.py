@@ -41,11 +41,11 @@ def play(
         require(math.isfinite(value), option, value, "a number")  # NaN passes the ranges above
     names = [name.strip() for name in topics.split(",") if name.strip()]
     playback = read_playback(run, names, start)
-    from flight_bringup.clients import player  # noqa: PLC0415 - loads rclpy, which other commands do not need
+    from flight_bringup.clients import Player  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     end = playback.t(playback.messages[-1].due_ns)
     with (
-        player(playback.types, SHARED) as sender,
+        Player(playback.types, SHARED) as sender,
         progress_bar(TextColumn("{task.fields[clock]}"), BarColumn(), TextColumn("{task.fields[shown]}")) as bar,
     ):
         task = bar.add_task("play", total=end - start, clock="", shown=f"{', '.join(playback.types)}, stamps {stamps}")

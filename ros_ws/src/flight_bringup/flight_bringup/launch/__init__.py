@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the launch files share. Needs `launch` and `launch_ros`, which come with a full ROS 2 alone."""
+"""Shared code of the launch files. Needs `launch` and `launch_ros`, which only a full ROS 2 has."""

@@ -1,37 +1,55 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Processes of a launch: started in stages, each beginning when those before it are ready; none ends before the flight does."""
+"""Start the nodes of a launch in stages: each stage waits for the `node_state` "ready" of the stage before."""
 
+import os
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
+import psutil
+from diagnostic_msgs.msg import KeyValue
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, LogInfo, RegisterEventHandler, Shutdown
-from launch.event_handlers import OnProcessIO
-from launch.events.process import ProcessExited, ProcessIO
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, RegisterEventHandler, Shutdown, TimerAction
+from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.ros_adapters import get_ros_node
+from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
-from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.graph import READY, NodeSpec, ParameterOverrides
-from flight_bringup.processes import end_with_parent
+from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
+from flight_bringup.graph import NodeSpec
+from flight_bringup.processes import READY_TIMEOUT, end_with_parent
 from flight_bringup.scenarios import scenarios
-from launch import LaunchContext
+from flight_ros import transport
+from flight_ros.topics import NODE_STATE, STATES, NodeState
+from launch import Event, EventHandler, LaunchContext
 
 BOOLEAN = ["true", "false"]
+SHUTDOWN_DELAY = 0.05  # s
+
+
+class NodeStateEvent(Event):
+    """A node of this launch has published its state."""
+
+    name = "flight_bringup.NodeStateEvent"
+
+    def __init__(self, node: str, state: str) -> None:
+        self.node = node  # fully qualified name
+        self.state = state
 
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
-    """The argument `scenario`; `otherwise` says what an empty one means."""
+    """The argument `scenario`; `otherwise` describes an empty one."""
     description = f"name of a scenario ({', '.join(scenarios())}), or path of a scenario file (.yaml){otherwise}"
     return DeclareLaunchArgument("scenario", default_value=default, description=description)
 
 
 def runs_argument() -> DeclareLaunchArgument:
     """The argument `runs`."""
-    return DeclareLaunchArgument("runs", default_value="runs", description="folder that the run's folder is made in")
+    return DeclareLaunchArgument("runs", default_value="runs", description="folder in which the folder of the run is created")
 
 
 def namespace_argument(description: str = "namespace of all nodes, one an aircraft") -> DeclareLaunchArgument:
@@ -39,62 +57,100 @@ def namespace_argument(description: str = "namespace of all nodes, one an aircra
     return DeclareLaunchArgument("namespace", default_value="", description=description)
 
 
-def text(context: LaunchContext, name: str) -> str:
+def argument(context: LaunchContext, name: str) -> str:
     """The value of an argument."""
     return str(LaunchConfiguration(name).perform(context))
 
 
 def end_with_launch(context: LaunchContext) -> None:
-    """All processes end with this one: launch leaves them running when it is itself ended by anything but SIGINT."""
+    """Let all processes end with this one. Launch leaves them running when anything but SIGINT ends it."""
     context.launch_configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
 
 
-def node(spec: NodeSpec, scenario: Scenario, told: ParameterOverrides) -> Node:
-    """A node of a flight, with its section of the scenario and what it is told beside it."""
+def flight_node(spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides) -> Node:
+    """A node of a flight with its section of the scenario and its parameter overrides."""
     return Node(
         package=spec.package,
         executable=spec.executable,
-        exec_name=spec.executable,  # else the log names each process by its prefix
+        exec_name=spec.executable,  # otherwise the log names each process by its prefix
         namespace=LaunchConfiguration("namespace"),
-        parameters=[str(scenario.path), told],
+        parameters=[str(scenario.path), overrides],
         output="screen",
-        on_exit=require_flown,
+        on_exit=fail_on_exit,
     )
 
 
-def require_flown(event: ProcessExited, context: LaunchContext) -> None:
-    """The end of any process before that of the flight ends all others, with exit status 1."""
+def fail_on_exit(event: ProcessExited, context: LaunchContext) -> None:
+    """End the launch with exit status 1 when a process ends before the flight."""
     if not context.is_shutdown:
         raise RuntimeError(f"{event.process_name} ended before the flight did")
 
 
-def when_said(process: Node, sentence: str, then: Callable[[], Sequence[Action] | None]) -> RegisterEventHandler:
-    """What follows each line of a process that holds a sentence."""
+def on_state(
+    context: LaunchContext, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
+) -> RegisterEventHandler:
+    """Run the actions of `then` once, when a node of this launch publishes a state."""
+    node = f"{_namespace(context)}/{spec.executable}"
 
-    def handle(event: ProcessIO) -> Sequence[Action] | None:
-        return then() if sentence in event.text.decode(errors="replace") else None
+    def matches(event: Event) -> bool:
+        return isinstance(event, NodeStateEvent) and (event.node, event.state) == (node, state)
 
-    return RegisterEventHandler(OnProcessIO(target_action=process, on_stdout=handle, on_stderr=handle))
+    return RegisterEventHandler(
+        EventHandler(matcher=matches, entities=[OpaqueFunction(function=lambda context: [*then()])], handle_once=True)
+    )
 
 
-def in_order(first: Mapping[NodeSpec, Node], then: Callable[[float], Sequence[Action]]) -> list[Action]:
-    """The first processes, and what follows once all of them have said that they are ready, given how long that took in s."""
+def start_in_stages(
+    context: LaunchContext, first: Mapping[NodeSpec, Node], second: Callable[[float], Sequence[Action]]
+) -> list[Action]:
+    """Start the first stage. Once all its nodes are ready, run the actions of `second`, given the time until then in s."""
+    _subscribe_states(context)
     begin = time.monotonic()
-    waiting = set(first)
+    waiting = dict.fromkeys(first)  # in order
 
-    def when_ready(spec: NodeSpec) -> Sequence[Action] | None:
-        if spec not in waiting:
-            return None
-        waiting.remove(spec)
-        return None if waiting else then(time.monotonic() - begin)
+    def ready(spec: NodeSpec) -> Sequence[Action]:
+        del waiting[spec]
+        return () if waiting else second(time.monotonic() - begin)
 
-    handlers = [when_said(process, READY, lambda spec=spec: when_ready(spec)) for spec, process in first.items()]
-    return [*handlers, *first.values()]
+    def warn(context: LaunchContext) -> list[Action]:
+        names = ", ".join(spec.executable for spec in waiting)
+        return [LogInfo(msg=f"timed out waiting for {names}: not ready after {READY_TIMEOUT:g} s")] if waiting else []
+
+    handlers = [on_state(context, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in first]
+    return [*handlers, *first.values(), TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=warn)])]
 
 
-def flown(run: Path, sentence: str = "flown to its end") -> list[Action]:
-    """The end of a flight that has flown as long as it was to."""
+def complete(run: Path, reason: str = "flight completed") -> list[Action]:
+    """The actions at the end of a flight that flew its whole duration."""
     return [
-        LogInfo(msg=f"flown; now: ros2 run flight_bringup rise-di report {shlex.quote(str(run))}"),
-        Shutdown(reason=sentence),
+        LogInfo(msg=f"{reason}; now: ros2 run flight_cli rise-di report {shlex.quote(str(run))}"),
+        Shutdown(reason=reason),
     ]
+
+
+def _subscribe_states(context: LaunchContext) -> None:
+    """Emit a NodeStateEvent for each state that a node of this launch publishes; see launch_ros.actions.LifecycleNode."""
+
+    def receive(message: KeyValue) -> None:
+        node, _, pid = message.key.rpartition("#")
+        if pid.isdecimal() and _is_descendant(int(pid)) and not context.is_shutdown:
+            context.asyncio_loop.call_soon_threadsafe(context.emit_event_sync, NodeStateEvent(node, message.value))
+
+    transport.prepare()  # before the first rclpy.init of this process
+    ros_node = get_ros_node(context)
+    ros_node.create_subscription(NODE_STATE.type, f"{_namespace(context)}/{NODE_STATE.name}", receive, STATES)
+    # At shutdown launch_ros waits for its executor before it stops the nodes: up to 1 s, without a timer.
+    ros_node.create_timer(SHUTDOWN_DELAY, lambda: None)
+
+
+def _namespace(context: LaunchContext) -> str:
+    """The absolute namespace of the nodes, as launch_ros.actions.Node has it; "" for the root."""
+    base = context.launch_configurations.get("ros_namespace")
+    return str(make_namespace_absolute(prefix_namespace(base, argument(context, "namespace")))).rstrip("/")
+
+
+def _is_descendant(pid: int) -> bool:
+    """Whether a process belongs to this launch, directly or behind a launch prefix, and not to another flight in the domain."""
+    with suppress(psutil.Error):
+        return os.getpid() in {parent.pid for parent in psutil.Process(pid).parents()}
+    return False

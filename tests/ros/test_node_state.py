@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The topic `node_state`: readiness and completion of nodes, for late subscribers and for the process runner."""
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+from diagnostic_msgs.msg import KeyValue
+from tests.ros.conftest import Start
+from tests.ros.peer import Peer, peer
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_bringup import processes
+from flight_bringup.clients import FlightMonitor
+from flight_bringup.graph import ONE_PROCESS, NodeSpec, parameter_overrides
+from flight_bringup.processes import FlightProcesses
+from flight_core.parameters import ParameterError
+from flight_ros.topics import NODE_STATE, STATES
+
+
+def received_states(peer_node: Peer, topic: str = NODE_STATE.name) -> dict[str, str]:
+    """The newest state by process, filled while the peer spins."""
+    states: dict[str, str] = {}
+
+    def receive(message: KeyValue) -> None:
+        states[message.key] = message.value
+
+    peer_node.node.create_subscription(KeyValue, topic, receive, STATES)
+    return states
+
+
+def test_a_late_subscriber_gets_the_state_of_each_process(start: Start, osprey_gust: Scenario) -> None:
+    arguments = ("--ros-args", "--params-file", str(osprey_gust.path), "-r", "__ns:=/one")
+    nodes = {
+        name: start(f"{module}.main", *arguments)
+        for name, module in (("controller", "rise_di_controller"), ("aircraft", "aircraft_sim"))
+    }
+    for node in nodes.values():
+        node.wait_for("ready")
+    with peer(topics=()) as peer_node:
+        states = received_states(peer_node, "/one/node_state")
+        expected = {f"/one/{name}#{node.popen.pid}": "ready" for name, node in nodes.items()}
+        peer_node.until(lambda: len(states) == len(expected))
+        assert states == expected
+
+
+def test_the_aircraft_completes_a_lockstep_flight_and_the_process_has_its_id(
+    start: Start, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    short = osprey_gust.vary(flight={"duration": 0.2})
+    overrides = parameter_overrides(ONE_PROCESS, short, tmp_path, 0.0, lockstep=True)
+    words = [word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}")]
+    flight = start("flight_bringup.main", "--ros-args", "--params-file", str(osprey_gust.path), *words)
+    flight.wait_for("flight completed at t = 0.2 s")
+    with peer(topics=()) as peer_node:
+        states = received_states(peer_node)
+        roles = ("aircraft", "controller", "recorder", "reference_model")
+        expected = {f"/{role}#{flight.popen.pid}": "completed" if role == "aircraft" else "ready" for role in roles}
+        peer_node.until(lambda: states == expected)
+
+
+def test_a_monitor_tells_a_node_from_one_of_another_flight(start: Start, osprey_gust: Scenario) -> None:
+    node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
+    with FlightMonitor(osprey_gust.controller.outputs, lockstep=True) as monitor:
+        pid, deadline = node.popen.pid, time.monotonic() + 30.0
+        while not monitor.is_ready("controller", pid):
+            assert time.monotonic() < deadline, node.output
+            time.sleep(0.01)
+        assert not monitor.is_ready("controller", pid + 1)
+        assert not monitor.is_ready("recorder", pid)
+
+
+@pytest.fixture
+def only_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A first stage of one process: the module `fake.main`, whose file the test writes."""
+    (tmp_path / "fake").mkdir()
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(processes, "FIRST_STAGE", (NodeSpec("fake", "controller"),))
+    monkeypatch.setattr(processes, "parameter_overrides", lambda *_, **__: {})
+    monkeypatch.setattr(processes, "READY_TIMEOUT", 3.0)
+    return tmp_path / "fake" / "main.py"
+
+
+def start_stage(scenario: Scenario, run: Path) -> None:
+    with (
+        FlightMonitor(scenario.controller.outputs, lockstep=True) as monitor,
+        FlightProcesses(scenario, run, monitor, lockstep=False, one_process=False),
+    ):
+        pass
+
+
+def test_a_log_line_does_not_start_a_flight(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
+    only_stage.write_text(
+        "import time\nprint('[INFO] [1.0] [controller]: ready', flush=True)\ntime.sleep(60)\n", encoding="utf-8"
+    )
+    with pytest.raises(ParameterError, match="timed out waiting for controller: not ready after 3 s; see the logs in "):
+        start_stage(osprey_gust, tmp_path / "run")
+    assert "[controller]: ready" in (tmp_path / "run" / "log" / "controller.log").read_text(encoding="utf-8")
+
+
+def test_a_process_that_ends_while_others_wait_is_named_at_once(
+    only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    only_stage.write_text("import sys\nprint('error: no such airframe')\nsys.exit(2)\n", encoding="utf-8")
+    begin = time.monotonic()
+    with pytest.raises(ParameterError, match=r"^controller ended with status 2: no such airframe$"):
+        start_stage(osprey_gust, tmp_path / "run")
+    assert time.monotonic() - begin < 2.5  # READY_TIMEOUT is 3 s
+
+
+def test_the_state_of_a_node_in_another_flight_does_not_start_this_one(
+    start: Start, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    other = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
+    other.wait_for("ready")
+    only_stage.write_text("import time\ntime.sleep(60)\n", encoding="utf-8")
+    with pytest.raises(ParameterError, match="timed out waiting for controller"):
+        start_stage(osprey_gust, tmp_path / "run")
+    assert other.popen.poll() is None
