@@ -11,6 +11,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
+import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Log, ParameterEvent
 from rclpy.exceptions import InvalidTopicNameException
@@ -24,10 +25,10 @@ from flight_log.bag import LOST_MESSAGES, BagChannel, BagWriter, LogAttachments
 from flight_log.disk import free_bytes
 from flight_log.message_definitions import definition
 from flight_recorder.params import RecorderParameters
-from flight_ros.endpoints import type_name
+from flight_ros.endpoints import mismatch, type_name
 from flight_ros.flight_node import NO_PUBLISHER_WARNING_NS, FlightNode
 from flight_ros.messages import instant, stamp_of
-from flight_ros.qos import qos_yaml, strongest_compatible
+from flight_ros.qos import rosbag2_profiles, strongest_compatible
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.ticker import Tick
 from flight_ros.topics import FLIGHT, PUBLISH, RECORD, RECORD_FOREIGN, RECORDED, TRUTH, Topic
@@ -117,7 +118,8 @@ class RecorderNode(FlightNode[RecorderParameters]):
         return PolledSubscription(self, topic, qos, raw=True)
 
     def _record(self, subscription: PolledSubscription, offered: Sequence[QoSProfile]) -> _RecordedTopic:
-        channel = self._bag.add_topic(subscription.name, type_name(subscription.topic.type), qos_yaml(offered))
+        qos = yaml.safe_dump(rosbag2_profiles(offered), sort_keys=False)
+        channel = self._bag.add_topic(subscription.name, type_name(subscription.topic.type), qos)
         return _RecordedTopic(subscription, channel)
 
     def period_ns(self) -> int:
@@ -240,8 +242,9 @@ class RecorderNode(FlightNode[RecorderParameters]):
     def check_graph(self) -> None:
         super().check_graph()
         for topic in self._topics:
-            if topic.foreign:
-                self.check_publishers(topic.name, topic.channel.type.name)
+            for peer in self.get_publishers_info_by_topic(topic.name) if topic.foreign else ():
+                if sentence := mismatch(topic.name, peer, topic.channel.type.name, None):
+                    self.get_logger().error(sentence, throttle_duration_sec=5.0)
 
     def _offered(self, name: str, message_type: str) -> list[QoSProfile]:
         return [peer.qos_profile for peer in self.get_publishers_info_by_topic(name) if peer.topic_type == message_type]
