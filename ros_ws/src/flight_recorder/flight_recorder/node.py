@@ -25,7 +25,7 @@ from flight_log.bag import LOST_MESSAGES, BagChannel, BagWriter, LogAttachments
 from flight_log.disk import free_bytes
 from flight_log.message_definitions import definition
 from flight_recorder.params import RecorderParameters
-from flight_ros.endpoints import mismatch, type_name
+from flight_ros.endpoints import type_name
 from flight_ros.flight_node import NO_PUBLISHER_WARNING_NS, FlightNode
 from flight_ros.messages import instant, stamp_of
 from flight_ros.qos import rosbag2_profiles, strongest_compatible
@@ -242,9 +242,8 @@ class RecorderNode(FlightNode[RecorderParameters]):
     def check_graph(self) -> None:
         super().check_graph()
         for topic in self._topics:
-            for peer in self.get_publishers_info_by_topic(topic.name) if topic.foreign else ():
-                if sentence := mismatch(topic.name, peer, topic.channel.type.name, None):
-                    self.get_logger().error(sentence, throttle_duration_sec=5.0)
+            if topic.foreign:
+                self.check_publishers(topic.name, topic.channel.type.name)
 
     def _offered(self, name: str, message_type: str) -> list[QoSProfile]:
         return [peer.qos_profile for peer in self.get_publishers_info_by_topic(name) if peer.topic_type == message_type]
