@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The layouts for Foxglove and PlotJuggler: what they name is in a run, at the place where they look for it.
+"""The layouts of `rise-di layouts` for Foxglove and PlotJuggler: format, arrangement, and channels of a run.
 
-The formats are held against what the two programs' own sources read; neither program is run here.
+The formats follow the sources of the two programs. Neither program runs here.
 """
 
 import json
@@ -14,33 +14,48 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler
 from flight_bringup.scenarios import find_scenario
+from flight_cli.cli import application
 from flight_core.tape import Tape
 
-LAYOUTS = Path(__file__).resolve().parents[2] / "ros_ws" / "src" / "flight_bringup" / "layouts"
-JSON = (LAYOUTS / "osprey_gust.foxglove.json").read_text(encoding="utf-8")
-XML = (LAYOUTS / "osprey_gust.plotjuggler.xml").read_text(encoding="utf-8")
+CHANNELS = channels_of(find_scenario("osprey_gust"))
+JSON, XML = foxglove(CHANNELS), plotjuggler(CHANNELS)
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
-WANTED = {
+CURVES = {
     *(f"{topic} {name}" for topic in ("y", "y_m") for name in OUTPUTS),
     *(f"internals {group}.{name}" for group in ("e", "integral_e", "Pi") for name in OUTPUTS),
     *(f"internals {group}.{name}" for group in ("u", "u_free", "limited") for name in INPUTS),
     *(f"internals {name}" for name in ("mode", "late", "age", "dt")),
-    "truth gust.vertical",
-    "truth gust.lateral",
+    *(f"truth gust.{axis}" for axis in ("longitudinal", "lateral", "vertical")),
 }
+TABS = {"tracking": 4, "error": 4, "input": 4, "integrals": 8, "controller": 4, "wind": 3}  # title: number of plots
+COLOUR = re.compile("#[0-9a-f]{6}")
+
+PANEL = {
+    "showXAxisLabels": True,
+    "showYAxisLabels": True,
+    "showLegend": True,
+    "legendDisplay": "floating",
+    "showPlotValuesInLegend": False,
+    "isSynced": True,
+    "xAxisVal": "timestamp",
+    "sidebarDimension": 240,
+}
+"""The fixed part of a Plot panel of Foxglove."""
 
 
 @pytest.fixture(scope="module", params=["osprey_gust", "osprey_servo"])
 def tape(request: pytest.FixtureRequest) -> Tape:
+    """A run; the layout of osprey_gust fits both scenarios."""
     return simulate(find_scenario(request.param).vary(flight={"duration": 0.1}))
 
 
 def leaves(tree: Any) -> Iterator[str]:
-    """Panels of a tree of splits, as react-mosaic has it: a name, or a direction with a first and a second."""
+    """Panels of a tree of splits (react-mosaic): a name, or a direction with a first and a second part."""
     if isinstance(tree, str):
         yield tree
         return
@@ -51,59 +66,99 @@ def leaves(tree: Any) -> Iterator[str]:
     yield from leaves(tree["second"])
 
 
-def test_the_files_are_what_the_command_writes() -> None:
-    channels = channels_of(find_scenario("osprey_gust"))
-    mend = "write them again: rise-di layouts osprey_gust --folder ros_ws/src/flight_bringup/layouts"
-    assert foxglove(channels) == JSON, mend
-    assert plotjuggler(channels) == XML, mend
+def test_the_command_writes_both_layouts(tmp_path: Path) -> None:
+    result = CliRunner().invoke(application(["layouts"]), ["layouts", "osprey_gust", "--folder", str(tmp_path / "new")])
+    assert result.exit_code == 0, result.output
+    files = {path.name: path.read_text(encoding="utf-8") for path in (tmp_path / "new").iterdir()}
+    assert files == {"osprey_gust.foxglove.json": JSON, "osprey_gust.plotjuggler.xml": XML}
+    assert result.output.split() == [str(tmp_path / "new" / name) for name in sorted(files)]
 
 
 def test_every_path_of_foxglove_leads_to_the_channel_that_its_label_names(tape: Tape) -> None:
-    shown = set()
+    curves = []
     for panel in json.loads(JSON)["configById"].values():
         for path in panel.get("paths", ()):
-            found = re.fullmatch(r"/(\w+)\.position\[(\d+)\]", path["value"])
-            assert found is not None, path
-            topic, place = found[1], int(found[2])
-            assert path["label"] == f"{topic}: {tape[topic].names[place]}"
-            shown.add(f"{topic} {tape[topic].names[place]}")
-    assert shown >= WANTED
+            parts = re.fullmatch(r"/(\w+)\.position\[(\d+)\]", path["value"])
+            assert parts is not None, path
+            curve = f"{parts[1]}: {tape[parts[1]].names[int(parts[2])]}"
+            assert path["label"] == curve
+            curves.append(curve.replace(": ", " "))
+    assert Counter(curves) == Counter(CURVES)
 
 
 def test_every_panel_of_foxglove_stands_in_one_tab() -> None:
     layout = json.loads(JSON)
+    assert layout.keys() == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
+    assert (layout["globalVariables"], layout["userNodes"], layout["playbackConfig"]) == ({}, {}, {"speed": 1})
     assert layout["layout"] == "Tab!rise_di"
-    tabs = layout["configById"]["Tab!rise_di"]["tabs"]
-    placed = Counter(name for tab in tabs for name in leaves(tab["layout"]))
-    assert set(placed.values()) == {1}
-    assert set(placed) == set(layout["configById"]) - {"Tab!rise_di"}
-    assert {name.split("!")[0] for name in placed} == {"Plot"}
+    tab_panel = layout["configById"]["Tab!rise_di"]
+    assert tab_panel.keys() == {"activeTabIdx", "tabs"}
+    assert tab_panel["activeTabIdx"] == 0
+    placed = {tab["title"]: list(leaves(tab["layout"])) for tab in tab_panel["tabs"]}
+    assert {title: len(names) for title, names in placed.items()} == TABS
+    assert list(placed) == list(TABS)
+    count = Counter(name for names in placed.values() for name in names)
+    assert set(count.values()) == {1}
+    assert set(count) == set(layout["configById"]) - {"Tab!rise_di"}
+    assert {name.split("!")[0] for name in count} == {"Plot"}
+
+
+def test_every_plot_of_foxglove_has_the_settings_of_a_plot_panel() -> None:
+    panels = json.loads(JSON)["configById"]
+    del panels["Tab!rise_di"]
+    for panel in panels.values():
+        paths = panel.pop("paths")
+        titles = {panel.pop("foxglovePanelTitle"), panel.pop("lichtblickPanelTitle")}  # one program, two names
+        assert len(titles) == 1
+        assert titles.pop()
+        assert panel == PANEL
+        assert len({path["color"] for path in paths}) == len(paths) > 0
+        for path in paths:
+            assert path.keys() == {"value", "label", "color", "enabled", "timestampMethod"}
+            assert (path["enabled"], path["timestampMethod"]) == (True, "receiveTime")
+            assert COLOUR.fullmatch(path["color"])
 
 
 def test_every_curve_of_plotjuggler_is_a_channel_of_a_run(tape: Tape) -> None:
-    shown = set()
+    curves = []
     for curve in ElementTree.fromstring(XML).iter("curve"):
-        _, topic, channel, position = curve.attrib["name"].split("/")
+        root, topic, channel, position = curve.attrib["name"].split("/")
         assert channel in tape[topic].names
-        assert position == "position"
-        shown.add(f"{topic} {channel}")
-    assert shown >= WANTED
+        assert (root, position) == ("", "position")
+        curves.append(f"{topic} {channel}")
+    assert Counter(curves) == Counter(CURVES)
 
 
-def test_every_splitter_of_plotjuggler_says_how_many_it_holds() -> None:
+def test_every_splitter_of_plotjuggler_has_its_count() -> None:
     root = ElementTree.fromstring(XML)
     splitters = list(root.iter("DockSplitter"))
     assert len(splitters) > 6
     for splitter in splitters:
         assert splitter.attrib["orientation"] in {"|", "-"}
         assert {child.tag for child in splitter} <= {"DockSplitter", "DockArea"}
-        assert len(splitter) == int(splitter.attrib["count"]) == len(splitter.attrib["sizes"].split(";"))
+        sizes = [float(size) for size in splitter.attrib["sizes"].split(";")]
+        assert len(splitter) == int(splitter.attrib["count"]) == len(sizes)
+        assert sum(sizes) == pytest.approx(1.0, abs=1e-5)
     assert all(len(area.findall("plot")) == 1 for area in root.iter("DockArea"))
-    assert [tab.attrib["tab_name"] for tab in root.iter("Tab")] == [
-        "tracking",
-        "error",
-        "input",
-        "integrals",
-        "controller",
-        "wind",
+    assert {tab.attrib["tab_name"]: len(list(tab.iter("plot"))) for tab in root.iter("Tab")} == TABS
+    assert [tab.attrib["tab_name"] for tab in root.iter("Tab")] == list(TABS)
+
+
+def test_plotjuggler_shows_flight_time_in_one_window() -> None:
+    root = ElementTree.fromstring(XML)
+    assert XML.startswith("<?xml ")
+    assert [(child.tag, child.attrib) for child in root] == [
+        ("tabbed_widget", {"name": "Main Window", "parent": "main_window"}),
+        ("use_relative_time_offset", {"enabled": "1"}),
     ]
+    assert [child.tag for child in root[0]] == ["Tab"] * len(TABS) + ["currentTabIndex"]
+    for tab in root.iter("Tab"):
+        assert tab.attrib["containers"] == "1"
+        assert [child.tag for child in tab] == ["Container"]
+    for area in root.iter("DockArea"):
+        assert area.attrib["name"]
+        plot = area[0]
+        assert plot.attrib == {"mode": "TimeSeries", "style": "Lines", "flip_x": "false", "flip_y": "false"}
+        colours = [curve.attrib["color"] for curve in plot]
+        assert len(set(colours)) == len(colours) > 0
+        assert all(COLOUR.fullmatch(colour) for colour in colours)

@@ -15,7 +15,6 @@ setup(
         ("share/flight_bringup", ["package.xml"]),
         ("share/flight_bringup/launch", sorted(glob("launch/*.launch.py"))),
         ("share/flight_bringup/config", sorted(glob("config/*.yaml"))),
-        ("share/flight_bringup/layouts", sorted(glob("layouts/*"))),
         ("share/flight_bringup/security", sorted(glob("security/*"))),
     ],
 )
