@@ -20,14 +20,12 @@ EXECUTABLES = {
     "reference_model": "reference_model",
     "rise_di_controller": "controller",
     "flight_recorder": "recorder",
-    "flight_bringup": "rise-di",
+    "flight_cli": "rise-di",
 }
 
 # The keys of rosdep (rosdep/python.yaml of ros/rosdistro); a ROS package is its own key.
-KEYS = {
-    name: f"python3-{name}" for name in ("jinja2", "matplotlib", "numpy", "psutil", "pydantic", "rich", "scipy", "typer", "yaml")
-}
-KEYS["markupsafe"] = "python3-jinja2"  # which depends on it
+PYTHON3 = ("jinja2", "matplotlib", "numpy", "psutil", "pydantic", "rich", "scipy", "typer", "yaml")
+KEYS = {name: f"python3-{name}" for name in PYTHON3} | {"markupsafe": "python3-jinja2"}  # which depends on it
 # Those that have none, or (rosbags) one that calls pip alone, which Ubuntu 24.04 refuses for its own Python.
 WITHOUT_KEY = {
     "cma",
