@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Theorem 1 on random aircraft: whatever A, B, f, if D is known and the gains follow the rules, e goes to the sampling floor.
+"""Theorem 1 on random aircraft: with the right D and gains by the rules, e converges to the ultimate bound of sampling.
 
-An aircraft is drawn in coordinates (y, z) that show its zero dynamics, z_dot = A_zy y + A_zz z at y = y_m, and handed over in
-rotated ones. The law is given D and gains; the gains are chosen as `gains` says, with the numbers of the aircraft as an
-oracle would have them, for it is the theorem that is tested here and not a way to identify.
+An aircraft is drawn in coordinates (y, z) that show its zero dynamics, z_dot = A_zy y + A_zz z at y = y_m, and then rotated.
+The law has D and gains only. `gains` computes them from the true aircraft, because these tests check the theorem and not
+an identification.
 """
 
 from typing import NamedTuple
@@ -25,9 +25,9 @@ from rise_di_controller import law as rise
 from rise_di_controller.decomposition import decompose, leading_minors, signs
 from rise_di_controller.law import LawParams, Sign, gain
 
-SLOWEST = 0.5  # 1/s, the least damping of the aircraft and of its zero dynamics
-DURATION, SETTLED = 8.0, 5.0  # s, of a flight, and from when on its error counts as settled: ten time constants of Lambda
-DT = 0.008  # s, and half of it
+MIN_DAMPING = 0.5  # 1/s, of the aircraft and of its zero dynamics
+DURATION, SETTLED = 8.0, 5.0  # s, length of a flight and the time at which e has settled: ten time constants of Lambda
+DT = 0.008  # s; the tests also use half of it
 
 
 class Sines(NamedTuple):
@@ -47,10 +47,10 @@ class Sines(NamedTuple):
 
 
 class Task(NamedTuple):
-    """A random aircraft, what it is to follow and where it starts."""
+    """A random aircraft, its reference and its initial error."""
 
     aircraft: Aircraft
-    D: FloatArray  # (m,) from which C B was built
+    D: FloatArray  # (m,) used to build C B
     rotation: FloatArray  # (n, n) from (y, z) to x
     reference: Sines
     e_0: FloatArray  # (m,)
@@ -61,24 +61,24 @@ def abscissa(matrix: FloatArray) -> float:
     return float(np.linalg.eigvals(matrix).real.max()) if matrix.size else -np.inf
 
 
-def draw(n: int, m: int, seed: int) -> Task:
-    """Relative degree one: C B = S D U with D drawn. The aircraft and its zero dynamics: damped by SLOWEST at the least."""
+def random_task(n: int, m: int, seed: int) -> Task:
+    """Random task of relative degree one, C B = S D U. The aircraft and its zero dynamics have at least MIN_DAMPING."""
     rng = np.random.default_rng(seed)
     directions = np.linalg.qr(rng.standard_normal((m, m)))[0]
     S = directions * rng.uniform(0.5, 2.0, m) @ directions.T
     D = rng.choice([-1.0, 1.0], m)
     U = np.triu(rng.uniform(-0.5, 0.5, (m, m)), 1) + np.eye(m)
     A = rng.standard_normal((n, n))
-    A -= (max(abscissa(A), abscissa(A[m:, m:])) + SLOWEST) * np.eye(n)
+    A -= (max(abscissa(A), abscissa(A[m:, m:])) + MIN_DAMPING) * np.eye(n)
     rotation = np.linalg.qr(rng.standard_normal((n, n)))[0]
-    none = np.zeros(0)
+    empty = np.zeros(0)
     aircraft = Aircraft(
         A=rotation @ A @ rotation.T,
         B=rotation[:, :m] @ S @ np.diag(D) @ U,
         C=rotation[:, :m].T,
         gravity=0.1 / n * rng.uniform(-1.0, 1.0, (n, n)),  # f: at most 0.1 in each x_dot
         gust_direction=np.zeros((n, 0)),
-        gusts=Gusts(none, none, none),
+        gusts=Gusts(empty, empty, empty),
         speed=np.array(1.0),
     )
     reference = Sines(rng.uniform(0.2, 1.0, m), rng.uniform(0.5, 2.0, m), rng.uniform(0.0, 2.0 * np.pi, m))
@@ -86,7 +86,7 @@ def draw(n: int, m: int, seed: int) -> Task:
 
 
 def slew_of_the_ideal_control(task: Task, scale: FloatArray) -> FloatArray:
-    """v*_dot over a flight, shape (N, m): of the input v = u / scale that keeps e at zero, by finite differences."""
+    """Slew v*_dot over a flight, shape (N, m), of the input v* = u / scale that keeps e = 0, by finite differences."""
     aircraft, rotation, dt = task.aircraft, task.rotation, 0.01
     m = len(task.D)
 
@@ -110,11 +110,11 @@ def slew_of_the_ideal_control(task: Task, scale: FloatArray) -> FloatArray:
 def gains(task: Task, sign: Sign) -> LawParams:
     """Gains by rule, last channel first, with V = D U D of the scaled Omega.
 
-    Inputs are scaled by the pivots of Omega, abs(Delta_k / Delta_(k-1)), which are never zero, while Omega_kk may be.
+    Inputs are scaled by the pivots of Omega, abs(Delta_k / Delta_(k-1)), which are never zero; Omega_kk may be zero.
     K is that of (22): K_m = 10 1/s, k_d,i = 1 + (m - 1) sum_{j>i} V_ij^2 K_j, which makes the symmetric part of V K positive
     definite: 2 abs(V_ij) K_j abs(r_i r_j) <= (m - 1) V_ij^2 K_j r_i^2 + K_j r_j^2 / (m - 1).
     beta: (30), with zeta_Nd,i = max abs((D U v*_dot)_i), which is N_d at e = 0, and a margin of a half.
-    Lambda is 2 1/s. omega is over-estimated by 2, as it should rather be too large.
+    Lambda is 2 1/s. omega is over-estimated by 2, because it must not be too small.
     """
     m = len(task.D)
     Omega = task.aircraft.C @ task.aircraft.B
@@ -123,14 +123,14 @@ def gains(task: Task, sign: Sign) -> LawParams:
     U = decompose(Omega * scale).U
     V = np.abs(task.D[:, None] * U * task.D)
     zeta = np.abs(slew_of_the_ideal_control(task, scale) @ (task.D[:, None] * U).T).max(axis=0)
-    slowest = 10.0
-    K, k_d, beta = np.full(m, slowest), np.zeros(m), np.zeros(m)
+    K_min = 10.0
+    K, k_d, beta = np.full(m, K_min), np.zeros(m), np.zeros(m)
     for i in reversed(range(m)):
         beta[i] = 1.5 * zeta[i] + V[i, i + 1 :] @ beta[i + 1 :]
         k_d[i] = 1.0 + (m - 1) * V[i, i + 1 :] ** 2 @ K[i + 1 :] if i < m - 1 else 0.0
-        K[i] = slowest + k_d[i]
+        K[i] = K_min + k_d[i]
     return LawParams(
-        K=gain(np.array(slowest - 1.0), k_d[:-1]),
+        K=gain(np.array(K_min - 1.0), k_d[:-1]),
         Lambda=np.full(m, 2.0),
         beta=beta,
         D=task.D,
@@ -142,17 +142,17 @@ def gains(task: Task, sign: Sign) -> LawParams:
 
 
 def fly(task: Task, law: LawParams, dt: float, bound: float = 100.0) -> FloatArray:
-    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above the bound: there the flight ends."""
+    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above the bound, which ends the flight."""
     period_ns, m = nanoseconds(dt), len(task.D)
     ideal = Actuators(np.zeros(m), np.full(m, -np.inf), np.full(m, np.inf), np.full(m, np.inf))
     hardware = PlantParams(task.aircraft, ideal, period_ns)
     y = task.reference.at(0.0) + task.e_0
-    flying, u = AircraftState(task.rotation[:, :m] @ y, np.zeros(m)), np.zeros(m)
+    aircraft_state, u = AircraftState(task.rotation[:, :m] @ y, np.zeros(m)), np.zeros(m)
     state = rise.engage(y, task.reference.at(0.0))
     errors = [state.e]
     for k in range(round(DURATION / dt)):
-        flying = plant.advance(k * period_ns, flying, u, period_ns, hardware)
-        y = dynamics.y(flying.x, task.aircraft)
+        aircraft_state = plant.advance(k * period_ns, aircraft_state, u, period_ns, hardware)
+        y = dynamics.y(aircraft_state.x, task.aircraft)
         state, u = rise.step(state, y, task.reference.at((k + 1) * dt), np.array(dt), law)
         errors.append(state.e)
         if np.abs(state.e).max() > bound:
@@ -160,8 +160,8 @@ def fly(task: Task, law: LawParams, dt: float, bound: float = 100.0) -> FloatArr
     return np.array(errors)
 
 
-def floor(task: Task, law: LawParams, dt: float) -> float:
-    """The largest error once settled."""
+def ultimate_bound(task: Task, law: LawParams, dt: float) -> float:
+    """The largest error after SETTLED."""
     return float(np.abs(fly(task, law, dt)[round(SETTLED / dt) :]).max())
 
 
@@ -169,49 +169,49 @@ TASKS = st.tuples(st.integers(2, 10), st.integers(1, 4), st.integers(0, 10**6))
 settle = settings(max_examples=15, deadline=None, derandomize=True)
 
 
-def drawn(sizes: tuple[int, int, int]) -> Task:
+def task_of(sizes: tuple[int, int, int]) -> Task:
     n, m, seed = sizes
-    return draw(n, min(m, n - 1), seed)  # n > m
+    return random_task(n, min(m, n - 1), seed)  # n > m
 
 
 @settle
 @given(sizes=TASKS)
-def test_the_signs_found_from_omega_are_those_it_was_built_from(sizes: tuple[int, int, int]) -> None:
-    task = drawn(sizes)
+def test_the_signs_of_omega_are_those_from_which_it_was_built(sizes: tuple[int, int, int]) -> None:
+    task = task_of(sizes)
     assert (signs(task.aircraft.C @ task.aircraft.B) == task.D).all()
     assert abscissa(task.aircraft.A) < 0.0
 
 
 @settle
 @given(sizes=TASKS)
-def test_implicit_sign_reaches_a_floor_that_falls_with_the_square_of_dt(sizes: tuple[int, int, int]) -> None:
-    # Measured on 74 aircraft: ratios 3.98 to 4.00, so 3 % is ten times what they scatter, and no other order lives there.
-    # The floor at 8 ms: 2e-5 to 1.3e-3 of signals of size 0.2 to 1.
-    task = drawn(sizes)
+def test_the_ultimate_bound_of_the_implicit_sign_falls_with_the_square_of_dt(sizes: tuple[int, int, int]) -> None:
+    # Measured with 74 aircraft: ratios 3.98 to 4.00, so 3 % is ten times their scatter and excludes any other order.
+    # The ultimate bound at 8 ms is 2e-5 to 1.3e-3, for signals of size 0.2 to 1.
+    task = task_of(sizes)
     law = gains(task, Sign.IMPLICIT)
-    coarse, fine = floor(task, law, DT), floor(task, law, DT / 2)
+    coarse, fine = ultimate_bound(task, law, DT), ultimate_bound(task, law, DT / 2)
     assert coarse < 0.005
     assert 3.88 < coarse / fine < 4.12
 
 
 @settle
 @given(sizes=TASKS)
-def test_literal_sign_reaches_a_floor_that_falls_with_dt(sizes: tuple[int, int, int]) -> None:
-    # A limit cycle, chaotic in detail: measured on 74 aircraft ratios of 1.4 to 2.5 about 1.9. No gain at all would be 1, the
-    # second order 4. The floor at 8 ms: 6e-4 to 0.032.
-    task = drawn(sizes)
+def test_the_ultimate_bound_of_the_literal_sign_falls_with_dt(sizes: tuple[int, int, int]) -> None:
+    # A chaotic limit cycle: measured with 74 aircraft, ratios are 1.4 to 2.5 with a mean of 1.9. No improvement would be 1,
+    # second order 4. The ultimate bound at 8 ms is 6e-4 to 0.032.
+    task = task_of(sizes)
     law = gains(task, Sign.LITERAL)
-    coarse, fine = floor(task, law, DT), floor(task, law, DT / 2)
+    coarse, fine = ultimate_bound(task, law, DT), ultimate_bound(task, law, DT / 2)
     assert coarse < 0.1
     assert 1.2 < coarse / fine < 3.2
 
 
 @settle
 @given(sizes=TASKS)
-def test_the_error_decreases_from_engagement_to_the_floor(sizes: tuple[int, int, int]) -> None:
+def test_the_error_decreases_from_engagement_to_the_ultimate_bound(sizes: tuple[int, int, int]) -> None:
     # Largest errors in the first second, in the third, and after 5 s. exp(-Lambda t) is 0.018 at 2 s, and the sign term is
-    # faster: measured on 150 aircraft at most 0.005 in the third second, which often is the floor already, and 0.006 after 5 s.
-    task = drawn(sizes)
+    # faster: measured with 150 aircraft at most 0.005 in the third second, often the ultimate bound, and 0.006 after 5 s.
+    task = task_of(sizes)
     errors = np.abs(fly(task, gains(task, Sign.IMPLICIT), DT)).max(axis=1)
     second = round(1.0 / DT)
     first, third, settled = errors[:second].max(), errors[2 * second : 3 * second].max(), errors[5 * second :].max()
@@ -222,9 +222,9 @@ def test_the_error_decreases_from_engagement_to_the_floor(sizes: tuple[int, int,
 @settle
 @given(sizes=TASKS, flipped=st.integers(0, 3))
 def test_one_wrong_sign_in_d_diverges(sizes: tuple[int, int, int], flipped: int) -> None:
-    # An odd number of wrong signs makes det(Omega D K Lambda) < 0, and with it the loop has a real exponential. Diverged: an
-    # error above 100, a hundred times the largest reference, within the 8 s in which the right D has long settled.
-    task = drawn(sizes)
+    # An odd number of wrong signs makes det(Omega D K Lambda) < 0, so the loop has a real unstable pole. Diverged: an error
+    # above 100, a hundred times the largest reference, within the 8 s after which the right D has settled.
+    task = task_of(sizes)
     assume(flipped < len(task.D))
     law = gains(task, Sign.IMPLICIT)
     wrong = law._replace(D=np.where(np.arange(len(task.D)) == flipped, -task.D, task.D))

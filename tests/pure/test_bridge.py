@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""When the bridge sends what: engagement, silence, the pilot, limits; on a clock of the test's own."""
+"""The bridge without ROS: engagement, failsafe, pilot override, saturation, stamps; the tests give the time."""
 
 import numpy as np
 import pytest
@@ -19,23 +19,23 @@ def at(t: float) -> int:
     return nanoseconds(1000.0 + t)
 
 
-def hear(bridge: Bridge, t: float, raw: float = 0.0) -> None:
+def receive_outputs(bridge: Bridge, t: float, raw: float = 0.0) -> None:
     for name in OUTPUTS:
         bridge.take_output(name, raw, at(t), at(t))
 
 
-def command(bridge: Bridge, t: float, u: float = 0.0, sender: str = "controller") -> None:
+def receive_u(bridge: Bridge, t: float, u: float = 0.0, sender: str = "controller") -> None:
     bridge.take_u(np.full(4, u), sender, at(t))
 
 
-def made(channel_map: ChannelMap = CHANNEL_MAP, *, dry_run: bool = False) -> Bridge:
+def new_bridge(channel_map: ChannelMap = CHANNEL_MAP, *, dry_run: bool = False) -> Bridge:
     return Bridge(channel_map, dry_run=dry_run)
 
 
-def engaged(channel_map: ChannelMap = CHANNEL_MAP) -> Bridge:
-    bridge = made(channel_map)
-    hear(bridge, 0.0)
-    command(bridge, 0.0)
+def engaged_bridge(channel_map: ChannelMap = CHANNEL_MAP) -> Bridge:
+    bridge = new_bridge(channel_map)
+    receive_outputs(bridge, 0.0)
+    receive_u(bridge, 0.0)
     assert bridge.engage(at(0.0)) == ""
     return bridge
 
@@ -46,59 +46,59 @@ def with_silence(neutral: float, release: float) -> ChannelMap:
     return ChannelMap.validate_mapping(content, "map")
 
 
-def test_it_engages_by_the_service_alone_and_only_with_all_that_it_needs() -> None:
-    bridge = made()
-    for missing, bring in (("q not received yet", hear), ("u not received yet", command)):
-        assert missing in bridge.engage(at(0.0))
+def test_only_the_service_engages_and_only_with_fresh_y_and_u() -> None:
+    bridge = new_bridge()
+    for reason, receive in (("q not received yet", receive_outputs), ("u not received yet", receive_u)):
+        assert reason in bridge.engage(at(0.0))
         assert bridge.step(at(0.0)) is Phase.DISENGAGED
-        bring(bridge, 0.0)
+        receive(bridge, 0.0)
     assert bridge.step(at(0.0)) is Phase.DISENGAGED
     assert bridge.engage(at(0.0)) == ""
     assert bridge.step(at(0.0)) is Phase.ENGAGED
 
 
-def test_it_refuses_what_is_old_and_says_which() -> None:
-    bridge = made()
-    hear(bridge, 0.0)
-    command(bridge, 0.3)
+def test_engagement_with_stale_inputs_is_refused_with_the_reason() -> None:
+    bridge = new_bridge()
+    receive_outputs(bridge, 0.0)
+    receive_u(bridge, 0.3)
     assert bridge.engage(at(0.3)).startswith("q is 0.30 s old (/ap/twist/filtered)")
-    hear(bridge, 0.6)
+    receive_outputs(bridge, 0.6)
     assert bridge.engage(at(0.6)) == "u is 0.30 s old"
 
 
 def test_a_dry_run_computes_but_never_sends_or_engages() -> None:
-    bridge = made(dry_run=True)
-    hear(bridge, 0.0)
-    command(bridge, 0.0, 0.1)
+    bridge = new_bridge(dry_run=True)
+    receive_outputs(bridge, 0.0)
+    receive_u(bridge, 0.0, 0.1)
     assert bridge.engage(at(0.0)).startswith("dry_run")
     assert not bridge.sends("joy", at(0.0))
     assert bridge.raw_u()[0] == pytest.approx(0.1 / 0.523599)
 
 
-def test_it_refuses_a_u_that_would_jump() -> None:
-    bridge = made()
-    hear(bridge, 0.0)
-    command(bridge, 0.0, 0.05)  # beyond a tenth of 0.26 rad
+def test_engagement_with_u_away_from_trim_is_refused() -> None:
+    bridge = new_bridge()
+    receive_outputs(bridge, 0.0)
+    receive_u(bridge, 0.0, 0.05)  # above a tenth of 0.26 rad
     assert bridge.engage(at(0.0)).startswith("u.elevator is 0.05 from trim")
 
 
 def test_u_stays_inside_its_limits_around_trim() -> None:
-    bridge = engaged()
-    command(bridge, 0.01, 9.0)
+    bridge = engaged_bridge()
+    receive_u(bridge, 0.01, 9.0)
     rows = CHANNEL_MAP.inputs.values()
     assert bridge.raw() == pytest.approx([to_raw(row.trim + row.upper, row.line) for row in rows])
-    command(bridge, 0.02, -9.0)
+    receive_u(bridge, 0.02, -9.0)
     assert bridge.raw() == pytest.approx([to_raw(row.trim + row.lower, row.line) for row in rows])
 
 
-def test_silence_of_u_brings_neutral_then_released_values_then_nothing() -> None:
-    bridge = engaged(with_silence(neutral=0.3, release=0.5))
+def test_a_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None:
+    bridge = engaged_bridge(with_silence(neutral=0.3, release=0.5))
     phases = []
     for t in np.arange(0.0, 1.2, 0.01).tolist():
-        hear(bridge, t + 1e-3)
+        receive_outputs(bridge, t + 1e-3)
         phases.append((bridge.step(at(t + 1e-3)), t, bridge.raw(), bridge.sends("joy", at(t))))
-    begins = {phase: next(t for one, t, *_ in phases if one is phase) for phase in Phase}
-    assert begins == pytest.approx(
+    starts = {phase: next(t for one, t, *_ in phases if one is phase) for phase in Phase}
+    assert starts == pytest.approx(
         {Phase.ENGAGED: 0.0, Phase.NEUTRAL: 0.2, Phase.RELEASE: 0.5, Phase.DISENGAGED: 1.0}, abs=0.011
     )  # a tick
     for phase, _, raw, sent in phases:
@@ -110,26 +110,26 @@ def test_silence_of_u_brings_neutral_then_released_values_then_nothing() -> None
     assert bridge.reason == "u is 0.20 s old"
 
 
-def test_what_returns_does_not_engage_again_by_itself() -> None:
-    bridge = engaged(with_silence(neutral=1.0, release=1.0))
-    hear(bridge, 0.3)
+def test_the_bridge_does_not_re_engage_by_itself() -> None:
+    bridge = engaged_bridge(with_silence(neutral=1.0, release=1.0))
+    receive_outputs(bridge, 0.3)
     assert bridge.step(at(0.3)) is Phase.NEUTRAL
-    command(bridge, 0.31)
+    receive_u(bridge, 0.31)
     assert bridge.step(at(0.32)) is Phase.NEUTRAL
-    assert bridge.engage(at(0.33)) == ""  # but it may be told to, at any time
+    assert bridge.engage(at(0.33)) == ""  # a request re-engages at any time
     assert bridge.step(at(0.33)) is Phase.ENGAGED
 
 
-def test_an_autopilot_that_is_silent_is_given_its_channels_back() -> None:
-    bridge = engaged()
-    command(bridge, 0.25)
+def test_a_timeout_of_y_releases_the_channels() -> None:
+    bridge = engaged_bridge()
+    receive_u(bridge, 0.25)
     assert bridge.step(at(0.25)) is Phase.RELEASE
     assert bridge.reason.startswith("q is 0.25 s old")
     assert bridge.step(at(0.76)) is Phase.DISENGAGED
 
 
-def test_the_pilot_disengages_at_once_and_no_one_engages_over_him() -> None:
-    bridge = engaged()
+def test_a_pilot_override_disengages_at_once_and_blocks_engagement() -> None:
+    bridge = engaged_bridge()
     bridge.take_override("gamepad", 0.0, at(0.01))
     assert bridge.step(at(0.01)) is Phase.ENGAGED
     bridge.take_override("gamepad", 1.0, at(0.02))
@@ -139,9 +139,9 @@ def test_the_pilot_disengages_at_once_and_no_one_engages_over_him() -> None:
     assert bridge.engage(at(0.05)) == ""
 
 
-def test_of_a_set_of_bits_those_count_that_are_the_pilots() -> None:
-    """ROSflight's rc_override: 0x01 to 0x20 are switches and sticks, 0x40 to 0x200 say that no command comes yet."""
-    bridge = made(load_map("rosflight"))
+def test_an_override_of_a_bit_field_counts_its_masked_bits() -> None:
+    """ROSflight's rc_override: 0x01 to 0x20 are switches and sticks, 0x40 to 0x200 flag missing commands."""
+    bridge = new_bridge(load_map("rosflight"))
     bridge.take_override("transmitter", float(0x40 | 0x80 | 0x100 | 0x200), at(0.0))
     assert not bridge.refusal(at(0.0)).startswith("pilot override")
     for bit in (0x01, 0x02, 0x04, 0x08, 0x10, 0x20):
@@ -149,50 +149,50 @@ def test_of_a_set_of_bits_those_count_that_are_the_pilots() -> None:
         assert bridge.refusal(at(0.0)) == "pilot override active: transmitter"
 
 
-def test_zero_times_stop_at_once() -> None:
-    bridge = engaged(with_silence(neutral=0.0, release=0.0))
-    hear(bridge, 0.3)
+def test_times_of_zero_skip_neutral_and_release_values() -> None:
+    bridge = engaged_bridge(with_silence(neutral=0.0, release=0.0))
+    receive_outputs(bridge, 0.3)
     assert bridge.step(at(0.3)) is Phase.DISENGAGED
 
 
-def test_a_second_controller_is_refused_until_the_first_is_silent() -> None:
-    bridge = made()
-    command(bridge, 0.0)
+def test_a_conflicting_publisher_of_u_is_refused_until_the_first_one_times_out() -> None:
+    bridge = new_bridge()
+    receive_u(bridge, 0.0)
     with pytest.raises(ChannelError, match="conflicting publisher second ignored: already receiving from controller"):
-        command(bridge, 0.1, sender="second")
-    command(bridge, 0.3, sender="second")
+        receive_u(bridge, 0.1, sender="second")
+    receive_u(bridge, 0.3, sender="second")
 
 
-def test_y_is_given_once_at_the_instant_of_its_rate_sample_and_only_while_all_are_fresh() -> None:
-    bridge = made()
+def test_y_is_returned_once_per_rate_sample_and_only_while_all_channels_are_fresh() -> None:
+    bridge = new_bridge()
     bridge.take_output("q", 0.5, at(0.0), at(0.01))
     assert bridge.y(at(0.01)) is None
-    hear(bridge, 0.02)
+    receive_outputs(bridge, 0.02)
     bridge.take_output("q", 0.5, at(0.03), at(0.03))
     sample = bridge.y(at(0.03))
     assert sample is not None
     assert sample.stamp_ns == at(0.03)
     assert sample.value.tolist() == [-0.5, -25.0, 0.0, 0.0]
     assert bridge.y(at(0.04)) is None
-    bridge.take_output("q", 0.5, at(0.25), at(0.25))  # the others are 0.23 s old, beyond 0.2 s
+    bridge.take_output("q", 0.5, at(0.25), at(0.25))  # the others are 0.23 s old, above 0.2 s
     assert bridge.y(at(0.25)) is None
 
 
 def test_stamps_of_another_clock_and_samples_out_of_order_are_refused() -> None:
-    bridge = made(load_map("mavros"))
+    bridge = new_bridge(load_map("mavros"))
     with pytest.raises(ChannelError, match="stamp: arrival") as refused:
-        bridge.take_output("q", 0.0, nanoseconds(12.0), at(0.0))  # since boot
+        bridge.take_output("q", 0.0, nanoseconds(12.0), at(0.0))  # time since boot
     assert refused.value.reason == "stamp"
     bridge.take_output("q", 0.0, at(0.0), at(0.0))
     with pytest.raises(ChannelError, match="before the last one"):
         bridge.take_output("q", 0.0, at(0.0), at(0.01))
 
 
-def test_heartbeats_begin_before_engagement_and_end_with_u() -> None:
-    bridge = made(load_map("px4"))
+def test_the_offboard_heartbeat_starts_before_engagement_and_ends_with_stale_inputs() -> None:
+    bridge = new_bridge(load_map("px4"))
     assert not bridge.sends("offboard", at(0.0))
-    hear(bridge, 0.0)
-    command(bridge, 0.0)
+    receive_outputs(bridge, 0.0)
+    receive_u(bridge, 0.0)
     assert bridge.sends("offboard", at(0.0))
     assert not bridge.sends("torque", at(0.0))
     for name in OUTPUTS[:3]:

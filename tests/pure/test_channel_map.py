@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Channel maps: each row of each map by values worked out by hand, the conversion, and what a map may not say.
+"""Channel maps: each row of each map against hand-worked values, the conversion, and the refusals of invalid maps.
 
-Messages of packages that are not installed (px4_msgs, mavros_msgs, rosflight_msgs, rosplane_msgs) are stood in for by plain
-objects with the published fields (tests/published_messages.py); those of common_interfaces are too here. Real ones of either
-kind are in tests/ros/test_bridge.py and test_published_messages.py.
+Plain objects with the published fields (tests/published_messages.py) replace the messages, because px4_msgs, mavros_msgs,
+rosflight_msgs and rosplane_msgs may not be installed. Tests with real messages are in tests/ros: test_bridge.py and
+test_published_messages.py.
 """
 
 import math
@@ -28,23 +28,23 @@ MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
 LINES = st.builds(Line, st.sampled_from((-1, 1)), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
 
 
-def thing(**fields: Any) -> SimpleNamespace:
+def message_like(**fields: Any) -> SimpleNamespace:
     return SimpleNamespace(**fields)
 
 
-FLU = thing(x=0.3, y=-0.2, z=-0.1)  # rolls right at 0.3 rad/s, nose up at 0.2, nose right at 0.1
-FRD = np.array([0.3, 0.2, 0.1], dtype=np.float32)  # the same motion, as fixed arrays of a message are
-MOTION = {"p": 0.3, "q": 0.2, "r": 0.1}  # what each of the maps has to make of it
+FLU = message_like(x=0.3, y=-0.2, z=-0.1)  # roll right at 0.3 rad/s, nose up at 0.2, nose right at 0.1
+FRD = np.array([0.3, 0.2, 0.1], dtype=np.float32)  # the same motion as a fixed array of a message
+MOTION = {"p": 0.3, "q": 0.2, "r": 0.1}  # the expected channels for each map
 RATES = {
-    "ardupilot": thing(twist=thing(linear=thing(x=9.0, y=9.0, z=9.0), angular=FLU)),
-    "mavros": thing(angular_velocity=FLU),
-    "px4": thing(angular_velocity=FRD),
-    "rosflight": thing(p=0.3, q=0.2, r=0.1, va=27.0),
+    "ardupilot": message_like(twist=message_like(linear=message_like(x=9.0, y=9.0, z=9.0), angular=FLU)),
+    "mavros": message_like(angular_velocity=FLU),
+    "px4": message_like(angular_velocity=FRD),
+    "rosflight": message_like(p=0.3, q=0.2, r=0.1, va=27.0),
 }
-AIRSPEED = {  # 27 m/s, which is 2 m/s above the trim of 25 m/s
-    "ardupilot": thing(vector=thing(x=-18.0, y=18.0, z=-9.0)),  # 9 (2, 2, 1), of length 27
-    "mavros": thing(airspeed=27.0),
-    "px4": thing(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
+AIRSPEED = {  # 27 m/s, 2 m/s above the trim of 25 m/s
+    "ardupilot": message_like(vector=message_like(x=-18.0, y=18.0, z=-9.0)),  # 9 (2, 2, 1), of length 27
+    "mavros": message_like(airspeed=27.0),
+    "px4": message_like(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
     "rosflight": RATES["rosflight"],
 }
 SENT = {  # elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to the right, rudder 0.1 rad to the right
@@ -70,12 +70,12 @@ def test_each_input_is_sent_in_the_autopilots_unit_and_sign(name: str) -> None:
     channel_map = load_map(name)
     for (path, expected), row in zip(SENT[name].items(), channel_map.inputs.values(), strict=True):
         assert path in (row.field, f"{row.message}.{row.field}")
-        assert to_raw(row.trim + 0.1, row.line) == pytest.approx(expected, abs=1e-3)  # us are whole ones anyway
+        assert to_raw(row.trim + 0.1, row.line) == pytest.approx(expected, abs=1e-3)  # the fields in us are integers
 
 
 @pytest.mark.parametrize("name", FOREIGN_MAPS)
-def test_each_field_of_a_map_is_published_and_takes_what_the_map_puts_into_it(name: str) -> None:
-    """float32 has 24 bits: what is put in comes back to 1e-7 of itself; what is a whole number comes back to half a unit."""
+def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name: str) -> None:
+    """A float32 has 24 bits, so a value is kept to 1e-7 of its size; an integer field rounds to half a unit."""
     channel_map = load_map(name)
     foreign = {key: kind_ for key, _, kind_ in channel_map.used_topics() if kind_ in PUBLISHED}
     messages = {key: blank(kind_) for key, kind_ in foreign.items()}
@@ -106,7 +106,7 @@ def test_each_field_of_a_map_is_published_and_takes_what_the_map_puts_into_it(na
 
 
 @pytest.mark.parametrize("name", MAPS)
-def test_each_map_sends_nothing_by_default_and_says_where_each_row_is_from(name: str) -> None:
+def test_each_map_is_a_dry_run_by_default_and_names_the_source_of_each_row(name: str) -> None:
     channel_map = load_map(name)
     assert channel_map.dry_run
     assert list(channel_map.outputs) == ["q", "V", "p", "r"]
@@ -118,7 +118,7 @@ def test_each_map_sends_nothing_by_default_and_says_where_each_row_is_from(name:
         assert to_channel(row.neutral, row.line) == pytest.approx(row.trim, abs=1e-6)
 
 
-def test_ardupilots_map_needs_the_message_types_of_common_interfaces_alone() -> None:
+def test_the_map_ardupilot_needs_only_message_types_of_common_interfaces() -> None:
     types = {kind for _, _, kind in load_map("ardupilot").used_topics()}
     assert types == {"geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Vector3Stamped", "sensor_msgs/msg/Joy"}
 
@@ -131,17 +131,17 @@ def test_sending_a_value_and_reading_it_back_gives_the_value(line: Line, channel
 @given(LINES, st.floats(-1e4, 1e4), st.floats(1e-3, 1e3))
 def test_a_channel_rises_with_the_raw_value_by_its_sign_and_scale(line: Line, raw: float, more: float) -> None:
     rise = to_channel(raw + more, line) - to_channel(raw, line)
-    assert rise == pytest.approx(line.sign * line.scale * more, rel=1e-6, abs=1e-5)  # cancellation beside 1e7
+    assert rise == pytest.approx(line.sign * line.scale * more, rel=1e-6, abs=1e-5)  # cancellation with terms of 1e7
 
 
 @given(st.floats(0.0, 300.0))
 def test_the_speed_of_a_dynamic_pressure_is_the_one_that_makes_it(speed: float) -> None:
-    message = thing(fluid_pressure=0.5 * 1.225 * speed**2)
+    message = message_like(fluid_pressure=0.5 * 1.225 * speed**2)
     assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == pytest.approx(speed, abs=1e-6)
 
 
 def test_fields_are_reached_by_their_paths() -> None:
-    message = thing(twist=thing(angular=thing(y=1.5)), axes=[0.0, 2.5], parts=[thing(z=3.5)])
+    message = message_like(twist=message_like(angular=message_like(y=1.5)), axes=[0.0, 2.5], parts=[message_like(z=3.5)])
     assert get_field(message, "twist.angular.y") == 1.5
     assert get_field(message, "axes[1]") == 2.5
     set_field(message, "parts[0].z", 4.5)
@@ -151,8 +151,8 @@ def test_fields_are_reached_by_their_paths() -> None:
             get_field(message, path)
 
 
-def test_whole_numbers_are_rounded_and_never_wrapped() -> None:
-    message = thing(channels=np.zeros(18, dtype=np.uint16))
+def test_values_of_integer_fields_are_rounded_and_never_wrapped() -> None:
+    message = message_like(channels=np.zeros(18, dtype=np.uint16))
     set_field(message, "channels[1]", 1595.5001)
     assert message.channels[1] == 1596
     for wrong in (math.nan, -1.0, 70000.0):
@@ -164,21 +164,21 @@ def test_whole_numbers_are_rounded_and_never_wrapped() -> None:
 @pytest.mark.parametrize("raw", [math.nan, math.inf])
 def test_a_value_that_is_not_finite_is_refused(raw: float) -> None:
     with pytest.raises(ChannelError, match="not finite") as refused:
-        read_raw(thing(q=raw), "q", "value")
+        read_raw(message_like(q=raw), "q", "value")
     assert refused.value.reason == "finite"
 
 
-def test_a_missing_message_package_is_one_sentence_that_says_what_to_install() -> None:
+def test_a_missing_message_package_is_one_sentence_that_names_the_package_to_install() -> None:
     with pytest.raises(ParameterError, match=r"px4_msgs/msg/VehicleOdometry: .*ros-jazzy-px4-msgs"):
         message_type("px4_msgs/msg/VehicleOdometry")
 
 
 def test_a_message_that_another_version_lacks_is_one_sentence() -> None:
     with pytest.raises(ParameterError, match="no Airspeed in the installed ardupilot_msgs"):
-        message_type("ardupilot_msgs/msg/Airspeed", lambda name: thing())
+        message_type("ardupilot_msgs/msg/Airspeed", lambda name: message_like())
 
 
-# What a map may not say: (place, value) and the sentence.
+# Invalid values: (key path, value) and the sentence of the refusal.
 REFUSALS = (
     (("outputs", "q", "sign"), 2, r"map test\.outputs\.q\.sign: found 2, expected 1 or -1|-1 or 1"),
     (("outputs", "q", "scale"), 0.0, r"map test\.outputs\.q\.scale: found 0\.0"),
@@ -209,7 +209,7 @@ def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], va
     content = yaml.safe_load((LIBRARY / "ardupilot.yaml").read_text(encoding="utf-8"))
     part = content
     for key in place[:-1]:
-        part[key] = dict(part[key])  # merged keys share what they hold
+        part[key] = dict(part[key])  # merged keys share one object
         part = part[key]
     part[place[-1]] = value
     with pytest.raises(ParameterError, match=sentence) as refused:
@@ -217,7 +217,7 @@ def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], va
     assert "\n" not in str(refused.value)
 
 
-def test_a_map_that_is_not_there_is_one_sentence(tmp_path: Path) -> None:
+def test_a_missing_map_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(
         ParameterError, match=r"bridge\.map: found 'nowhere', expected one of ardupilot, mavros, px4, rosflight"
     ):

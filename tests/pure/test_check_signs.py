@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di check-signs`: a map that would turn the loop around is refused before anything is sent."""
+"""`rise-di check-signs`: a map with a wrong sign is refused before anything is sent."""
 
 import json
 from pathlib import Path
@@ -42,7 +42,7 @@ def changed(name: str, kind: str, channel: str, **values: Any) -> ChannelMap:
 
 
 def listed(value: Any) -> Any:
-    """With lists for tuples, as YAML has them."""
+    """The value with lists in place of tuples, for YAML."""
     if isinstance(value, dict):
         return {key: listed(one) for key, one in value.items()}
     return [listed(one) for one in value] if isinstance(value, tuple) else value
@@ -56,9 +56,9 @@ def written(channel_map: ChannelMap, folder: Path) -> str:
 
 @pytest.mark.parametrize("name", MAPS)
 def test_the_shipped_maps_fit_the_controller_of_the_osprey(name: str) -> None:
-    shown = CliRunner().invoke(app, ["check-signs", name, "--json"])
-    assert shown.exit_code == 0
-    assert [(one["output"], one["input"], one["D"]) for one in json.loads(shown.stdout)["channels"]] == [
+    result = CliRunner().invoke(app, ["check-signs", name, "--json"])
+    assert result.exit_code == 0
+    assert [(one["output"], one["input"], one["D"]) for one in json.loads(result.stdout)["channels"]] == [
         ("q", "elevator", 1),
         ("p", "aileron", 1),
         ("r", "rudder", 1),
@@ -75,12 +75,12 @@ def test_through_a_map_of_the_right_signs_omega_is_that_of_the_airframe() -> Non
 @pytest.mark.parametrize("name", MAPS)
 def test_an_input_with_the_wrong_sign_changes_its_own_d_only(name: str, channel: str) -> None:
     row, k = load_map(name).inputs[channel], INPUTS.index(channel)
-    span = sum(row.range)  # the sign turns about the middle, so that trim stays inside the range
+    span = sum(row.range)  # the sign changes about the middle, so that trim stays inside the range
     flipped = changed(name, "inputs", channel, sign=-row.sign, offset=row.offset + row.sign * row.scale * span)
-    found = check(flipped, omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1))
-    assert [one.D for one in found.channels] == [-1 if i == k else 1 for i in range(4)]
-    assert len(found.contradictions) == 1
-    assert f"D of {OUTPUTS[k]} and {channel} is -1, the controller has +1" in found.contradictions[0]
+    checked = check(flipped, omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1))
+    assert [one.D for one in checked.channels] == [-1 if i == k else 1 for i in range(4)]
+    assert len(checked.contradictions) == 1
+    assert f"D of {OUTPUTS[k]} and {channel} is -1, the controller has +1" in checked.contradictions[0]
 
 
 @pytest.mark.parametrize("channel", OUTPUTS)
@@ -90,18 +90,18 @@ def test_two_wrong_signs_that_cancel_in_d_are_still_a_contradiction(channel: str
     row = flipped.inputs[INPUTS[k]]
     content = flipped.model_dump()
     content["inputs"][INPUTS[k]] |= {"sign": -row.sign}
-    found = check(ChannelMap.validate_mapping(content, "map"), omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1))
-    assert [one.D for one in found.channels] == [1, 1, 1, 1]
-    assert f"outputs.{channel} of the map ardupilot has the wrong sign" in found.contradictions[0]
+    checked = check(ChannelMap.validate_mapping(content, "map"), omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1))
+    assert [one.D for one in checked.channels] == [1, 1, 1, 1]
+    assert f"outputs.{channel} of the map ardupilot has the wrong sign" in checked.contradictions[0]
 
 
 def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> None:
     path = written(changed("ardupilot", "inputs", "elevator", sign=-1), tmp_path)
-    shown = CliRunner().invoke(app, ["check-signs", path])
-    assert shown.exit_code == 1
+    result = CliRunner().invoke(app, ["check-signs", path])
+    assert result.exit_code == 1
     assert (
         "error: with the map ardupilot D of q and elevator is -1, the controller has +1: a positive elevator makes"
-        in shown.stderr
+        in result.stderr
     )
 
 
@@ -116,10 +116,10 @@ def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> No
     ids=lambda one: " ".join(one) if isinstance(one, tuple) else "",
 )
 def test_options_that_contradict_a_bridge_are_refused(options: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
-    shown = CliRunner().invoke(app, ["fly", "osprey_gust", *options, "--runs", str(tmp_path)])
-    assert isinstance(shown.exception, ParameterError)
-    assert str(shown.exception).startswith(sentence)
-    assert not list(tmp_path.iterdir())  # refused before anything is made
+    result = CliRunner().invoke(app, ["fly", "osprey_gust", *options, "--runs", str(tmp_path)])
+    assert isinstance(result.exception, ParameterError)
+    assert str(result.exception).startswith(sentence)
+    assert not list(tmp_path.iterdir())  # refused before a run folder is created
 
 
 def test_a_map_of_other_channels_or_motions_is_one_sentence() -> None:
@@ -129,11 +129,11 @@ def test_a_map_of_other_channels_or_motions_is_one_sentence() -> None:
         through(changed("ardupilot", "inputs", "elevator", positive="roll right"), omega_of_the_osprey())
 
 
-# What a recorded flight shows
+# Estimate from a recorded flight
 
 
 def excited(Omega: FloatArray, noise: float) -> tuple[Signal, Signal]:
-    """y_dot = -2 y + Omega u at 100 Hz for 20 s, each input in steps of its own period; integrated exactly between samples."""
+    """y_dot = -2 y + Omega u at 100 Hz for 20 s, each input in steps of its own period; exact between samples."""
     generator = np.random.default_rng(1)
     t = 0.01 * np.arange(2000)
     periods = np.array([1.1, 1.7, 2.3, 2.9])
@@ -154,11 +154,11 @@ def test_an_excited_flight_gives_omega_back() -> None:
 
 
 def test_noise_makes_the_estimate_uncertain_but_not_wrong() -> None:
-    """Ten times the noise of osprey_servo: of the strong channels it is sure, and of no sign is it sure and wrong."""
+    """With ten times the noise of osprey_servo the strong channels are certain, and no certain sign is wrong."""
     Omega = np.diag([50.0, -80.0, 1.0, -0.1])
     y, u = excited(Omega, noise=0.02)
-    found = estimate(y, u, OUTPUTS, INPUTS)
-    diagonal, ratio = np.diag(found.Omega), np.diag(found.ratio)
+    measured = estimate(y, u, OUTPUTS, INPUTS)
+    diagonal, ratio = np.diag(measured.Omega), np.diag(measured.ratio)
     assert (ratio[:2] > MIN_ERROR_RATIO).all()
     assert ratio[3] < MIN_ERROR_RATIO
     assert all(np.sign(diagonal[k]) == np.sign(Omega[k, k]) for k in range(4) if ratio[k] > MIN_ERROR_RATIO)
@@ -171,15 +171,15 @@ def test_a_recorded_flight_of_the_osprey_shows_the_signs_of_its_omega() -> None:
     right = check(load_map("ardupilot"), omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1), measured)
     assert not right.contradictions
     wrong = changed("ardupilot", "inputs", "rudder", positive="nose left")
-    found = check(wrong, omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, -1, 1), measured)
-    assert len(found.contradictions) == 1
-    assert "the recorded flight has r_dot rise with rudder" in found.contradictions[0]
+    checked = check(wrong, omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, -1, 1), measured)
+    assert len(checked.contradictions) == 1
+    assert "the recorded flight has r_dot rise with rudder" in checked.contradictions[0]
 
 
 def test_a_log_with_a_constant_input_or_too_few_samples_is_refused() -> None:
     y, u = excited(np.eye(4), noise=0.0)
-    still = Signal(u.stamp_ns, u.names, u.values * np.array([1.0, 1.0, 0.0, 1.0]))
+    constant = Signal(u.stamp_ns, u.names, u.values * np.array([1.0, 1.0, 0.0, 1.0]))
     with pytest.raises(ParameterError, match=r"u\.rudder of the log: found a value that never changes"):
-        estimate(y, still, OUTPUTS, INPUTS)
+        estimate(y, constant, OUTPUTS, INPUTS)
     with pytest.raises(ParameterError, match=r"the log: found 2 intervals"):
         estimate(y, u.until(nanoseconds(0.12)), OUTPUTS, INPUTS)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Omega = S D U: the factors, what D depends on, what is refused, and which pairing of channels gives D = I."""
+"""Omega = S D U: the factors, the dependence of D, refusals, and the pairing of channels with D = I."""
 
 import math
 
@@ -50,7 +50,7 @@ def product(sdu: SDU) -> FloatArray:
 
 
 def decomposed(Omega: FloatArray) -> SDU:
-    """Leave out the examples that have no S D U."""
+    """S D U of Omega; examples without it are left out."""
     try:
         return decompose(Omega)
     except DecompositionError:
@@ -66,10 +66,10 @@ def osprey() -> FloatArray:
 
 
 @given(matrices())
-def test_the_factors_have_the_shapes_that_the_paper_asks_for(Omega: FloatArray) -> None:
+def test_the_factors_have_the_structure_that_the_paper_requires(Omega: FloatArray) -> None:
     S, D, U = decomposed(Omega)
     assert np.array_equal(S, S.T)
-    # A Cholesky factor exists for positive definite matrices alone; the shift is the rounding of the entries of S.
+    # A Cholesky factor exists only for positive definite matrices; the shift is the rounding of the entries of S.
     np.linalg.cholesky(S + EPSILON * len(S) * np.diag(np.diag(S)))
     assert set(D) <= {-1.0, 1.0}
     assert np.array_equal(U, np.triu(U))
@@ -80,17 +80,17 @@ def test_the_factors_have_the_shapes_that_the_paper_asks_for(Omega: FloatArray) 
 def test_the_product_of_the_factors_is_omega_to_machine_precision(Omega: FloatArray) -> None:
     sdu = decomposed(Omega)
     residual = np.linalg.norm(product(sdu) - Omega)
-    # 1.0 was the largest of 20 000 random matrices of up to 6 channels with entries over 6 decades; times 10.
+    # The largest of 20 000 random matrices with up to 6 channels and entries over 6 decades was 1.0; the bound is 10.
     assert residual <= 10.0 * len(Omega) * EPSILON * np.linalg.norm(sdu.S) * np.linalg.norm(sdu.U)
 
 
 @given(factors())
-def test_factors_put_together_come_back_as_they_are_unique(known: SDU) -> None:
-    found = decompose(product(known))
-    # S has eigenvalues in [1, 101]: its rounding is amplified by far less than 1e6, which 1e-10 leaves room for.
-    np.testing.assert_allclose(found.S, known.S, rtol=1e-10, atol=1e-10 * float(np.max(known.S)))
-    np.testing.assert_array_equal(found.D, known.D)
-    np.testing.assert_allclose(found.U, known.U, atol=1e-10 * float(np.max(known.S)))
+def test_unique_factors_are_recovered_from_their_product(known: SDU) -> None:
+    recovered = decompose(product(known))
+    # S has eigenvalues in [1, 101]: rounding is amplified by far less than 1e6, which a tolerance of 1e-10 allows.
+    np.testing.assert_allclose(recovered.S, known.S, rtol=1e-10, atol=1e-10 * float(np.max(known.S)))
+    np.testing.assert_array_equal(recovered.D, known.D)
+    np.testing.assert_allclose(recovered.U, known.U, atol=1e-10 * float(np.max(known.S)))
 
 
 @given(matrices())
@@ -102,7 +102,7 @@ def test_d_is_the_sign_of_the_ratios_of_leading_minors(Omega: FloatArray) -> Non
 
 
 @given(matrices(), st.data())
-def test_flipping_an_input_flips_its_own_d_alone(Omega: FloatArray, data: st.DataObject) -> None:
+def test_a_sign_change_of_an_input_changes_its_own_d_only(Omega: FloatArray, data: st.DataObject) -> None:
     D = decomposed(Omega).D
     k = data.draw(st.integers(0, len(Omega) - 1))
     flip = np.where(np.arange(len(Omega)) == k, -1.0, 1.0)
@@ -111,7 +111,7 @@ def test_flipping_an_input_flips_its_own_d_alone(Omega: FloatArray, data: st.Dat
 
 @given(matrices(), st.data())
 def test_units_of_inputs_and_outputs_do_not_change_d(Omega: FloatArray, data: st.DataObject) -> None:
-    # Clear of the limit of 1e-9: its distance is measured in equilibrated units, which other units move by a factor.
+    # Far from the limit of 1e-9, which holds for equilibrated units and changes by a factor with other units.
     D = decomposed(Omega).D
     assume(all(abs(minor) > 1e-6 for minor in leading_minors(Omega)))
     units = arrays(np.float64, len(Omega), elements=st.sampled_from([1e-3, 0.01, 0.3048, 1.0, 57.3, 1e4]))
@@ -128,7 +128,7 @@ def test_coupling_depends_on_neither_units_nor_signs_of_the_inputs(Omega: FloatA
 
 @given(matrices())
 @settings(max_examples=30)  # up to 14 400 orders of five channels
-def test_what_search_finds_has_d_equal_to_one_and_the_u_it_says(Omega: FloatArray) -> None:
+def test_search_returns_a_pairing_with_identity_d_and_its_u(Omega: FloatArray) -> None:
     pairing = search(Omega)
     assume(pairing is not None)
     assert pairing is not None
@@ -139,7 +139,7 @@ def test_what_search_finds_has_d_equal_to_one_and_the_u_it_says(Omega: FloatArra
 
 
 @given(matrices())
-def test_where_omega_has_s_d_u_flipping_inputs_by_d_is_the_whole_change(Omega: FloatArray) -> None:
+def test_search_changes_only_input_signs_where_omega_has_s_d_u(Omega: FloatArray) -> None:
     D = decomposed(Omega).D
     pairing = search(Omega)
     assert pairing is not None
@@ -162,7 +162,7 @@ def test_a_positive_diagonal_does_not_make_d_one() -> None:
     np.testing.assert_array_equal(U, [[1.0, 4.0], [0.0, 1.0]])
 
 
-def test_a_nonsingular_omega_without_s_d_u_is_refused_by_the_number_of_its_minor() -> None:
+def test_a_nonsingular_omega_without_s_d_u_is_refused_with_the_number_of_its_minor() -> None:
     with pytest.raises(DecompositionError, match=r"^Omega: found leading minor 1 zero .*, expected .*") as caught:
         decompose(np.array([[0.0, 1.0], [1.0, 0.0]]))
     assert caught.value.minor == 1
@@ -173,7 +173,7 @@ def test_a_nonsingular_omega_without_s_d_u_is_refused_by_the_number_of_its_minor
     ("Omega", "minor"),
     [
         ([[0.0, 0.0], [0.0, 0.0]], 1),
-        ([[1e-17, 1.0], [1.0, 0.0]], 1),  # a zero that rounding filled in
+        ([[1e-17, 1.0], [1.0, 0.0]], 1),  # zero up to rounding
         ([[1.0, 1.0], [1.0, 1.0]], 2),
         ([[1.0, 1.0], [1.0, 1.0 + 1e-12]], 2),
         ([[1.0, 0.1, 0.0], [0.1, 0.01, 1.0], [0.0, 1.0, 1.0]], 2),  # 0.1 * 0.1 is not 0.01 in floating point
@@ -188,12 +188,12 @@ def test_a_minor_that_is_zero_up_to_rounding_is_refused_in_any_unit(Omega: list[
     assert caught.value.minor == minor
 
 
-def test_a_minor_that_is_small_in_its_units_alone_is_not_refused() -> None:
+def test_a_minor_that_is_small_only_in_its_units_is_accepted() -> None:
     np.testing.assert_array_equal(signs(np.diag([1e-200, 1e200])), [1.0, 1.0])
 
 
 def test_a_minor_of_one_part_in_a_million_still_has_a_sign() -> None:
-    # Published derivatives have two to five digits: what is told apart by a sixth digit must not be refused.
+    # Published derivatives have two to five digits: a difference in the sixth digit must be accepted.
     np.testing.assert_array_equal(signs(np.array([[1.0, 1.0], [1.0, 1.0 - 1e-6]])), [1.0, -1.0])
 
 
@@ -207,18 +207,18 @@ def test_a_minor_of_one_part_in_a_million_still_has_a_sign() -> None:
         (np.array([[1.0, 0.0], [0.0, math.inf]]), r"Omega: found .*inf.*, expected finite values"),
     ],
 )
-def test_what_is_not_a_square_of_numbers_is_refused(Omega: FloatArray, sentence: str) -> None:
+def test_a_matrix_that_is_not_square_or_not_finite_is_refused(Omega: FloatArray, sentence: str) -> None:
     for function in (decompose, signs, leading_minors, unit_diagonal, coupling, search):
         with pytest.raises(DecompositionError, match=sentence):
             function(Omega)
 
 
-def test_leading_minors_answers_zeros() -> None:
+def test_leading_minors_may_be_zero() -> None:
     np.testing.assert_array_equal(leading_minors(np.array([[0.0, 1.0], [1.0, 0.0]])), [0.0, -1.0])
 
 
-def test_the_osprey_has_d_equal_to_one_and_hardly_any_coupling() -> None:
-    # Channels q, V, p, r and elevator, thrust, aileron, rudder, positive as the airframe file says.
+def test_the_osprey_has_identity_d_and_little_coupling() -> None:
+    # Channels q, V, p, r and elevator, thrust, aileron, rudder, with the signs of the airframe file.
     np.testing.assert_array_equal(signs(osprey()), [1.0, 1.0, 1.0, 1.0])
     assert coupling(osprey()) == pytest.approx(0.058, abs=5e-4)
 
@@ -239,21 +239,21 @@ def test_rudder_paired_with_roll_rate_flips_a_d_and_makes_u_large() -> None:
     assert U[2, 3] == pytest.approx(-83.5, abs=1e-9)
 
 
-def test_search_flips_a_bad_pairing_unless_told_how_large_u_may_be() -> None:
+def test_search_keeps_a_bad_pairing_unless_u_is_limited() -> None:
     swapped = osprey()[:, [0, 1, 3, 2]]
-    flipped = search(swapped)
-    assert flipped is not None
-    assert flipped.inputs == (0, 1, 2, 3)
-    assert flipped.signs == (1, 1, -1, 1)
-    repaired = search(swapped, largest_U=1.0)
-    assert repaired is not None
-    assert repaired.outputs == (0, 1, 2, 3)
-    assert repaired.inputs == (0, 1, 3, 2)
-    assert repaired.signs == (1, 1, 1, 1)
-    assert float(np.max(np.abs(repaired.U - np.eye(4)))) == pytest.approx(0.058, abs=5e-4)
+    sign_change = search(swapped)
+    assert sign_change is not None
+    assert sign_change.inputs == (0, 1, 2, 3)
+    assert sign_change.signs == (1, 1, -1, 1)
+    re_paired = search(swapped, largest_U=1.0)
+    assert re_paired is not None
+    assert re_paired.outputs == (0, 1, 2, 3)
+    assert re_paired.inputs == (0, 1, 3, 2)
+    assert re_paired.signs == (1, 1, 1, 1)
+    assert float(np.max(np.abs(re_paired.U - np.eye(4)))) == pytest.approx(0.058, abs=5e-4)
 
 
-def test_search_pairs_anew_where_no_signs_help() -> None:
+def test_search_changes_the_pairing_where_sign_changes_do_not_suffice() -> None:
     pairing = search(np.array([[0.0, 1.0], [1.0, 0.0]]))
     assert pairing is not None
     assert pairing.outputs == (0, 1)
@@ -263,25 +263,25 @@ def test_search_pairs_anew_where_no_signs_help() -> None:
 
 @pytest.mark.parametrize(("near", "far", "inputs"), [(1.0, 0.1, (1, 2, 0)), (0.1, 1.0, (2, 0, 1))])
 def test_search_prefers_the_smaller_u_among_equal_changes(near: float, far: float, inputs: tuple[int, ...]) -> None:
-    # No output responds to its own input, so all three are paired anew, one way round or the other.
+    # No output responds to its own input, so the pairing of all three changes in one of two ways.
     pairing = search(np.array([[0.0, near, far], [far, 0.0, near], [near, far, 0.0]]))
     assert pairing is not None
     assert pairing.inputs == inputs
-    assert float(np.max(np.abs(pairing.U - np.eye(3)))) < 0.2  # the other way round it is above 1
+    assert float(np.max(np.abs(pairing.U - np.eye(3)))) < 0.2  # it is above 1 for the other pairing
 
 
 def test_search_finds_nothing_for_a_singular_omega() -> None:
     assert search(np.array([[1.0, 2.0], [2.0, 4.0]])) is None
 
 
-def test_coupling_is_infinite_where_an_output_ignores_its_own_input() -> None:
+def test_coupling_is_infinite_where_an_output_does_not_respond_to_its_own_input() -> None:
     assert coupling(np.array([[1.0, 1.0], [1.0, 0.0]])) == math.inf
     with pytest.raises(DecompositionError, match="found Omega_22 = 0"):
         unit_diagonal(np.array([[1.0, 1.0], [1.0, 0.0]]))
 
 
-def test_fifty_percent_on_every_entry_never_changes_d_of_the_osprey() -> None:
+def test_an_uncertainty_of_50_percent_per_entry_does_not_change_d_of_the_osprey() -> None:
     generator = np.random.default_rng(20101)
     Omega = osprey()
-    for _ in range(1000):  # 5000 give none either; 90 % gives 2 to 4 in 10 000
+    for _ in range(1000):  # also none in 5000; with 90 % 2 to 4 in 10 000
         np.testing.assert_array_equal(signs(Omega * generator.uniform(0.5, 1.5, Omega.shape)), np.ones(4))

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Engagement in flight: whenever the law comes, goes or takes other gains, u does not jump and tracking goes on.
+"""Bumpless transfer in flight: engagement, re-engagement and new gains do not make u jump, and tracking recovers.
 
-The servos of scenario osprey_servo, without noise, on sines, at 100 Hz and in steps of 5 ms, ticked as the node ticks. At ten
-random instants, one in each 4 s of 40, something happens.
+The servos are those of scenario osprey_servo, without noise, with sines as commands, at 100 Hz and in steps of 5 ms. The
+loop calls the controller as the node does. Events happen at ten random instants, one in each 4 s of 40 s.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from rise_di_controller.params import ControllerParameters
 
 PERIOD_NS = 10_000_000
 TICKS = 4000
-SINES = {  # u never rests; p small, for what it turns while nobody flies is a bank that the rudder has to hold against
+SINES = {  # u always moves; p is small, because the bank that builds up without control loads the rudder
     "q": {"amplitude": 0.1, "frequency": 1.0},
     "V": {"amplitude": 1.0, "frequency": 0.3},
     "p": {"amplitude": 0.1, "frequency": 0.8, "phase": 0.4},
@@ -42,25 +42,25 @@ OUTPUTS = [AIRFRAME.outputs.index(name) for name in SERVO.controller.outputs]  #
 INPUTS = [SERVO.controller.inputs.index(name) for name in AIRFRAME.inputs]  # and back
 LIMITS = SERVO.controller.guard().limits
 RANGE = LIMITS.upper - LIMITS.lower  # 60 deg and 100 %
-ROUNDING = 1e-12 * RANGE  # u is a sum of some ten terms below its range, each rounded to 1e-16 of it
+ROUNDING = 1e-12 * RANGE  # u is a sum of about ten terms within its range, each with a rounding error of 1e-16 of it
 
 
-class Given(NamedTuple):
-    """What the controller is given in a tick."""
+class Conditions(NamedTuple):
+    """Conditions of one tick."""
 
-    y: bool = True  # whether a fresh y comes
-    y_m: bool = True  # whether a fresh y_m comes
+    y: bool = True  # whether a fresh y is received
+    y_m: bool = True  # whether a fresh y_m is received
     active: bool = True
     parameters: ControllerParameters = SERVO.controller
 
 
 class Tick(NamedTuple):
-    """One tick of the controller."""
+    """Record of one tick of the controller."""
 
     before: ControllerState
     after: ControllerState
-    old: LawParams  # before it
-    new: LawParams  # in it
+    old: LawParams  # before the tick
+    new: LawParams  # in the tick
     dt: float  # 0 where the law took no step
     error: FloatArray  # C x - y_m, in the law's order
 
@@ -72,48 +72,48 @@ def references() -> FloatArray:
     return np.column_stack([y_m[name] for name in SERVO.controller.outputs])
 
 
-def fly(given: Callable[[int], Given]) -> list[Tick]:
-    """Fly the scenario; new parameters are taken between two ticks, without a jump, as the node takes them."""
+def fly(conditions: Callable[[int], Conditions]) -> list[Tick]:
+    """Simulate the scenario. New parameters are taken between two ticks by `retune`, as in the node."""
     hardware = SERVO.aircraft.plant()
-    aircraft, state, old = plant.initial_state(hardware), guard.initial_state(4), given(0).parameters.law()
+    aircraft, state, old = plant.initial_state(hardware), guard.initial_state(4), conditions(0).parameters.law()
     y: StampedVector | None = None
     y_m: list[StampedVector] = []
-    flown = []
+    records = []
     for k in range(TICKS):
-        now_ns, now = k * PERIOD_NS, given(k)
+        now_ns, now = k * PERIOD_NS, conditions(k)
         if k > 0:
             aircraft = plant.advance(now_ns - PERIOD_NS, aircraft, state.u[INPUTS], PERIOD_NS, hardware)
         measured, reference = dynamics.y(aircraft.x, hardware.aircraft)[OUTPUTS], references()[k]
         y = StampedVector(now_ns, measured) if now.y else y
         y_m = [*y_m[-15:], StampedVector(now_ns, reference)] if now.y_m else y_m
         before, law = state, now.parameters.law()
-        if state.law is not None and now.parameters != given(max(k - 1, 0)).parameters:
+        if state.law is not None and now.parameters != conditions(max(k - 1, 0)).parameters:
             state = state._replace(law=retune(state.law, old, law))
-        state, used = guard.tick(state, now_ns, y, y_m, now.parameters.guard(), law, now.active)
-        flown.append(Tick(before, state, old, law, used.dt if used is not None else 0.0, measured - reference))
+        state, inputs = guard.tick(state, now_ns, y, y_m, now.parameters.guard(), law, now.active)
+        records.append(Tick(before, state, old, law, inputs.dt if inputs is not None else 0.0, measured - reference))
         old = law
-    return flown
+    return records
 
 
 def instants(seed: int) -> list[int]:
-    """Ten random ticks, one in each 4 s: the first 1.5 s of each, so that 2.5 s remain for what begins there."""
+    """Ten random ticks, one in the first 1.5 s of each 4 s, so that 2.5 s remain for the event."""
     return [400 * i + int(offset) for i, offset in enumerate(np.random.default_rng(seed).integers(10, 150, 10))]
 
 
 def step_of_the_law(tick: Tick) -> FloatArray:
-    """By how much (23) may move u in a tick, sampled: input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2) + dt beta)."""
+    """Largest change of u by (23) in a tick: input_scale (K abs(e - e_p + Lambda dt (e + e_p) / 2) + dt beta)."""
     assert tick.before.law is not None
     assert tick.after.law is not None
     law, e, e_p = tick.new, tick.after.law.e, tick.before.law.e
-    # With the literal sign, used before it is updated, the last increment of Pi before a change is still to come.
+    # The literal sign uses Pi before its update, so the last increment before a change of the gains is still pending.
     beta = np.maximum(tick.old.beta, law.beta)
-    moved: FloatArray = law.input_scale * (law.K * np.abs(e - e_p + law.Lambda * tick.dt * (e + e_p) / 2.0) + tick.dt * beta)
-    return moved
+    change: FloatArray = law.input_scale * (law.K * np.abs(e - e_p + law.Lambda * tick.dt * (e + e_p) / 2.0) + tick.dt * beta)
+    return change
 
 
-def assert_no_jumps(flown: list[Tick]) -> None:
-    """In no tick does u move but by the law's step or by the ramp to trim; at an engagement it does not move at all."""
-    for tick in flown:
+def assert_no_jumps(records: list[Tick]) -> None:
+    """Check that u changes only by a step of the law or by the ramp to trim, and not at all at an engagement."""
+    for tick in records:
         if tick.after.mode is Mode.ENGAGED:
             allowed = step_of_the_law(tick) if tick.before.mode is Mode.ENGAGED else np.zeros(4)
         else:
@@ -121,61 +121,61 @@ def assert_no_jumps(flown: list[Tick]) -> None:
         assert (np.abs(tick.after.u - tick.before.u) <= allowed + ROUNDING).all(), tick
 
 
-def engagements(flown: list[Tick]) -> list[int]:
-    """The ticks that engaged the law again."""
-    modes = [tick.after.mode for tick in flown]
+def engagements(records: list[Tick]) -> list[int]:
+    """Numbers of the ticks that re-engaged the law."""
+    modes = [tick.after.mode for tick in records]
     return [k for k in range(1, len(modes)) if modes[k] is Mode.ENGAGED and modes[k - 1] is not Mode.ENGAGED]
 
 
-def assert_tracking_goes_on(flown: list[Tick], again: list[int]) -> None:
-    """A second after each engagement q, p and r are back where the undisturbed flight has them; V, slower, is on its way.
+def assert_tracking_recovers(records: list[Tick], engaged: list[int]) -> None:
+    """One second after each engagement q, p and r are close to the undisturbed flight; V, which is slower, is nearer to it.
 
     Measured: within 4 mrad/s and 0.43 m/s, after errors of up to 120 mrad/s and 0.9 m/s at engagement.
     """
-    at_engagement = np.max([np.abs(flown[k].error - undisturbed()[k].error) for k in again], axis=0)
-    a_second_later = np.max([np.abs(flown[k + 100].error - undisturbed()[k + 100].error) for k in again], axis=0)
-    assert (at_engagement > [0.05, 0.04, 0.03, 0.3]).all()  # there was something to recover from
+    at_engagement = np.max([np.abs(records[k].error - undisturbed()[k].error) for k in engaged], axis=0)
+    a_second_later = np.max([np.abs(records[k + 100].error - undisturbed()[k + 100].error) for k in engaged], axis=0)
+    assert (at_engagement > [0.05, 0.04, 0.03, 0.3]).all()  # there is an error to recover from
     assert (a_second_later < [0.005, 0.005, 0.005, 0.5]).all()
 
 
 @cache
 def undisturbed() -> list[Tick]:
-    return fly(lambda k: Given())
+    return fly(lambda k: Conditions())
 
 
-def test_ticked_here_the_flight_is_the_simulators_to_the_last_bit() -> None:
+def test_the_loop_of_these_tests_equals_the_simulation_to_the_last_bit() -> None:
     u = simulate(SERVO.vary(flight={"duration": 3.0}))["u"]
     assert np.array([tick.after.u for tick in undisturbed()[: len(u.values)]]).tobytes() == u.values.tobytes()
 
 
-def test_lost_inputs_come_back_at_ten_instants_without_a_jump() -> None:
-    # Losses of 0.2 to 1.5 s, of y or of y_m: some end in HOLD, some on the RAMP to trim.
+def test_re_engagement_after_stale_inputs_is_bumpless() -> None:
+    # y or y_m is missing for 0.2 to 1.5 s: some gaps end in HOLD, some in RAMP.
     rng = np.random.default_rng(11)
     lost = {
         k: bool(y_lost)
         for begin, length, y_lost in zip(instants(1), rng.integers(20, 150, 10), rng.integers(0, 2, 10), strict=True)
         for k in range(begin, begin + int(length))
     }
-    flown = fly(lambda k: Given(y=k not in lost or not lost[k], y_m=k not in lost or lost[k]))
-    again = engagements(flown)
-    assert len(again) == 10
-    assert {flown[k].before.mode for k in again} == {Mode.HOLD, Mode.RAMP}
-    assert_no_jumps(flown)
-    assert_tracking_goes_on(flown, again)
+    records = fly(lambda k: Conditions(y=k not in lost or not lost[k], y_m=k not in lost or lost[k]))
+    engaged = engagements(records)
+    assert len(engaged) == 10
+    assert {records[k].before.mode for k in engaged} == {Mode.HOLD, Mode.RAMP}
+    assert_no_jumps(records)
+    assert_tracking_recovers(records, engaged)
 
 
 @pytest.mark.parametrize("policy", ["trim", "hold"])
-def test_deactivated_and_activated_again_at_ten_instants_without_a_jump(policy: str) -> None:
-    # For 0.01 to 1.5 s.
+def test_re_engagement_after_deactivation_is_bumpless(policy: str) -> None:
+    # The controller is inactive for 0.01 to 1.5 s.
     parameters = SERVO.vary(controller={"on_deactivate": policy}).controller
     lengths = np.random.default_rng(12).integers(1, 150, 10)
     off = {k for begin, length in zip(instants(2), lengths, strict=True) for k in range(begin, begin + int(length))}
-    flown = fly(lambda k: Given(active=k not in off, parameters=parameters))
-    again = engagements(flown)
-    assert len(again) == 10
-    assert {flown[k].before.mode for k in again} == {Mode.INACTIVE}
-    assert_no_jumps(flown)
-    assert_tracking_goes_on(flown, again)
+    records = fly(lambda k: Conditions(active=k not in off, parameters=parameters))
+    engaged = engagements(records)
+    assert len(engaged) == 10
+    assert {records[k].before.mode for k in engaged} == {Mode.INACTIVE}
+    assert_no_jumps(records)
+    assert_tracking_recovers(records, engaged)
 
 
 def gains(rng: np.random.Generator, sign: str) -> ControllerParameters:
@@ -189,34 +189,34 @@ def gains(rng: np.random.Generator, sign: str) -> ControllerParameters:
 
 
 @pytest.mark.parametrize("sign", ["soft", "implicit", "literal"])
-def test_new_gains_at_ten_instants_without_a_jump(sign: str) -> None:
+def test_new_gains_in_flight_are_bumpless(sign: str) -> None:
     changes, rng = instants(3), np.random.default_rng(13)
     sets = [SERVO.vary(controller={"sign": sign}).controller, *(gains(rng, sign) for _ in changes)]
-    flown = fly(lambda k: Given(parameters=sets[int(np.searchsorted(changes, k, side="right"))]))
-    assert engagements(flown) == []
+    records = fly(lambda k: Conditions(parameters=sets[int(np.searchsorted(changes, k, side="right"))]))
+    assert engagements(records) == []
     without = []
     for k in changes:
-        tick, before = flown[k], flown[k - 1].after.law
+        tick, before = records[k], records[k - 1].after.law
         assert before is not None
         u = control(before, before, tick.old)
-        taken = retune(before, tick.old, tick.new)
-        assert (np.abs(control(taken, taken, tick.new) - u) <= ROUNDING).all()
+        retuned = retune(before, tick.old, tick.new)
+        assert (np.abs(control(retuned, retuned, tick.new) - u) <= ROUNDING).all()
         without.append((np.abs(control(before, before, tick.new) - u) / RANGE).max())
-    assert max(without) > 0.005  # a jump by 0.5 % of the range and more: there was something to absorb
-    assert_no_jumps(flown)
+    assert max(without) > 0.005  # without `retune`, u would jump by more than 0.5 % of its range
+    assert_no_jumps(records)
     # Measured rms of q, p, r, V: soft 3.6, 2.6, 4.2 mrad/s, 0.10 m/s (3.7, 2.7, 4.2, 0.10 undisturbed), implicit 3.1, 4.1, 6.2,
-    # 0.15, literal 12, 17, 20, 0.19: behind servos these two chatter, with any gains.
-    rms = np.sqrt(np.mean([tick.error**2 for tick in flown], axis=0))
+    # 0.15, literal 12, 17, 20, 0.19: with servos these two chatter for any gains.
+    rms = np.sqrt(np.mean([tick.error**2 for tick in records], axis=0))
     assert (rms < ([0.005, 0.005, 0.007, 0.16] if sign != "literal" else [0.025, 0.025, 0.025, 0.25])).all()
 
 
-# Engaging with e(0) = (0.1 rad/s, 2 m/s, 0.2 rad/s, 0.1 rad/s) in q, V, p, r: the aircraft is thrown off trim, y_m = 0.
+# Engaging with e(0) = (0.1 rad/s, 2 m/s, 0.2 rad/s, 0.1 rad/s) in q, V, p, r: the aircraft starts off trim, y_m = 0.
 OFF_TRIM = {"q": 0.1, "V": 2.0, "p": 0.2, "r": 0.1}
 
 
 @cache
-def thrown(*, latched: bool) -> tuple[FloatArray, FloatArray]:
-    """Errors e (600, 4) and inputs u (600, 4) of 6 s, the law's order; without latching the law takes e_0 = 0."""
+def upset(*, latched: bool) -> tuple[FloatArray, FloatArray]:
+    """Errors e (600, 4) and inputs u (600, 4) of 6 s in the law's order. Without latching e_0 is 0."""
     hardware, parameters = SERVO.aircraft.plant(), SERVO.controller
     x = np.zeros(len(AIRFRAME.states))
     for name, value in OFF_TRIM.items():
@@ -236,24 +236,24 @@ def thrown(*, latched: bool) -> tuple[FloatArray, FloatArray]:
     return np.array(e), np.array(u)
 
 
-def test_engaging_with_an_error_commands_nothing_at_the_first_tick() -> None:
+def test_engagement_with_an_error_commands_zero_at_the_first_tick() -> None:
     # Measured at the second tick, 10 ms later, of elevator, aileron, rudder, thrust: 0.06, 0.02, 0.49 deg, 0.8 %; without
-    # latching 1.9, 2.4, 5.8 deg and the stop of 50 %. The prototype: 2.55, 2.7, 7.1 deg, 100 %.
-    _, u = thrown(latched=True)
-    _, without = thrown(latched=False)
+    # latching 1.9, 2.4, 5.8 deg and the limit of 50 %. The prototype: 2.55, 2.7, 7.1 deg, 100 %.
+    _, u = upset(latched=True)
+    _, without = upset(latched=False)
     assert u[0].tolist() == [0.0] * 4
     assert (np.abs(u[1]) < [0.002, 0.001, 0.01, 0.01]).all()
     assert (np.abs(without[1]) > 10.0 * np.abs(u[1])).all()
     assert np.abs(without[1][3]) == LIMITS.upper[3]
 
 
-def test_latching_e_0_overshoots_less_and_asks_for_less() -> None:
+def test_latching_e_0_reduces_overshoot_and_peak_command() -> None:
     # Measured overshoot of q, p, r, V in % of e(0): 1.2, 0.7, 25, 20, without latching 25, 22, 49, 26; peak of elevator,
-    # aileron, rudder, thrust: 0.25, 0.15, 3.1 deg, 32 %, without 1.9, 2.4, 6.5 deg, 50 % (its stop). The prototype, whose start
-    # may have been another: 4 to 12 %, without 16 to 51 %; 0.39, 0.70, 2.2 deg, 34 %.
+    # aileron, rudder, thrust: 0.25, 0.15, 3.1 deg, 32 %, without 1.9, 2.4, 6.5 deg, 50 % (its limit). The prototype,
+    # possibly with another initial state: 4 to 12 %, without 16 to 51 %; 0.39, 0.70, 2.2 deg, 34 %.
     overshoot, peak = {}, {}
     for latched in (True, False):
-        e, u = thrown(latched=latched)
+        e, u = upset(latched=latched)
         overshoot[latched] = -(e / e[0]).min(axis=0)
         peak[latched] = np.abs(u).max(axis=0)
     assert (overshoot[True] <= [0.02, 0.02, 0.3, 0.22]).all()
@@ -261,10 +261,10 @@ def test_latching_e_0_overshoots_less_and_asks_for_less() -> None:
     assert (peak[True] < 0.7 * peak[False]).all()
 
 
-def test_latched_or_not_the_error_goes_to_zero() -> None:
-    # The price of latching: measured 0.23 s to 5 % of e(0) in q, 0.07 s without. After 6 s a hundredth is left at most.
-    e, _ = thrown(latched=True)
+def test_the_error_goes_to_zero_with_and_without_latching() -> None:
+    # Latching is slower: measured 0.23 s to 5 % of e(0) in q, 0.07 s without. After 6 s at most a hundredth is left.
+    e, _ = upset(latched=True)
     assert int(np.argmax(np.abs(e[:, 0]) < 0.05 * e[0, 0])) in range(15, 30)
     for latched in (True, False):
-        e, _ = thrown(latched=latched)
+        e, _ = upset(latched=latched)
         assert (np.abs(e[-1]) < 0.01 * np.abs(e[0])).all()

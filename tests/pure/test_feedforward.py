@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The feedforward: what it cancels, that it changes nothing where it is off, that it never jumps, and what it is worth."""
+"""Feedforward: its numbers, its effect on the error, that it is off by default, and bumpless transfer."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -42,8 +42,8 @@ BY_HAND = Nominal(
     lead=np.zeros(1),
 )
 
-# Two channels and two states behind them, one of them an angle that gravity turns into y: an aircraft in small.
-# CB = [[2, 0.4], [0.3, -1]], so D = (1, -1); held at y = 0 the other two move at -2 1/s and not at all.
+# A small aircraft: two channels and two further states, one of them an angle that acts on y through gravity.
+# CB = [[2, 0.4], [0.3, -1]], so D = (1, -1). At y = 0 the eigenvalues of the other two states are -2 1/s and 0.
 A = ((-1.0, 0.2, 1.5, 0.0), (0.3, -2.0, 0.5, 0.0), (1.0, 0.4, -2.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 B = ((2.0, 0.4), (0.3, -1.0), (0.0, 0.0), (0.0, 0.0))
 GRAVITY = ((0.0, 0.0, 0.0, -3.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
@@ -58,7 +58,7 @@ CONTROLLER: dict[str, Any] = SERVO.controller.model_dump() | {
     "outputs": ("a", "b"),
     "inputs": ("u", "v"),
     "k_d": (0.01,),
-    "k_g": 0.01,  # with beta of 1e-9 a law that can do next to nothing
+    "k_g": 0.01,  # with beta of 1e-9 the law has almost no effect
     "beta": (1e-9, 1e-9),
     "Lambda": (0.01, 0.01),
     "D": (1, -1),
@@ -71,20 +71,20 @@ CONTROLLER: dict[str, Any] = SERVO.controller.model_dump() | {
 }
 
 
-def small(rate: float = 100.0, **model: Any) -> ControllerParameters:
-    """A controller of the aircraft in small; lead is half a period where nothing else is said."""
+def small_aircraft(rate: float = 100.0, **model: Any) -> ControllerParameters:
+    """A controller of the small aircraft; lead is half a period unless `model` has it."""
     values = CONTROLLER | {"rate": rate, "feedforward": MODEL | {"lead": (0.5 / rate,) * 2} | model}
     return ControllerParameters.validate_mapping(values, "controller")
 
 
 def reference(t: float) -> FloatArray:
-    """A reference at rest before 0 that never rests again, its second derivative continuous."""
+    """A reference that is at rest until 0 and moves afterwards, with a continuous second derivative."""
     t = max(t, 0.0)
     return np.array([np.sin(t) ** 3, (1.0 - np.cos(2.0 * t)) ** 2 / 2.0])
 
 
 def largest_error(params: ControllerParameters) -> float:
-    """Largest error in 6 s behind the guard, sampled at the controller's rate, integrated in steps of a tenth of it."""
+    """Largest error in 6 s with the guard, sampled at the controller's rate, integrated in steps of a tenth of a period."""
     limits, law, state, x = params.guard(), params.law(), guard.initial_state(2), np.zeros(4)
     samples: list[StampedVector] = []
     errors = []
@@ -102,12 +102,12 @@ def largest_error(params: ControllerParameters) -> float:
     return float(max(errors))
 
 
-# What it computes
+# Numbers of a step
 
 
-def test_one_tick_gives_the_numbers_worked_by_hand() -> None:
-    # From x = (0, 0) to y_m = 0.1 in 0.1 s: y_m_dot = 1, and the other state, eta_dot = 4 y_m - 3 eta with y_m = t, follows
-    # exactly to 4 (3 t - 1 + exp(-3 t)) / 9 = 0.0181414, Runge-Kutta within (3 t)^5 / 5! of it.
+def test_one_tick_gives_the_hand_worked_numbers() -> None:
+    # From x = (0, 0) to y_m = 0.1 in 0.1 s: y_m_dot = 1. The other state, eta_dot = 4 y_m - 3 eta with y_m = t, is
+    # 4 (3 t - 1 + exp(-3 t)) / 9 = 0.0181414 then, and Runge-Kutta is within (3 t)^5 / 5! of it.
     # In the middle x = (0.05, 0.0090707), so u = (1 - (-0.05 + 2 0.0090707)) / 2 = 0.5159293.
     state, added = feedforward.step(feedforward.initial_state(np.zeros(1), BY_HAND), np.array([0.1]), np.array(0.1), BY_HAND)
     assert state.x == pytest.approx([0.1, 0.0181414], abs=1e-5)
@@ -115,42 +115,42 @@ def test_one_tick_gives_the_numbers_worked_by_hand() -> None:
     assert added.tolist() == [0.0]
 
 
-def test_the_input_is_taken_ahead_along_the_straight_line_through_the_last_two() -> None:
-    # Ticks of 0.1 and 0.2 s have their middles 0.15 s apart; from the last one it is 0.1 s to the tick, and 0.05 s of lead.
-    led = BY_HAND._replace(lead=np.array([0.05]))
-    first, _ = feedforward.step(feedforward.initial_state(np.zeros(1), led), np.array([0.1]), np.array(0.1), led)
-    second, _ = feedforward.step(first, np.array([0.5]), np.array(0.2), led)
+def test_the_input_is_extrapolated_linearly_from_the_last_two() -> None:
+    # The middles of ticks of 0.1 and 0.2 s are 0.15 s apart; from the last middle it is 0.1 s to the tick plus 0.05 s of lead.
+    nominal = BY_HAND._replace(lead=np.array([0.05]))
+    first, _ = feedforward.step(feedforward.initial_state(np.zeros(1), nominal), np.array([0.1]), np.array(0.1), nominal)
+    second, _ = feedforward.step(first, np.array([0.5]), np.array(0.2), nominal)
     assert second.u_0 == pytest.approx(second.u + 0.15 * (second.u - first.u) / 0.15)
 
 
 def test_zero_dynamics_are_the_zeros_of_the_model() -> None:
-    # y = x_1 held at 0 leaves x_2_dot = -3 x_2; in the small aircraft c_dot = -2 c and d_dot = 0
+    # With y = x_1 at 0, x_2_dot = -3 x_2; in the small aircraft c_dot = -2 c and d_dot = 0
     assert feedforward.zero_dynamics(BY_HAND) == pytest.approx([-3.0])
-    nominal = small().nominal()
+    nominal = small_aircraft().nominal()
     assert nominal is not None
     assert sorted(feedforward.zero_dynamics(nominal).real) == pytest.approx([-2.0, 0.0])
 
 
-def test_it_needs_no_state_of_the_aircraft() -> None:
-    # whatever y is, what is added stays the same to the last bit
-    still, tumbling = (ticks(small(), y) for y in (reference, lambda t: np.full(2, 10.0 * np.sin(30.0 * t))))
-    assert [state.u_ff.tobytes() for state in still] == [state.u_ff.tobytes() for state in tumbling]
-    assert (still[-1].u != tumbling[-1].u).all()
+def test_the_feedforward_does_not_depend_on_y() -> None:
+    # For two different y, u_ff is the same to the last bit.
+    tracking, oscillating = (ticks(small_aircraft(), y) for y in (reference, lambda t: np.full(2, 10.0 * np.sin(30.0 * t))))
+    assert [state.u_ff.tobytes() for state in tracking] == [state.u_ff.tobytes() for state in oscillating]
+    assert (tracking[-1].u != oscillating[-1].u).all()
 
 
-def test_on_a_plant_that_is_the_model_the_error_falls_to_that_of_sampling_without_the_law() -> None:
-    # K = 1.02 and beta = 1e-9 alone leave an error of 1.6. With the feedforward it is 1.0e-3: what the straight line through
-    # two ticks misses, which quarters with the period; 3.5 to 4.5 tells second order from first (2) and third (8).
-    coarse, fine = largest_error(small(100.0)), largest_error(small(200.0))
+def test_on_the_nominal_plant_the_feedforward_alone_leaves_the_sampling_error() -> None:
+    # K = 1.02 and beta = 1e-9 alone leave an error of 1.6. With the feedforward it is 1.0e-3, the error of the linear
+    # extrapolation, which is of second order in the period: 3.5 to 4.5 differs from first order (2) and third order (8).
+    coarse, fine = largest_error(small_aircraft(100.0)), largest_error(small_aircraft(200.0))
     assert coarse < 2e-3
     assert 3.5 < coarse / fine < 4.5
-    assert largest_error(small().model_copy(update={"feedforward": None})) > 0.5
+    assert largest_error(small_aircraft().model_copy(update={"feedforward": None})) > 0.5
 
 
 # Off by default
 
 
-def test_it_is_off_where_no_scenario_asks_for_it() -> None:
+def test_the_feedforward_is_off_by_default() -> None:
     for name in ("osprey_gust", "osprey_servo"):
         assert find_scenario(name).controller.feedforward is None
         assert find_scenario(name).controller.guard().nominal is None
@@ -166,24 +166,24 @@ def short(**changes: Any) -> Scenario:
     }
     starts = zip(SERVO.aircraft.gusts.items(), (7.0, 9.5), strict=True)
     gusts = {name: gust.model_dump() | {"start": start} for (name, gust), start in starts}
-    flown = SERVO.vary(flight={"duration": 12.0}, aircraft={"gusts": gusts}, reference_model={"pulses": pulses})
-    # y and y_m at the controller's rate, in steps of 5 ms: a fifth of the work, scores within 1 %
-    slow = flown.vary(aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0})
+    fast = SERVO.vary(flight={"duration": 12.0}, aircraft={"gusts": gusts}, reference_model={"pulses": pulses})
+    # y and y_m at the controller's rate, in steps of 5 ms: a fifth of the computation, scores within 1 %
+    slow = fast.vary(aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0})
     return slow.vary(**changes)
 
 
 def recomputed(params: ControllerParameters, tape: Tape) -> tuple[FloatArray, FloatArray]:
-    """U and u_ff of every step of a tape, from its y, y_m and dt alone."""
+    """Inputs u and u_ff of every step of a tape, from its y, y_m and dt only."""
     log, limits, law = tape["internals"], params.guard(), params.law()
     y, y_m = log.group("y").values, log.group("y_m").values
     u = log.group("u").values[0]
     u_trim, state = u, rise.engage(y[0], y_m[0])
-    ahead = None if limits.nominal is None else feedforward.initial_state(y_m[0], limits.nominal)
+    ff_state = None if limits.nominal is None else feedforward.initial_state(y_m[0], limits.nominal)
     us, added = [u], [np.zeros_like(u)]
     for k in range(1, len(y)):
         start, u_ff, dt = u_trim, np.zeros_like(u), float(log["dt"][k])
-        if ahead is not None and limits.nominal is not None:
-            ahead, u_ff = feedforward.step(ahead, y_m[k], dt, limits.nominal)
+        if ff_state is not None and limits.nominal is not None:
+            ff_state, u_ff = feedforward.step(ff_state, y_m[k], dt, limits.nominal)
             start = u_trim + u_ff
         state, _, u = guard.step_with_anti_windup(state, y[k], y_m[k], dt, start, u, law, limits.limits)
         us.append(u)
@@ -191,24 +191,24 @@ def recomputed(params: ControllerParameters, tape: Tape) -> tuple[FloatArray, Fl
     return np.array(us), np.array(added)
 
 
-@pytest.mark.parametrize("with_it", [False, True])
-def test_the_log_holds_what_gives_u_again_to_the_last_bit(with_it: bool) -> None:
-    # Without feedforward the loop above is the law inside its limits and nothing else: off leaves every bit as it was.
-    scenario = both(short(flight={"duration": 3.0}))[with_it]
+@pytest.mark.parametrize("enabled", [False, True])
+def test_u_is_recomputed_from_the_log_to_the_last_bit(enabled: bool) -> None:
+    # Without feedforward the loop above is the law inside its limits only: the feedforward that is off changes no bit.
+    scenario = both(short(flight={"duration": 3.0}))[enabled]
     tape = simulate(scenario)
     u, u_ff = recomputed(scenario.controller, tape)
     assert u.tobytes() == tape["internals"].group("u").values.tobytes() == tape["u"].values.tobytes()
     assert u_ff.tobytes() == tape["internals"].group("u_ff").values.tobytes()
-    assert bool(u_ff.any()) is with_it
+    assert bool(u_ff.any()) is enabled
 
 
-# Without a jump
+# Bumpless transfer
 
 
 def ticks(
     params: ControllerParameters, y: Callable[[float], FloatArray], missing: tuple[float, float] = (9.0, 9.0)
 ) -> list[ControllerState]:
-    """Every 10 ms from 0.5 to 1.5 s, in the middle of the reference's motion; no samples come in `missing`."""
+    """States at every 10 ms from 0.5 to 1.5 s, while the reference moves; no samples are received in `missing`."""
     state, states = guard.initial_state(2), []
     y_now, y_m_samples = StampedVector(0, np.zeros(2)), [StampedVector(0, np.zeros(2))]
     for k in range(50, 150):
@@ -220,18 +220,18 @@ def ticks(
     return states
 
 
-def test_engagement_and_engagement_again_in_the_middle_of_a_manoeuvre_do_not_jump() -> None:
-    states = ticks(small(), reference, missing=(0.8, 1.2))
+def test_engagement_and_re_engagement_during_a_manoeuvre_are_bumpless() -> None:
+    states = ticks(small_aircraft(), reference, missing=(0.8, 1.2))
     modes = [state.mode for state in states]
     engaged = [0, modes.index(guard.Mode.ENGAGED, modes.index(guard.Mode.HOLD))]
     assert engaged[1] == 70
-    # y = y_m leaves the law at rest, so u moves by the feedforward alone, by 0.04 to 0.07 a tick; the whole of it would be a
-    # jump of 0.8 at the first engagement and of 4.6 at the second.
-    nominal = small().nominal()
+    # With y = y_m the law is at rest, so u changes by the feedforward only, by 0.04 to 0.07 per tick. The whole u_ff would be
+    # a jump of 0.8 at the first engagement and of 4.6 at the second.
+    nominal = small_aircraft().nominal()
     assert nominal is not None
     for first in engaged:
         u = np.array([state.u for state in states[first : first + 20]])
-        assert (u[:3] == u[0]).all()  # two ticks to know the line, and none of it until then
+        assert (u[:3] == u[0]).all()  # two ticks determine the slope and add nothing
         assert 0.005 < np.abs(np.diff(u[2:], axis=0)).max() < 0.1
         t = 0.5 + first / 100
         rate = (reference(t + 0.01) - reference(t)) / 0.01
@@ -239,8 +239,8 @@ def test_engagement_and_engagement_again_in_the_middle_of_a_manoeuvre_do_not_jum
         assert np.abs(whole).max() > 0.5
 
 
-def test_new_gains_leave_the_feedforward_and_the_input_where_they_were() -> None:
-    old = small()
+def test_new_gains_change_neither_the_feedforward_nor_the_input() -> None:
+    old = small_aircraft()
     values = old.model_dump() | {"k_g": 5.0, "Lambda": (2.0, 2.0), "delay": 0.02}
     new = ControllerParameters.validate_mapping(values, "controller")
     state = ticks(old, lambda t: reference(t) + 0.1 * t)[-1]
@@ -282,14 +282,14 @@ def test_new_gains_leave_the_feedforward_and_the_input_where_they_were() -> None
         ),
     ],
 )
-def test_a_model_that_cannot_be_led_along_is_refused(change: Mapping[str, Any], sentence: str) -> None:
+def test_an_unusable_nominal_model_is_refused(change: Mapping[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
-        small(**change)
+        small_aircraft(**change)
 
 
-def test_a_model_without_hidden_states_or_gravity_is_taken() -> None:
+def test_a_model_without_hidden_states_or_gravity_is_accepted() -> None:
     square: dict[str, Any] = {"states": ("b", "a"), "A": (0.0,) * 4, "B": (0.3, -1.0, 2.0, 0.4), "gravity": None}
-    nominal = small(**square).nominal()
+    nominal = small_aircraft(**square).nominal()
     assert nominal is not None
     assert len(feedforward.zero_dynamics(nominal)) == 0
     assert nominal.inverse @ [[2.0, 0.4], [0.3, -1.0]] == pytest.approx(np.eye(2))
@@ -298,7 +298,7 @@ def test_a_model_without_hidden_states_or_gravity_is_taken() -> None:
 # The osprey
 
 
-def test_the_gains_command_writes_the_airframe_along_where_asked_and_the_section_reads_back(tmp_path: Path) -> None:
+def test_the_gains_command_writes_the_nominal_model_on_request_and_the_section_reads_back(tmp_path: Path) -> None:
     path, scenario = tmp_path / "gains.yaml", tmp_path / "short.yaml"
     scenario.write_text(SERVO.path.read_text(encoding="utf-8").replace("duration: 60.0", "duration: 3.0"), encoding="utf-8")
     arguments = ["gains", "osprey", "--scenario", str(scenario), "--samples", "1", "--write", str(path)]
@@ -311,27 +311,27 @@ def test_the_gains_command_writes_the_airframe_along_where_asked_and_the_section
     nominal = written.nominal()
     assert nominal is not None
     assert expected is not None
-    for found, wanted in zip(nominal, expected, strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-12)  # six digits
-    # half a period, 3 ms of topics, and the lags: servos of 20 ms, an engine of 0.1 s
+    for actual, desired in zip(nominal, expected, strict=True):
+        np.testing.assert_allclose(actual, desired, rtol=1e-5, atol=1e-12)  # six digits
+    # half a period, 3 ms of transport delay, and the lags: servos of 20 ms, an engine of 0.1 s
     assert nominal.lead.tolist() == [0.028, 0.028, 0.028, 0.108]
-    # and the columns stay with their inputs: rudder before elevator
+    # a scenario with another order of the inputs does not match these columns
     other = written.model_copy(update={"inputs": tuple(reversed(written.inputs)), "feedforward": None})
     with pytest.raises(ParameterError, match=r"feedforward\.B"):
         with_feedforward(other, load_airframe("osprey"))
 
 
-def test_what_is_left_to_beta_is_the_slew_that_the_model_did_not_foresee() -> None:
-    # N_d is -D U times the slew of the ideal control, less that of u_ff. Over 20 aircraft at +-30 % in calm air 20 %, 17 %,
-    # 20 % and 37 % of it are left in the mean, of elevator, thrust, aileron and rudder; half stands for "most of it is gone".
+def test_beta_has_to_exceed_only_the_slew_that_the_feedforward_leaves() -> None:
+    # N_d is -D U times the slew of the ideal control less the slew of u_ff. For 20 aircraft at +-30 % in calm air the mean
+    # remainder is 20 %, 17 %, 20 % and 37 % of the slew of elevator, thrust, aileron and rudder; the test allows half.
     airframe = load_airframe("osprey")
-    found = study_airframe(airframe, manoeuvre(short(), airframe)._replace(gusts={}), 0.3, 20)
-    whole = np.abs(found.u_dot[:, 1:]).max(axis=0)
-    left = np.abs(found.u_dot[:, 1:] - found.u_dot[:, :1]).max(axis=0)
+    study = study_airframe(airframe, manoeuvre(short(), airframe)._replace(gusts={}), 0.3, 20)
+    whole = np.abs(study.u_dot[:, 1:]).max(axis=0)
+    left = np.abs(study.u_dot[:, 1:] - study.u_dot[:, :1]).max(axis=0)
     assert (left.mean(axis=0) < 0.5 * whole.mean(axis=0)).all()
 
 
-def test_the_gains_command_writes_none_where_it_only_checks() -> None:
+def test_the_gains_command_refuses_feedforward_beside_check() -> None:
     refused = CliRunner().invoke(app, ["gains", "osprey", "--check", "--feedforward"])
     assert isinstance(refused.exception, ParameterError)
     assert str(refused.exception).startswith("--feedforward: found it beside --check, expected one of them")
@@ -354,16 +354,16 @@ def scores() -> dict[str, FloatArray]:
     }
 
 
-def test_behind_servos_the_published_osprey_errs_less_with_it(scores: dict[str, FloatArray]) -> None:
-    # Measured: 1.98 -> 0.22 in calm air, where noise is what is left, and 5.29 -> 4.52 in 12 s with two gusts, which are no
-    # part of the model and stay. Half of each gain is left as a margin.
+def test_the_feedforward_reduces_the_error_of_the_nominal_osprey_with_servos(scores: dict[str, FloatArray]) -> None:
+    # Measured: 1.98 -> 0.22 in calm air, where noise remains, and 5.29 -> 4.52 in 12 s with two gusts, which the model does
+    # not include. The margin is half of each improvement.
     assert scores["calm"][0, 1] < 0.55 * scores["calm"][0, 0]
     assert scores["nominal"][0, 1] < 0.93 * scores["nominal"][0, 0]
 
 
 @pytest.mark.parametrize("level", ["+-0.3", "+-0.5"])
-def test_on_aircraft_that_the_model_is_wrong_about_it_still_helps(scores: dict[str, FloatArray], level: str) -> None:
-    # Measured: each of the 16 errs less, by 12 % in the mean at +-30 % and by 9 % at +-50 %. Half of that is left as a margin.
-    without, with_it = scores[level].T
-    assert (with_it < without).all()
-    assert with_it.mean() < 0.95 * without.mean()
+def test_the_feedforward_reduces_the_error_of_uncertain_aircraft(scores: dict[str, FloatArray], level: str) -> None:
+    # Measured: all 16 scores fall, by 12 % in the mean at +-30 % and by 9 % at +-50 %. The margin is half of that.
+    without, enabled = scores[level].T
+    assert (enabled < without).all()
+    assert enabled.mean() < 0.95 * without.mean()

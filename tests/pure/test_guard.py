@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Around the law: samples of one instant, engagement, stale and repeated samples."""
+"""Guard of the law: alignment of y_m, engagement, failsafe, saturation, anti-windup and the log."""
 
 import numpy as np
 import pytest
@@ -36,10 +36,10 @@ def test_reference_is_taken_at_the_stamp_of_y() -> None:
         value = align(samples, round(ms * MS), 10 * MS)
         return None if value is None else float(value[0])
 
-    assert at(10) == 1.0  # its own sample
+    assert at(10) == 1.0  # a sample of that stamp
     assert at(15) == pytest.approx(2.0)  # between two
-    assert at(25) == pytest.approx(4.0)  # beyond the newest, along the last two
-    assert at(31) is None  # beyond the reach of one period
+    assert at(25) == pytest.approx(4.0)  # extrapolated from the last two
+    assert at(31) is None  # more than one period after the newest
     assert at(-1) is None  # before the oldest
 
 
@@ -50,14 +50,14 @@ def test_a_single_sample_is_held_for_one_period() -> None:
     assert align([sample(0, 7.0)], 11 * MS, 10 * MS) is None
 
 
-def test_a_reference_whose_samples_bunch_up_is_not_thrown_far_by_their_noise() -> None:
-    # Two samples 1 us apart that differ by 1: a straight line through them is 8000 off 8 ms later. The slope is taken from
-    # samples at least a twentieth of the reach apart, here of the first and the last; without such it is held.
-    bunch = [StampedVector(2 * MS, np.array([1.0])), StampedVector(2 * MS + 1000, np.array([2.0]))]
-    value = align([sample(0, 0.0), *bunch], 10 * MS, 10 * MS)
+def test_noise_of_closely_spaced_reference_samples_is_not_amplified() -> None:
+    # Two samples 1 us apart differ by 1: the line through them is wrong by 8000 after 8 ms. The slope is taken from samples
+    # that are at least a twentieth of the extrapolation limit apart, here the first and the last; otherwise the value is held.
+    close = [StampedVector(2 * MS, np.array([1.0])), StampedVector(2 * MS + 1000, np.array([2.0]))]
+    value = align([sample(0, 0.0), *close], 10 * MS, 10 * MS)
     assert value is not None
     assert value[0] == pytest.approx(2.0 * 10.0 / 2.001, rel=1e-12)
-    assert align(bunch, 10 * MS, 10 * MS) == pytest.approx([2.0], rel=0.0)
+    assert align(close, 10 * MS, 10 * MS) == pytest.approx([2.0], rel=0.0)
 
 
 @given(ms=st.floats(0, 20))
@@ -67,7 +67,7 @@ def test_a_straight_line_is_reproduced_at_any_instant(ms: float) -> None:
     assert value[0] == pytest.approx(round(ms * MS) / MS, abs=1e-9)
 
 
-def fly(params: ControllerParameters, *ticks: tuple[float, StampedVector | None, list[StampedVector]]) -> list[ControllerState]:
+def run(params: ControllerParameters, *ticks: tuple[float, StampedVector | None, list[StampedVector]]) -> list[ControllerState]:
     state, states = guard.initial_state(4), []
     for now_ms, y, y_m in ticks:
         state, _ = guard.tick(state, round(now_ms * MS), y, y_m, params.guard(), params.law())
@@ -75,8 +75,8 @@ def fly(params: ControllerParameters, *ticks: tuple[float, StampedVector | None,
     return states
 
 
-def test_waits_until_both_signals_are_there_then_engages_with_zero_input(params: ControllerParameters) -> None:
-    modes = fly(
+def test_waits_until_both_signals_are_received_then_engages_with_zero_input(params: ControllerParameters) -> None:
+    modes = run(
         params,
         (0, None, []),
         (10, sample(10, 1.0), []),
@@ -88,7 +88,7 @@ def test_waits_until_both_signals_are_there_then_engages_with_zero_input(params:
 
 
 def test_each_new_sample_is_one_step_of_the_law_with_its_measured_dt(params: ControllerParameters) -> None:
-    first, second = fly(params, (0, sample(0, 1.0), [sample(0)]), (12, sample(12, 1.1), [sample(12)]))[0:2]
+    first, second = run(params, (0, sample(0, 1.0), [sample(0)]), (12, sample(12, 1.1), [sample(12)]))[0:2]
     law_state = engage(np.full(4, 1.0), np.zeros(4))
     _, u = step(law_state, np.full(4, 1.1), np.zeros(4), np.array(0.012), params.law())
     assert first.u.tolist() == [0.0] * 4
@@ -96,32 +96,32 @@ def test_each_new_sample_is_one_step_of_the_law_with_its_measured_dt(params: Con
 
 
 @pytest.mark.parametrize(("gap_ms", "dt_ms"), [(1, 2), (25, 25), (80, 80), (200, 100)])
-def test_the_measured_dt_is_held_between_a_fifth_and_three_periods(
+def test_the_measured_dt_is_clipped_between_a_fifth_and_ten_periods(
     params: ControllerParameters, gap_ms: int, dt_ms: int
 ) -> None:
     state, _ = guard.tick(guard.initial_state(4), 0, sample(0, 1.0), [sample(0)], params.guard(), params.law())
-    _, used = guard.tick(state, gap_ms * MS, sample(gap_ms, 1.0), [sample(gap_ms)], params.guard(), params.law())
-    assert used is not None
-    assert used.dt == pytest.approx(dt_ms / 1000)
+    _, inputs = guard.tick(state, gap_ms * MS, sample(gap_ms, 1.0), [sample(gap_ms)], params.guard(), params.law())
+    assert inputs is not None
+    assert inputs.dt == pytest.approx(dt_ms / 1000)
 
 
-def test_a_sample_seen_before_changes_nothing(params: ControllerParameters) -> None:
+def test_a_repeated_sample_changes_nothing(params: ControllerParameters) -> None:
     y, y_m = sample(10, 1.0), [sample(10)]
-    states = fly(params, (0, sample(0, 1.0), [sample(0)]), (10, y, y_m), (20, y, y_m))
+    states = run(params, (0, sample(0, 1.0), [sample(0)]), (10, y, y_m), (20, y, y_m))
     assert states[2].u is states[1].u
     assert states[2].law is states[1].law
 
 
-def test_stale_samples_hold_then_ramp_to_trim_and_fresh_ones_engage_again_without_a_jump(osprey_gust: Scenario) -> None:
+def test_the_failsafe_holds_then_ramps_to_trim_and_fresh_samples_re_engage_without_a_jump(osprey_gust: Scenario) -> None:
     params = osprey_gust.vary(controller={"max_age": 0.1, "hold": 0.2, "ramp": 0.4}).controller
     y, y_m = sample(10, 1.1), [sample(10)]
-    states = fly(
+    states = run(
         params,
         (0, sample(0, 1.0), [sample(0)]),
         (10, y, y_m),
-        (120, y, y_m),  # 110 ms old: lost from here
-        (320, y, y_m),  # 200 ms after
-        (520, y, y_m),  # 400 ms after: half way down the ramp
+        (120, y, y_m),  # 110 ms old: stale
+        (320, y, y_m),  # 200 ms later
+        (520, y, y_m),  # 400 ms later: half of the ramp
         (600, sample(600, 1.3), [sample(600)]),
         (610, sample(610, 1.3), [sample(610)]),
         (1800, y, y_m),
@@ -143,7 +143,7 @@ def test_stale_samples_hold_then_ramp_to_trim_and_fresh_ones_engage_again_withou
     assert (states[3].u == held).all()
     assert states[3].law is states[1].law  # nothing is integrated
     assert states[4].u == pytest.approx(0.5 * held)
-    assert (states[5].u == states[4].u).all()  # engaged again: no jump at all
+    assert (states[5].u == states[4].u).all()  # bumpless re-engagement
     assert (states[5].u_trim == states[4].u).all()
     law_state = states[5].law
     assert law_state is not None
@@ -153,29 +153,31 @@ def test_stale_samples_hold_then_ramp_to_trim_and_fresh_ones_engage_again_withou
 
 
 @pytest.mark.parametrize("policy", ["trim", "hold"])
-def test_deactivation_lets_go_of_the_input_as_the_policy_says(policy: str, osprey_gust: Scenario) -> None:
+def test_deactivation_holds_or_ramps_the_input_as_configured(policy: str, osprey_gust: Scenario) -> None:
     params = osprey_gust.vary(controller={"ramp": 0.4, "on_deactivate": policy}).controller
     state = guard.initial_state(4)
-    seen = []
+    states = []
     for ms, active in ((0, True), (10, True), (20, False), (220, False), (620, False), (630, True)):
         now = sample(ms, 1.0 + ms / 100)
         state, _ = guard.tick(state, ms * MS, now, [sample(ms)], params.guard(), params.law(), active)
-        seen.append(state)
-    assert [state.mode.name for state in seen] == ["ENGAGED", "ENGAGED", "INACTIVE", "INACTIVE", "INACTIVE", "ENGAGED"]
-    share = [1.0, 1.0, 1.0] if policy == "hold" else [1.0, 0.5, 0.0]
-    for state, expected in zip(seen[2:5], share, strict=True):
-        assert state.u == pytest.approx(expected * seen[1].u)
-    assert (seen[5].u == seen[4].u).all()  # and it engages again from there
+        states.append(state)
+    assert [state.mode.name for state in states] == ["ENGAGED", "ENGAGED", "INACTIVE", "INACTIVE", "INACTIVE", "ENGAGED"]
+    scales = [1.0, 1.0, 1.0] if policy == "hold" else [1.0, 0.5, 0.0]
+    for state, expected in zip(states[2:5], scales, strict=True):
+        assert state.u == pytest.approx(expected * states[1].u)
+    assert (states[5].u == states[4].u).all()  # bumpless re-engagement
 
 
-def test_a_controller_that_never_flew_commands_nothing_when_inactive(params: ControllerParameters) -> None:
-    state, used = guard.tick(guard.initial_state(4), 0, sample(0, 1.0), [sample(0)], params.guard(), params.law(), active=False)
-    assert (state.mode, used) == (Mode.INACTIVE, None)
+def test_a_controller_that_was_never_engaged_commands_nothing_when_inactive(params: ControllerParameters) -> None:
+    state, inputs = guard.tick(
+        guard.initial_state(4), 0, sample(0, 1.0), [sample(0)], params.guard(), params.law(), active=False
+    )
+    assert (state.mode, inputs) == (Mode.INACTIVE, None)
 
 
 @given(instants=st.lists(st.tuples(st.integers(1, 400), st.booleans(), st.floats(-1, 1)), min_size=2, max_size=40))
-def test_the_input_never_jumps_but_by_a_step_of_the_law(instants: list[tuple[int, bool, float]]) -> None:
-    # Whatever comes and goes: between two ticks u changes by the law's step, by the ramp, or not at all.
+def test_the_input_changes_only_by_a_step_of_the_law_or_by_the_ramp(instants: list[tuple[int, bool, float]]) -> None:
+    # Fresh and stale samples at random: between two ticks u changes by a step of the law, by the ramp, or not at all.
     state, now_ns = guard.initial_state(4), 0
     y, y_m = sample(0, 0.0), [sample(0)]
     for wait_ms, fresh, value in instants:
@@ -208,17 +210,17 @@ STATES = st.builds(LawState, PAIRS, PAIRS, PAIRS, PAIRS)
 
 @pytest.mark.parametrize("sign", list(Sign))
 @given(state=STATES, y=PAIRS)
-def test_inside_its_limits_the_guarded_law_is_the_law_to_the_last_bit(sign: Sign, state: LawState, y: FloatArray) -> None:
+def test_anti_windup_without_saturation_leaves_the_law_to_the_last_bit(sign: Sign, state: LawState, y: FloatArray) -> None:
     law = TWO._replace(sign=sign)
     zero, dt = np.zeros(2), np.array(0.01)
     after, u = step(state, y, zero, dt, law)
-    guarded, u_free, limited = guard.step_with_anti_windup(state, y, zero, dt, zero, u, law, NO_LIMITS)
+    limited_state, u_free, limited = guard.step_with_anti_windup(state, y, zero, dt, zero, u, law, NO_LIMITS)
     assert limited.tobytes() == u_free.tobytes() == (zero + u).tobytes()
-    assert [part.tobytes() for part in guarded] == [part.tobytes() for part in after]
+    assert [part.tobytes() for part in limited_state] == [part.tobytes() for part in after]
 
 
 @given(u=PAIRS, before=PAIRS, bound=st.floats(0.1, 5), rate=st.floats(0.1, 100))
-def test_limits_are_kept_and_nothing_inside_them_is_touched(
+def test_saturation_keeps_the_limits_and_leaves_an_input_inside_them_unchanged(
     u: FloatArray, before: FloatArray, bound: float, rate: float
 ) -> None:
     limits = Limits(np.full(2, -bound), np.full(2, bound), np.full(2, rate))
@@ -230,7 +232,7 @@ def test_limits_are_kept_and_nothing_inside_them_is_touched(
     assert (limited[inside] == u[inside]).all()
 
 
-def test_an_input_outside_its_limits_comes_back_inside_them() -> None:
+def test_saturation_clips_an_input_that_starts_outside_its_limits() -> None:
     limits = Limits(np.full(2, -1.0), np.full(2, 1.0), np.full(2, 10.0))
     assert guard.saturate(np.array([5.0, -5.0]), np.array([3.0, -3.0]), np.array(0.01), limits).tolist() == [1.0, -1.0]
 
@@ -244,18 +246,18 @@ def test_integrals_stop_only_in_the_direction_that_worsens_saturation(
     limits = Limits(np.full(2, -bound), np.full(2, bound), np.full(2, rate))
     zero, dt = np.zeros(2), np.array(0.01)
     free, u = step(state, y, zero, dt, TWO)
-    guarded, _, _ = guard.step_with_anti_windup(state, y, zero, dt, trim, zero, TWO, limits)
+    limited_state, _, _ = guard.step_with_anti_windup(state, y, zero, dt, trim, zero, TWO, limits)
     beyond = trim + u - guard.saturate(trim + u, zero, dt, limits)
     outward = -TWO.D * (free.integral_e - state.integral_e) * beyond > 0
-    assert (guarded.integral_e == np.where(outward, state.integral_e, free.integral_e)).all()
+    assert (limited_state.integral_e == np.where(outward, state.integral_e, free.integral_e)).all()
     outward = -TWO.D * (free.Pi - state.Pi) * beyond > 0
-    assert (guarded.Pi[~outward] == free.Pi[~outward]).all()
-    assert (np.minimum(state.Pi, free.Pi) - 1e-9 <= guarded.Pi).all()
-    assert (guarded.Pi <= np.maximum(state.Pi, free.Pi) + 1e-9).all()
+    assert (limited_state.Pi[~outward] == free.Pi[~outward]).all()
+    assert (np.minimum(state.Pi, free.Pi) - 1e-9 <= limited_state.Pi).all()
+    assert (limited_state.Pi <= np.maximum(state.Pi, free.Pi) + 1e-9).all()
 
 
 def test_an_input_reaches_its_limit_however_large_a_tick_of_the_integrals_is() -> None:
-    # A tick of Pi moves u by 0.5 0.01 3 = 0.015; taken back whole, it would leave u anywhere within that of the limit.
+    # A step of Pi changes u by 0.5 0.01 3 = 0.015. Without scaling, u could end anywhere within 0.015 of the limit.
     limits = Limits(np.full(2, -np.inf), np.full(2, 0.01), np.full(2, np.inf))
     zero, e = np.zeros(2), np.array([-0.2, 0.2])
     state, u = engage(e, zero), zero
@@ -265,7 +267,7 @@ def test_an_input_reaches_its_limit_however_large_a_tick_of_the_integrals_is() -
 
 
 @given(state=STATES, k=st.floats(0.5, 50), Lambda=st.floats(0.1, 10), scale=st.floats(0.1, 10))
-def test_new_gains_leave_the_input_where_it_was(state: LawState, k: float, Lambda: float, scale: float) -> None:
+def test_new_gains_transfer_without_a_bump(state: LawState, k: float, Lambda: float, scale: float) -> None:
     new = TWO._replace(K=TWO.K * k, Lambda=TWO.Lambda * Lambda, input_scale=TWO.input_scale * scale, beta=TWO.beta * 2)
     retuned = retune(state, TWO, new)
     before, after = control(state, state, TWO), control(retuned, retuned, new)
@@ -283,27 +285,29 @@ def test_internals_hold_the_integrals_and_what_limited_each_input(params: Contro
     state = guard.initial_state(4)._replace(
         law=law_state, u_free=np.array([0.5, 5.0, -5.0, 0.9]), u=np.array([0.5, 1.0, -1.0, 0.7]), u_trim=np.full(4, 0.1)
     )
-    used = guard.TickInputs(0, np.zeros(4), np.zeros(4), 0.0, 0.01)
-    shown = dict(
-        zip(internals.names(params.outputs, params.inputs), internals.values(state, used, limits, 0.0, 0.0, 7, 8), strict=True)
+    inputs = guard.TickInputs(0, np.zeros(4), np.zeros(4), 0.0, 0.01)
+    values = dict(
+        zip(
+            internals.names(params.outputs, params.inputs), internals.values(state, inputs, limits, 0.0, 0.0, 7, 8), strict=True
+        )
     )
-    assert (shown["e.q"], shown["e_0.q"], shown["integral_e.q"], shown["Pi.q"]) == (1.0, 0.0, 2.0, 3.0)
-    assert (shown["u_free.aileron"], shown["u.aileron"], shown["u_trim.aileron"]) == (5.0, 1.0, 0.1)
-    limited = [shown[f"limited.{name}"] for name in params.inputs]
+    assert (values["e.q"], values["e_0.q"], values["integral_e.q"], values["Pi.q"]) == (1.0, 0.0, 2.0, 3.0)
+    assert (values["u_free.aileron"], values["u.aileron"], values["u_trim.aileron"]) == (5.0, 1.0, 0.1)
+    limited = [values[f"limited.{name}"] for name in params.inputs]
     assert limited == [Saturation.NO, Saturation.MAGNITUDE, Saturation.MAGNITUDE, Saturation.RATE]
 
 
 def test_internals_are_named_after_the_outputs(params: ControllerParameters) -> None:
-    state, used = guard.tick(guard.initial_state(4), 0, sample(0, 1.5), [sample(0, 0.5)], params.guard(), params.law())
-    assert used is not None
-    shown = dict(
+    state, inputs = guard.tick(guard.initial_state(4), 0, sample(0, 1.5), [sample(0, 0.5)], params.guard(), params.law())
+    assert inputs is not None
+    values = dict(
         zip(
             internals.names(params.outputs, params.inputs),
-            internals.values(state, used, params.guard().limits, 1e-4, 2e-3, 1, 2**48 - 1),
+            internals.values(state, inputs, params.guard().limits, 1e-4, 2e-3, 1, 2**48 - 1),
             strict=True,
         )
     )
-    assert shown["mode"] == Mode.ENGAGED
-    assert (shown["late"], shown["age"], shown["number"], shown["dt"]) == (1e-4, 2e-3, 1.0, 0.0)
-    assert int(shown["parameters"]) == 2**48 - 1
-    assert (shown["y.V"], shown["y_m.V"], shown["e.V"], shown["Pi.V"]) == (1.5, 0.5, 1.0, 0.0)
+    assert values["mode"] == Mode.ENGAGED
+    assert (values["late"], values["age"], values["number"], values["dt"]) == (1e-4, 2e-3, 1.0, 0.0)
+    assert int(values["parameters"]) == 2**48 - 1
+    assert (values["y.V"], values["y_m.V"], values["e.V"], values["Pi.V"]) == (1.5, 0.5, 1.0, 0.0)

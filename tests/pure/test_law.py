@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The law's step, pinned by numbers worked by hand and by closed forms."""
+"""A step of the law against hand-worked numbers and closed forms."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ DT = 0.1
 
 
 def one_channel(sign: Sign, D: float = -1.0) -> LawParams:
-    """K = 2, Lambda = 3, beta = 4, input scale 1/2: numbers that can be followed by hand."""
+    """K = 2, Lambda = 3, beta = 4, input scale 1/2."""
     return LawParams(
         K=gain(np.array(1.0), np.array([])),
         Lambda=np.array([3.0]),
@@ -29,8 +29,8 @@ def one_channel(sign: Sign, D: float = -1.0) -> LawParams:
     )
 
 
-def fly(params: LawParams, errors: list[float], dt: float = DT) -> list[float]:
-    """The inputs u of one channel for a series of errors, the first of which is that of engagement."""
+def respond(params: LawParams, errors: list[float], dt: float = DT) -> list[float]:
+    """Inputs u of one channel for a series of errors, of which the first is that of engagement."""
     state = engage(np.array([errors[0]]), np.zeros(1))
     inputs = []
     for e in errors[1:]:
@@ -47,31 +47,31 @@ def test_gain_has_the_structure_of_equation_22() -> None:
 def test_literal_sign_gives_the_hand_worked_inputs() -> None:
     # e_0 = 1; e = 1.2: integral 0.1 (1.2 + 1)/2 = 0.11, Pi applied 0: v = 2 (0.2 + 3 0.11) = 1.06
     # e = 0.9: integral 0.11 + 0.1 (0.9 + 1.2)/2 = 0.215, Pi applied 0.1 4 = 0.4: v = 2 (-0.1 + 3 0.215) + 0.4 = 1.49
-    # D = -1 turns -D into +1; u = v / 2
-    assert fly(one_channel(Sign.LITERAL), [1.0, 1.2, 0.9]) == pytest.approx([0.53, 0.745], abs=1e-15)
+    # D = -1, so -D = +1; u = v / 2
+    assert respond(one_channel(Sign.LITERAL), [1.0, 1.2, 0.9]) == pytest.approx([0.53, 0.745], abs=1e-15)
 
 
 def test_implicit_sign_applies_the_saturated_sign_in_the_same_tick() -> None:
     # e_hat = 1.2 + 0.2 - 0.1 2 (0.2 + 3 0.11) = 1.294, over dt^2 omega beta = 0.04 is above 1: s = 1, Pi = 0.4
     # v = 1.06 + 0.4
-    assert fly(one_channel(Sign.IMPLICIT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
+    assert respond(one_channel(Sign.IMPLICIT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
 
 
 def test_implicit_sign_takes_the_value_that_makes_the_predicted_error_zero() -> None:
     # From rest, e = 0.01: integral 0.0005, e_hat = 0.01 + 0.01 - 0.2 (0.01 + 3 0.0005) = 0.0177
     # s = 0.0177 / 0.04 = 0.4425, Pi = 0.1 4 0.4425 = 0.177, v = -(2 (0.01 + 0.0015) + 0.177) = -0.2
-    assert fly(one_channel(Sign.IMPLICIT, D=1.0), [0.0, 0.01]) == pytest.approx([-0.1], abs=1e-15)
+    assert respond(one_channel(Sign.IMPLICIT, D=1.0), [0.0, 0.01]) == pytest.approx([-0.1], abs=1e-15)
 
 
 def test_softened_sign_is_proportional_inside_its_width_and_one_outside() -> None:
     # e = 0.05, eps = 0.1: s = 0.5, Pi = 0.1 4 0.5 = 0.2, integral 0.0025: v = 2 (0.05 + 3 0.0025) + 0.2 = 0.315
-    assert fly(one_channel(Sign.SOFT), [0.0, 0.05]) == pytest.approx([0.1575], abs=1e-15)
+    assert respond(one_channel(Sign.SOFT), [0.0, 0.05]) == pytest.approx([0.1575], abs=1e-15)
     # e = 1.2 from 1: s = 1, as with the implicit sign
-    assert fly(one_channel(Sign.SOFT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
+    assert respond(one_channel(Sign.SOFT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
 
 
 def test_input_is_zero_at_engagement_whatever_the_error() -> None:
-    # (20) with t = 0: u = -D K (e(0) - e(0)) - D Pi(0) = 0; the first step has moved by one tick's integrals alone.
+    # (20) with t = 0: u = -D K (e(0) - e(0)) - D Pi(0) = 0; the first step adds the integrals of one tick only.
     state = engage(np.array([5.0, -3.0]), np.array([1.0, 1.0]))
     assert state.e_0.tolist() == [4.0, -4.0]
     assert state.integral_e.tolist() == [0.0, 0.0]
@@ -81,39 +81,39 @@ def test_input_is_zero_at_engagement_whatever_the_error() -> None:
 @pytest.mark.parametrize("sign", list(Sign))
 def test_constant_error_gives_a_ramp(sign: Sign) -> None:
     # (20), (21) with e = e_0 = 2: u = -D (K Lambda e + beta) t, so v grows by 2 3 2 0.1 + 4 0.1 = 1.6 a tick, u by 0.8.
-    inputs = np.array(fly(one_channel(sign), [2.0] * 50))
+    inputs = np.array(respond(one_channel(sign), [2.0] * 50))
     assert np.diff(inputs) == pytest.approx(0.8, rel=1e-12)
-    # The literal sign uses Pi as it stands, one tick behind the implicit one.
+    # The literal sign uses Pi as it stands, one tick later than the implicit sign.
     assert inputs[0] == pytest.approx(0.6 if sign is Sign.LITERAL else 0.8, rel=1e-12)
 
 
 @pytest.mark.parametrize("sign", list(Sign))
 def test_zero_error_leaves_the_input_at_zero(sign: Sign) -> None:
-    assert fly(one_channel(sign), [0.0] * 100) == [0.0] * 99
+    assert respond(one_channel(sign), [0.0] * 100) == [0.0] * 99
 
 
 @pytest.mark.parametrize("sign", list(Sign))
 @given(errors=st.lists(st.floats(-10, 10), min_size=3, max_size=20))
 def test_the_law_is_odd_in_the_error(sign: Sign, errors: list[float]) -> None:
     # Every term of (20), (21) is odd in e, and so is each sampling of them.
-    mirrored = fly(one_channel(sign), [-e for e in errors])
-    assert mirrored == [-u for u in fly(one_channel(sign), errors)]
+    mirrored = respond(one_channel(sign), [-e for e in errors])
+    assert mirrored == [-u for u in respond(one_channel(sign), errors)]
 
 
 @given(e=st.lists(st.floats(-1, 1), min_size=2, max_size=2))
 def test_channels_do_not_mix(e: list[float]) -> None:
-    # K, Lambda, beta and D are diagonal: the first channel of two flies as if it were alone.
-    alone = one_channel(Sign.IMPLICIT)
-    doubled: dict[str, Any] = {name: np.repeat(getattr(alone, name), 2) for name in alone._fields if name != "sign"}
-    both = alone._replace(**doubled)
+    # K, Lambda, beta and D are diagonal: the first of two channels equals a single channel.
+    single = one_channel(Sign.IMPLICIT)
+    doubled: dict[str, Any] = {name: np.repeat(getattr(single, name), 2) for name in single._fields if name != "sign"}
+    both = single._replace(**doubled)
     zero = np.zeros(2)
     _, u = step(engage(zero, zero), np.array(e), zero, np.array(DT), both)
-    assert u[0] == fly(one_channel(Sign.IMPLICIT), [0.0, e[0]])[0]
+    assert u[0] == respond(one_channel(Sign.IMPLICIT), [0.0, e[0]])[0]
 
 
 def test_a_step_changes_none_of_its_arguments() -> None:
     state = LawState(*(np.array([value]) for value in (1.0, 2.0, 3.0, 4.0)))
     y, y_m, params = np.array([1.5]), np.array([0.5]), one_channel(Sign.IMPLICIT)
     step(state, y, y_m, np.array(DT), params)
-    kept: tuple[FloatArray, ...] = (*state, y, y_m)
-    assert [float(value[0]) for value in kept] == [1.0, 2.0, 3.0, 4.0, 1.5, 0.5]
+    arguments: tuple[FloatArray, ...] = (*state, y, y_m)
+    assert [float(value[0]) for value in arguments] == [1.0, 2.0, 3.0, 4.0, 1.5, 0.5]

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-# ruff: noqa: D102, N802 - functions bear the paper's symbols, which say what they are
-"""The paper, equation by equation, on a random plant; then each of its slips, shown to be one, and its repair.
+# ruff: noqa: D102, N802 - functions have the symbols of the paper as names
+"""The equations of the paper on a random plant; then each of its errata as a counterexample, and its repair.
 
-The closed loop here is the paper's continuous one, (1), (2), (20), (21), integrated to 1e-10: it exists to check the paper.
-The law that flies is `rise_di_controller.law`, and the last test of the first part ties the two together.
+The closed loop here is the continuous one of the paper, (1), (2), (20), (21), integrated to 1e-10, to check the paper.
+The sampled law is `rise_di_controller.law`; the last test of the first part shows that it converges to the continuous one.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ from rise_di_controller.decomposition import DecompositionError, decompose
 from rise_di_controller.law import LawParams, Sign, gain
 
 EXACT = 1e-11  # rounding in sums of some hundred terms of size 1 to 100
-DIFFERENCED = 1e-5  # central differences over 1 ms of a solution good to 1e-10; measured below 1e-6
+DIFFERENCED = 1e-5  # central differences over 1 ms of a solution with an error of 1e-10; measured below 1e-6
 
 # ---------------------------------------------------------------------------------------------------------------------
 # A random plant under the continuous law
@@ -68,13 +68,13 @@ class Problem(NamedTuple):
 
 
 def law_of(p: Problem) -> LawParams:
-    """The problem's gains as the law takes them, its inputs unscaled."""
+    """Parameters of the law with the gains of the problem and unscaled inputs."""
     one = np.ones(len(p.D))
     return example(1.0, 1.0).params._replace(K=p.K, Lambda=p.Lambda, beta=p.beta, D=p.D, input_scale=one, omega=one)
 
 
 def random_problem(seed: int, n: int = 6, m: int = 3) -> Problem:
-    """Omega = S D U by choice: B = C^+ Omega plus what C does not see. A and A_m are shifted until they are Hurwitz."""
+    """Random plant with Omega = S D U: B = C^+ Omega plus a part that C does not see. A and A_m are shifted to be Hurwitz."""
     rng = np.random.default_rng(seed)
 
     def hurwitz() -> FloatArray:
@@ -108,7 +108,7 @@ def random_problem(seed: int, n: int = 6, m: int = 3) -> Problem:
 
 @dataclass(frozen=True)
 class Loop:
-    """The closed loop (1), (2), (20), (21) over a stretch in which no e_i changes sign, and its signals at an instant."""
+    """The closed loop (1), (2), (20), (21) over an interval in which no e_i changes sign, and its signals at an instant."""
 
     p: Problem
     e_0: FloatArray
@@ -172,9 +172,9 @@ class Loop:
         return np.asarray(self.M @ (plant - model + p.Lambda * self.e_dot(t)) + self.e(t))
 
     def split(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Equations (17), (18) with x_urho = 0, so c1 = 0 in (7): N_d and N~ without, and the term they differ about.
+        """Equations (17), (18) with x_urho = 0, so c1 = 0 in (7): N_d, N~, and the term that the paper puts into N~.
 
-        x_o = C^+ C x is what the outputs show, x_u the rest, likewise for the model. The term is -M C A_m x_mu_dot.
+        x_o = C^+ C x is the part that the outputs show, x_u the rest, likewise for the model. The term is -M C A_m x_mu_dot.
         """
         p = self.p
         shown = np.linalg.pinv(p.C) @ p.C
@@ -207,8 +207,9 @@ def run(p: Problem, x_0: FloatArray, x_m0: FloatArray, duration: float) -> Loop:
         return np.concatenate([x_dot, p.A_m @ x_m + p.B_m @ p.u_m(t), e, p.beta * np.sign(e)])
 
     start = np.concatenate([x_0, x_m0, np.zeros(2 * m)])
-    stretch = (0.0, duration)
-    solved = solve_ivp(w_dot, stretch, start, method="DOP853", rtol=1e-10, atol=1e-10, max_step=0.005, dense_output=True)
+    solved = solve_ivp(
+        w_dot, (0.0, duration), start, method="DOP853", rtol=1e-10, atol=1e-10, max_step=0.005, dense_output=True
+    )
     assert solved.sol is not None
     return Loop(p, e_0, solved.sol)
 
@@ -220,10 +221,10 @@ INSTANTS = np.linspace(0.02, DURATION - 0.02, 7)
 
 @pytest.fixture(scope="module", params=[4, 5, 6])
 def loop(request: pytest.FixtureRequest) -> Loop:
-    found = run(random_problem(request.param), X_0, np.zeros(6), DURATION)
-    signs = {tuple(np.sign(found.e(float(t)))) for t in np.linspace(0.0, DURATION, 50)}
-    assert len(signs) == 1  # differences across a jump of Sgn(e) would mean nothing
-    return found
+    closed_loop = run(random_problem(request.param), X_0, np.zeros(6), DURATION)
+    signs = {tuple(np.sign(closed_loop.e(float(t)))) for t in np.linspace(0.0, DURATION, 50)}
+    assert len(signs) == 1  # differences across a jump of Sgn(e) would be invalid
+    return closed_loop
 
 
 def differenced(signal: Callable[[float], FloatArray | float], t: float, h: float = 1e-3) -> FloatArray:
@@ -238,7 +239,7 @@ def close(a: FloatArray | float, b: FloatArray | float, tolerance: float) -> boo
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What is right
+# Identities that hold
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -305,15 +306,15 @@ def test_25_and_26_give_Phi_without_its_last_entry(loop: Loop) -> None:
 
 
 def test_27_bounds_Phi_where_zeta_U_bounds_every_entry_of_U() -> None:
-    # abs(Phi_i) <= zeta_U sum_(j>i) k_j abs(r_j); with zeta_U a tenth below the largest abs(U_ij), r along that j breaks it.
+    # abs(Phi_i) <= zeta_U sum_(j>i) k_j abs(r_j); with a zeta_U below 0.9 max abs(U_ij), r along that j violates it.
     p = random_problem(4)
     above = np.triu(p.U, 1)
     zeta_U = np.max(np.abs(above))
     i, j = np.argwhere(np.abs(above) == zeta_U)[0]
     for r in (np.eye(3)[j], *np.random.default_rng(1).normal(size=(100, 3))):
         Phi = p.D * (above @ (p.D * p.K * r))
-        later = np.array([np.sum((p.K * np.abs(r))[k + 1 :]) for k in range(3)])
-        assert np.all(np.abs(Phi) <= zeta_U * later * (1.0 + EXACT))
+        following = np.array([np.sum((p.K * np.abs(r))[k + 1 :]) for k in range(3)])
+        assert np.all(np.abs(Phi) <= zeta_U * following * (1.0 + EXACT))
     assert np.abs(p.D * (above @ (p.D * p.K * np.eye(3)[j])))[i] > 0.9 * zeta_U * p.K[j]
 
 
@@ -331,7 +332,7 @@ def test_V1_dot_of_32_has_the_gain_22_as_three_squares(loop: Loop) -> None:
 
 
 def test_V2_dot_is_a_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> None:
-    # The sum of (32) and -L (46), as `flight_analysis.design.lyapunov.decay_matrix` has it, on a plant of this test.
+    # The sum of (32) and -L (46), as in `flight_analysis.design.lyapunov.decay_matrix`, on a plant of this test.
     p = loop.p
     Q = decay_matrix(KnownPlant(p.A, p.B, p.C, p.f), law_of(p))
     for t in INSTANTS:
@@ -341,8 +342,8 @@ def test_V2_dot_is_a_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> 
 
 
 @pytest.mark.parametrize("sign", [Sign.LITERAL, Sign.IMPLICIT])
-def test_the_law_that_flies_tends_to_20_with_its_period(loop: Loop, sign: Sign) -> None:
-    # First order, for u is held over a period: halving it halves the distance (measured 1.9 to 2.1).
+def test_the_sampled_law_converges_to_20_with_its_period(loop: Loop, sign: Sign) -> None:
+    # First order, because u is held over a period: half of the period halves the distance (measured 1.9 to 2.1).
     p = loop.p
     params = law_of(p)._replace(sign=sign)
     distance = []
@@ -355,7 +356,7 @@ def test_the_law_that_flies_tends_to_20_with_its_period(loop: Loop, sign: Sign) 
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What is not, and what repairs it
+# Errata and their repairs
 # ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -371,22 +372,22 @@ def at_rest() -> Loop:
 
 
 def test_at_rest_N_d_is_minus_D_U_times_the_slew_of_the_ideal_input() -> None:
-    # u* = Omega^-1 (y_m_dot - C A x - C f) keeps e = 0; its slew along the flight it makes is what beta has to beat.
+    # u* = Omega^-1 (y_m_dot - C A x - C f) keeps e = 0; beta has to exceed its slew along the flight.
     loop = at_rest()
     p = loop.p
     x_0, x_m0, _, _ = loop.unpack(0.0)
 
     def ideal(t: float, x: FloatArray, x_m: FloatArray) -> FloatArray:
-        wanted = p.C @ (p.A_m @ x_m + p.B_m @ p.u_m(t) - p.A @ x - p.f(t, x))
-        return np.asarray(np.linalg.solve(p.C @ p.B, wanted))
+        demand = p.C @ (p.A_m @ x_m + p.B_m @ p.u_m(t) - p.A @ x - p.f(t, x))
+        return np.asarray(np.linalg.solve(p.C @ p.B, demand))
 
     def w_dot(t: float, w: FloatArray) -> FloatArray:
         x, x_m = np.split(w, 2)
         return np.concatenate([p.A @ x + p.f(t, x) + p.B @ ideal(t, x, x_m), p.A_m @ x_m + p.B_m @ p.u_m(t)])
 
     def u_star(t: float) -> FloatArray:
-        reached = solve_ivp(w_dot, (0.0, t), np.concatenate([x_0, x_m0]), method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-        return ideal(t, *np.split(reached, 2))
+        state = solve_ivp(w_dot, (0.0, t), np.concatenate([x_0, x_m0]), method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+        return ideal(t, *np.split(state, 2))
 
     N_d, _, term = loop.split(0.0)
     assert close(N_d + term, -p.D * (p.U @ differenced(u_star, 0.0)), DIFFERENCED)
@@ -402,7 +403,7 @@ def test_N_tilde_as_written_in_18_does_not_vanish_with_z_so_that_19_is_false() -
 def test_N_tilde_vanishes_with_z_once_the_reference_term_is_moved_to_N_d(loop: Loop) -> None:
     _, N_tilde, _ = at_rest().split(0.0)
     assert np.linalg.norm(N_tilde) < 1e-12
-    p = loop.p  # and off rest it is linear in z, so that (19) holds with a constant rho
+    p = loop.p  # for z != 0 it is linear in z, so (19) holds with a constant rho
     G = loop.M @ (p.C @ p.A @ np.linalg.pinv(p.C) + np.diag(p.Lambda))
     rho = np.linalg.norm(np.hstack([np.eye(3) - G * p.Lambda, G]), 2)
     for t in INSTANTS:
@@ -412,7 +413,7 @@ def test_N_tilde_vanishes_with_z_once_the_reference_term_is_moved_to_N_d(loop: L
 
 
 def test_the_bound_in_30_has_two_indices_for_each_row_sums_its_own_entries_of_U() -> None:
-    # Psi = (D U D - I) beta Sgn(e): over all signs its i-th entry reaches sum_(j>i) abs(U_ij) beta_j, and never more.
+    # Psi = (D U D - I) beta Sgn(e): over all signs the maximum of its i-th entry is sum_(j>i) abs(U_ij) beta_j.
     p = random_problem(4)
     DUD = p.D[:, None] * p.U * p.D
     Psi = np.array([(DUD - np.eye(3)) @ (p.beta * np.array(signs)) for signs in product((-1.0, 1.0), repeat=3)])
@@ -420,21 +421,21 @@ def test_the_bound_in_30_has_two_indices_for_each_row_sums_its_own_entries_of_U(
 
 
 def coupled_flight(beta: FloatArray) -> float:
-    """The largest e past 6 s with U_12 = 3 in the small example and K_1 raised as step 3 asks for that U_12."""
+    """The largest e after 6 s with U_12 = 3 in the small example and K_1 increased as step 3 requires."""
     case = example(0.0025, 15.0)
     S, D = decompose(case.plant.C @ case.plant.B)[:2]
     U = np.array([[1.0, 3.0], [0.0, 1.0]])
     plant = case.plant._replace(B=np.vstack([S * D @ U, 0.1 * np.eye(2)]))
     params = case.params._replace(K=np.array([60.0, 4.0]), omega=2.0 * np.abs(np.diag(S * D @ U)), beta=beta)
     assert np.linalg.eigvalsh(decay_matrix(plant, params)).min() > 0.0
-    found = evidence(plant, fly(plant, case.y_m, 0.0025, params, case.x_0), params)
-    assert np.all(np.max(np.abs(found.N_d), axis=0) < [2.0, 2.0])
-    return float(np.max(np.abs(found.e[found.t > 6.0])))
+    signals = evidence(plant, fly(plant, case.y_m, 0.0025, params, case.x_0), params)
+    assert np.all(np.max(np.abs(signals.N_d), axis=0) < [2.0, 2.0])
+    return float(np.max(np.abs(signals.e[signals.t > 6.0])))
 
 
 def test_beta_that_counts_row_j_of_U_in_place_of_entry_ij_does_not_track() -> None:
-    # The last row of U has nothing beyond its one, so that reading asks for beta_1 >= zeta_Nd,1 alone.
-    assert coupled_flight(np.array([2.1, 2.1])) > 5e-3  # measured 1.3e-2, whatever the period
+    # The last row of U has only its diagonal entry, so with this index the condition is beta_1 >= zeta_Nd,1 only.
+    assert coupled_flight(np.array([2.1, 2.1])) > 5e-3  # measured 1.3e-2 for any period
 
 
 def test_beta_that_counts_entry_ij_of_U_tracks() -> None:
@@ -452,19 +453,19 @@ def lemma_1_ratio(T: float) -> float:
 
 def test_40_fails_for_a_bounded_e_that_tends_to_zero_with_a_bounded_derivative() -> None:
     # (40) keeps the ratio below gamma_2 + (gamma_1 + sup abs(e)) / integral abs(e), which falls with T. For e = sin(t^2)/t,
-    # abs(e_dot) <= 3, it grows like T / log T, so no gamma_1, gamma_2 do.
+    # abs(e_dot) <= 3, the ratio grows like T / log T, so no gamma_1, gamma_2 exist.
     assert [lemma_1_ratio(T) for T in (10.0, 100.0, 1000.0)] == pytest.approx([7.3, 41.8, 283.8], rel=0.01)
 
 
 def test_gamma_2_of_the_sampled_law_with_the_literal_sign_grows_as_the_period_falls() -> None:
-    # Chatter shrinks with dt but not its slope as fast: (29) with this gamma_2 asks for a beta that grows without bound.
+    # Chatter decreases with dt, its slope more slowly: (29) with this gamma_2 requires a beta that grows without bound.
     ratios = []
     for dt in (0.02, 0.01, 0.005, 0.0025):
         case = example(dt, 10.0)
         params = case.params._replace(sign=Sign.LITERAL)
-        found = evidence(case.plant, fly(case.plant, case.y_m, dt, params, case.x_0), params)
-        late = found.t > 5.0
-        ratios.append(np.sum(np.abs(found.e_dot[late]), axis=0) / np.sum(np.abs(found.e[late]), axis=0))
+        signals = evidence(case.plant, fly(case.plant, case.y_m, dt, params, case.x_0), params)
+        late = signals.t > 5.0
+        ratios.append(np.sum(np.abs(signals.e_dot[late]), axis=0) / np.sum(np.abs(signals.e[late]), axis=0))
     assert all(np.all(after > 1.2 * before) for before, after in pairwise(ratios))
 
 
@@ -474,20 +475,20 @@ def test_with_U_the_identity_the_classical_condition_keeps_P_positive_without_le
     S, D = decompose(case.plant.C @ case.plant.B)[:2]
     plant = case.plant._replace(B=np.vstack([S * D, 0.1 * np.eye(2)]))
     params = case.params._replace(beta=np.array([6.0, 6.0]))
-    found = evidence(plant, fly(plant, case.y_m, 0.005, params, case.x_0), params)
-    settled = found.t > 0.02  # the two ends of a second difference are of lower order
-    N_d_dot = np.gradient(found.N_d[settled], found.t[settled], axis=0)
-    needed = np.max(np.abs(found.N_d), axis=0) + np.percentile(np.abs(N_d_dot), 99, axis=0) / params.Lambda
-    assert np.all(params.beta > needed)
-    zeta_b = params.beta @ np.abs(found.e[0]) - found.e[0] @ found.N_d[0]
-    assert np.min(zeta_b + found.P) > 0.0
+    signals = evidence(plant, fly(plant, case.y_m, 0.005, params, case.x_0), params)
+    settled = signals.t > 0.02  # the ends of a second difference have a lower order
+    N_d_dot = np.gradient(signals.N_d[settled], signals.t[settled], axis=0)
+    required = np.max(np.abs(signals.N_d), axis=0) + np.percentile(np.abs(N_d_dot), 99, axis=0) / params.Lambda
+    assert np.all(params.beta > required)
+    zeta_b = params.beta @ np.abs(signals.e[0]) - signals.e[0] @ signals.N_d[0]
+    assert np.min(zeta_b + signals.P) > 0.0
 
 
 def test_a_matrix_without_a_leading_minor_has_no_decomposition_though_it_can_be_inverted() -> None:
     # (S D U)_11 = S_11 d_1 is never zero, so no choice of S, D, U gives [[0, 1], [1, 0]].
     with pytest.raises(DecompositionError, match="leading minor 1"):
         decompose(np.array([[0.0, 1.0], [1.0, 0.0]]))
-    S, D, U = decompose(np.array([[1.0, 0.0], [0.0, 1.0]]))  # the same channels, paired the other way round
+    S, D, U = decompose(np.array([[1.0, 0.0], [0.0, 1.0]]))  # the same channels with the other pairing
     assert np.array_equal(S, np.eye(2))
     assert np.array_equal(D, [1.0, 1.0])
     assert np.array_equal(U, np.eye(2))
@@ -506,7 +507,7 @@ def hidden_state(pole: float) -> tuple[float, float]:
 
 
 def test_an_unstable_zero_leaves_a_state_unbounded_and_then_the_error() -> None:
-    # Assumption 3 asks for it in other words. Omega = 1 and the gains are the same; only the hidden state runs away.
+    # Assumption 3 excludes it. Omega = 1 and the gains are the same; only the hidden state diverges.
     state, e = hidden_state(1.0)
     assert state > 1e4
     assert e > 1.0
@@ -518,8 +519,8 @@ def test_a_stable_zero_leaves_that_state_bounded() -> None:
     assert e < 1e-3
 
 
-def test_a_servo_between_u_and_the_plant_takes_away_Omega() -> None:
-    # x_s_dot = (u - x_s) / tau drives the plant: relative degree 2, C B = 0, and (10)-(11) have nothing to decompose.
+def test_a_servo_between_u_and_the_plant_makes_Omega_zero() -> None:
+    # x_s_dot = (u - x_s) / tau drives the plant: relative degree 2, C B = 0, and (10)-(11) cannot be applied.
     p = random_problem(4)
     B = np.vstack([np.zeros((6, 3)), np.eye(3) / 0.02])
     with pytest.raises(DecompositionError, match="leading minor 1"):
@@ -541,14 +542,14 @@ def behind_a_servo(T_eps: float) -> float:
     return float(np.max(np.abs(flight.x[-2000:, 0])) / eps[0])
 
 
-def test_the_softened_sign_rests_behind_a_servo_where_routh_says_so() -> None:
+def test_the_softened_sign_settles_behind_a_servo_within_the_limit_of_routh() -> None:
     # Lambda + 1/T_eps < 1/tau, so T_eps > 20.4 ms at Lambda = 1, and somewhat more for the lag of sampling, 0.75 ms.
-    assert behind_a_servo(0.8 * 0.0204) > 0.5  # measured 1.5: a limit cycle, for growth ends where s saturates
-    assert behind_a_servo(1.2 * 0.0204) < 0.01  # measured 8e-4, on its way to zero
+    assert behind_a_servo(0.8 * 0.0204) > 0.5  # measured 1.5: a limit cycle, because s saturates
+    assert behind_a_servo(1.2 * 0.0204) < 0.01  # measured 8e-4 and falling
 
 
 def osprey(gust: float = 0.0) -> dynamics.Aircraft:
-    """The airframe, in a vertical gust of this speed at t = 0."""
+    """The osprey in a vertical gust of this speed at t = 0."""
     gusts = {"vertical": Gust(start=0.0, speed=gust, length=15.24)}
     return AircraftParameters(airframe="osprey", rate=100.0, step=0.01, gusts=gusts).load()[1]
 
@@ -574,7 +575,7 @@ def test_f_dot_of_gravity_is_bounded_by_z_once_the_part_with_q_minus_q_m_is_in_N
 
 
 def test_bound_7_cannot_hold_at_every_instant_for_alpha_leaves_trim_in_a_gust_while_e_is_zero() -> None:
-    # Outputs held on trim by the ideal input, x_m = 0: z = 0, yet alpha rises to 21.1 deg, so x_u <= c1 norm(z) is false.
+    # The ideal input keeps the outputs at trim, x_m = 0: z = 0, but alpha rises to 21.1 deg, so x_u <= c1 norm(z) is false.
     aircraft = osprey(gust=10.12)
     C, B = aircraft.C, aircraft.B
     held = np.eye(8) - B @ np.linalg.solve(C @ B, C)
@@ -588,9 +589,9 @@ def test_bound_7_cannot_hold_at_every_instant_for_alpha_leaves_trim_in_a_gust_wh
 
 
 def largest_y_m_ddot(model: Model, rise: float) -> float:
-    """The peak of abs(y_m_ddot) where the command climbs to one within `rise` seconds, by second differences."""
-    one, none = np.ones((1, 1)), np.zeros(1)
-    climb = Profile(0.0 * one, one, np.array(rise), none, none + 1.0, none, none, none)
+    """The peak of abs(y_m_ddot) for a command that rises to one within `rise` seconds, by second differences."""
+    one, zero = np.ones((1, 1)), np.zeros(1)
+    climb = Profile(0.0 * one, one, np.array(rise), zero, zero + 1.0, zero, zero, zero)
     dt, x_m, y_m = rise / 5.0, np.zeros(len(model.A_m)), [0.0]
     steps = stepper(dt, model)
     for k in range(round(0.5 / dt)):
@@ -600,7 +601,7 @@ def largest_y_m_ddot(model: Model, rise: float) -> float:
 
 
 def test_a_step_command_through_a_first_order_model_makes_N_d_unbounded() -> None:
-    # y_m_ddot holds C B_m u_m_dot = 4 / rise: ten times the beta for a tenth of the rise, and no beta for a step.
+    # y_m_ddot contains C B_m u_m_dot = 4 / rise: a tenth of the rise needs ten times the beta, and no beta suffices for a step.
     first_order = Model(np.array([[-4.0]]), np.array([[4.0]]), np.array([[1.0]]))
     peaks = [largest_y_m_ddot(first_order, rise) for rise in (0.1, 0.01, 0.001)]
     assert peaks == pytest.approx([40.0, 400.0, 4000.0], rel=0.1)  # measured 37, 396, 3997

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The reference model and its commands against closed forms."""
+"""The reference model and its commands against closed forms and exact simulation."""
 
 import math
 
@@ -42,7 +42,7 @@ def test_a_pulse_rises_holds_and_falls_over_its_edges() -> None:
 
 @given(t=st.floats(0, 10), dt=st.floats(1e-6, 1e-3))
 def test_commands_have_a_bounded_derivative(t: float, dt: float) -> None:
-    # Equation (2) asks for u_m_dot bounded: a pulse's edge is value / rise, two edges never overlap here.
+    # Equation (2) requires a bounded u_m_dot: the slope of an edge is value / rise, and edges do not overlap here.
     profile = parameters(pulses=PULSES).profile()
     change = np.abs(command(t + dt, profile) - command(t, profile))
     assert (change <= np.array([0.2, 0.4, 0.0]) / 0.1 * dt + 1e-12).all()
@@ -56,7 +56,7 @@ def test_a_coordinated_turn_follows_the_integral_of_the_bank_rate() -> None:
         bank, _ = quad(
             lambda s: float(command(s, profile)[1]), 0.0, t, points=[1.0, 1.1, 2.5, 2.6] if t > 2.6 else None, limit=200
         )
-        # r = g / V0 sin(phi): the turn rate at which lift has no sideways rest
+        # r = g / V0 sin(phi) is the turn rate without sideslip
         assert float(command(t, profile)[2]) == pytest.approx(9.81 / 25.0 * math.sin(bank), abs=1e-8)
 
 
@@ -90,7 +90,7 @@ def test_a_step_is_one_runge_kutta_step_of_equation_2() -> None:
     def x_dot(t: float, x: FloatArray, _: None, params: model.Model) -> FloatArray:
         return np.asarray(model.x_m_dot(t, x, command(t, profile), params))
 
-    # PULSES change u_m within this step; rounding alone tells the two apart.
+    # PULSES change u_m within this step; the two differ by rounding only.
     u_m = np.concatenate([command(1.0 + part * dt, profile) for part in (0.0, 0.5, 1.0)])
     one_step = rk4(x_dot, 1.0, x_m, None, matrices, dt)
     assert model.step(x_m, u_m, model.stepper(dt, matrices)) == pytest.approx(one_step, rel=1e-14, abs=1e-15)
@@ -109,5 +109,5 @@ def test_the_general_form_and_the_second_order_form_are_the_same_model() -> None
         "B_m": parameters().model().B_m.ravel().tolist(),
     }
     general = parameters(second_order=None, linear=same).model()
-    for mine, theirs in zip(general, parameters().model(), strict=True):
-        assert (mine == theirs).all()
+    for general_matrix, matrix in zip(general, parameters().model(), strict=True):
+        assert (general_matrix == matrix).all()

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What "D known" demands of the user, flown: the right D tracks, a wrong one diverges.
+"""Flights with the right D, which track, and with a wrong D, which diverge.
 
-Three aircraft: the Osprey with the textbook's elevator (trailing edge down positive), the Osprey with rudder and aileron
+Three aircraft: the Osprey with the elevator sign of textbooks (trailing edge down positive), the Osprey with rudder and aileron
 exchanged, and a plant whose Omega = C B has a positive diagonal and a negative determinant.
 """
 
@@ -44,7 +44,7 @@ UNLIMITED = SERVO.vary(aircraft={"actuators": {}}, controller={"lower": None, "u
 
 
 def trailing_edge_down(scenario: Scenario, folder: Path) -> Scenario:
-    """The same flight of an airframe whose elevator turns the nose down when positive; D is not adapted."""
+    """The same flight with an airframe whose positive elevator pitches the nose down; D is unchanged."""
     airframe = yaml.safe_load((LIBRARY / "osprey.yaml").read_text(encoding="utf-8"))
     elevator = list(airframe["inputs"]).index("elevator")
     airframe["inputs"]["elevator"]["positive"] = "trailing edge down"
@@ -62,31 +62,31 @@ def q_error(tape: Tape) -> FloatArray:
 
 
 def first(t: FloatArray, values: FloatArray, bound: float) -> float:
-    """When abs(values) is first above a bound; inf where never."""
+    """The first instant at which abs(values) is above a bound; inf where there is none."""
     beyond = np.abs(values) > bound
     return float(t[beyond][0]) if beyond.any() else math.inf
 
 
 @pytest.mark.parametrize("scenario", [pytest.param(SERVO, id="servos"), pytest.param(UNLIMITED, id="no limits")])
-def test_with_the_textbooks_elevator_the_right_d_tracks(scenario: Scenario, tmp_path: Path) -> None:
-    # D = (-1, 1, 1, 1). Measured rms of q: 1.97 mrad/s through servos, 1.95 without them; the prototype: 2.0 and 2.2.
+def test_an_elevator_with_trailing_edge_down_positive_tracks_with_the_right_d(scenario: Scenario, tmp_path: Path) -> None:
+    # D = (-1, 1, 1, 1). Measured rms of q: 1.97 mrad/s through servos, 1.95 without limits; the prototype: 2.0 and 2.2.
     right = trailing_edge_down(scenario, tmp_path).vary(controller={"D": [-1, 1, 1, 1]}, flight={"duration": 30.0})
-    sixty_seconds = error_metrics(q_error(simulate(right))).rms * math.sqrt(30.0 / 60.0)  # nothing happens to q after 30 s
+    sixty_seconds = error_metrics(q_error(simulate(right))).rms * math.sqrt(30.0 / 60.0)  # no events for q after 30 s
     assert sixty_seconds <= 0.0022
 
 
-def test_a_sign_turned_in_the_airframe_and_in_d_is_the_same_flight_to_the_last_bit(tmp_path: Path) -> None:
-    flown = SERVO.vary(flight={"duration": 4.0})
-    turned = trailing_edge_down(flown, tmp_path).vary(controller={"D": [-1, 1, 1, 1]})
-    nose_up, nose_down = simulate(flown), simulate(turned)
+def test_a_sign_change_in_the_airframe_and_in_d_gives_the_same_flight_to_the_last_bit(tmp_path: Path) -> None:
+    original = SERVO.vary(flight={"duration": 4.0})
+    changed = trailing_edge_down(original, tmp_path).vary(controller={"D": [-1, 1, 1, 1]})
+    nose_up, nose_down = simulate(original), simulate(changed)
     assert nose_down["y"].values.tobytes() == nose_up["y"].values.tobytes()
     assert (nose_down["u"]["elevator"] == -nose_up["u"]["elevator"]).all()
     assert np.abs(nose_up["u"]["elevator"]).max() > 0.0
 
 
-def test_with_the_textbooks_elevator_identity_d_diverges_at_the_first_command(tmp_path: Path) -> None:
+def test_an_elevator_with_trailing_edge_down_positive_diverges_with_identity_d_at_the_first_command(tmp_path: Path) -> None:
     # Diverged: abs(e_q) above 1 rad/s, ten times the command. Measured at 2.38 s, 0.38 s after it; the prototype: 2.38 s.
-    # And it goes on: a factor of e each 0.08 s, above 1e5 rad/s 1.4 s after the command.
+    # It grows further, by a factor of e each 0.08 s, to more than 1e5 rad/s 1.4 s after the command.
     tape = simulate(trailing_edge_down(UNLIMITED, tmp_path).vary(flight={"duration": 3.4}))
     t, e = tape.time("truth"), q_error(tape)
     assert np.abs(e[t < 2.0]).max() < 1e-3
@@ -94,38 +94,38 @@ def test_with_the_textbooks_elevator_identity_d_diverges_at_the_first_command(tm
     assert np.abs(e[-1]) > 1e5
 
 
-def test_limits_slow_the_divergence_down_to_a_full_turn(tmp_path: Path) -> None:
-    # Against the stops q cannot grow without bound. Diverged: pitched by more than a full turn. Measured at 5.45 s; the
-    # prototype: 5.27 s, its bound unknown. The elevator sits at its stop and q turns at 2.2 rad/s.
+def test_saturation_slows_the_divergence_down_to_a_full_turn(tmp_path: Path) -> None:
+    # With the stops q is bounded. Diverged: a pitch angle of more than a full turn. Measured at 5.45 s; the prototype:
+    # 5.27 s with an unknown bound. The elevator is at its stop and q is 2.2 rad/s.
     tape = simulate(trailing_edge_down(SERVO, tmp_path).vary(flight={"duration": 6.0}))
     t, theta = tape.time("truth"), tape["truth"].group("x")["theta"]
     assert first(t, theta, 2.0 * math.pi) == pytest.approx(5.4, abs=0.3)
     assert np.abs(tape["truth"].group("actuator")["elevator"][t > 3.0]).min() == pytest.approx(math.radians(30.0), rel=1e-5)
 
 
-# Below: the law and the plant alone, at periods and gains that a scenario does not reach.
+# Below: the law and the plant without a scenario, at periods and gains that scenarios do not allow.
 
 Reference = Callable[[float], FloatArray]
 
 
 def fly(aircraft: Aircraft, law: LawParams, y_m: list[FloatArray], dt: float, bound: float) -> FloatArray:
-    """The errors e at 0, dt, 2 dt, ... from trim, shape (ticks, m), until one is above the bound: there the flight ends."""
+    """The errors e at 0, dt, 2 dt, ... from trim, shape (ticks, m), until one is above the bound, which ends the flight."""
     period_ns, m = nanoseconds(dt), len(law.K)
     ideal = Actuators(np.zeros(m), np.full(m, -np.inf), np.full(m, np.inf), np.full(m, np.inf))
     hardware = PlantParams(aircraft, ideal, period_ns)
-    flying, u = plant.initial_state(hardware), np.zeros(m)
-    state = rise.engage(dynamics.y(flying.x, aircraft), y_m[0])
+    aircraft_state, u = plant.initial_state(hardware), np.zeros(m)
+    state = rise.engage(dynamics.y(aircraft_state.x, aircraft), y_m[0])
     errors = [state.e]
     for k, reference in enumerate(y_m[1:]):
-        flying = plant.advance(k * period_ns, flying, u, period_ns, hardware)
-        state, u = rise.step(state, dynamics.y(flying.x, aircraft), reference, np.array(dt), law)
+        aircraft_state = plant.advance(k * period_ns, aircraft_state, u, period_ns, hardware)
+        state, u = rise.step(state, dynamics.y(aircraft_state.x, aircraft), reference, np.array(dt), law)
         errors.append(state.e)
         if np.abs(state.e).max() > bound:
             break
     return np.array(errors)
 
 
-# Rudder before aileron: [q, V, p, r] driven by [elevator, thrust, rudder, aileron], paper's world, dt = 0.5 ms, 4 s.
+# Rudder before aileron: [q, V, p, r] driven by [elevator, thrust, rudder, aileron], as in the paper, dt = 0.5 ms, 4 s.
 # q 0.1 rad/s from 0.5 s to 1.5 s, p 0.4 rad/s from 1 s to 2.5 s, r coordinated. Diverged: abs(e_i) above 1, rad/s or m/s.
 
 FAST = 0.0005
@@ -163,7 +163,7 @@ def swapped_law(aircraft: Aircraft, D: list[float], factor: float) -> LawParams:
 def test_rudder_before_aileron_needs_another_d_and_is_a_bad_pairing(swapped: Aircraft) -> None:
     factors = decompose(swapped.C @ swapped.B)
     assert factors.D.tolist() == [1.0, 1.0, -1.0, 1.0]
-    # U_34: how much the aileron does to p beside the rudder, 1.5 / -0.02, and a little more.
+    # U_34: the effect of the aileron on p relative to that of the rudder, 1.5 / -0.02, and a small remainder.
     assert factors.U[2, 3] == pytest.approx(-83.5, abs=0.1)
 
 
@@ -171,7 +171,7 @@ def test_rudder_before_aileron_with_the_right_d_is_poor_and_improves_with_k_of_p
     swapped: Aircraft, manoeuvre: list[FloatArray]
 ) -> None:
     # Measured rms for K_3 times 5, 25, 125: p 19, 1.2, 0.10 mrad/s and r 43, 6.2, 1.1. The prototype, in
-    # another manoeuvre: p 430, 67, 7.6. Each factor of 5 gains 4 at the least.
+    # another manoeuvre: p 430, 67, 7.6. Each factor of 5 in K reduces the rms by at least 4.
     rms = {}
     for factor in (5.0, 25.0, 125.0):
         errors = fly(swapped, swapped_law(swapped, [1.0, 1.0, -1.0, 1.0], factor), manoeuvre, FAST, bound=1.0)
@@ -179,7 +179,7 @@ def test_rudder_before_aileron_with_the_right_d_is_poor_and_improves_with_k_of_p
         rms[factor] = np.sqrt(np.mean(errors[:, 2:] ** 2, axis=0))
     assert (rms[5.0] > 4.0 * rms[25.0]).all()
     assert (rms[25.0] > 4.0 * rms[125.0]).all()
-    # Pairing matters more than gains: with the aileron on p and K_3 as it was p has 0.001 mrad/s.
+    # The pairing matters more than the gains: with the aileron on p and the original K_3, p has 0.001 mrad/s.
     _, paired = SERVO.aircraft.load()
     errors = fly(paired, swapped_law(paired, [1.0, 1.0, 1.0, 1.0], 1.0), manoeuvre, FAST, bound=1.0)
     assert (rms[125.0] > 50.0 * np.sqrt(np.mean(errors[:, 2:] ** 2, axis=0))).all()
@@ -189,8 +189,8 @@ def test_rudder_before_aileron_with_the_right_d_is_poor_and_improves_with_k_of_p
 def test_rudder_before_aileron_with_identity_d_diverges_at_the_first_roll(
     swapped: Aircraft, manoeuvre: list[FloatArray], factor: float
 ) -> None:
-    # Measured 0.03 s, 0.02 s, 0.01 s after the command of p at 1 s, whatever K_3. The prototype: at 12 s, where its first
-    # command of p is; flown so, this one diverges at 12.03 s.
+    # Measured 0.03 s, 0.02 s, 0.01 s after the command of p at 1 s, for each K_3. The prototype: at 12 s, its first
+    # command of p; with the same commands this loop diverges at 12.03 s.
     errors = fly(swapped, swapped_law(swapped, [1.0, 1.0, 1.0, 1.0], factor), manoeuvre, FAST, bound=1.0)
     assert 1.0 < len(errors) * FAST < 1.2
 
@@ -212,7 +212,7 @@ SINES: list[FloatArray] = [0.1 * np.sin(np.array([1.0, 1.3]) * 0.01 * k) for k i
 
 
 def fly_small(D: list[float], K: list[float]) -> FloatArray:
-    # beta_1 is far above U_12 beta_2 = 4 beta_2, as (30) asks
+    # beta_1 is far above U_12 beta_2 = 4 beta_2, as (30) requires
     beta = np.array([2.0, 0.2])
     law = LawParams(np.array(K), np.ones(2), beta, np.array(D), np.ones(2), np.full(2, 2.0), np.ones(2), sign=Sign.IMPLICIT)
     return fly(SMALL, law, SINES, 0.01, bound=10.0)
@@ -226,7 +226,7 @@ def test_a_positive_diagonal_does_not_mean_identity_d() -> None:
 
 @pytest.mark.parametrize("K", [[1.0, 1.0], [2.0, 2.0], [5.0, 5.0], [20.0, 5.0], [5.0, 20.0], [50.0, 20.0]], ids=str)
 def test_negative_determinant_with_identity_d_diverges_for_every_k(K: list[float]) -> None:
-    # det(Omega K) < 0 is an exponential for any K. Measured at 0.37 to 3.2 s; the prototype: 0.66 to 1.6 s.
+    # det(Omega K) < 0 means an unstable exponential for any K. Measured at 0.37 to 3.2 s; the prototype: 0.66 to 1.6 s.
     assert len(fly_small([1.0, 1.0], K)) * 0.01 < 4.0
 
 
@@ -237,7 +237,7 @@ def test_negative_determinant_with_the_right_d_converges_where_k_has_the_order_o
     assert np.abs(errors[-300:]).max() < 0.002
 
 
-def test_negative_determinant_with_the_right_d_diverges_where_k_has_no_order() -> None:
-    # K = (5, 5) is not of the form (22), whose first gain is the larger: trace(Omega D K) = 5 - 5 leaves the damping to A.
-    # Measured at 7.4 s, slowly; the prototype: at 7.5 s.
+def test_negative_determinant_with_the_right_d_diverges_where_k_lacks_the_order_of_22() -> None:
+    # K = (5, 5) is not of the form (22), which has the larger gain first: trace(Omega D K) = 5 - 5 leaves the damping to A.
+    # Measured slow divergence at 7.4 s; the prototype: at 7.5 s.
     assert 6.0 < len(fly_small([1.0, -1.0], [5.0, 5.0])) * 0.01 < 9.0

@@ -150,7 +150,7 @@ def true_error(autopilot: Process, sky: Sky) -> dict[str, Any]:
     return {name: rows[flown, 1 + k] - np.interp(t[flown], t_m, y_m[name]) for k, name in enumerate(y_m)}
 
 
-def test_the_unchanged_controller_tracks_through_the_map_and_its_death_gives_the_channels_back(sky: Sky) -> None:
+def test_the_unchanged_controller_tracks_through_the_map_and_a_killed_controller_releases_the_channels(sky: Sky) -> None:
     assert CliRunner().invoke(app, ["check-signs", sky.map, "--scenario", str(SCENARIO)]).exit_code == 0
     autopilot = sky.autopilot()
     bridge = sky.bridge("-p", "dry_run:=false")
@@ -182,7 +182,7 @@ def test_the_unchanged_controller_tracks_through_the_map_and_its_death_gives_the
     assert len(released) > 10  # 25 at 50 Hz
 
 
-def test_pilot_silent_autopilot_and_end_of_the_bridge_each_give_the_channels_back(sky: Sky) -> None:
+def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the_channels(sky: Sky) -> None:
     autopilot = sky.autopilot()
     bridge = sky.bridge("-p", "dry_run:=false")
     sky.node("rise_di_controller.main").wait_for("ready")
@@ -237,7 +237,7 @@ def test_pilot_silent_autopilot_and_end_of_the_bridge_each_give_the_channels_bac
     assert not released
 
 
-def test_a_stale_u_brings_neutral_then_releasing_values_then_nothing_each_for_its_time(sky: Sky) -> None:
+def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(sky: Sky) -> None:
     """The controller lives and u comes again: what counts is the age of u, not who is there."""
     sky.autopilot()
     sky.change_map("silence", neutral=NEUTRAL)
@@ -317,7 +317,7 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
     assert not sky.joys
 
 
-def test_rise_di_fly_has_the_bridge_in_the_aircrafts_place_and_logs_what_the_autopilot_says(
+def test_rise_di_fly_starts_the_bridge_and_logs_the_topics_of_the_autopilot(
     sky: Sky, start: Start, tmp_path: Path
 ) -> None:
     sky.autopilot()
@@ -339,14 +339,14 @@ def test_rise_di_fly_has_the_bridge_in_the_aircrafts_place_and_logs_what_the_aut
     assert not sky.joys
 
 
-def test_a_map_with_a_flipped_sign_is_not_flown(sky: Sky, start: Start) -> None:
+def test_a_map_with_a_wrong_sign_is_refused(sky: Sky, start: Start) -> None:
     sky.change_map("inputs", "elevator", sign=-1)
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", sky.map, "--send")
     assert flight.end() == 2
     assert "with the map ardupilot D of q and elevator is -1, the controller has +1" in flight.output
 
 
-def test_a_dry_run_says_what_it_would_send_and_sends_nothing(sky: Sky) -> None:
+def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(sky: Sky) -> None:
     sky.autopilot()
     sky.bridge()
 
@@ -375,7 +375,7 @@ def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Sta
         bridge.wait_for("/ap/joy: /peer subscribes to sensor_msgs/msg/Imu, expected sensor_msgs/msg/Joy")
 
 
-def test_a_message_package_that_is_missing_ends_the_bridge_with_what_to_install(start: Start) -> None:
+def test_a_missing_message_package_ends_the_bridge_with_the_package_to_install(start: Start) -> None:
     bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4")
     assert bridge.end() == 2
     assert "error: px4_msgs/msg/VehicleOdometry: found no Python package px4_msgs" in bridge.output
@@ -428,7 +428,7 @@ def test_a_real_pressure_gives_the_speed() -> None:
     assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == pytest.approx(30.0)
 
 
-def test_inputs_are_put_into_a_real_joy() -> None:
+def test_inputs_are_written_into_a_real_joy() -> None:
     channel_map = load_map("ardupilot")
     message = Joy()
     for path, value in channel_map.messages["joy"].values.items():

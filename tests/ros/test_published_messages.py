@@ -43,7 +43,7 @@ def needs_packages_of(channel_map: ChannelMap) -> None:
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_the_package_has_the_fields_that_are_said_to_be_published(name: str) -> None:
+def test_the_package_has_the_published_fields(name: str) -> None:
     needs(name.partition("/")[0])
     found: dict[str, str] = message_type(name).get_fields_and_field_types()  # type: ignore[attr-defined]
     for field, published in PUBLISHED[name].items():
@@ -98,7 +98,7 @@ def test_outputs_are_read_from_real_messages(name: str, channels: str, fill: Cal
 
 
 @pytest.mark.parametrize("name", FOREIGN_MAPS)
-def test_inputs_are_put_into_real_messages(name: str) -> None:
+def test_inputs_are_written_into_real_messages(name: str) -> None:
     channel_map = load_map(name)
     needs_packages_of(channel_map)
     for (path, expected), row in zip(SENT[name].items(), channel_map.inputs.values(), strict=True):
@@ -153,7 +153,7 @@ def spin(peer_node: Peer, duration: float) -> None:
     peer_node.until(lambda: time.monotonic() > end)
 
 
-def test_a_bridge_speaks_to_px4_in_its_own_messages(start: Start) -> None:
+def test_a_bridge_exchanges_the_messages_of_px4(start: Start) -> None:
     """Heartbeats with fresh y and u, setpoints once engaged; no u ends both."""
     needs("px4_msgs")
     bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false")
