@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What all tests share: the default scenario."""
+"""Fixtures of all tests: the default scenario."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from hypothesis import settings
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
 
-# How long an example takes says something of the machine, not of what is tested.
+# The time of an example depends on the host, not on the code under test.
 settings.register_profile("flight", deadline=None)
 settings.load_profile("flight")
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as any publisher may send them, made without ROS."""
+"""JointState messages of an independent publisher, serialised without ROS."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is published of the message types that the channel maps use beside common_interfaces: names and types of fields.
+"""Fields of the message types that the channel maps use and that common_interfaces lacks, as their packages publish them.
 
-Only the fields that a map names. Read in the definitions at the commits below; tests/ros/test_published_messages.py compares
-them with the packages where those are installed.
+Only the fields that a map uses, from the definitions at the commits below. tests/ros/test_published_messages.py compares them
+with the installed packages.
 """
 
 import re
@@ -38,34 +38,34 @@ PUBLISHED: dict[str, dict[str, str]] = {
 }
 
 FOREIGN_MAPS = ("px4", "mavros", "rosflight")
-"""Maps whose rows name them."""
+"""Maps that use these types."""
 
 
 class Kind(NamedTuple):
     """The type of a field."""
 
     element: str
-    length: int | None  # of an array that has one
+    length: int | None  # of an array of fixed length
     is_array: bool
 
 
 def kind(field: str) -> Kind:
-    """A type as a definition states it, such as float32, float32[3] or uint16[]."""
-    found = re.fullmatch(r"([\w/]+)(\[(\d*)\])?", field)
-    assert found is not None, field
-    return Kind(found[1], int(found[3]) if found[3] else None, found[2] is not None)
+    """Parse the type of a field, such as float32, float32[3] or uint16[]."""
+    match = re.fullmatch(r"([\w/]+)(\[(\d*)\])?", field)
+    assert match is not None, field
+    return Kind(match[1], int(match[3]) if match[3] else None, match[2] is not None)
 
 
 def blank(type_name: str) -> SimpleNamespace:
-    """An object with the published fields at zero, as rclpy makes them: arrays of NumPy, of the very width."""
-    made = SimpleNamespace()
+    """An object with the published fields at zero, as rclpy creates them: arrays of NumPy with the type of the field."""
+    message = SimpleNamespace()
     for name, field in PUBLISHED[type_name].items():
         element, length, is_array = kind(field)
         if element == HEADER:
             value: object = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0))
         elif is_array:
-            value = np.zeros(length or 18, dtype=element)  # 18 as many as MAVLink has channels
+            value = np.zeros(length or 18, dtype=element)  # MAVLink has 18 channels
         else:
             value = {"f": 0.0, "u": 0, "b": False}[element[0]]
-        setattr(made, name, value)
-    return made
+        setattr(message, name, value)
+    return message

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A small disk to fill, where mounting one is allowed."""
+"""A small file system for tests of a full disk; skipped without the permission to mount it."""
 
 import errno
 import os
@@ -17,12 +17,12 @@ from flight_log.disk import free_bytes
 
 @contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[Path]:
-    """A file system of so many bytes, mounted on a new folder."""
+    """A file system of `size` bytes, mounted on a new folder."""
     mount, unmount = (shutil.which(command) for command in ("mount", "umount"))
     folder.mkdir()
     command = [str(mount), "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)]
     if not (mount and unmount) or subprocess.run(command, check=False, capture_output=True).returncode != 0:
-        pytest.skip("a small file system may not be mounted here")
+        pytest.skip("no permission to mount a small file system")
     try:
         yield folder
     finally:
@@ -30,13 +30,13 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
 
 
 def fill(path: Path) -> None:
-    """Take all the space that is left, in one piece: what somebody else gives up afterwards stays free."""
+    """Allocate all free space once. Space that another process frees later stays free."""
     with path.open("ab", buffering=0) as stream:
         taken = 0
         while free := free_bytes(path.parent):
             try:
                 os.posix_fallocate(stream.fileno(), taken, free)
                 taken += free
-            except OSError as error:  # somebody else has taken some of it meanwhile
+            except OSError as error:  # another process has allocated a part of it
                 if error.errno != errno.ENOSPC:
                     raise

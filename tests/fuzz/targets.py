@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is fuzzed: every reader of something that comes from outside, as a function of bytes.
+"""Fuzz targets: every reader of external input, as a function of bytes.
 
-A target returns, or raises what is no refusal: any exception but the stack's own, a refusal that is no sentence. `SEEDS` gives
-each the inputs to begin with, made by the stack's own writers; what fuzzers have found lies in tests/corpus/<target>/.
+A target returns for input that is read or rejected with one sentence. It raises any other exception. `SEEDS` holds the initial
+inputs of each target, made by the writers of the stack; tests/corpus/<target>/ holds the findings.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -36,61 +36,61 @@ from rise_di_controller.controller import Controller
 from rise_di_controller.params import ControllerParameters
 
 MAX_SENTENCE_LENGTH = 2000
-"""Characters: what is said of an input does not grow with it."""
+"""Characters of an error sentence, however long the input is."""
 
 Target = Callable[[bytes, Path], None]
-"""Reads the input, with a folder of its own to lay it in."""
+"""Reads the input; the folder is for its files."""
 
 
-def refused(call: Callable[[], object]) -> bool:
-    """Whether the call was refused, by the stack's own error, with one sentence."""
+def rejected(call: Callable[[], object]) -> bool:
+    """Whether the call raises ParameterError, which must have one sentence."""
     try:
         call()
     except ParameterError as error:
-        said = str(error)
-        if not said.strip() or len(said.splitlines()) != 1 or len(said) > MAX_SENTENCE_LENGTH:
-            raise AssertionError(f"no sentence: {said[:MAX_SENTENCE_LENGTH]!r} of {len(said)} characters") from error
+        message = str(error)
+        if not message.strip() or len(message.splitlines()) != 1 or len(message) > MAX_SENTENCE_LENGTH:
+            raise AssertionError(f"no sentence: {message[:MAX_SENTENCE_LENGTH]!r} of {len(message)} characters") from error
         return True
     return False
 
 
 def mcap(data: bytes, folder: Path) -> None:
-    """A log: read as a flight, as messages, as a replay; then repaired, which leaves what reads without a fault."""
+    """A log: read as a flight, as messages and as a replay; then repaired. The repaired log is not damaged."""
     run = _run(folder, data)
     file = run / "run_0.mcap"
-    refused(lambda: read_run(file))
-    refused(lambda: latency(file))
-    refused(lambda: read_playback(file))
-    refused(lambda: _replay(file))
-    if not refused(lambda: repair(run)):
+    rejected(lambda: read_run(file))
+    rejected(lambda: latency(file))
+    rejected(lambda: read_playback(file))
+    rejected(lambda: _replay(file))
+    if not rejected(lambda: repair(run)):
         again = repair(run)
         if any(one.damaged for one in again.files):
-            raise AssertionError("what was repaired is damaged")
+            raise AssertionError("the repaired log is damaged")
 
 
 def metadata(data: bytes, folder: Path) -> None:
-    """metadata.yaml of a bag, and the file of metadata that goes into one."""
+    """metadata.yaml of a bag, and a file of metadata for a bag."""
     run = _run(folder, _PLAIN)
     (run / "metadata.yaml").write_bytes(data)
-    refused(lambda: read_bag_metadata(run))
-    refused(lambda: read_metadata_records(run / "metadata.yaml"))
-    refused(lambda: read_run(run))
-    refused(lambda: repair(run))
+    rejected(lambda: read_bag_metadata(run))
+    rejected(lambda: read_metadata_records(run / "metadata.yaml"))
+    rejected(lambda: read_run(run))
+    rejected(lambda: repair(run))
 
 
 def scenario(data: bytes, folder: Path) -> None:
-    """A scenario file, up to what is about to fly."""
+    """A scenario file, up to the controller and the simulator."""
     path = folder / "scenario.yaml"
     path.write_bytes(data)
 
     def fly() -> None:
         chosen = load_scenario(path)
-        with np.errstate(all="ignore"):  # an aircraft that diverges is flown, and ended, elsewhere
+        with np.errstate(all="ignore"):  # divergence is tested elsewhere
             Controller(chosen.controller)
-            if not chosen.aircraft.is_jsbsim:  # which loads a model, in a process of its own
+            if not chosen.aircraft.is_jsbsim:  # which loads a model in a process of its own
                 Simulator(chosen.aircraft).sample(0, np.zeros(len(chosen.controller.inputs)))
 
-    refused(fly)
+    rejected(fly)
 
 
 def airframe(data: bytes, folder: Path) -> None:
@@ -104,11 +104,11 @@ def airframe(data: bytes, folder: Path) -> None:
             frame.matrix_c() @ frame.matrix_b()
         frame.matrix_a(), frame.matrix_gravity(), frame.products()
 
-    refused(matrices)
+    rejected(matrices)
 
 
 def channel_map(data: bytes, folder: Path) -> None:
-    """A channel map, up to a bridge by it."""
+    """A channel map, up to its bridge."""
     path = folder / "map.yaml"
     path.write_bytes(data)
 
@@ -116,20 +116,20 @@ def channel_map(data: bytes, folder: Path) -> None:
         made = Bridge(load_map(str(path)), dry_run=False)
         made.engage(0), made.raw(), made.raw_u()
 
-    refused(bridge)
+    rejected(bridge)
 
 
 def message(data: bytes, folder: Path) -> None:
-    """The payload of a message, as the log's readers take it: alone, and behind a sound one."""
+    """The payload of a message for the readers of a log: alone, and between valid ones."""
     for messages in ([data], [_SAMPLE, data, _SAMPLE]):
         decode = decoder("/y", JOINT_STATE)
         assert decode is not None
         decode(messages)
     run = _run(folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)]))
-    refused(lambda: read_run(run))
-    refused(lambda: latency(run))
-    refused(lambda: read_playback(run))
-    refused(lambda: parameter_changes(run, "controller", ControllerParameters.model_fields))
+    rejected(lambda: read_run(run))
+    rejected(lambda: latency(run))
+    rejected(lambda: read_playback(run))
+    rejected(lambda: parameter_changes(run, "controller", ControllerParameters.model_fields))
 
 
 TARGETS: Mapping[str, Target] = {
@@ -159,7 +159,7 @@ def _replay(file: Path) -> None:
             replay(recorded.tape, parameters, None, parameter_changes(file, "controller", ControllerParameters.model_fields))
 
 
-# What fuzzing begins with
+# Seeds
 
 
 def log(
@@ -171,7 +171,7 @@ def log(
     chunked: bool = True,
     indexed: bool = True,
 ) -> bytes:
-    """An MCAP file of (topic, type, payload), 1 ms apart; without checksums, which a changed byte would not pass."""
+    """An MCAP file of (topic, type, payload), 1 ms apart. By default it has no checksums, which would reveal a changed byte."""
     stream = BytesIO()
     writer = Writer(
         stream,

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line on what is no input: an exit status that says so, one sentence, no traceback, nothing waited for."""
+"""Fuzzing of the command line: invalid input gives an exit status and one sentence, no traceback, no hang."""
 
 import contextlib
 import io
@@ -27,8 +27,8 @@ few = settings(
 )
 
 
-class Said(NamedTuple):
-    """How a command ended."""
+class CommandResult(NamedTuple):
+    """Exit status and output of a command."""
 
     status: int
     output: str
@@ -37,7 +37,7 @@ class Said(NamedTuple):
 
 @contextlib.contextmanager
 def as_command(*arguments: str) -> Iterator[None]:
-    """sys.argv and what Ctrl-C does, as before afterwards."""
+    """Set sys.argv; restore it and the handler of SIGINT afterwards."""
     argv, handler = sys.argv, signal.getsignal(signal.SIGINT)
     sys.argv = ["rise-di", *arguments]
     try:
@@ -47,8 +47,8 @@ def as_command(*arguments: str) -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
 
 
-def rise_di(*arguments: str) -> Said:
-    """The command, in this process: what it raises beside SystemExit would be its traceback."""
+def rise_di(*arguments: str) -> CommandResult:
+    """Run the command in this process. An exception other than SystemExit would be a traceback."""
     output, errors = io.StringIO(), io.StringIO()
     with as_command(*arguments), contextlib.redirect_stdout(output), contextlib.redirect_stderr(errors):
         try:
@@ -56,25 +56,25 @@ def rise_di(*arguments: str) -> Said:
             status = 0
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else 1
-    return Said(status, output.getvalue(), errors.getvalue())
+    return CommandResult(status, output.getvalue(), errors.getvalue())
 
 
-def require_refusal(said: Said) -> None:
-    """Exit status 2, and one sentence; of a wrong option the usage, as Typer writes it."""
-    assert said.status == 2, said
-    assert "Traceback" not in said.errors
-    sentences = [line for line in said.errors.splitlines() if line.startswith("error: ")]
+def require_rejection(result: CommandResult) -> None:
+    """Require exit status 2 and one sentence, or the usage text of Typer for an invalid option."""
+    assert result.status == 2, result
+    assert "Traceback" not in result.errors
+    sentences = [line for line in result.errors.splitlines() if line.startswith("error: ")]
     if sentences:
         assert len(sentences) == 1
-        assert said.errors.splitlines()[-1] == sentences[0]
+        assert result.errors.splitlines()[-1] == sentences[0]
         assert len(sentences[0]) < 1100
     else:
-        assert said.errors.startswith("Usage: "), said.errors
+        assert result.errors.startswith("Usage: "), result.errors
 
 
 @pytest.fixture
 def garbage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder of files that are none, which is also the working folder."""
+    """A folder of invalid files, which is the working folder."""
     monkeypatch.chdir(tmp_path)
     for name, content in {
         "empty": b"",
@@ -116,8 +116,8 @@ RUNS = [
 @pytest.mark.parametrize(
     "command", [["report"], ["replay"], ["repair"], ["play"], ["check-signs", "px4", "--bag"]], ids=lambda c: c[0]
 )
-def test_a_run_that_is_none_is_refused(command: list[str], run: str, garbage: Path) -> None:
-    require_refusal(rise_di(*command, run))
+def test_an_invalid_run_is_rejected(command: list[str], run: str, garbage: Path) -> None:
+    require_rejection(rise_di(*command, run))
 
 
 FILES = [
@@ -140,8 +140,8 @@ FILES = [
 @pytest.mark.parametrize(
     "command", [["fly", "--in-process"], ["fly"], ["gains"], ["check-signs"], ["gains", "osprey", "--scenario"]], ids=str
 )
-def test_a_file_that_is_none_is_refused(command: list[str], name: str, garbage: Path) -> None:
-    require_refusal(rise_di(*command, name))
+def test_an_invalid_file_is_rejected(command: list[str], name: str, garbage: Path) -> None:
+    require_rejection(rise_di(*command, name))
 
 
 OPTIONS = {
@@ -169,11 +169,11 @@ OPTIONS = {
 
 
 @pytest.mark.parametrize("command", OPTIONS)
-def test_a_value_that_is_none_is_refused(command: str, garbage: Path) -> None:
+def test_an_invalid_value_is_rejected(command: str, garbage: Path) -> None:
     for value in OPTIONS[command]:
         if command.startswith("play") and value == ",":
-            continue  # which is none, and stands for all topics
-        require_refusal(rise_di(*command.split(), value))
+            continue  # an empty list, which selects all topics
+        require_rejection(rise_di(*command.split(), value))
 
 
 COMMANDS = ["fly", "report", "replay", "repair", "play", "gains", "check-signs", "airframes", "layouts", "identify"]
@@ -184,9 +184,9 @@ WORDS = st.sampled_from(COMMANDS + OTHERS + VALUES) | st.text(st.characters(code
 
 @few
 @given(st.lists(WORDS, max_size=5))
-def test_no_words_end_in_a_traceback(garbage: Path, words: list[str]) -> None:
+def test_no_arguments_end_in_a_traceback(garbage: Path, words: list[str]) -> None:
     if words[:1] == ["fly"]:
-        words = ["fly", "absent", *words[1:]]  # what may fly, flies
-    said = rise_di(*words)
-    assert said.status in (0, 1, 2)
-    assert "Traceback" not in said.errors
+        words = ["fly", "absent", *words[1:]]  # do not fly a valid scenario
+    result = rise_di(*words)
+    assert result.status in (0, 1, 2)
+    assert "Traceback" not in result.errors

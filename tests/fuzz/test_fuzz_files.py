@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files and messages of any content are read, or refused with one sentence: no other exception, no hang, bounded memory."""
+"""Fuzzing of file readers: any content is read or rejected with one sentence, in bounded time and memory."""
 
 import os
 import subprocess
@@ -15,7 +15,7 @@ import yaml
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from tests.conftest import REPOSITORY
-from tests.fuzz.targets import SEEDS, TARGETS, log, refused
+from tests.fuzz.targets import SEEDS, TARGETS, log, rejected
 from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -25,7 +25,7 @@ from flight_log.tape_reader import read_run
 
 CORPUS = REPOSITORY / "tests" / "corpus"
 
-# The same examples each time: a test that fails fails for everybody. Long searches are benchmarks/fuzz.py's.
+# Deterministic examples. benchmarks/fuzz.py does long searches.
 few = settings(
     max_examples=30,
     derandomize=True,
@@ -37,7 +37,7 @@ few = settings(
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_what_fuzzers_found_is_read_or_refused_in_time_and_memory(target: str) -> None:
+def test_the_corpus_is_read_or_rejected_in_bounded_time_and_memory(target: str) -> None:
     files = sorted(str(path) for path in (CORPUS / target).iterdir())
     assert files
     command = [sys.executable, "-m", "benchmarks.fuzz", target, "--replay", *files]
@@ -50,14 +50,14 @@ def test_the_corpus_is_small() -> None:
     assert sum(path.stat().st_size for path in CORPUS.rglob("*") if path.is_file()) < 300_000
 
 
-# Bytes: cut, changed, put elsewhere
+# Bytes: truncated, changed, moved
 
 BINARY = {name: SEEDS[name]() for name in ("mcap", "message")}
 
 
 @st.composite
 def damaged(draw: st.DrawFn, name: str) -> bytes:
-    """A sound input that was cut, in which bytes were changed, taken out or come twice."""
+    """A valid input that is truncated, or with changed, removed or duplicated bytes."""
     data = bytearray(draw(st.sampled_from(BINARY[name])))
     for _ in range(draw(st.integers(1, 4))):
         place, other = sorted((draw(st.integers(0, len(data))), draw(st.integers(0, len(data)))))
@@ -80,17 +80,17 @@ NUMBERS = [0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1, 2**63, 2*
 
 @few
 @given(damaged("mcap"))
-def test_a_damaged_log_is_read_repaired_or_refused(tmp_path: Path, data: bytes) -> None:
+def test_a_damaged_log_is_read_repaired_or_rejected(tmp_path: Path, data: bytes) -> None:
     TARGETS["mcap"](data, tmp_path)
 
 
 @few
 @given(damaged("message") | st.binary(max_size=200))
-def test_a_damaged_message_in_a_log_is_read_or_left_out(tmp_path: Path, data: bytes) -> None:
+def test_a_damaged_message_in_a_log_is_read_or_skipped(tmp_path: Path, data: bytes) -> None:
     TARGETS["message"](data, tmp_path)
 
 
-# Text: values that are not what is asked for, wherever one stands
+# Text: unexpected values at any place
 
 SCALARS = (
     st.none()
@@ -107,7 +107,7 @@ VALUES = st.recursive(
 
 @st.composite
 def edited(draw: st.DrawFn, seeds: list[Any]) -> bytes:
-    """A sound file in which some values are others, or under other keys."""
+    """A valid file with some other values or keys."""
     tree = yaml.safe_load(draw(st.sampled_from(seeds)))
     for _ in range(draw(st.integers(1, 3))):
         node = tree
@@ -131,25 +131,25 @@ def edited(draw: st.DrawFn, seeds: list[Any]) -> bytes:
 
 @few
 @given(edited(SEEDS["scenario"]()))
-def test_a_scenario_with_other_values_flies_or_is_refused(tmp_path: Path, data: bytes) -> None:
+def test_a_scenario_with_other_values_flies_or_is_rejected(tmp_path: Path, data: bytes) -> None:
     TARGETS["scenario"](data, tmp_path)
 
 
 @few
 @given(edited(SEEDS["airframe"]()))
-def test_an_airframe_with_other_values_is_one_or_is_refused(tmp_path: Path, data: bytes) -> None:
+def test_an_airframe_with_other_values_is_valid_or_rejected(tmp_path: Path, data: bytes) -> None:
     TARGETS["airframe"](data, tmp_path)
 
 
 @few
 @given(edited(SEEDS["map"]()))
-def test_a_channel_map_with_other_values_is_one_or_is_refused(tmp_path: Path, data: bytes) -> None:
+def test_a_channel_map_with_other_values_is_valid_or_rejected(tmp_path: Path, data: bytes) -> None:
     TARGETS["map"](data, tmp_path)
 
 
 @few
 @given(edited(SEEDS["metadata"]()) | st.binary(max_size=100))
-def test_metadata_with_other_values_leave_the_log_readable(tmp_path: Path, data: bytes) -> None:
+def test_metadata_with_other_values_leaves_the_log_readable(tmp_path: Path, data: bytes) -> None:
     TARGETS["metadata"](data, tmp_path)
 
 
@@ -176,19 +176,19 @@ def test_metadata_with_other_values_leave_the_log_readable(tmp_path: Path, data:
     ],
     ids=range(15),
 )
-def test_yaml_that_is_made_to_hurt_is_refused(target: str, text: str, tmp_path: Path) -> None:
+def test_malicious_yaml_is_rejected(target: str, text: str, tmp_path: Path) -> None:
     TARGETS[target](text.encode(), tmp_path)
 
 
-def test_a_file_too_large_for_one_and_a_pipe_are_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_too_large_and_a_pipe_are_rejected(tmp_path: Path) -> None:
     TARGETS["scenario"](b"# " + b"x" * (2 << 20), tmp_path)
     (tmp_path / "run").mkdir()
     for name in ("run_0.mcap", "metadata.yaml"):
         os.mkfifo(tmp_path / "run" / name)
-    assert refused(lambda: read_run(tmp_path / "run"))  # and nobody is waited for
+    assert rejected(lambda: read_run(tmp_path / "run"))  # without blocking on the pipe
 
 
-# Flights of any content: what can be read has a report
+# Flights of any content: a readable log has a report
 
 Report = Callable[[Callable[[Path], object], list[tuple[str, str, bytes]]], None]
 TOPICS = st.sampled_from(["/y", "/y_m", "/u", "/u_m", "/internals", "/truth", "/two/y", "y", "/", ""])
@@ -204,7 +204,7 @@ NUMBER = st.floats() | st.sampled_from([0.0, 1.0, 1e300, -1e300, 5e-324])
 
 @st.composite
 def flights(draw: st.DrawFn, complete: dict[str, tuple[str, ...]]) -> list[tuple[str, str, bytes]]:
-    """Messages of a flight, of which some topics, channels, stamps and values are as they should be."""
+    """Messages of a flight with some correct topics, channels, stamps and values."""
     messages = []
     for topic, names in [*complete.items(), *draw(st.dictionaries(TOPICS, CHANNELS.map(tuple), max_size=2)).items()]:
         for k in range(draw(st.integers(0, 4))):
@@ -222,14 +222,14 @@ def channels(scenario: Scenario) -> dict[str, tuple[str, ...]]:
 
 @pytest.fixture
 def reported(tmp_path: Path, osprey_gust: Scenario) -> Report:
-    """What reads these messages as a flight of the default scenario."""
+    """Reads messages as a flight of the default scenario."""
 
     def report(read: Callable[[Path], object], messages: list[tuple[str, str, bytes]]) -> None:
         run = tmp_path / "run"
         run.mkdir(exist_ok=True)
         (run / "run_0.mcap").write_bytes(log(messages, attached={"osprey_gust.yaml": osprey_gust.path.read_bytes()}))
         with np.errstate(all="ignore"):
-            refused(lambda: read(run))
+            rejected(lambda: read(run))
 
     return report
 
@@ -239,13 +239,13 @@ FLIGHTS = flights(channels(find_scenario("osprey_gust")))
 
 @few
 @given(FLIGHTS)
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, on values that no flight has
-def test_a_flight_of_any_values_has_figures_or_is_refused(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, for extreme values
+def test_a_flight_of_any_values_has_a_summary_or_is_rejected(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
     reported(read_flight, messages)
 
 
 @settings(few, max_examples=5)  # each page takes half a second
 @given(FLIGHTS)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_a_flight_of_any_values_has_a_page_or_is_refused(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
+def test_a_flight_of_any_values_has_a_page_or_is_rejected(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
     reported(write_report, messages)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Real processes over real DDS: each test in a domain of its own, and nothing left running after it."""
+"""Fixtures for real processes over real DDS. Each test has its own domain; its processes are killed afterwards."""
 
 import itertools
 import os
@@ -20,7 +20,7 @@ Start = Callable[..., "Process"]
 
 
 class Process:
-    """A process under test, its output collected line by line."""
+    """A process under test and the lines of its output."""
 
     def __init__(self, *arguments: str, cwd: Path, within: Sequence[str] = (), stdin: int | None = None) -> None:
         self.popen = subprocess.Popen(
@@ -45,29 +45,29 @@ class Process:
 
     @property
     def output(self) -> str:
-        """All that was said so far."""
+        """The output so far."""
         return "\n".join(self.lines)
 
     def wait_for(self, text: str, timeout: float = 30.0) -> None:
-        """Until a line holds the text."""
+        """Wait until a line contains the text."""
         with self._changed:
-            said = self._changed.wait_for(lambda: any(text in line for line in self.lines), timeout)
-        assert said, f"{text!r} not said within {timeout} s; said:\n{self.output}"
+            logged = self._changed.wait_for(lambda: any(text in line for line in self.lines), timeout)
+        assert logged, f"{text!r} not logged within {timeout} s; output:\n{self.output}"
 
     def children(self) -> list[psutil.Process]:
-        """Its processes."""
+        """Its child processes."""
         return psutil.Process(self.popen.pid).children(recursive=True)
 
     def interrupt(self) -> None:
-        """As Ctrl-C does."""
+        """Send SIGINT, as Ctrl-C does."""
         self.popen.send_signal(signal.SIGINT)
 
     def end(self, timeout: float = 30.0) -> int:
-        """Wait for the end; the exit status."""
+        """Wait for the end. Returns the exit status."""
         try:
             status = self.popen.wait(timeout)
         except subprocess.TimeoutExpired:
-            pytest.fail(f"still running after {timeout} s; said:\n{self.output}")
+            pytest.fail(f"still running after {timeout} s; output:\n{self.output}")
         self._reader.join()
         assert self.popen.stdout is not None
         self.popen.stdout.close()
@@ -76,7 +76,7 @@ class Process:
 
 @pytest.fixture(autouse=True)
 def domain(monkeypatch: pytest.MonkeyPatch) -> int:
-    """A ROS domain that no other test is in; 1 to 100 keep clear of the ports that Linux gives away."""
+    """A ROS domain of this test alone. The ports of domains 1 to 100 are below the ephemeral ports of Linux."""
     number = 1 + next(_numbers) % 100
     monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
     return number
@@ -84,9 +84,9 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> int:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
-    """Start `python -m MODULE ...` in the test's folder, `within` another command.
+    """Start `python -m MODULE ...` in the test's folder, optionally `within` another command.
 
-    Whatever still runs at the test's end is killed, with its children.
+    Processes that still run at the end of the test are killed with their children.
     """
     started: list[Process] = []
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A peer for a node under test: publishes y and y_m, listens to everything the controller says, calls its services."""
+"""A peer of a node under test: publishes y and y_m, subscribes to topics of the node, calls its services."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -24,7 +24,7 @@ OUTPUTS = ("q", "V", "p", "r")
 
 
 class Peer:
-    """Event-driven: `until` spins until a condition holds."""
+    """A node that runs while `until` waits for a condition. `received` holds its messages by topic."""
 
     def __init__(self, context: Context, topics: tuple[str, ...], qos: QoSProfile) -> None:
         self.node = Node("peer", context=context)
@@ -46,13 +46,13 @@ class Peer:
                 each()
 
     def send(self, y: float = 0.0, y_m: float = 0.0) -> None:
-        """One sample of y and y_m, all channels alike, stamped now."""
+        """Publish one sample of y and one of y_m, with equal channels, stamped now."""
         now_ns = time.time_ns()
         for name, value in (("y_m", y_m), ("y", y)):
             self.publish(name, to_message(now_ns, OUTPUTS, np.full(4, value), "peer"))
 
     def publish(self, topic: str, message: JointState) -> None:
-        """Any named vector on any topic."""
+        """Publish a named vector on a topic."""
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(JointState, topic, PUBLISH)
         self._publishers[topic].publish(message)
@@ -66,18 +66,18 @@ class Peer:
         return future.result()
 
     def modes(self) -> list[int]:
-        """The modes in `internals`, repeats left out."""
+        """The sequence of modes in `internals`, without repetitions."""
         modes = [int(message.position[message.name.index("mode")]) for message in self.received["internals"]]
         return [mode for index, mode in enumerate(modes) if index == 0 or modes[index - 1] != mode]
 
     def u(self) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """All inputs heard, shape (N, m)."""
+        """All received inputs, shape (N, m)."""
         return np.array([message.position for message in self.received["u"]])
 
 
 @contextmanager
 def peer(topics: tuple[str, ...] = ("u", "internals", "/diagnostics"), qos: QoSProfile | None = None) -> Iterator[Peer]:
-    """A peer in a context of its own, that listens to these topics."""
+    """A peer in its own context with subscriptions to these topics."""
     transport.prepare()
     context = Context()
     rclpy.init(context=context)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Payloads of any content, as a node takes them: a sample, or refused with a reason, and the next sound one is read."""
+"""Fuzzing of the decoders: any payload is decoded or rejected with a reason, and the next valid message is decoded."""
 
 from typing import Any
 
@@ -33,7 +33,7 @@ many = settings(
 
 @st.composite
 def payloads(draw: st.DrawFn) -> bytes:
-    """A sound payload in which some bytes are others, or which is cut or longer; or any bytes."""
+    """A valid payload with changed bytes, or truncated, or extended."""
     names = draw(st.sampled_from([NAMES, NAMES[::-1], ("q",), ("q", "q", "V", "p", "r"), ()]))
     values = draw(st.lists(st.floats(), min_size=len(names), max_size=len(names)))
     stamp = draw(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
@@ -57,8 +57,8 @@ def payloads(draw: st.DrawFn) -> bytes:
 CORPUS = [path.read_bytes() for path in sorted((REPOSITORY / "tests" / "corpus" / "message").iterdir())]
 
 
-def taken(decoder: Decoder, raw: bytes) -> None:
-    """Read it, or see that it is refused with a reason of those that are counted."""
+def decode_or_reject(decoder: Decoder, raw: bytes) -> None:
+    """Decode a payload, or require that it is rejected with one of the counted reasons."""
     reason = ""
     try:
         sample = decoder.decode(raw)
@@ -71,22 +71,22 @@ def taken(decoder: Decoder, raw: bytes) -> None:
 
 @many
 @given(payloads() | st.binary(max_size=120) | st.sampled_from(CORPUS))
-def test_any_payload_is_a_sample_or_refused_and_spoils_no_other(raw: bytes) -> None:
-    for seal in (None, MessageAuthenticator(bytes(32), "/y", None)):
-        decoder = Decoder(NAMES, seal)
-        taken(decoder, raw)
-        good = Encoder(NAMES, "/aircraft#1", seal).encode(7, np.array([1.0, 2.0, 3.0, 4.0]))
-        for _ in range(2):  # the long way, then the short one
+def test_any_payload_is_decoded_or_rejected_without_effect_on_the_next_one(raw: bytes) -> None:
+    for authenticator in (None, MessageAuthenticator(bytes(32), "/y", None)):
+        decoder = Decoder(NAMES, authenticator)
+        decode_or_reject(decoder, raw)
+        good = Encoder(NAMES, "/aircraft#1", authenticator).encode(7, np.array([1.0, 2.0, 3.0, 4.0]))
+        for _ in range(2):  # first with an unknown layout, then with a known one
             sample = decoder.decode(good)
             assert sample is not None
             assert sample.value.tolist() == [1.0, 2.0, 3.0, 4.0]
-            taken(decoder, raw)
+            decode_or_reject(decoder, raw)
 
 
 @many
 @given(st.data())
-def test_any_payload_of_an_autopilots_topic_is_a_value_or_refused(data: st.DataObject) -> None:
-    channel_map = load_map("ardupilot")  # its message types are installed with the others
+def test_any_payload_of_an_autopilots_topic_is_a_value_or_rejected(data: st.DataObject) -> None:
+    channel_map = load_map("ardupilot")  # its message types are installed
     row = data.draw(st.sampled_from([*channel_map.outputs.values()]))
     kind: Any = message_type(row.type)
     raw = data.draw(payloads() | st.binary(max_size=200))

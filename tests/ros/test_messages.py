@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Named vectors as bytes: against rosbags, which serialises by itself, and against the middleware."""
+"""Named vectors as bytes: against the independent serialisation of rosbags, and against the middleware."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ STAMPS = st.integers(0, 2**31 * 10**9 - 1)
 
 
 def independent(stamp_ns: int, names: list[str], values: list[float], frame_id: str) -> bytes:
-    """The same message as rosbags serialises it."""
+    """The same message, serialised by rosbags."""
     stamp = TYPES["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     header = TYPES["std_msgs/msg/Header"](stamp, frame_id)
     none = np.zeros(0)
@@ -37,7 +37,7 @@ def test_a_sample_is_encoded_as_an_independent_library_encodes_it(
 ) -> None:
     values = data.draw(st.lists(st.floats(), min_size=len(names), max_size=len(names)))
     encoder = Encoder(names, frame_id)
-    encoder.encode(1, np.zeros(len(names)))  # what an earlier sample leaves behind does not show
+    encoder.encode(1, np.zeros(len(names)))  # an earlier sample leaves no trace
     assert encoder.encode(stamp_ns, np.array(values)) == independent(stamp_ns, names, values, frame_id)
 
 
@@ -49,18 +49,18 @@ def test_the_middleware_reads_what_was_encoded() -> None:
 
 
 @given(st.permutations(["q", "V", "p", "r"]), st.lists(st.floats(-1e9, 1e9), min_size=4, max_size=4), STAMPS)
-def test_wanted_channels_come_back_by_name_the_first_time_and_every_time(
+def test_wanted_channels_are_decoded_by_name_with_and_without_a_known_layout(
     names: list[str], values: list[float], stamp_ns: int
 ) -> None:
     decoder, encoder = Decoder(("p", "V")), Encoder(names, "/aircraft#1")
-    for _ in range(2):  # the second sample takes the short way
+    for _ in range(2):  # the second sample has a known layout
         sample = decoder.decode(encoder.encode(stamp_ns, np.array(values)))
         assert sample is not None
         assert (sample.stamp_ns, sample.sender) == (stamp_ns, "/aircraft#1")
         assert sample.value.tolist() == [values[names.index("p")], values[names.index("V")]]
 
 
-def test_a_decoder_follows_a_sender_that_changes_its_names_or_another_one() -> None:
+def test_a_decoder_follows_a_change_of_channel_names_or_publisher() -> None:
     decoder = Decoder(("q",))
     for names, frame_id in ((("q", "V"), "a"), (("V", "q"), "a"), (("q",), "b"), (("q", "V"), "a")):
         raw = Encoder(names, frame_id).encode(5, np.array([float(name == "q") for name in names]))
@@ -73,7 +73,7 @@ def test_a_vector_without_channels_is_no_sample() -> None:
     assert Decoder(("q",)).decode(Encoder((), "aircraft").encode(7, NO_CHANNELS)) is None
 
 
-def bad_samples() -> list[tuple[str, bytes]]:
+def invalid_samples() -> list[tuple[str, bytes]]:
     good = Encoder(("q", "V"), "a").encode(1, np.array([1.0, 2.0]))
     nan = Encoder(("q", "V"), "a").encode(2, np.array([np.nan, 2.0]))
     return [
@@ -85,15 +85,15 @@ def bad_samples() -> list[tuple[str, bytes]]:
     ]
 
 
-@pytest.mark.parametrize(("reason", "raw"), bad_samples())
-@pytest.mark.parametrize("after_a_good_one", [False, True])
-def test_what_cannot_be_used_is_refused_with_its_reason(reason: str, raw: bytes, after_a_good_one: bool) -> None:
+@pytest.mark.parametrize(("reason", "raw"), invalid_samples())
+@pytest.mark.parametrize("known_layout", [False, True])
+def test_an_invalid_message_is_rejected_with_its_reason(reason: str, raw: bytes, known_layout: bool) -> None:
     decoder, good = Decoder(("q", "V")), Encoder(("q", "V"), "a").encode(1, np.array([1.0, 2.0]))
-    if after_a_good_one:
+    if known_layout:
         decoder.decode(good)
-    with pytest.raises(ChannelError) as refused:
+    with pytest.raises(ChannelError) as rejected:
         decoder.decode(raw)
-    assert refused.value.reason == reason
+    assert rejected.value.reason == reason
     sample = decoder.decode(good)
     assert sample is not None
     assert sample.value.tolist() == [1.0, 2.0]

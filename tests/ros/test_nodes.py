@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each node alone: its refusals, its patience, its end."""
+"""Each node alone: parameter errors, waiting for a publisher, clean shutdown."""
 
 import signal
 import subprocess
@@ -21,7 +21,7 @@ NODES = {
 
 
 @pytest.mark.parametrize("package", NODES)
-def test_a_node_without_parameters_says_what_is_missing_and_ends_with_status_2(package: str, start: Start) -> None:
+def test_a_node_without_parameters_names_the_missing_one_and_ends_with_status_2(package: str, start: Start) -> None:
     node = start(f"{package}.main")
     assert node.end() == 2
     assert len(node.lines) == 1
@@ -39,7 +39,7 @@ def test_a_node_without_parameters_says_what_is_missing_and_ends_with_status_2(p
         (["--params-file", "nowhere.yaml"], "error: failed to initialize rcl: Couldn't parse params file"),
     ],
 )
-def test_a_bad_parameter_is_one_sentence(arguments: list[str], sentence: str, start: Start, osprey_gust: Scenario) -> None:
+def test_an_invalid_parameter_is_one_sentence(arguments: list[str], sentence: str, start: Start, osprey_gust: Scenario) -> None:
     node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path), *arguments)
     assert node.end() == 2
     assert any(line.startswith(sentence) for line in node.lines), node.output
@@ -48,7 +48,7 @@ def test_a_bad_parameter_is_one_sentence(arguments: list[str], sentence: str, st
 
 @pytest.mark.parametrize(("package", "waits_for"), [("rise_di_controller", "/y"), ("aircraft_sim", "/u")])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_without_its_peer_says_so_keeps_waiting_and_ends_cleanly(
+def test_a_node_without_a_publisher_warns_keeps_waiting_and_shuts_down_cleanly(
     package: str, waits_for: str, number: signal.Signals, start: Start, osprey_gust: Scenario
 ) -> None:
     node = start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path))
@@ -60,7 +60,7 @@ def test_a_node_without_its_peer_says_so_keeps_waiting_and_ends_cleanly(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_that_is_stopped_while_it_loads_ends_cleanly(
+def test_a_node_that_is_stopped_during_its_start_shuts_down_cleanly(
     number: signal.Signals, start: Start, osprey_gust: Scenario
 ) -> None:
     with peer(topics=()) as peer_node:
@@ -68,21 +68,23 @@ def test_a_node_that_is_stopped_while_it_loads_ends_cleanly(
         early_participant = f"_start_{node.popen.pid}"
         peer_node.until(
             lambda: early_participant in peer_node.node.get_node_names() or "ready" in node.output
-        )  # at times it is that quick
+        )  # the start may be faster than the discovery
         node.popen.send_signal(number)
         assert node.end(5.0) == 0
         assert "Traceback" not in node.output
 
 
-def test_what_holds_a_nodes_place_while_it_loads_goes(start: Start, osprey_gust: Scenario) -> None:
+def test_the_early_participant_is_destroyed_once_the_node_exists(start: Start, osprey_gust: Scenario) -> None:
     with peer(topics=()) as peer_node:
         node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
         node.wait_for("ready")
         peer_node.until(lambda: set(peer_node.node.get_node_names()) == {"peer", "controller"})
 
 
-def test_nothing_is_loaded_once_a_node_is_ready(start: Start, osprey_gust: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
-    # What a function of a library loads at its first call, it would load in the middle of a tick.
+def test_no_module_is_imported_once_a_node_is_ready(
+    start: Start, osprey_gust: Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A library function that imports modules at its first call would do so inside a tick.
     monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
     with peer(topics=("/diagnostics",)) as peer_node:
         nodes = [start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path)) for package in NODES]
@@ -96,8 +98,8 @@ def test_nothing_is_loaded_once_a_node_is_ready(start: Start, osprey_gust: Scena
         assert [line for line in node.output.partition("]: ready")[2].splitlines() if "import time:" in line] == []
 
 
-def test_a_storm_of_signals_ends_a_node_as_one_does(start: Start, osprey_gust: Scenario) -> None:
-    # A lock taken in the handler would hang here: the second signal comes while the first is handled.
+def test_a_burst_of_signals_ends_a_node_as_one_signal_does(start: Start, osprey_gust: Scenario) -> None:
+    # A lock in the signal handler would deadlock here: the second signal interrupts the first handler.
     node = start("aircraft_sim.main", "--ros-args", "--params-file", str(osprey_gust.path))
     node.wait_for("waiting for /u")
     for _ in range(50):
@@ -106,7 +108,7 @@ def test_a_storm_of_signals_ends_a_node_as_one_does(start: Start, osprey_gust: S
     assert node.end(5.0) == 0
 
 
-def test_a_missing_transport_profile_is_refused_before_anything_starts(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_transport_profile_is_an_error_before_the_start(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/nowhere/profile.xml")
     node = start("aircraft_sim.main")
     assert node.end() == 2
@@ -114,13 +116,13 @@ def test_a_missing_transport_profile_is_refused_before_anything_starts(start: St
 
 
 @pytest.mark.parametrize("package", ["aircraft_sim", "reference_model"])
-def test_a_start_in_the_past_is_refused_not_caught_up_with(package: str, start: Start, osprey_gust: Scenario) -> None:
+def test_a_start_time_in_the_past_is_an_error(package: str, start: Start, osprey_gust: Scenario) -> None:
     node = start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path), "-p", "start_time:=1000000.0")
     assert node.end() == 2
     assert any("start_time: found an instant" in line for line in node.lines)
 
 
-def test_a_recorder_that_cannot_write_says_where(start: Start, osprey_gust: Scenario) -> None:
+def test_a_recorder_that_cannot_write_names_the_folder(start: Start, osprey_gust: Scenario) -> None:
     arguments = ("--params-file", str(osprey_gust.path), "-p", "directory:=/proc/nowhere")
     node = start("flight_recorder.main", "--ros-args", *arguments)
     assert node.end() == 2
@@ -128,8 +130,8 @@ def test_a_recorder_that_cannot_write_says_where(start: Start, osprey_gust: Scen
 
 
 @pytest.mark.parametrize(("package", "executable"), NODES.items())
-def test_installed_executable_runs(package: str, executable: str) -> None:
+def test_an_installed_executable_runs(package: str, executable: str) -> None:
     script = Path(__file__).resolve().parents[2] / "ros_ws" / "install" / package / "lib" / package / executable
-    shown = subprocess.run([script], capture_output=True, text=True, timeout=60, check=False)
-    assert shown.returncode == 2
-    assert f"error: {executable}." in shown.stderr
+    process = subprocess.run([script], capture_output=True, text=True, timeout=60, check=False)
+    assert process.returncode == 2
+    assert f"error: {executable}." in process.stderr

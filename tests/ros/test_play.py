@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded flight played to nodes that listen: every byte, in time, and a controller that answers as it did."""
+"""rise-di play: subscribers get every byte of a recorded flight in time; a controller reproduces its u."""
 
 import time
 from collections.abc import Iterator
@@ -37,20 +37,20 @@ def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path
     return write_run(tape, tmp_path_factory.mktemp("play") / "run", LogAttachments(osprey_gust.path)).parent
 
 
-class Listener:
-    """Takes the bytes of topics as they come, with the instants at which they were sent."""
+class Receiver:
+    """Subscribes to topics; holds the bytes of their messages and the instants at which they were sent."""
 
     def __init__(self, *topics: Topic) -> None:
         transport.prepare()
         self._context = Context()
         rclpy.init(context=self._context)
-        self._node = Node("listener", context=self._context)
+        self._node = Node("receiver", context=self._context)
         self._polled_subscriptions = [PolledSubscription(self._node, topic, LOCKSTEP, raw=True) for topic in topics]
         self.received: dict[str, list[bytes]] = {topic.name: [] for topic in topics}
         self.sent: dict[str, list[int]] = {topic.name: [] for topic in topics}
 
     def until(self, topic: Topic, count: int, timeout: float = 40.0) -> None:
-        """Until so many messages have come on a topic."""
+        """Wait for a number of messages of a topic."""
         deadline = time.monotonic() + timeout
         while len(self.received[topic.name]) < count:
             assert time.monotonic() < deadline, (
@@ -63,14 +63,14 @@ class Listener:
             time.sleep(0.002)
 
     def close(self) -> None:
-        """Leave."""
+        """Destroy the node."""
         self._node.destroy_node()
         self._context.try_shutdown()
 
 
 @contextmanager
-def listener(*topics: Topic) -> Iterator[Listener]:
-    made = Listener(*topics)
+def receiver(*topics: Topic) -> Iterator[Receiver]:
+    made = Receiver(*topics)
     try:
         yield made
     finally:
@@ -81,86 +81,84 @@ def of(run: Path, topic: str) -> list[bytes]:
     return [message.data for message in read_playback(run, [topic]).messages]
 
 
-def test_a_flight_is_played_byte_by_byte_with_its_timing_and_the_clock_of_the_log(run: Path, start: Start) -> None:
-    with listener(Y, Y_M, CLOCK) as ears:
+def test_a_flight_is_played_byte_by_byte_with_its_timing_and_its_clock(run: Path, start: Start) -> None:
+    with receiver(Y, Y_M, CLOCK) as receiving:
         process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "2")
-        ears.until(Y, 1001)
-        ears.until(Y_M, 1001)
+        receiving.until(Y, 1001)
+        receiving.until(Y_M, 1001)
         assert process.end() == 0, process.output
-        ears.until(CLOCK, 201)
-    assert ears.received["y"] == of(run, "y")
-    assert ears.received["y_m"] == of(run, "y_m")
-    assert [stamp_of(clock) for clock in ears.received["/clock"]] == [k * 10 * MS for k in range(201)]
-    # 2 s at twice the rate, on absolute deadlines: what the machine delays is made up for, and never adds up
-    sent = np.array(ears.sent["y"])
+        receiving.until(CLOCK, 201)
+    assert receiving.received["y"] == of(run, "y")
+    assert receiving.received["y_m"] == of(run, "y_m")
+    assert [stamp_of(clock) for clock in receiving.received["/clock"]] == [k * 10 * MS for k in range(201)]
+    # 2 s at twice the rate, on absolute deadlines: host delays do not accumulate
+    sent = np.array(receiving.sent["y"])
     late = (sent - sent[0]) / NANOSECONDS - np.arange(1001) * 0.001
     assert np.median(np.abs(late)) < 0.02
 
 
-def test_stamps_are_moved_to_now_at_the_rate_and_all_else_stays_as_recorded(run: Path, start: Start) -> None:
-    with listener(Y) as ears:
+def test_stamps_are_moved_to_now_and_all_other_bytes_are_unchanged(run: Path, start: Start) -> None:
+    with receiver(Y) as receiving:
         process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--rate", "2", "--start", "1.5")
-        ears.until(Y, 251)
+        receiving.until(Y, 251)
         assert process.end() == 0, process.output
-    stamps = np.array([stamp_of(message) for message in ears.received["y"]])
+    stamps = np.array([stamp_of(message) for message in receiving.received["y"]])
     assert set(np.diff(stamps)) == {MS}  # 2 ms at twice the rate
-    assert np.median(np.abs(stamps - np.array(ears.sent["y"]))) < 50 * MS  # as fresh as they were
+    assert np.median(np.abs(stamps - np.array(receiving.sent["y"]))) < 50 * MS  # as fresh as they were
     recorded = of(run, "y")[-251:]
-    assert [message[:4] + message[12:] for message in ears.received["y"]] == [
+    assert [message[:4] + message[12:] for message in receiving.received["y"]] == [
         message[:4] + message[12:] for message in recorded
     ]
 
 
-def test_a_domain_in_which_somebody_publishes_the_topic_is_refused(run: Path, start: Start, domain: int) -> None:
+def test_a_domain_with_a_publisher_of_the_topic_is_an_error(run: Path, start: Start, domain: int) -> None:
     with peer(()) as peer_node:
         peer_node.publish("y", to_message(0, ("q",), np.zeros(1), "peer"))
         process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
         assert process.end() == 2
-    (said,) = process.lines
-    assert said.startswith(
+    (message,) = process.lines
+    assert message.startswith(
         f"error: ROS_DOMAIN_ID {domain}: found 1 publishers of /y already, expected no publisher: set ROS_DOMAIN"
     )
 
 
-def test_a_loop_goes_on_until_it_is_interrupted(run: Path, start: Start) -> None:
-    with listener(Y) as ears:
+def test_a_loop_repeats_until_it_is_interrupted(run: Path, start: Start) -> None:
+    with receiver(Y) as receiving:
         process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--start", "1.9", "--loop")
-        ears.until(Y, 3 * 51 + 1)
+        receiving.until(Y, 3 * 51 + 1)
         process.interrupt()
         begin = time.monotonic()
         assert process.end() == 130
     assert time.monotonic() - begin < 3.0
     assert "Traceback" not in process.output
-    stamps = [stamp_of(message) for message in ears.received["y"]]
+    stamps = [stamp_of(message) for message in receiving.received["y"]]
     assert stamps == sorted(stamps)  # also from one pass to the next
 
 
 @pytest.fixture(scope="module")
 def lockstep_run(tmp_path_factory: pytest.TempPathFactory, osprey_gust: Scenario) -> Path:
-    """Where the lockstep flight of the next test goes."""
+    """Folder of the lockstep flight of the next test."""
     return tmp_path_factory.mktemp("lockstep")
 
 
-def test_a_controller_alone_answers_a_lockstep_flight_with_the_same_bytes(
-    lockstep_run: Path, osprey_gust: Scenario, start: Start
-) -> None:
+def test_a_controller_reproduces_a_lockstep_flight_to_the_byte(lockstep_run: Path, osprey_gust: Scenario, start: Start) -> None:
     flight = start("flight_cli.cli", "fly", "osprey_gust", "--one-process", "--duration", "2", "--runs", str(lockstep_run))
     assert flight.end(timeout=120) == 0, flight.output
     recorded = lockstep_run / "latest"
-    u, said = of(recorded, "u"), of(recorded, "internals")
+    u, internals = of(recorded, "u"), of(recorded, "internals")
     controller = ("--params-file", str(osprey_gust.path), "-p", "lockstep:=true", "-p", "y_rate:=500.0")
-    with listener(U, INTERNALS) as ears:
+    with receiver(U, INTERNALS) as receiving:
         node = start("rise_di_controller.main", "--ros-args", *controller)
         node.wait_for("ready")
         process = start("flight_cli.cli", "play", str(recorded), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "3")
-        ears.until(U, len(u))
-        ears.until(INTERNALS, len(said))
+        receiving.until(U, len(u))
+        receiving.until(INTERNALS, len(internals))
         assert process.end() == 0, process.output
-    assert ears.received["u"] == u
-    assert ears.received["internals"] == said
+    assert receiving.received["u"] == u
+    assert receiving.received["internals"] == internals
 
 
-def test_a_controller_in_real_time_flies_along_a_recorded_flight(run: Path, osprey_gust: Scenario, start: Start) -> None:
+def test_a_controller_in_real_time_follows_a_recorded_flight(run: Path, osprey_gust: Scenario, start: Start) -> None:
     with peer() as peer_node:
         node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
         node.wait_for("ready")
@@ -168,9 +166,9 @@ def test_a_controller_in_real_time_flies_along_a_recorded_flight(run: Path, ospr
         node.wait_for("WAITING -> ENGAGED")
         peer_node.until(lambda: process.popen.poll() is not None)
         assert process.end() == 0, process.output
-        answered = peer_node.u()
-    # The recorded aircraft does not fly this u, and these ticks see other samples of y than the recorded ones did: it is near,
-    # not equal. In 2 s the recorded u goes to 0.06.
+        u = peer_node.u()
+    # The recorded aircraft does not respond to this u, and these ticks use other samples of y than the recorded ones. So
+    # both u are close but not equal. In 2 s the recorded u reaches 0.06.
     log = read_run(run).tape["u"].values
-    assert len(answered) > 100
-    assert np.abs(answered).max() == pytest.approx(np.abs(log).max(), rel=0.3)
+    assert len(u) > 100
+    assert np.abs(u).max() == pytest.approx(np.abs(log).max(), rel=0.3)

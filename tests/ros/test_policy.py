@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The access control policy that is shipped names what the nodes have, no less and no more."""
+"""The access control policy allows exactly the topics and services that the nodes have."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -27,17 +27,17 @@ class Access(NamedTuple):
     request: frozenset[str]
 
     def merged(self, other: "Access") -> "Access":
-        """What either has."""
+        """The union of both."""
         return Access(*(one | more for one, more in zip(self, other, strict=True)))
 
 
 def in_full(name: str, node: str) -> str:
-    """As the policy's format resolves it: behind "~" by the node's name, else by the namespace, which is the root here."""
+    """The full name, resolved as in the policy format: "~" is the node's name; the namespace is the root."""
     return f"/{node}/{name[1:]}" if name.startswith("~") else f"/{name.removeprefix('/')}"
 
 
 def allowed() -> dict[str, Access]:
-    """What each node may do, by its name."""
+    """What the policy allows each node, by node name."""
     found = {}
     for enclave in ElementTree.parse(POLICY).getroot().findall("enclaves/enclave"):
         profiles = enclave.findall("profiles/profile")
@@ -56,7 +56,7 @@ def allowed() -> dict[str, Access]:
 
 
 def graph(peer_node: Peer, node: str) -> Access:
-    """What a node has."""
+    """The topics and services of a node in the ROS graph."""
     lists = []
     for kind in ("publisher", "subscriber", "service", "client"):
         find = getattr(peer_node.node, f"get_{kind}_names_and_types_by_node")
@@ -64,20 +64,20 @@ def graph(peer_node: Peer, node: str) -> Access:
     return Access(*lists)
 
 
-def seen(peer_node: Peer, nodes: tuple[str, ...], policy: dict[str, Access]) -> dict[str, Access]:
-    """What the nodes have, once all that is allowed in either way of flying has been found, or nothing more comes."""
+def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
+    """The topics and services of the nodes, once the discovery has settled."""
     found: dict[str, Access] = {}
 
-    def stands() -> bool:
-        there = {name for name, _ in peer_node.node.get_node_names_and_namespaces()}
-        if not there >= set(nodes):
+    def settled() -> bool:
+        present = {name for name, _ in peer_node.node.get_node_names_and_namespaces()}
+        if not present >= set(nodes):
             return False
         before = dict(found)
         found.update({node: graph(peer_node, node) for node in nodes})
         return found == before and all(one.publish and one.reply for one in found.values())
 
-    for _ in range(3):  # endpoints of a node come one by one
-        peer_node.until(stands, timeout=60.0)
+    for _ in range(3):  # the endpoints of a node are discovered one by one
+        peer_node.until(settled, timeout=60.0)
         waited = peer_node.node.get_clock().now().nanoseconds + 500_000_000
         peer_node.until(lambda end=waited: peer_node.node.get_clock().now().nanoseconds > end)  # type: ignore[misc]
     return found
@@ -86,7 +86,7 @@ def seen(peer_node: Peer, nodes: tuple[str, ...], policy: dict[str, Access]) -> 
 ROLES = ("aircraft", "reference_model", "controller", "recorder")
 
 
-def test_the_policy_names_every_topic_and_service_of_a_flight_and_no_other(
+def test_the_policy_allows_exactly_the_topics_and_services_of_a_flight(
     start: Start, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     policy, file = allowed(), str(osprey_gust.path)
@@ -96,34 +96,34 @@ def test_the_policy_names_every_topic_and_service_of_a_flight_and_no_other(
         processes.append(start("flight_recorder.main", "--ros-args", "--params-file", file))
         for process in processes:
             process.wait_for("ready", timeout=60.0)
-        real_time = seen(peer_node, ROLES, policy)
+        real_time = discovered(peer_node, ROLES)
         for process in processes:
             process.interrupt()
             process.end()
-        told = [f"{role}:lockstep:=true" for role in ROLES] + ["aircraft:control_rate:=100.0", "controller:y_rate:=500.0"]
-        told.append(f"recorder:directory:={tmp_path / 'run'}")
-        start("flight_bringup.main", "--ros-args", "--params-file", file, *(word for one in told for word in ("-p", one)))
-        lockstep = seen(peer_node, ROLES, policy)
+        overrides = [f"{role}:lockstep:=true" for role in ROLES] + ["aircraft:control_rate:=100.0", "controller:y_rate:=500.0"]
+        overrides.append(f"recorder:directory:={tmp_path / 'run'}")
+        start("flight_bringup.main", "--ros-args", "--params-file", file, *(word for one in overrides for word in ("-p", one)))
+        lockstep = discovered(peer_node, ROLES)
     for role in ROLES:
         assert real_time[role].merged(lockstep[role]) == policy[role], role
 
 
-def test_the_policy_names_what_the_monitor_of_a_flight_has(osprey_gust: Scenario) -> None:
+def test_the_policy_allows_exactly_those_of_the_flight_monitor(osprey_gust: Scenario) -> None:
     with peer(topics=()) as peer_node, FlightMonitor(osprey_gust.controller.outputs, lockstep=False):
-        assert seen(peer_node, ("monitor",), allowed())["monitor"] == allowed()["monitor"]
+        assert discovered(peer_node, ("monitor",))["monitor"] == allowed()["monitor"]
 
 
-def test_the_policy_names_what_the_bridge_has_with_every_map(start: Start) -> None:
+def test_the_policy_allows_exactly_those_of_the_bridge_with_every_map(start: Start) -> None:
     maps = [load_map(path.stem) for path in sorted(LIBRARY.glob("*.yaml"))]
     used = [row for channel_map in maps for row in channel_map.used_topics()]
-    sent = {topic for key, topic, _ in used if key.startswith("messages.")}
-    heard = {topic for key, topic, _ in used if not key.startswith("messages.")}
+    published = {topic for key, topic, _ in used if key.startswith("messages.")}
+    subscribed = {topic for key, topic, _ in used if not key.startswith("messages.")}
     policy = allowed()["bridge"]
     with peer(topics=()) as peer_node:
-        start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot").wait_for("dry run")  # its message types are here
-        own = seen(peer_node, ("bridge",), allowed())["bridge"]
-    assert own.publish | sent == policy.publish
-    assert own.subscribe | heard == policy.subscribe
+        start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot").wait_for("dry run")
+        own = discovered(peer_node, ("bridge",))["bridge"]
+    assert own.publish | published == policy.publish
+    assert own.subscribe | subscribed == policy.subscribe
     assert (own.reply, own.request) == (policy.reply, policy.request)
 
 
@@ -133,5 +133,5 @@ def test_the_policy_allows_no_wildcard() -> None:
 
 
 @pytest.mark.parametrize("node", allowed())
-def test_nobody_may_ask_a_service(node: str) -> None:
+def test_the_policy_allows_no_service_request(node: str) -> None:
     assert not allowed()[node].request

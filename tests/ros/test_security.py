@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Who can hear y and have a u flown: from another host, from this one, with a key and without (docs/security.md)."""
+"""Attacks from this host and from another one, with and without a key: message authentication, replay protection, transport."""
 
 import json
 import shutil
@@ -28,85 +28,85 @@ from flight_ros.transport import LOOPBACK_PROFILE
 INPUTS = ("elevator", "thrust", "aileron", "rudder")
 KEY, OTHER_KEY = bytes(range(32)), bytes(range(1, 33))
 PATIENCE = 5.0
-"""s that an outsider tries. One that gets through does so within 1 s on an idle machine (discovery 0.1 s, then y at 500 Hz)."""
+"""s of an attack. A successful one takes 1 s on an idle host (discovery 0.1 s, then y at 500 Hz)."""
 
 BUSY = 120.0
-"""s that a busy machine is left for what takes 1 s on an idle one: the start of a process, for the most part."""
+"""s, timeout on a busy host for what takes 1 s on an idle one, mostly the start of a process."""
 
 
-# Signed samples, as bytes
+# Message authentication
 
 
-def sealed(topic: str = "/u", key: bytes = KEY, since_ns: int | None = None) -> MessageAuthenticator:
+def make_authenticator(topic: str = "/u", key: bytes = KEY, since_ns: int | None = None) -> MessageAuthenticator:
     return MessageAuthenticator(key, topic, since_ns)
 
 
-def u_message(stamp_ns: int, seal: MessageAuthenticator | None = None) -> bytes:
-    return Encoder(INPUTS, "/controller#1", seal).encode(stamp_ns, np.array([0.1, 0.2, 0.3, 0.4]))
+def u_message(stamp_ns: int, authenticator: MessageAuthenticator | None = None) -> bytes:
+    return Encoder(INPUTS, "/controller#1", authenticator).encode(stamp_ns, np.array([0.1, 0.2, 0.3, 0.4]))
 
 
-def refusal(decoder: Decoder, raw: bytes) -> str:
-    with pytest.raises(ChannelError) as refused:
+def rejection(decoder: Decoder, raw: bytes) -> str:
+    with pytest.raises(ChannelError) as rejected:
         decoder.decode(raw)
-    return refused.value.reason
+    return rejected.value.reason
 
 
-@pytest.mark.parametrize("seal", [None, sealed()], ids=["no key", "key"])
-def test_a_signed_sample_is_read_with_the_key_and_by_those_who_have_none(seal: MessageAuthenticator | None) -> None:
-    decoder = Decoder(INPUTS, seal)
-    for stamp_ns in (5, 6, 7):  # the later ones take the short way
-        sample = decoder.decode(u_message(stamp_ns, sealed()))
+@pytest.mark.parametrize("authenticator", [None, make_authenticator()], ids=["no key", "key"])
+def test_a_signed_sample_is_decoded_with_the_key_and_without_one(authenticator: MessageAuthenticator | None) -> None:
+    decoder = Decoder(INPUTS, authenticator)
+    for stamp_ns in (5, 6, 7):  # the later ones have a known layout
+        sample = decoder.decode(u_message(stamp_ns, make_authenticator()))
         assert sample is not None
         assert (sample.stamp_ns, sample.sender, sample.value.tolist()) == (stamp_ns, "/controller#1", [0.1, 0.2, 0.3, 0.4])
 
 
 @given(st.data())
-def test_no_changed_byte_of_a_signed_sample_passes(data: st.DataObject) -> None:
-    raw = bytearray(u_message(5, sealed()))
+def test_a_signed_sample_with_a_changed_byte_is_rejected(data: st.DataObject) -> None:
+    raw = bytearray(u_message(5, make_authenticator()))
     place = data.draw(st.integers(0, len(raw) - 1))
     raw[place] ^= data.draw(st.integers(1, 255))
-    decoder = Decoder(INPUTS, sealed())
-    decoder.decode(u_message(4, sealed()))
-    assert refusal(decoder, bytes(raw)) == "mac"
+    decoder = Decoder(INPUTS, make_authenticator())
+    decoder.decode(u_message(4, make_authenticator()))
+    assert rejection(decoder, bytes(raw)) == "mac"
 
 
 @given(st.binary(max_size=300))
-def test_no_bytes_of_others_pass(raw: bytes) -> None:
-    assert refusal(Decoder(INPUTS, sealed()), raw) == "mac"
+def test_arbitrary_bytes_are_rejected(raw: bytes) -> None:
+    assert rejection(Decoder(INPUTS, make_authenticator()), raw) == "mac"
 
 
 @pytest.mark.parametrize(
-    "seal",
-    [None, sealed(key=OTHER_KEY), sealed("/two/u"), sealed("/y")],
+    "authenticator",
+    [None, make_authenticator(key=OTHER_KEY), make_authenticator("/two/u"), make_authenticator("/y")],
     ids=["no key", "another key", "another aircraft", "y"],
 )
-def test_a_sample_without_the_key_or_for_another_topic_is_refused(seal: MessageAuthenticator | None) -> None:
-    assert refusal(Decoder(INPUTS, sealed()), u_message(5, seal)) == "mac"
+def test_a_sample_without_the_key_or_for_another_topic_is_rejected(authenticator: MessageAuthenticator | None) -> None:
+    assert rejection(Decoder(INPUTS, make_authenticator()), u_message(5, authenticator)) == "mac"
 
 
-def test_signed_samples_are_let_in_once_and_none_from_before_the_start() -> None:
-    decoder = Decoder(INPUTS, sealed(since_ns=100))
-    assert refusal(decoder, u_message(100, sealed())) == "order"
-    assert decoder.decode(u_message(101, sealed())) is not None
+def test_replay_protection_accepts_a_sample_once_and_none_from_before_the_start() -> None:
+    decoder = Decoder(INPUTS, make_authenticator(since_ns=100))
+    assert rejection(decoder, u_message(100, make_authenticator())) == "order"
+    assert decoder.decode(u_message(101, make_authenticator())) is not None
     for stamp_ns in (101, 90):
-        assert refusal(decoder, u_message(stamp_ns, sealed())) == "order"
-    assert refusal(decoder, u_message(2**30, sealed(key=OTHER_KEY))) == "mac"  # and moves nothing
-    assert decoder.decode(u_message(102, sealed())) is not None
+        assert rejection(decoder, u_message(stamp_ns, make_authenticator())) == "order"
+    assert rejection(decoder, u_message(2**30, make_authenticator(key=OTHER_KEY))) == "mac"  # without effect on the last stamp
+    assert decoder.decode(u_message(102, make_authenticator())) is not None
 
 
-def test_without_a_key_the_bytes_are_as_ever() -> None:
-    signed, plain = u_message(5, sealed()), u_message(5)
+def test_without_a_key_a_message_has_no_code() -> None:
+    signed, plain = u_message(5, make_authenticator()), u_message(5)
     assert plain == Encoder(INPUTS, "/controller#1").encode(5, np.array([0.1, 0.2, 0.3, 0.4]))
     assert b";mac=" not in plain
-    assert signed == u_message(5, sealed())  # in lockstep signed bytes repeat too
+    assert signed == u_message(5, make_authenticator())  # signed bytes are repeatable, as lockstep requires
 
 
-# This host
+# Attacks from this host
 
 
 @pytest.fixture
 def keys(tmp_path: Path) -> tuple[Path, Path]:
-    """Two key files: that of the flight, and another one."""
+    """Two key files: the one of the flight, and another one."""
     made = tmp_path / "key", tmp_path / "other"
     for path, key in zip(made, (KEY, OTHER_KEY), strict=True):
         path.write_bytes(key)
@@ -114,8 +114,8 @@ def keys(tmp_path: Path) -> tuple[Path, Path]:
     return made
 
 
-def aircraft(start: Start, scenario: Scenario, *told: str, within: tuple[str, ...] = ()) -> Process:
-    process = start("aircraft_sim.main", "--ros-args", "--params-file", str(scenario.path), *told, within=within)
+def aircraft(start: Start, scenario: Scenario, *arguments: str, within: tuple[str, ...] = ()) -> Process:
+    process = start("aircraft_sim.main", "--ros-args", "--params-file", str(scenario.path), *arguments, within=within)
     process.wait_for("ready", BUSY)
     return process
 
@@ -127,34 +127,34 @@ def environment(**variables: str) -> tuple[str, ...]:
 ON_LOOPBACK = environment(FASTRTPS_DEFAULT_PROFILES_FILE=str(LOOPBACK_PROFILE), ROS_AUTOMATIC_DISCOVERY_RANGE="SYSTEM_DEFAULT")
 
 
-def heard(outsider: Process) -> int:
-    """How many y it heard, once it has ended."""
-    assert outsider.end(BUSY) == 0, outsider.output
-    return int(json.loads(outsider.lines[-1])["heard"])
+def received(attacker: Process) -> int:
+    """Number of samples of y that the attacker received until its end."""
+    assert attacker.end(BUSY) == 0, attacker.output
+    return int(json.loads(attacker.lines[-1])["received"])
 
 
-def test_by_default_any_process_of_this_machine_hears_y_and_has_its_u_flown(start: Start, osprey_gust: Scenario) -> None:
-    flown = aircraft(start, osprey_gust)
-    assert heard(start("tests.ros.outsider", "30", within=ON_LOOPBACK)) > 0
-    flown.wait_for("receiving u from /controller#1")
+def test_by_default_any_process_of_this_host_receives_y_and_commands_u(start: Start, osprey_gust: Scenario) -> None:
+    node = aircraft(start, osprey_gust)
+    assert received(start("tests.ros.attacker", "30", within=ON_LOOPBACK)) > 0
+    node.wait_for("receiving u from /controller#1")
 
 
 @pytest.mark.parametrize("number", [0, 1], ids=["no key", "another key"])
-def test_with_a_key_no_process_of_this_machine_without_it_has_its_u_flown(
+def test_with_a_key_a_process_of_this_host_without_it_cannot_command_u(
     number: int, start: Start, osprey_gust: Scenario, keys: tuple[Path, Path]
 ) -> None:
-    flown = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
-    attacker = start("tests.ros.outsider", "30", *([str(keys[1])] if number else []), within=ON_LOOPBACK)
-    assert heard(attacker) > 0  # what stays open: it can listen
-    flown.wait_for("it is signed with another key" if number else "it is not signed")
-    assert "receiving u from" not in flown.output
+    node = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
+    attacker = start("tests.ros.attacker", "30", *([str(keys[1])] if number else []), within=ON_LOOPBACK)
+    assert received(attacker) > 0  # y is not encrypted
+    node.wait_for("wrong message authentication code" if number else "no message authentication code")
+    assert "receiving u from" not in node.output
 
 
-def test_with_the_key_it_is_flown(start: Start, osprey_gust: Scenario, keys: tuple[Path, Path]) -> None:
-    flown = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
-    assert heard(start("tests.ros.outsider", "30", str(keys[0]), within=ON_LOOPBACK)) > 0
-    flown.wait_for("receiving u from /controller#1")
-    assert "sample refused" not in flown.output
+def test_a_process_with_the_key_commands_u(start: Start, osprey_gust: Scenario, keys: tuple[Path, Path]) -> None:
+    node = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
+    assert received(start("tests.ros.attacker", "30", str(keys[0]), within=ON_LOOPBACK)) > 0
+    node.wait_for("receiving u from /controller#1")
+    assert "sample refused" not in node.output
 
 
 @pytest.fixture
@@ -163,43 +163,43 @@ def peer_node() -> Iterator[Peer]:
         yield made
 
 
-def counted(peer_node: Peer, reason: str) -> Callable[[], bool]:
-    """Whether the diagnostics say that u were refused for it."""
+def is_rejected(peer_node: Peer, reason: str) -> Callable[[], bool]:
+    """Condition: the diagnostics count samples of u that were rejected for this reason."""
 
-    def is_counted() -> bool:
+    def counted() -> bool:
         values = [value for array in peer_node.received["/diagnostics"] for status in array.status for value in status.values]
         return any(value.key == f"refused u: {reason}" and int(value.value) > 0 for value in values)
 
-    return is_counted
+    return counted
 
 
-def test_what_was_overheard_is_not_flown_again(
+def test_a_replayed_u_is_rejected_also_after_a_restart(
     start: Start, osprey_gust: Scenario, keys: tuple[Path, Path], peer_node: Peer
 ) -> None:
     before = time.time_ns()
     first = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
     publisher = peer_node.node.create_publisher(U.type, U.name, 10)
-    sealed_u = Encoder(INPUTS, "/controller#1", sealed())
-    overheard: list[bytes] = []
+    encoder = Encoder(INPUTS, "/controller#1", make_authenticator())
+    recorded: list[bytes] = []
 
     def send() -> None:
-        overheard.append(sealed_u.encode(time.time_ns(), np.zeros(4)))
-        publisher.publish(overheard[-1])
+        recorded.append(encoder.encode(time.time_ns(), np.zeros(4)))
+        publisher.publish(recorded[-1])
 
     peer_node.until(lambda: "receiving u from" in first.output, BUSY, each=send)
-    again = overheard[-1]
-    peer_node.until(counted(peer_node, "order"), BUSY, each=lambda: publisher.publish(again))
+    replayed = recorded[-1]
+    peer_node.until(is_rejected(peer_node, "order"), BUSY, each=lambda: publisher.publish(replayed))
     first.interrupt()
     assert first.end(BUSY) == 0
-    # An aircraft that is started anew remembers nothing, and refuses what is older than itself.
+    # A restarted aircraft has no memory of the last stamp, but rejects samples from before its start.
     peer_node.received["/diagnostics"].clear()
     second = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
-    peer_node.until(counted(peer_node, "order"), BUSY, each=lambda: publisher.publish(again))
-    peer_node.until(counted(peer_node, "mac"), BUSY, each=lambda: publisher.publish(u_message(before)))
+    peer_node.until(is_rejected(peer_node, "order"), BUSY, each=lambda: publisher.publish(replayed))
+    peer_node.until(is_rejected(peer_node, "mac"), BUSY, each=lambda: publisher.publish(u_message(before)))
     assert "receiving u from" not in second.output
 
 
-def test_a_flight_with_a_key_is_flown_and_signed(
+def test_a_flight_with_a_key_is_signed_and_replays_exactly(
     start: Start, osprey_gust: Scenario, keys: tuple[Path, Path], tmp_path: Path
 ) -> None:
     text = osprey_gust.path.read_text(encoding="utf-8")
@@ -209,9 +209,9 @@ def test_a_flight_with_a_key_is_flown_and_signed(
     scenario.write_text(text, encoding="utf-8")
     flight = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--duration", "2", "--runs", str(tmp_path / "runs"))
     assert flight.end(BUSY) == 0, flight.output
-    flown = start("flight_cli.cli", "replay", str(tmp_path / "runs" / "latest"))
-    assert flown.end(BUSY) == 0, flown.output
-    assert "every bit equal" in flown.output
+    node = start("flight_cli.cli", "replay", str(tmp_path / "runs" / "latest"))
+    assert node.end(BUSY) == 0, node.output
+    assert "every bit equal" in node.output
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_a_flight_with_a_key_is_flown_and_signed(
         (None, 0, "cannot be read (No such file or directory), expected"),
     ],
 )
-def test_a_key_file_that_is_none_stops_the_node(
+def test_an_invalid_key_file_stops_the_node(
     content: bytes | None, mode: int, sentence: str, start: Start, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     path = tmp_path / "bad"
@@ -235,11 +235,11 @@ def test_a_key_file_that_is_none_stops_the_node(
     assert f"error: aircraft.key_file: found {path} {sentence}" in node.output or sentence in node.output
 
 
-# Another host: a network namespace of its own, joined by a pair of virtual Ethernet devices
+# Attacks from another host: a separate network namespace, connected by a pair of virtual Ethernet devices
 
 
 class Hosts(NamedTuple):
-    """What to start a process with on each of two hosts, and the address of the first."""
+    """The commands that start a process on each of two hosts, and the address of the first one."""
 
     first: tuple[str, ...]
     second: tuple[str, ...]
@@ -248,7 +248,7 @@ class Hosts(NamedTuple):
 
 @pytest.fixture
 def hosts() -> Iterator[Hosts]:
-    """Two hosts on one network. Skipped where this user may not make any."""
+    """Two hosts on one network. Skipped without the permission to create them."""
     unshare, nsenter, ip = (shutil.which(command) or "" for command in ("unshare", "nsenter", "ip"))
     if not (unshare and nsenter and ip):
         pytest.skip("no unshare, nsenter (util-linux) or ip (iproute2) here")
@@ -277,7 +277,7 @@ def hosts() -> Iterator[Hosts]:
                 ["link", "set", "lo", "up"],
             ):
                 subprocess.run([*place, ip, *command], check=True)
-        for place in places:  # Linux says so up to a second later, and Fast DDS passes over a device that is not up
+        for place in places:  # it takes up to a second, and Fast DDS ignores a device that is not up
             deadline = time.monotonic() + 5.0
             while (
                 "state UP"
@@ -300,12 +300,12 @@ OPEN_PROFILE = """<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_P
     <userTransports><transport_id>udp</transport_id></userTransports><useBuiltinTransports>false</useBuiltinTransports>
   </rtps></participant>
 </profiles>
-"""  # UDP alone: namespaces of one machine share its memory, which hosts do not
+"""  # UDP alone: namespaces of one host share its memory, which hosts do not
 
 
 @pytest.fixture
 def on_network(tmp_path: Path) -> tuple[str, ...]:
-    """The environment of a process whose transport is the network."""
+    """The environment of a process with network transport."""
     profile = tmp_path / "open.xml"
     profile.write_text(OPEN_PROFILE, encoding="utf-8")
     return environment(
@@ -315,27 +315,27 @@ def on_network(tmp_path: Path) -> tuple[str, ...]:
     )
 
 
-def test_by_default_nobody_on_another_host_hears_y_or_has_its_u_flown(
+def test_by_default_another_host_neither_receives_y_nor_commands_u(
     start: Start, osprey_gust: Scenario, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
-    flown = aircraft(start, osprey_gust, within=hosts.first)
-    assert heard(start("tests.ros.outsider", f"{PATIENCE}", within=(*hosts.second, *on_network))) == 0
-    assert "receiving u from" not in flown.output
-    assert "sample refused" not in flown.output  # not even an attempt has arrived
+    node = aircraft(start, osprey_gust, within=hosts.first)
+    assert received(start("tests.ros.attacker", f"{PATIENCE}", within=(*hosts.second, *on_network))) == 0
+    assert "receiving u from" not in node.output
+    assert "sample refused" not in node.output  # no sample has arrived
 
 
-def test_on_a_network_of_its_own_profile_another_host_hears_y_and_has_its_u_flown(
+def test_with_a_network_profile_another_host_receives_y_and_commands_u(
     start: Start, osprey_gust: Scenario, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
-    flown = aircraft(start, osprey_gust, within=(*hosts.first, *on_network))
-    assert heard(start("tests.ros.outsider", "30", within=(*hosts.second, *on_network))) > 0
-    flown.wait_for("receiving u from /controller#1")
+    node = aircraft(start, osprey_gust, within=(*hosts.first, *on_network))
+    assert received(start("tests.ros.attacker", "30", within=(*hosts.second, *on_network))) > 0
+    node.wait_for("receiving u from /controller#1")
 
 
-def test_on_a_network_with_a_key_another_host_hears_y_but_has_no_u_flown(
+def test_with_a_network_profile_and_a_key_another_host_receives_y_but_cannot_command_u(
     start: Start, osprey_gust: Scenario, hosts: Hosts, on_network: tuple[str, ...], keys: tuple[Path, Path]
 ) -> None:
-    flown = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}", within=(*hosts.first, *on_network))
-    assert heard(start("tests.ros.outsider", "30", within=(*hosts.second, *on_network))) > 0
-    flown.wait_for("it is not signed")
-    assert "receiving u from" not in flown.output
+    node = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}", within=(*hosts.first, *on_network))
+    assert received(start("tests.ros.attacker", "30", within=(*hosts.second, *on_network))) > 0
+    node.wait_for("no message authentication code")
+    assert "receiving u from" not in node.output

@@ -100,10 +100,9 @@ class Player:
 def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
     seconds, nanosecond = STAMP.unpack_from(data, STAMP_PLACE)
     since_ns = seconds * NANOSECONDS + nanosecond - first_ns
+    stamp_ns = begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate))
     message = bytearray(data)
-    STAMP.pack_into(
-        message, STAMP_PLACE, *divmod(begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate)), NANOSECONDS)
-    )
+    STAMP.pack_into(message, STAMP_PLACE, *divmod(stamp_ns, NANOSECONDS))
     return bytes(message)
 
 

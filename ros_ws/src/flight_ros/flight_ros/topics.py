@@ -50,7 +50,7 @@ def publisher_qos(period_ns: int) -> QoSProfile:
 
 
 class NodeState(StrEnum):
-    """State of a node on `node_state`. READY: its event loop begins. COMPLETED: the aircraft has completed a lockstep flight."""
+    """State of a node on `node_state`. READY: its event loop runs. COMPLETED: the aircraft has completed a lockstep flight."""
 
     READY = "ready"
     COMPLETED = "completed"

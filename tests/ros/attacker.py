@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Somebody who has no business in a flight: hears y where it can, and commands the aircraft in the controller's name.
+"""Attacker of a flight: subscribes to y, and publishes u under the name of the controller.
 
-python -m tests.ros.outsider SECONDS [KEY_FILE]     # ends at once when it hears y and has sent u for a second
+python -m tests.ros.attacker SECONDS [KEY_FILE]     # ends early after ENOUGH samples of y and u
 
-Its transport is what the environment says. With a key it signs. Prints how many samples of y it has heard, as JSON.
+The environment selects its transport. With a key it signs. It prints the number of received samples of y as JSON.
 """
 
 import json
@@ -21,9 +21,9 @@ from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import NEWEST_SAMPLES, U, Y
 
 INPUTS = ("elevator", "thrust", "aileron", "rudder")
-ENOUGH = 50  # samples of y, and as many u
+ENOUGH = 50  # samples of y received, and samples of u sent
 
-# What any subscriber matches, whatever it asks for but what was kept.
+# Compatible with every subscriber that does not request transient-local durability.
 SEND = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -31,19 +31,19 @@ def main() -> None:
     """Attack."""
     seconds, *keys = sys.argv[1:]
     rclpy.init()
-    node = rclpy.create_node("outsider")
+    node = rclpy.create_node("attacker")
     subscription = PolledSubscription(node, Y, NEWEST_SAMPLES, raw=True)
     publisher = node.create_publisher(U.type, U.name, SEND)
-    seal = MessageAuthenticator(read_key(keys[0], "key_file"), "/u", None) if keys else None
-    encoder = Encoder(INPUTS, "/controller#1", seal)
-    heard = sent = 0
+    authenticator = MessageAuthenticator(read_key(keys[0], "key_file"), "/u", None) if keys else None
+    encoder = Encoder(INPUTS, "/controller#1", authenticator)
+    received = sent = 0
     deadline = time.monotonic() + float(seconds)
-    while time.monotonic() < deadline and not (heard >= ENOUGH and sent >= ENOUGH):
-        heard += len(subscription.take())
+    while time.monotonic() < deadline and not (received >= ENOUGH and sent >= ENOUGH):
+        received += len(subscription.take())
         publisher.publish(encoder.encode(time.time_ns(), np.array([0.0, 0.0, 0.02, 0.0])))
-        sent += heard > 0
+        sent += received > 0
         time.sleep(0.02)
-    print(json.dumps({"heard": heard}), flush=True)
+    print(json.dumps({"received": received}), flush=True)
     node.destroy_node()
     rclpy.try_shutdown()
 
