@@ -1,25 +1,25 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The osprey behind servos, measured with noise, delay and losses: figures beside those of a prototype of this law.
+"""Benchmark of the osprey with servos, noise, delay and losses, compared with a prototype of this law.
 
 python -m benchmarks.servo_world                  # all tables, ten minutes on two cores
 python -m benchmarks.servo_world --table noise    # one of them
 
-The prototype is another program by the same equations, the one that the gains of osprey_servo come from. Its figures are known
-to two or three digits. What they mean:
+The prototype is another program with the same equations. The gains of osprey_servo come from it. Its results have two or three
+digits, under these conditions:
 
-- y, y_m and the law share one rate (100 Hz where nothing else is said) and its instants; topics take no time;
-- the softened sign is three total lags wide in each channel, a total lag being that of the actuator + 1.5 periods;
+- y, y_m and the law share one rate (100 Hz by default) and its instants; topics take no time;
+- the softened sign is three total lags wide in each channel; a total lag is that of the actuator + 1.5 periods;
 - errors are true errors C x - y_m, rms over 60 s; noise is rms per sample;
 - the slew of an input is the mean of abs(u_dot), the rate of an actuator its largest at any instant;
-- a turn is coordinated to the bank of the reference model. Here it is to that of the command, 0.36 s earlier, which shows in r
-  alone: tests/pure/test_servo_world.py flies the other one.
+- a turn is coordinated to the bank of the reference model. Here it is coordinated to the bank of the command, 0.36 s earlier.
+  Only r differs; tests/pure/test_servo_world.py verifies that this is the reason.
 """
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from itertools import product
 from typing import Annotated, Any, NamedTuple
@@ -33,7 +33,7 @@ from rich.progress import track
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.gain_conditions import LinearPlant, Loop, delay_margin
-from flight_analysis.metrics import ErrorFigures, error_figures, true_error
+from flight_analysis.metrics import ErrorMetrics, error_metrics, true_error
 from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_campaign.statistics import score_units
@@ -44,29 +44,29 @@ from rise_di_controller import guard
 from rise_di_controller.law import LawParams
 
 NOISE = [0.0017, 0.03, 0.0017, 0.0017]  # q, V, p, r in rad/s and m/s, rms per sample of 10 ms
-SETTLED = {"q": ("vertical", 0.005), "V": ("vertical", 0.1), "r": ("lateral", 0.005)}  # rad/s, m/s: below it a gust is over
-FINE_STEP = 0.0005  # s: actuators lead by half a step of the integration, which the size of a limit cycle shows
+SETTLED = {"q": ("vertical", 0.005), "V": ("vertical", 0.1), "r": ("lateral", 0.005)}  # rad/s, m/s: settled below it
+FINE_STEP = 0.0005  # s: actuators lead by half an integration step, which changes the size of a limit cycle
 TRIPLED = 3.0  # times the score without delay
-WIDTH = 150  # characters, the least that the tables take, also into a file
+WIDTH = 150  # characters, least width of the tables
 DELAY_STEP, LONGEST_DELAY = 0.002, 0.13  # s
-SEEDS = range(1, 9)  # where losses in or out of a gust decide
+SEEDS = range(1, 9)  # means over seeds, for it matters whether losses fall into a gust
 
-Figure = tuple[float, ...]
+Values = tuple[float, ...]
 
 
 class Row(NamedTuple):
-    """A flight and what the prototype had of it, by the name of a figure; over several seeds the mean of each."""
+    """A flight and the prototype's values by metric; of several seeds the means."""
 
     name: str
     scenario: Scenario
-    published: Mapping[str, Figure]
+    published: Mapping[str, Values]
     window: tuple[float, float] = (0.0, 60.0)  # s
     seeds: Sequence[int] = (1,)
-    nominal_dt: bool = False  # integrate one period a sample, however much time has passed
+    nominal_dt: bool = False  # integrate one period per sample, whatever the elapsed time
 
 
-class Flown(NamedTuple):
-    """A flight of a row."""
+class WindowedFlight(NamedTuple):
+    """A flight and the window of time that is evaluated."""
 
     scenario: Scenario
     tape: Tape
@@ -79,63 +79,63 @@ class Flown(NamedTuple):
         return Signal(signal.stamp_ns[keep], signal.names, signal.values[keep])
 
 
-# Figures, in the units of the prototype: q, p, r in mrad/s, V in m/s, inputs in deg and %, airframe's order
+# Metrics in the units of the prototype: q, p, r in mrad/s, V in m/s, inputs in deg and %, in the airframe's order
 
 
-def rms(flown: Flown) -> FloatArray:
-    """Root mean square of the true error, (m,)."""
-    return _errors(flown, lambda figures: figures.rms)
+def rms(flight: WindowedFlight) -> FloatArray:
+    """Rms of the true error, (m,)."""
+    return _errors(flight, lambda figures: figures.rms)
 
 
-def largest(flown: Flown) -> FloatArray:
+def largest(flight: WindowedFlight) -> FloatArray:
     """Largest true error, (m,)."""
-    return _errors(flown, lambda figures: figures.max)
+    return _errors(flight, lambda figures: figures.max)
 
 
-def largest_u(flown: Flown) -> FloatArray:
+def largest_u(flight: WindowedFlight) -> FloatArray:
     """Largest abs(u), (m,)."""
-    u = flown.inside(flown.tape["u"])
-    return _inputs(flown, lambda name: np.abs(u[name]).max())
+    u = flight.inside(flight.tape["u"])
+    return _inputs(flight, lambda name: np.abs(u[name]).max())
 
 
-def slew(flown: Flown) -> FloatArray:
+def slew(flight: WindowedFlight) -> FloatArray:
     """Mean abs(u_dot), (m,), per s."""
-    u = flown.inside(flown.tape["u"])
-    return _inputs(flown, lambda name: float(np.mean(np.abs(np.diff(u[name])) / np.diff(u.stamp_ns)) * 1e9))
+    u = flight.inside(flight.tape["u"])
+    return _inputs(flight, lambda name: float(np.mean(np.abs(np.diff(u[name])) / np.diff(u.stamp_ns)) * 1e9))
 
 
-def largest_rate(flown: Flown) -> FloatArray:
+def largest_rate(flight: WindowedFlight) -> FloatArray:
     """Largest rate of the actuators, (m,), per s: abs(u - position) / lag right after a tick, as far as the limit allows."""
-    u, position = flown.inside(flown.tape["u"]), flown.inside(flown.tape["truth"]).group("actuator")
-    limits = flown.scenario.aircraft.actuators
+    u, position = flight.inside(flight.tape["u"]), flight.inside(flight.tape["truth"]).group("actuator")
+    limits = flight.scenario.aircraft.actuators
     lag, limit = (dict(zip(position.names, values, strict=True)) for values in (limits.lag, limits.rate))
-    return _inputs(flown, lambda name: min(np.abs(u[name] - position[name]).max() / lag[name], limit[name]))
+    return _inputs(flight, lambda name: min(np.abs(u[name] - position[name]).max() / lag[name], limit[name]))
 
 
-def settling(flown: Flown) -> FloatArray:
-    """How long after the entry of its gust an error last was above SETTLED, s, by channel of SETTLED."""
-    error, gusts = true_error_of(flown.tape), flown.scenario.gust_windows()
+def settling(flight: WindowedFlight) -> FloatArray:
+    """Time from the entry of a gust to the last error above SETTLED, s, by channel of SETTLED."""
+    error, gusts = true_error_of(flight.tape), flight.scenario.gust_windows()
     entries = sorted(start for start, _ in gusts.values())
     times = []
     for name, (gust, bound) in SETTLED.items():
         start, _ = gusts[gust]
-        until = min([entry for entry in entries if entry > start], default=flown.window[1])
-        one = Flown(flown.scenario, flown.tape, (start, until)).inside(error)
+        until = min([entry for entry in entries if entry > start], default=flight.window[1])
+        one = WindowedFlight(flight.scenario, flight.tape, (start, until)).inside(error)
         times.append(one.stamp_ns[np.abs(one[name]) > bound].max() / 1e9 - start)
     return np.array(times)
 
 
-def first_rms(flown: Flown) -> FloatArray:
-    """That of the first channel, q, alone, (1,)."""
-    return rms(flown)[:1]
+def first_rms(flight: WindowedFlight) -> FloatArray:
+    """Rms of the first channel, q, (1,)."""
+    return rms(flight)[:1]
 
 
-def first_slew(flown: Flown) -> FloatArray:
-    """That of the first input, the elevator, alone, (1,)."""
-    return slew(flown)[:1]
+def first_slew(flight: WindowedFlight) -> FloatArray:
+    """Slew of the first input, the elevator, (1,)."""
+    return slew(flight)[:1]
 
 
-FIGURES: dict[str, Callable[[Flown], FloatArray]] = {
+METRICS: dict[str, Callable[[WindowedFlight], FloatArray]] = {
     "rms": rms,
     "largest error": largest,
     "largest u": largest_u,
@@ -148,40 +148,40 @@ FIGURES: dict[str, Callable[[Flown], FloatArray]] = {
 
 
 def true_error_of(tape: Tape) -> Signal:
-    """The true error. Raises ParameterError for a tape that does not know it."""
+    """The true error. Raises ParameterError for a tape without it."""
     error = true_error(tape)
     if error is None:
-        raise ParameterError("truth: found no outputs in it, expected those of the simulated aircraft")
+        raise ParameterError("truth: found no outputs, expected those of the simulated aircraft")
     return error
 
 
-def _errors(flown: Flown, read: Callable[[ErrorFigures], float]) -> FloatArray:
-    error, units = flown.inside(true_error_of(flown.tape)), display_units(flown.scenario)
-    return np.array([read(error_figures(error[name])) * units[name].factor for name in error.names])
+def _errors(flight: WindowedFlight, read: Callable[[ErrorMetrics], float]) -> FloatArray:
+    error, units = flight.inside(true_error_of(flight.tape)), display_units(flight.scenario)
+    return np.array([read(error_metrics(error[name])) * units[name].factor for name in error.names])
 
 
-def _inputs(flown: Flown, read: Callable[[str], float]) -> FloatArray:
-    units = display_units(flown.scenario)
-    return np.array([read(name) * units[name].factor for name in flown.scenario.aircraft.channels().inputs])
+def _inputs(flight: WindowedFlight, read: Callable[[str], float]) -> FloatArray:
+    units = display_units(flight.scenario)
+    return np.array([read(name) * units[name].factor for name in flight.scenario.aircraft.channels().inputs])
 
 
 def measure(row: Row) -> dict[str, FloatArray]:
-    """The figures of a row that the prototype has too."""
+    """The metrics of a row that the prototype has too."""
     sensors = row.scenario.aircraft.sensors.model_dump()
-    found: dict[str, list[FloatArray]] = {key: [] for key in row.published}
-    with _integrated(nominal=row.nominal_dt):
+    measured: dict[str, list[FloatArray]] = {key: [] for key in row.published}
+    with _nominal_dt() if row.nominal_dt else nullcontext():
         for seed in row.seeds:
             scenario = row.scenario.vary(aircraft={"sensors": sensors | {"seed": seed}})
-            flown = Flown(scenario, simulate(scenario), row.window)
-            for key, values in found.items():
-                values.append(FIGURES[key](flown))
-    return {key: np.mean(values, axis=0) for key, values in found.items()}
+            flight = WindowedFlight(scenario, simulate(scenario), row.window)
+            for key, values in measured.items():
+                values.append(METRICS[key](flight))
+    return {key: np.mean(values, axis=0) for key, values in measured.items()}
 
 
 @contextmanager
-def _integrated(*, nominal: bool) -> Iterator[None]:
-    before = guard.DT_RANGE
-    guard.DT_RANGE = (1.0, 1.0) if nominal else before
+def _nominal_dt() -> Iterator[None]:
+    """The law integrates exactly one period per sample."""
+    before, guard.DT_RANGE = guard.DT_RANGE, (1.0, 1.0)
     try:
         yield
     finally:
@@ -192,21 +192,21 @@ def _integrated(*, nominal: bool) -> Iterator[None]:
 
 
 def score(scenario: Scenario) -> float:
-    """Sum over the channels of rms of the true error in its unit, of a flight."""
+    """Score of a flight: the sum over the channels of the rms true error in its unit."""
     error = true_error_of(simulate(scenario))
     unit = score_units(error.names, scenario.aircraft.channels().outputs)
-    return float(sum(error_figures(error[name]).rms / one for name, one in zip(error.names, unit.tolist(), strict=True)))
+    return float(sum(error_metrics(error[name]).rms / one for name, one in zip(error.names, unit.tolist(), strict=True)))
 
 
 def delayed(scenario: Scenario, delay: float, rate: float = 1.0 / DELAY_STEP) -> Scenario:
-    """The scenario with y late by `delay` s, whole periods of the aircraft's rate; that never counts as stale."""
+    """The scenario with y delayed by `delay` s, in whole periods of the aircraft's rate, and max_age raised accordingly."""
     sensors = scenario.aircraft.sensors.model_dump() | {"delay": delay}
     patient = {"max_age": scenario.controller.max_age + LONGEST_DELAY}
     return scenario.vary(aircraft={"rate": rate, "step": 1.0 / rate, "sensors": sensors}, controller=patient)
 
 
 def tripling_delay(scenario: Scenario) -> float:
-    """The delay at which the score is TRIPLED times that without, s: bisection, and linear between the last two."""
+    """The delay at which the score is TRIPLED times the score without delay, s: bisection, then linear interpolation."""
     alone = score(delayed(scenario, 0.0))
 
     def grown(steps: int) -> float:
@@ -223,7 +223,7 @@ def tripling_delay(scenario: Scenario) -> float:
 
 
 def linear_loop(scenario: Scenario) -> tuple[LinearPlant, LawParams, Loop]:
-    """The linear sampled loop of a softened sign, or of none (PI), in the law's order."""
+    """The linear sampled loop with a softened sign or without a sign (PI), in the law's order."""
     airframe, _ = scenario.aircraft.load()
     controller, lags = scenario.controller, scenario.aircraft.actuators.lag
     columns = [list(airframe.inputs).index(name) for name in controller.inputs]
@@ -239,11 +239,11 @@ def linear_loop(scenario: Scenario) -> tuple[LinearPlant, LawParams, Loop]:
 
 
 def servo_scenario(period: float = 0.01, *, gusts: bool = True, **controller: Any) -> Scenario:
-    """osprey_servo without noise as the prototype flew it; keys of the controller may be changed."""
+    """osprey_servo without noise under the prototype's conditions, with changes of the controller."""
     scenario, rate = find_scenario("osprey_servo"), 1.0 / period
-    calm: Changes = {} if gusts else {"gusts": {}}
+    wind: Changes = {} if gusts else {"gusts": {}}
     return scenario.vary(
-        aircraft={"rate": rate, "step": 0.0025, "sensors": {}} | calm,
+        aircraft={"rate": rate, "step": 0.0025, "sensors": {}} | wind,
         reference_model={"rate": rate},
         controller={"rate": rate, "delay": 0.0, "softening": 3.0} | controller,
     )
@@ -334,9 +334,9 @@ def gain_rows() -> list[Row]:
 
 
 def sampling_rows() -> list[Row]:
-    """Laws at rest and on sines with the gains of benchmarks/sampling.py, calm; V in m/s here too.
+    """Laws at rest and on sines with the gains of benchmarks/sampling.py, in calm air; V in m/s here too.
 
-    r on the sines is that of another bank, see above. With the prototype's, measured: implicit 2.21, soft 2.19, PI 5.49.
+    On the sines r differs for the bank, see above. With the prototype's bank, measured: implicit 2.21, soft 2.19, PI 5.49.
     """
     published = {
         ("literal", False): {"rms": (2.9, 0.107, 17.6, 6.0), "slew": (3.9, 54, 15, 15)},
@@ -371,18 +371,18 @@ def noise_rows() -> list[Row]:
         sensors = {"sensors": {"noise": [gyro, 0.0, gyro, gyro]}}
         calm = partial(servo_scenario, gusts=False)
         fine = sensors | {"step": FINE_STEP}
-        told = {"rms of q": (soft,), "slew of elevator": (soft_slew,)}
-        literal_told = {"rms of q": (literal,), "slew of elevator": (literal_slew,)}
+        soft_values = {"rms of q": (soft,), "slew of elevator": (soft_slew,)}
+        literal_values = {"rms of q": (literal,), "slew of elevator": (literal_slew,)}
         rows += [
-            Row(f"soft, {gyro:g} rad/s", calm().vary(aircraft=sensors), told),
-            Row(f"literal, {gyro:g} rad/s", calm(**LITERAL).vary(aircraft=fine), literal_told),
+            Row(f"soft, {gyro:g} rad/s", calm().vary(aircraft=sensors), soft_values),
+            Row(f"literal, {gyro:g} rad/s", calm(**LITERAL).vary(aircraft=fine), literal_values),
             Row(f"PI, {gyro:g} rad/s", calm(**PI).vary(aircraft=sensors), {"rms of q": (pi,)}),
         ]
     return rows
 
 
 def loss_rows() -> list[Row]:
-    """Samples lost, each a lost tick, in the gusts and with noise."""
+    """Lost samples of y, each a tick without a step, in the gusts and with noise."""
     nominal = {0.05: (7.9, 0.089, 10.3, 6.7), 0.2: (8.9, 0.093, 11.8, 7.5), 0.5: (12.6, 0.114, 17.1, 11.1)}
     real = {0.05: (7.6, 0.088, 9.9, 6.4), 0.2: (7.6, 0.088, 9.8, 6.4), 0.5: (7.8, 0.090, 9.8, 6.5)}
     noisy = servo_scenario().vary(aircraft={"sensors": {"noise": NOISE}})
@@ -395,19 +395,19 @@ def loss_rows() -> list[Row]:
 
 
 class DelayRow(NamedTuple):
-    """A loop and the delays at which the prototype's score tripled, and at which it was unstable in linear theory, ms."""
+    """A loop, and the prototype's delays of a tripled score and of linear instability, ms."""
 
     name: str
     scenario: Scenario
     tripled: float | None
-    linear: float | None  # None where the sign has no linear loop, or the prototype's margin is not known
+    linear: float | None  # None for a nonlinear sign, or where the prototype's margin is unknown
 
 
 def delay_rows() -> list[DelayRow]:
     """Delay of y beyond sampling, hold and servo, in the gusts without noise.
 
-    Where the prototype gives a span, "21 to 28 ms", it is read as from linear theory to the tripled score. Without actuators
-    the score of the implicit sign is 2.87 times at 12 ms and 3.17 times at the prototype's 14 ms: one step of 2 ms.
+    A range of the prototype, "21 to 28 ms", is read as linear instability to tripled score. Without actuators the score of the
+    implicit sign grows by 2.87 at 12 ms and by 3.17 at the prototype's 14 ms, one step of 2 ms later.
     """
     bare: Changes = {"actuators": {}}
     no_lag: Changes = {"lag": [0.0] * 4}
@@ -428,17 +428,17 @@ def delay_rows() -> list[DelayRow]:
 
 TABLES: dict[str, tuple[str, Callable[[], list[Row]]]] = {
     "gains": ("Laws, gains and rates", gain_rows),
-    "sampling": ("How the sign is sampled, behind servos", sampling_rows),
+    "sampling": ("Sampling of the sign, with servos", sampling_rows),
     "noise": ("Noise of the gyros in calm air", noise_rows),
     "losses": ("Lost samples", loss_rows),
 }
 
 
 def main(
-    table: Annotated[str | None, typer.Option(help=f"One of {', '.join([*TABLES, 'delays'])}; all where left out.")] = None,
+    table: Annotated[str | None, typer.Option(help=f"One of {', '.join([*TABLES, 'delays'])}; all by default.")] = None,
     processes: Annotated[int, typer.Option(min=1, help="Flights at a time.")] = os.cpu_count() or 1,
 ) -> None:
-    """Print figures of the osprey behind servos beside those of the prototype, and their ratio."""
+    """Print metrics of the osprey with servos beside those of the prototype, and their ratio."""
     console, bar = Console(), Console(stderr=True)
     console.width = max(console.width, WIDTH)
     require(table in (None, "delays", *TABLES), "--table", repr(table), f"one of {', '.join([*TABLES, 'delays'])}")
@@ -447,33 +447,35 @@ def main(
         for name, (title, make) in TABLES.items():
             if table in (None, name):
                 rows = make()
-                found = track(pool.map(measure, rows), name, len(rows), console=bar)
-                shown = new_table(title, ("flight", "figure", "here", "prototype", "ratio"), texts=2)
-                for row, figures in zip(rows, found, strict=True):
-                    for key, values in figures.items():
-                        of = np.array(row.published[key])
-                        ratios = " / ".join(f"{ratio:.2f}" for ratio in values / of)
-                        shown.add_row(row.name, key, cells(values), cells(of), ratios)
-                console.print(shown)
+                measured = track(pool.map(measure, rows), name, len(rows), console=bar)
+                output = new_table(title, ("flight", "metric", "here", "prototype", "ratio"), texts=2)
+                for row, metrics in zip(rows, measured, strict=True):
+                    for key, values in metrics.items():
+                        published = np.array(row.published[key])
+                        ratios = " / ".join(f"{ratio:.2f}" for ratio in values / published)
+                        output.add_row(row.name, key, cells(values), cells(published), ratios)
+                console.print(output)
         if table in (None, "delays"):
             delays = delay_rows()
             loops = [row.scenario for row in delays]
             tripled = list(track(pool.map(tripling_delay, loops), "delays", len(loops), console=bar))
-            shown = new_table(
-                "Delay: when the score triples, and when the linear loop turns unstable, ms",
+            output = new_table(
+                "Delay of a tripled score and of linear instability, ms",
                 ("loop", "tripled", "prototype", "ratio", "linear", "prototype", "ratio"),
                 texts=1,
             )
-            for one, flown in zip(delays, tripled, strict=True):
-                linear = None if one.linear is None else delay_margin(*linear_loop(one.scenario))
-                shown.add_row(one.name, *_beside(flown, one.tripled), *_beside(linear, one.linear))
-            console.print(shown)
+            for loop, delay in zip(delays, tripled, strict=True):
+                linear = None if loop.linear is None else delay_margin(*linear_loop(loop.scenario))
+                output.add_row(loop.name, *_compared(delay, loop.tripled), *_compared(linear, loop.linear))
+            console.print(output)
 
 
-def _beside(found: float | None, published: float | None) -> tuple[str, str, str]:
-    """Cells of a delay in s beside one in ms."""
-    here = "" if found is None else f"{found * 1e3:.1f}"
-    return (here, "", "") if found is None or published is None else (here, f"{published:g}", f"{found * 1e3 / published:.2f}")
+def _compared(measured: float | None, published: float | None) -> tuple[str, str, str]:
+    """Cells of a measured delay in s, a published one in ms, and their ratio."""
+    if measured is None:
+        return "", "", ""
+    here = f"{measured * 1e3:.1f}"
+    return (here, "", "") if published is None else (here, f"{published:g}", f"{measured * 1e3 / published:.2f}")
 
 
 if __name__ == "__main__":

@@ -162,3 +162,8 @@ def test_the_command_line_shows_its_help_without_loading_what_commands_need() ->
 )
 def test_a_node_loads_nothing_heavy_that_it_does_not_need(node: str, heavy: set[str]) -> None:
     assert not modules_loaded_by(f"import {node}.node") & heavy
+
+
+@pytest.mark.parametrize("module", ["flight_analysis.report.run_folder", "flight_analysis.closed_loop.simulate"])
+def test_a_flight_loads_no_library_of_the_report(module: str) -> None:
+    assert not modules_loaded_by(f"import {module}") & {"scipy", "plotly", "jinja2", "polars", "matplotlib"}

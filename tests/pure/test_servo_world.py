@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The osprey behind servos with noise, delay and losses: as a prototype of this law flew it, to 10 %.
+"""The osprey with servos, noise, delay and losses agrees with a prototype of this law to 10 %.
 
-The prototype is another program by the same equations; benchmarks/servo_world.py has all of its figures, says what they mean,
-and prints them beside those of this stack. Here are rows of each table. The prototype's figures have two or three digits, so
-that up to 5 % of the 10 is their rounding. Measured are 0 to 5 %, and up to 9 % in r, for the reason shown below.
+The prototype is another program with the same equations. benchmarks/servo_world.py holds all of its results and their
+conditions. This file tests rows of each table. The prototype's results have two or three digits, so rounding takes up to 5 % of
+the 10 %. Measured differences are 0 to 5 %, in r up to 9 % for a reason that is tested below.
 
 Further rows of the same tables are in test_sensors.py (noise, losses with the measured dt), test_actuators.py (PI),
 test_saturation.py (stops and rates) and test_gains.py (linear margins).
@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks import servo_world
-from benchmarks.servo_world import FIGURES, LITERAL, PI, TABLES, Row, delayed, linear_loop, measure, score, servo_scenario
+from benchmarks.servo_world import LITERAL, METRICS, PI, TABLES, Row, delayed, linear_loop, measure, score, servo_scenario
 from scipy.signal import lsim
-from tests.pure.test_saturation import error, last_beyond, moved_in, pulse, state
+from tests.pure.test_saturation import error, last_beyond, pulse, state, with_stops
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -35,20 +35,20 @@ def measured(name: str) -> dict[str, FloatArray]:
     return measure(ROWS[name])
 
 
-def assert_agrees(found: dict[str, FloatArray], row: Row) -> None:
-    for key, of in row.published.items():
-        assert found[key] == pytest.approx(of, rel=0.1), key
+def assert_agrees(metrics: dict[str, FloatArray], row: Row) -> None:
+    for key, published in row.published.items():
+        assert metrics[key] == pytest.approx(published, rel=0.1), key
 
 
 @pytest.mark.parametrize(
     "name",
     [
         "soft, 20 ms, calm",
-        "soft, 10 ms, gusts",  # and how long after each gust q, V and r settle: 1.70, 3.65, 1.52 s
+        "soft, 10 ms, gusts",  # also the settling times of q, V and r after each gust: 1.70, 3.65, 1.52 s
         "soft, low gains, gusts",
         "soft, high gains, gusts",
         "literal, calm",  # the limit cycle
-        "implicit, at rest",  # with the gains of benchmarks/sampling.py: its chatter behind servos that it does not know of
+        "implicit, at rest",  # gains of benchmarks/sampling.py; chatter with servos that the law ignores
         "soft, 0.005 rad/s",  # gyro noise per sample of 10 ms, calm air; none on V
         "soft, 0.05 rad/s",
         "PI, 0.005 rad/s",
@@ -57,12 +57,12 @@ def assert_agrees(found: dict[str, FloatArray], row: Row) -> None:
         "none lost",  # gusts, gyro noise 1.7 mrad/s, airspeed noise 0.03 m/s
     ],
 )
-def test_a_flight_of_the_prototype_flies_alike_here(name: str) -> None:
+def test_a_flight_agrees_with_the_prototype(name: str) -> None:
     assert_agrees(measured(name), ROWS[name])
 
 
-def test_beta_stops_paying_where_the_gyros_are_as_noisy_as_the_error() -> None:
-    # The prototype's two meet at 0.02 rad/s per sample, 7.2 mrad/s each; here they are 7.01 and 6.82 there.
+def test_the_sign_term_loses_its_advantage_with_gyros_as_noisy_as_the_error() -> None:
+    # The prototype's laws are equal at 0.02 rad/s per sample, 7.2 mrad/s each; here they have 7.01 and 6.82.
     q = {
         (sign, gyro): float(measured(f"{sign}, {gyro:g} rad/s")["rms of q"][0])
         for sign in ("soft", "PI")
@@ -73,10 +73,10 @@ def test_beta_stops_paying_where_the_gyros_are_as_noisy_as_the_error() -> None:
 
 
 @pytest.mark.parametrize(("name", "seeds"), [("20% lost, nominal dt", range(1, 5)), ("50% lost, nominal dt", range(1, 4))])
-def test_lost_ticks_cost_what_they_cost_the_prototype_where_one_period_is_integrated_a_sample(name: str, seeds: range) -> None:
-    # One flight is no figure: which samples of a gust are lost decides. Over twelve seeds the rms scatters (one standard
-    # deviation) by 0.6, 0.0015, 0.23, 0.5 at 20 % lost, by 2.2, 0.004, 0.9, 0.6 at 50 %. The means of twelve, 9.0, 0.092, 11.8,
-    # 7.9 and 12.7, 0.114, 17.3, 10.8, are the prototype's to 5 %.
+def test_lost_ticks_with_nominal_dt_cost_as_much_as_in_the_prototype(name: str, seeds: range) -> None:
+    # A single flight scatters with the samples that are lost in a gust. Over twelve seeds the rms has standard deviations of
+    # 0.6, 0.0015, 0.23, 0.5 at 20 % lost, of 2.2, 0.004, 0.9, 0.6 at 50 %. The means of twelve, 9.0, 0.092, 11.8,
+    # 7.9 and 12.7, 0.114, 17.3, 10.8, agree with the prototype to 5 %.
     assert_agrees(measure(ROWS[name]._replace(seeds=seeds)), ROWS[name])
 
 
@@ -84,42 +84,40 @@ def test_lost_ticks_cost_what_they_cost_the_prototype_where_one_period_is_integr
 
 
 @pytest.mark.parametrize(
-    ("changes", "stands", "breaks"),
+    ("changes", "below", "above"),
     [
         pytest.param({}, 0.045, 0.055, id="soft"),  # the prototype: 50 ms
         pytest.param(LITERAL, 0.040, 0.045, id="literal"),  # 44 ms
         pytest.param(PI, 0.090, 0.105, id="PI"),  # 98 ms
     ],
 )
-def test_the_score_triples_at_the_delay_at_which_the_prototypes_does(
-    changes: dict[str, Any], stands: float, breaks: float
-) -> None:
+def test_the_score_triples_at_the_delay_of_the_prototype(changes: dict[str, Any], below: float, above: float) -> None:
     # By bisection 50.1, 42.1 and 98.2 ms: benchmarks/servo_world.py. Delays here come in whole samples of 5 ms.
-    alone, below, above = (score(delayed(servo_scenario(**changes), delay, 200.0)) for delay in (0.0, stands, breaks))
-    assert below < servo_world.TRIPLED * alone < above
+    scores = [score(delayed(servo_scenario(**changes), delay, 200.0)) for delay in (0.0, below, above)]
+    assert scores[1] < servo_world.TRIPLED * scores[0] < scores[2]
 
 
-def test_ten_milliseconds_of_topics_cost_three_percent() -> None:
-    # Of V and r, says the prototype; here of V, and 1 % of the others.
+def test_ten_milliseconds_of_topic_delay_cost_three_percent() -> None:
+    # In the prototype of V and r; here of V, and 1 % of the others.
     none, late = (measure(Row("", delayed(servo_scenario(), delay, 100.0), {"rms": ()}))["rms"] for delay in (0.0, 0.01))
-    grown = late / none
-    assert (grown > 1.0).all()
-    assert (grown < 1.04).all()
-    assert grown[1] == pytest.approx(1.03, abs=0.01)
+    ratio = late / none
+    assert (ratio > 1.0).all()
+    assert (ratio < 1.04).all()
+    assert ratio[1] == pytest.approx(1.03, abs=0.01)
 
 
-def test_the_loop_stands_ten_times_its_gain() -> None:
-    # The prototype: 11 times. The linear sampled loop without delay.
+def test_the_loop_has_a_gain_margin_of_ten() -> None:
+    # The prototype has 11. The linear sampled loop without delay.
     plant, law, loop = linear_loop(servo_scenario())
     stable = {gain: is_stable(plant._replace(B=plant.B * gain), law, loop, np.zeros(4)) for gain in (10.0, 12.0)}
     assert stable == {10.0: True, 12.0: False}
 
 
-# What the figures that differ differ by
+# Reasons for differences
 
 
-def by_the_bank_of_the_model(scenario: Scenario) -> Callable[[FloatArray, Profile], FloatArray]:
-    """u_m with the turn coordinated to the bank of the reference model, phi_m_dot = p_m, in place of that of the command."""
+def turn_with_model_bank(scenario: Scenario) -> Callable[[FloatArray, Profile], FloatArray]:
+    """u_m with the turn coordinated to the bank of the reference model, phi_m_dot = p_m, instead of the command."""
     reference = scenario.reference_model
     profile = reference.profile()
     straight = profile._replace(turn_rate=0.0 * profile.turn_rate)
@@ -138,37 +136,40 @@ def by_the_bank_of_the_model(scenario: Scenario) -> Callable[[FloatArray, Profil
     return turned
 
 
-def test_r_differs_in_calm_air_because_the_turn_is_coordinated_to_another_bank(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The prototype's r follows the bank of the reference model: 14 mrad/s at most with the softened sign, PI 4.7 rms and 23 at
-    # most. Here the bank is that of the command: measured 12.5, and 5.47 and 25.6; with the prototype's 13.7, and 4.62, 22.2.
+def test_r_differs_in_calm_air_because_turns_are_coordinated_to_the_bank_of_the_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The prototype uses the bank of the reference model: max of r 14 mrad/s with the softened sign, PI 4.7 rms and max 23.
+    # Measured here with the bank of the command 12.5, and 5.47 and 25.6; with the prototype's bank 13.7, and 4.62 and 22.2.
     soft, pi = ROWS["soft, 10 ms, calm"], ROWS["PI, calm"]
     with pytest.raises(AssertionError):
         assert_agrees(measure(pi), pi)
-    monkeypatch.setattr("reference_model.reference.command", by_the_bank_of_the_model(pi.scenario))
+    monkeypatch.setattr("reference_model.reference.command", turn_with_model_bank(pi.scenario))
     assert_agrees(measure(soft), soft)
     assert_agrees(measure(pi), pi)
 
 
-def test_the_windup_of_the_thrust_is_that_of_a_pulse_of_twenty_seconds() -> None:
+def test_integrator_windup_and_anti_windup_of_the_thrust_agree_with_the_prototype() -> None:
     # Thrust +-15 %, V +4 m/s from 10 s to 30 s as in the manoeuvre of the scenario. The prototype: 677 % commanded, undershoot
-    # 1.42 m/s, 12.6 s to within 0.1 m/s, rms 0.96 m/s; conditional integration 60 %, 0.00, 4.1, 0.44. Measured 681, 1.41, 12.5,
-    # 0.946 and 60.6, 0.001, 4.08, 0.438. A pulse of 10 s, as in test_saturation.py, leaves 673, 1.34, 14.2, 1.17 of the first.
-    back, figures = 30.0, {}
+    # 1.42 m/s, 12.6 s to within 0.1 m/s, rms 0.96 m/s; with anti-windup (conditional integration) 60 %, 0.00, 4.1, 0.44.
+    # Measured 681, 1.41, 12.5, 0.946 and 60.6, 0.001, 4.08, 0.438. A pulse of 10 s, as in test_saturation.py, gives 673, 1.34,
+    # 14.2, 1.17 without anti-windup.
+    back, metrics = 30.0, {}
     for guarded in (False, True):
-        held = moved_in("thrust", 0.15, guarded=guarded)
+        held = with_stops("thrust", 0.15, guarded=guarded)
         tape = simulate(held.vary(flight={"duration": 60.0}, reference_model={"pulses": {"V": pulse(10.0, back, 4.0)}}))
         e, t = error(tape)["V"], tape.time("truth")
-        figures[guarded] = [
+        metrics[guarded] = [
             100.0 * np.abs(tape["internals"]["u_free.thrust"]).max(),
             -state(tape, "V")[t > back].min(),
             last_beyond(t, e, 0.1) - back,
             np.sqrt(np.mean(e**2)),
         ]
-    assert figures[False] == pytest.approx([677, 1.42, 12.6, 0.96], rel=0.1)
-    assert figures[True][0::2] == pytest.approx([60, 4.1], rel=0.1)
-    assert figures[True][1] < 0.005  # the prototype: 0.00
-    assert figures[True][3] == pytest.approx(0.44, rel=0.1)
+    assert metrics[False] == pytest.approx([677, 1.42, 12.6, 0.96], rel=0.1)
+    assert metrics[True][0::2] == pytest.approx([60, 4.1], rel=0.1)
+    assert metrics[True][1] < 0.005  # the prototype: 0.00
+    assert metrics[True][3] == pytest.approx(0.44, rel=0.1)
 
 
-def test_every_figure_of_every_row_is_one_that_is_measured() -> None:
-    assert {key for row in ROWS.values() for key in row.published} == set(FIGURES)
+def test_every_metric_of_every_row_is_known() -> None:
+    assert {key for row in ROWS.values() for key in row.published} == set(METRICS)
