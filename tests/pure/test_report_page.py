@@ -74,7 +74,7 @@ def curve(browser: Browser, plot: int, name: str, row: int = 1) -> tuple[list[fl
 
 def test_the_page_draws_all_figures_without_errors(browser: Browser, page: Path) -> None:
     open_page(browser, page)
-    assert browser.complaints == []
+    assert browser.console == []
     headings = browser.run("[...document.querySelectorAll('section h2')].map(heading => heading.textContent)")
     drawn = browser.run(f"{PLOTS}.map(plot => plot.querySelectorAll('.scatterlayer .trace, .barlayer .trace').length)")
     curves = dict(zip(headings, drawn, strict=True))
@@ -108,7 +108,7 @@ def test_a_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, 
     again, _ = curve(browser, 0, "y")
     assert len(again) < len(t)
     assert [again[0], again[-1]] == pytest.approx([0.0, 7.0], abs=0.01)  # to a bin
-    assert browser.complaints == []
+    assert browser.console == []
 
 
 def test_a_zoom_keeps_the_peaks_of_each_pixel(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
@@ -136,7 +136,7 @@ def test_the_dark_page_has_its_own_colours_and_follows_the_scheme(browser: Brows
     light = browser.run(look)
     assert light[0] == "rgb(255, 255, 255)"
     assert all(one != other for one, other in zip(dark, light, strict=True))
-    assert browser.complaints == []
+    assert browser.console == []
 
 
 def test_a_page_prints_in_light_colours_and_returns_to_the_screen(browser: Browser, page: Path) -> None:
@@ -147,7 +147,7 @@ def test_a_page_prints_in_light_colours_and_returns_to_the_screen(browser: Brows
     browser.wait_for(f"{DRAWN} === 3")
     assert browser.run(f"{PLOTS}[0].layout.xaxis.range") == [2.0, 3.0]
     assert browser.run(f"{PLOTS}[0].clientWidth") > 900
-    assert browser.complaints == []
+    assert browser.console == []
 
 
 def test_several_flights_are_overlaid(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
@@ -157,7 +157,7 @@ def test_several_flights_are_overlaid(browser: Browser, tmp_path: Path, servo: R
     open_page(browser, path)
     assert browser.run(f"{PLOTS}.slice(0, 4).map(plot => plot.data.length)") == [12, 8, 8, 8]
     zoom(browser, 1.0, 2.0, plot=1)
-    assert browser.complaints == []
+    assert browser.console == []
 
 
 def test_no_table_is_wider_than_the_page(browser: Browser, page: Path) -> None:
