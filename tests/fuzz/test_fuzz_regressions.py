@@ -82,10 +82,10 @@ def test_a_scenario_in_a_log_is_extracted_without_overwriting_the_log(name: str,
     content = osprey_gust.path.read_bytes()
     outputs, inputs = osprey_gust.controller.outputs, osprey_gust.controller.inputs
     topics = {"/y": outputs, "/y_m": outputs, "/u": inputs}
-    flown = [
+    messages = [
         (topic, JOINT_STATE, vector(k * 10_000_000, names, (0.0,) * 4)) for k in range(3) for topic, names in topics.items()
     ]
-    log_before = log(flown, attached={name: content})
+    log_before = log(messages, attached={name: content})
     run = write_run(tmp_path, log_before)
     read_flight(run)
     assert (run / "run_0.mcap").read_bytes() == log_before
@@ -164,10 +164,10 @@ def test_text_of_a_log_cannot_end_the_script_of_the_page() -> None:
 @pytest.mark.parametrize("value", [1e300, float("nan"), float("-inf")])
 def test_a_value_of_the_summary_that_is_not_finite_is_null(value: float, tmp_path: Path, osprey_gust: Scenario) -> None:
     topics = {"/y": osprey_gust.controller.outputs, "/y_m": osprey_gust.controller.outputs, "/u": osprey_gust.controller.inputs}
-    flown = [
+    messages = [
         (topic, JOINT_STATE, vector(k * 10_000_000, names, (value,) * 4)) for k in range(3) for topic, names in topics.items()
     ]
-    run = write_run(tmp_path, log(flown, attached={"osprey_gust.yaml": osprey_gust.path.read_bytes()}))
+    run = write_run(tmp_path, log(messages, attached={"osprey_gust.yaml": osprey_gust.path.read_bytes()}))
     summary = read_flight(run).summary
     json.dumps(summary, allow_nan=False)
     assert summary["errors"]["q"]["whole"]["rms"] in (None, 0.0)
