@@ -5,7 +5,7 @@ from setuptools import setup
 setup(
     name="flight_core",
     version="0.1.0",
-    description="Shared words of the RISE-DI flight stack: validated parameters, named vectors, integrators, rates, scenario files, tapes.",
+    description="Basics of the RISE-DI flight stack without ROS: parameters, named vectors, rates, integrators, scenario files, the tape.",
     license="Apache-2.0",
     packages=["flight_core"],
     data_files=[

@@ -5,7 +5,7 @@ from setuptools import setup
 setup(
     name="flight_ros",
     version="0.1.0",
-    description="The only shared ROS code of the RISE-DI flight stack: topics, parameters, messages as named vectors, the ticker, the node skeleton.",
+    description="Shared ROS code of the RISE-DI flight stack: topics, parameters, messages as named vectors, ticker, base class of a node.",
     license="Apache-2.0",
     packages=["flight_ros"],
     package_data={"flight_ros": ["loopback.xml"]},
