@@ -478,16 +478,16 @@ def command(*arguments: str) -> Result:
 
 
 def test_the_command_counts_the_ticks(run: Path) -> None:
-    shown = command(str(run))
-    assert (shown.exit_code, shown.stdout) == (0, "201 ticks, every bit equal\n")
+    result = command(str(run))
+    assert (result.exit_code, result.stdout) == (0, "201 ticks, every bit equal\n")
 
 
 def test_the_command_finds_one_bit_of_one_gain_in_the_scenario_of_the_log(tape: Tape, tmp_path: Path) -> None:
     gains = [flipped(5.0), 5.0, 3.0, 0.5]
     run = write_run(tape, tmp_path / "run", LogAttachments(scenario_file(tmp_path, controller={"Lambda": gains}))).parent
-    shown = command(str(run))
-    assert shown.exit_code == 1
-    first, count, note = shown.stdout.splitlines()
+    result = command(str(run))
+    assert result.exit_code == 1
+    first, count, note = result.stdout.splitlines()
     number = re.match(r"tick (\d+) differs first, at t = .* s: u.elevator recorded .*, computed .*, [1-9]\d* ULP$", first)
     assert number is not None
     assert re.match(r"201 ticks, \d+ differ, the last at t = .* s; u_free in \d+, u in \d+", count)
@@ -496,11 +496,11 @@ def test_the_command_finds_one_bit_of_one_gain_in_the_scenario_of_the_log(tape: 
     )
     # the same by --set, on the log with the right ones, and as JSON
     right = write_run(tape, tmp_path / "right", LogAttachments(scenario_file(tmp_path))).parent
-    shown = command(str(right), "--set", f"controller.Lambda={gains}", "--json")
-    assert shown.exit_code == 1
-    found = json.loads(shown.stdout)
-    assert (found["equal"], found["open_loop"], found["ticks"]) == (False, True, 201)
-    assert found["first"]["number"] == int(number[1])
+    result = command(str(right), "--set", f"controller.Lambda={gains}", "--json")
+    assert result.exit_code == 1
+    summary = json.loads(result.stdout)
+    assert (summary["equal"], summary["open_loop"], summary["ticks"]) == (False, True, 201)
+    assert summary["first"]["number"] == int(number[1])
 
 
 def test_a_log_cut_short_is_checked_as_far_as_it_goes(run: Path) -> None:
@@ -508,20 +508,20 @@ def test_a_log_cut_short_is_checked_as_far_as_it_goes(run: Path) -> None:
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) * 3 // 4])
     (run / "metadata.yaml").unlink()
-    found = json.loads(command(str(run), "--json").stdout)
-    assert found["equal"]
-    assert 20 < found["ticks"] == found["checked"] < 201
-    assert any("is truncated" in note for note in found["notes"])
+    summary = json.loads(command(str(run), "--json").stdout)
+    assert summary["equal"]
+    assert 20 < summary["ticks"] == summary["checked"] < 201
+    assert any("is truncated" in note for note in summary["notes"])
 
 
 def test_other_gains_are_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -> None:
     csv_file = tmp_path / "u.csv"
-    shown = command(
+    result = command(
         str(run), "--set", "controller.k_g=3.0", "--set", "controller.upper=[0.01, 1, 1, 1]", "--csv", str(csv_file)
     )
-    assert shown.exit_code == 1
-    assert shown.stdout.count(OPEN_LOOP) == 2  # over the table, and in the notes
-    assert re.search(r"^ *elevator( +[\d.e-]+){4} *$", shown.stdout, re.MULTILINE)
+    assert result.exit_code == 1
+    assert result.stdout.count(OPEN_LOOP) == 2  # over the table, and in the notes
+    assert re.search(r"^ *elevator( +[\d.e-]+){4} *$", result.stdout, re.MULTILINE)
     with csv_file.open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     log = read_run(run).tape["internals"]
@@ -540,10 +540,10 @@ def test_other_gains_are_shown_beside_what_was_recorded(run: Path, tmp_path: Pat
     ],
 )
 def test_an_invalid_setting_is_one_sentence(setting: str, sentence: str, run: Path) -> None:
-    shown = command(str(run), "--set", setting)
-    assert isinstance(shown.exception, ParameterError)
-    assert str(shown.exception).startswith(sentence)
-    assert len(str(shown.exception).splitlines()) == 1
+    result = command(str(run), "--set", setting)
+    assert isinstance(result.exception, ParameterError)
+    assert str(result.exception).startswith(sentence)
+    assert len(str(result.exception).splitlines()) == 1
 
 
 def test_a_log_without_scenario_or_controller_is_one_sentence(tape: Tape, tmp_path: Path) -> None:
@@ -557,9 +557,9 @@ def test_a_log_without_scenario_or_controller_is_one_sentence(tape: Tape, tmp_pa
             "the log: found no sample",
         ),
     ):
-        shown = command(str(run))
-        assert isinstance(shown.exception, ParameterError)
-        assert str(shown.exception).startswith(sentence)
+        result = command(str(run))
+        assert isinstance(result.exception, ParameterError)
+        assert str(result.exception).startswith(sentence)
 
 
 def test_changes_of_parameters_are_read_from_the_log(tmp_path: Path) -> None:

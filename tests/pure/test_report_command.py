@@ -29,7 +29,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     for name in ("osprey_gust", "osprey_servo"):
         scenario = find_scenario(name).vary(flight={"duration": 2.0})
         run = new_run(scenario, folder)
-        write_report(run, fly_in_process(scenario, run, lambda t, shown: None))
+        write_report(run, fly_in_process(scenario, run, lambda t, output: None))
         runs.append(run)
     return runs
 
@@ -49,11 +49,11 @@ def test_two_runs_are_compared(
     monkeypatch.chdir(tmp_path)
     before = (runs[0] / "report.html").read_bytes()
     report(runs, html=Path("two.html"))
-    shown = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert "2 flights compared" in (tmp_path / "two.html").read_text(encoding="utf-8")
-    assert f"1: {runs[0].name}, completed" in shown
-    assert "settling" not in shown  # the terminal shows errors only
-    assert shown.splitlines()[-1] == "report:  two.html"
+    assert f"1: {runs[0].name}, completed" in output
+    assert "settling" not in output  # the terminal shows errors only
+    assert output.splitlines()[-1] == "report:  two.html"
     assert (runs[0] / "report.html").read_bytes() == before
     report(runs, as_json=True)
     assert [one["scenario"] for one in json.loads(capsys.readouterr().out)] == ["osprey_gust", "osprey_servo"]

@@ -277,19 +277,19 @@ def _as_published(
     tape: Tape, topic: str, names: Sequence[str], stamp_ns: NDArray[np.int64], otherwise: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Samples of a topic at these stamps, shape (N, m), else the values `otherwise`; and the mask of stamps with a sample."""
-    found = np.zeros(len(stamp_ns), dtype=bool)
+    matched = np.zeros(len(stamp_ns), dtype=bool)
     if topic not in tape or not set(names) <= set(tape[topic].names):
-        return otherwise, found
+        return otherwise, matched
     published, values = tape[topic].values[:, [tape[topic].names.index(name) for name in names]], otherwise.copy()
     rows: dict[int, list[int]] = {}
     for row, stamp in enumerate(tape[topic].stamp_ns.tolist()):
         rows.setdefault(stamp, []).append(row)
     for k, stamp in enumerate(stamp_ns.tolist()):
         candidates = rows.get(stamp, [])  # two if a failsafe u has the stamp of a y that arrived later
-        found[k] = bool(candidates)
+        matched[k] = bool(candidates)
         if candidates and not any(published[row].tobytes() == values[k].tobytes() for row in candidates):
             values[k] = published[candidates[0]]
-    return values, found
+    return values, matched
 
 
 def _coverage_notes(ticks: _Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:

@@ -418,7 +418,7 @@ commands on every channel, a gust from above.
 {{ controller }}
 /**/recorder:
   ros__parameters:
-    rate: 100.0                # Hz, how often the topics are emptied
+    rate: 100.0                # Hz, polling of the subscriptions
 """)
 
 

@@ -102,7 +102,7 @@ def tracking_figure(context: PlotContext) -> go.Figure:
 
 
 def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> go.Figure:
-    """E = y - y_m of every output. Where the tape knows errors of the sensors, the true error over the measured one.
+    """E = y - y_m of every output. Where the tape holds errors of the sensors, the true error over the measured one.
 
     Noise floors, by channel in SI, are lines on both sides of 0 where they are wide enough to see.
     """

@@ -70,7 +70,7 @@ def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
             "controller",
             (
                 log("mode: 1 engaged, 2 hold, 3 ramp, 4 trim, 5 inactive", "mode"),
-                log("limited: 1 magnitude, 2 rate", *(f"limited.{name}" for name in inputs)),
+                log("saturation: 1 magnitude, 2 rate", *(f"limited.{name}" for name in inputs)),
                 log("late, age (s)", "late", "age"),
                 log("dt (s)", "dt"),
             ),

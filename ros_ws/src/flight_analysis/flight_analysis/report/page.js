@@ -1,4 +1,4 @@
-// Draws the figures of a report: each <figure> holds a plotly specification; plotly itself and all samples are packed in the page.
+// Draws the figures of a report: each <figure> holds a plotly specification; plotly and all samples are packed in the page.
 "use strict";
 
 const MARGIN = 0.5; // of the view, drawn on both sides of it for panning
@@ -16,10 +16,10 @@ let turn = 0;
 async function unpack(id, width = 1) {
   const packed = await fetch("data:;base64," + document.getElementById(id).textContent);
   const stream = packed.body.pipeThrough(new DecompressionStream("deflate"));
-  const sorted = new Uint8Array(await new Response(stream).arrayBuffer());
-  const count = sorted.length / width, bytes = new Uint8Array(sorted.length);
-  for (let place = 0; place < width; place++)
-    for (let k = 0; k < count; k++) bytes[k * width + place] = sorted[place * count + k];
+  const shuffled = new Uint8Array(await new Response(stream).arrayBuffer());
+  const count = shuffled.length / width, bytes = new Uint8Array(shuffled.length);
+  for (let byte = 0; byte < width; byte++)
+    for (let k = 0; k < count; k++) bytes[k * width + byte] = shuffled[byte * count + k];
   return bytes.buffer;
 }
 
@@ -49,7 +49,7 @@ function firstAfter(t, instant) {
 function view(t, v, [from, to], most) {
   const begin = Math.max(firstAfter(t, from) - 1, 0), end = Math.min(firstAfter(t, to) + 2, t.length);
   const width = end - begin > most ? Math.ceil((end - begin) / (most / 2)) : 1;
-  const places = [];
+  const indices = [];
   for (let first = begin; first < end; first += width) {
     let low = -1, high = -1, gap = -1;
     for (let k = first; k < Math.min(first + width, end); k++) {
@@ -59,9 +59,9 @@ function view(t, v, [from, to], most) {
         if (high < 0 || v[k] > v[high]) high = k;
       }
     }
-    places.push(...[...new Set([low, high, gap])].filter(k => k >= 0).sort((a, b) => a - b));
+    indices.push(...[...new Set([low, high, gap])].filter(k => k >= 0).sort((a, b) => a - b));
   }
-  return {x: places.map(k => t[k]), y: places.map(k => v[k])};
+  return {x: indices.map(k => t[k]), y: indices.map(k => v[k])};
 }
 
 async function views(data) { // of the decimated traces, by index
@@ -84,7 +84,7 @@ function specification(figure, style) {
 async function draw(figure, style) {
   const {data, layout} = specification(figure, style);
   if (range && figure.inTime) {
-    for (const [place, {x, y}] of await views(data)) Object.assign(data[place], {x, y});
+    for (const [index, {x, y}] of await views(data)) Object.assign(data[index], {x, y});
     for (const axis of axes(layout)) layout[axis].range = [...range];
   }
   await Plotly.newPlot(figure.plot, data, layout, {displaylogo: false, responsive: true, doubleClick: "reset"});
@@ -125,8 +125,8 @@ async function showAll() { // visible figures first
 
 function print() { // light colours, width of a sheet; synchronous, for the browser does not wait
   for (const figure of figures) {
-    const {data, layout} = specification(figure, "light"), shown = figure.plot.data ?? data;
-    for (const [place, {x, y}] of shown.entries()) Object.assign(data[place], {x, y});
+    const {data, layout} = specification(figure, "light"), current = figure.plot.data ?? data;
+    for (const [index, {x, y}] of current.entries()) Object.assign(data[index], {x, y});
     if (range && figure.inTime) for (const axis of axes(layout)) layout[axis].range = [...range];
     for (const text of [layout, ...(layout.annotations ?? [])]) text.font.size *= SHEET.height;
     Object.assign(layout, {width: SHEET.width, height: SHEET.height * layout.height});

@@ -65,12 +65,12 @@ class Event(NamedTuple):
 
 def events(tape: Tape, gusts: Windows) -> list[Event]:
     """Gusts, modes other than ENGAGED, and saturations of each input, one event each, in order of their start."""
-    found = []
+    listed = []
     intervals = figures.gust_intervals(tape, gusts) + figures.mode_intervals(tape)
     for label, group in groupby(intervals, key=lambda interval: interval.label):
         spans = [(interval.start, interval.stop) for interval in group]
         times = f", {len(spans)} times" if len(spans) > 1 else ""
-        found.append(Event(label, spans[0][0], spans[-1][1], f"{sum(stop - start for start, stop in spans):.2f} s{times}"))
+        listed.append(Event(label, spans[0][0], spans[-1][1], f"{sum(stop - start for start, stop in spans):.2f} s{times}"))
     if "internals" in tape:
         limited, t = tape["internals"].group("limited"), tape.time("internals")
         for name, kind in product(limited.names, (Saturation.MAGNITUDE, Saturation.RATE)):
@@ -78,13 +78,13 @@ def events(tape: Tape, gusts: Windows) -> list[Event]:
             if saturated.any():
                 first, last = t[saturated][[0, -1]]
                 extent = f"{saturated.sum()} of {len(saturated)} ticks"
-                found.append(Event(f"{name} saturated: {kind.name.lower()}", first, last, extent))
-    return sorted(found, key=lambda event: event.start)
+                listed.append(Event(f"{name} saturated: {kind.name.lower()}", first, last, extent))
+    return sorted(listed, key=lambda event: event.start)
 
 
-def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], happened: Sequence[Event]) -> list[Table]:
+def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], event_list: Sequence[Event]) -> list[Table]:
     """Tables of the error, the inputs, the events and the ticks; a table without rows is left out."""
-    tables = (_error_table(summary, units), _input_table(summary, units), _event_table(happened), _tick_table(summary))
+    tables = (_error_table(summary, units), _input_table(summary, units), _event_table(event_list), _tick_table(summary))
     return [table for table in tables if table.rows]
 
 
@@ -102,11 +102,10 @@ def _input_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
     return Table("Inputs", (*INPUT_COLUMNS, SATURATION_COLUMN), input_rows(summary, units), INPUT_LEGEND + SATURATION_LEGEND)
 
 
-def _event_table(happened: Sequence[Event]) -> Table:
+def _event_table(event_list: Sequence[Event]) -> Table:
     columns = [Column("", head) for head in ("from (s)", "to (s)", "")]
-    return Table(
-        "Events", columns, [(event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent) for event in happened]
-    )
+    rows = [(event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent) for event in event_list]
+    return Table("Events", columns, rows)
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
