@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The images and the compose file fit the tree: what can be shown without a container engine."""
+"""The Dockerfiles and the compose file against the tree, without a container engine."""
 
 import re
 import tomllib
@@ -29,31 +29,31 @@ def instructions(dockerfile: Path) -> list[tuple[str, str]]:
     return [(word, rest) for word, _, rest in (line.partition(" ") for line in joined)]
 
 
-def sent(path: str) -> bool:
-    """Whether .dockerignore lets a path into the build: the last pattern that fits it, or a folder it is in, decides."""
-    inside = True
+def in_context(path: str) -> bool:
+    """Whether a path is in the build context: the last pattern of .dockerignore that matches it, or a folder above, decides."""
+    included = True
     for line in (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines():
         pattern = line.removeprefix("!")
         above = [PurePosixPath(path), *PurePosixPath(path).parents][:-1]
         anywhere = pattern.startswith("**/")
-        fits = any(fnmatchcase(part.name if anywhere else str(part), pattern.removeprefix("**/")) for part in above)
-        if line and not line.startswith("#") and fits:
-            inside = line.startswith("!")
-    return inside
+        matches = any(fnmatchcase(part.name if anywhere else str(part), pattern.removeprefix("**/")) for part in above)
+        if line and not line.startswith("#") and matches:
+            included = line.startswith("!")
+    return included
 
 
 def pins(lock: Path) -> dict[str, tuple[set[str], int]]:
-    """Of each package in a lock file: its versions, more than one where they depend on Python's, and how many hashes."""
-    found: dict[str, tuple[set[str], int]] = {}
+    """The versions of each package in a lock file, one for each Python where they differ, and the number of hashes."""
+    packages: dict[str, tuple[set[str], int]] = {}
     for block in re.split(r"\n(?=\S)", lock.read_text(encoding="utf-8")):
         if match := re.match(r"([\w.-]+)==([^\s;]+)", block):
-            versions, hashes = found.get(match[1], (set(), 0))
-            found[match[1]] = versions | {match[2]}, hashes + block.count("--hash=sha256:")
-    return found
+            versions, hashes = packages.get(match[1], (set(), 0))
+            packages[match[1]] = versions | {match[2]}, hashes + block.count("--hash=sha256:")
+    return packages
 
 
 @pytest.mark.parametrize("dockerfile", DOCKERFILES, ids=lambda path: path.name)
-def test_what_a_dockerfile_copies_is_there_and_is_sent(dockerfile: Path) -> None:
+def test_a_dockerfile_copies_files_of_the_build_context(dockerfile: Path) -> None:
     copied = [
         source
         for word, rest in instructions(dockerfile)
@@ -63,10 +63,10 @@ def test_what_a_dockerfile_copies_is_there_and_is_sent(dockerfile: Path) -> None
     assert copied
     for source in copied:
         assert (ROOT / source).exists(), source
-        assert sent(source), source
+        assert in_context(source), source
 
 
-def test_only_what_is_built_is_sent() -> None:
+def test_the_build_context_holds_sources_only() -> None:
     for path in (
         ".git/HEAD",
         ".venv/bin/python",
@@ -76,49 +76,49 @@ def test_only_what_is_built_is_sent() -> None:
         "ros_ws/log/x",
         "docs/x.md",
     ):
-        assert not sent(path), path
+        assert not in_context(path), path
     package = "ros_ws/src/flight_core"
-    assert not sent(f"{package}/flight_core/__pycache__/rates.pyc")
-    assert not sent(f"{package}/flight_core.egg-info/PKG-INFO")
-    assert sent(f"{package}/flight_core/rates.py")
+    assert not in_context(f"{package}/flight_core/__pycache__/rates.pyc")
+    assert not in_context(f"{package}/flight_core.egg-info/PKG-INFO")
+    assert in_context(f"{package}/flight_core/rates.py")
 
 
 @pytest.mark.parametrize("dockerfile", DOCKERFILES, ids=lambda path: path.name)
 def test_an_image_is_small_and_its_user_is_not_root(dockerfile: Path) -> None:
     words = instructions(dockerfile)
     stages = [index for index, (word, _) in enumerate(words) if word == "FROM"]
-    assert len(stages) == 2, "one stage that builds, one that flies"
+    assert len(stages) == 2, "one stage to build, one to run"
     last = dict(words[stages[-1] :])
-    assert int(last["USER"]) > 0, "by number, so that it can be checked without the image's list of users"
+    assert int(last["USER"]) > 0, "a number, which needs no user list of the image"
     assert last["VOLUME"] == "/runs"
     assert not re.search(r"\bpip\b|build-essential|gcc|colcon", " ".join(rest for _, rest in words[stages[-1] :]))
     bases = [rest.partition("=")[2] for word, rest in words if word == "ARG" and "BASE=" in rest]
     assert all(re.fullmatch(r"[\w./-]+:[\w.-]+", base) and not base.endswith(":latest") for base in bases)
 
 
-def test_both_images_run_alike() -> None:
+def test_both_images_have_the_same_runtime() -> None:
     assert len({path.read_text(encoding="utf-8").partition(SAME_FROM_HERE)[2] for path in DOCKERFILES}) == 1
     assert len(DOCKERFILES) == 2
 
 
-def test_images_are_installed_by_the_same_uv_as_the_makefile() -> None:
+def test_the_images_use_the_uv_of_the_makefile() -> None:
     version = re.search(r"^UV_VERSION := (\S+)", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     assert version is not None
     for dockerfile in DOCKERFILES:
         assert re.findall(r"uv==(\S+) --hash=sha256:[0-9a-f]{64}", dockerfile.read_text(encoding="utf-8")) == [version[1]]
 
 
-def test_the_lists_of_packages_agree() -> None:
+def test_the_package_lists_agree() -> None:
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["dependency-groups"]
     direct = {re.split(r"[<=>\[]", name)[0].lower() for group in ("core", "report", "campaign") for name in groups[group]}
     main, ros = pins(ROOT / "requirements.lock"), pins(DOCKER / "requirements-ros.lock")
-    mend = "make -C docker requirements-ros.lock"
-    assert direct <= ros.keys(), mend
+    remedy = "make -C docker requirements-ros.lock"
+    assert direct <= ros.keys(), remedy
     assert not {name for name in ros if name.startswith("ros-")}, "ROS 2 comes with the image"
     assert all(hashes for _, hashes in ros.values())
     assert ros["numpy"][0] == {"1.26.4"}, "Ubuntu 24.04's, which the messages are compiled with"
     others = ros.keys() - {"numpy", "scipy", "jax", "jaxlib", "ml-dtypes"}  # these follow numpy
-    assert not {name for name in others if name in main and not ros[name][0] <= main[name][0]}, mend
+    assert not {name for name in others if name in main and not ros[name][0] <= main[name][0]}, remedy
 
 
 @pytest.mark.parametrize("name", SERVICES)
@@ -136,14 +136,14 @@ def test_a_service_starts_its_node_with_parameters_that_it_has(name: str) -> Non
     assert {option for option, _ in options} <= {"--params-file", "-p"}
 
 
-def test_services_are_the_nodes_of_a_flight() -> None:
+def test_the_services_are_the_nodes_of_a_flight() -> None:
     assert SERVICES.keys() == {"aircraft", "reference_model", "controller", "recorder"}
-    told = {name for name, service in SERVICES.items() if any("start_time:=" in word for word in service["command"])}
-    assert told == {"aircraft", "reference_model"}  # those that have a t = 0
+    timed = {name for name, service in SERVICES.items() if any("start_time:=" in word for word in service["command"])}
+    assert timed == {"aircraft", "reference_model"}  # the nodes with a t = 0
 
 
-def test_nothing_of_the_services_is_open_to_a_network() -> None:
-    # one namespace with the loopback interface alone, which the stack's own profile of the middleware talks over
+def test_no_service_has_a_network() -> None:
+    # One network namespace with the loopback interface only; the stack's DDS profile uses it.
     assert SERVICES["recorder"]["network_mode"] == "none"
     assert {service["network_mode"] for name, service in SERVICES.items() if name != "recorder"} == {"service:recorder"}
     for service in SERVICES.values():
@@ -154,11 +154,11 @@ def test_nothing_of_the_services_is_open_to_a_network() -> None:
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_a_service_is_watched_ended_and_not_restarted(name: str) -> None:
+def test_a_service_has_a_health_check_a_grace_period_and_no_restart(name: str) -> None:
     service = SERVICES[name]
     image = dict(instructions(DOCKER / "Dockerfile"))["HEALTHCHECK"]
     command = yaml.safe_load(image[image.index("CMD [") + 4 :])
-    assert service["healthcheck"] == {"test": ["CMD", *command, name]}  # intervals are the image's
+    assert service["healthcheck"] == {"test": ["CMD", *command, name]}  # with the image's intervals
     assert service["restart"] == "no"
     assert service["stop_grace_period"] == "5s"
-    assert service["depends_on"] == ([] if name == "recorder" else ["recorder"])  # compose ends them the other way round
+    assert service["depends_on"] == ([] if name == "recorder" else ["recorder"])  # compose stops them in reverse order

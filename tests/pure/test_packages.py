@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every package is a correct ament_python package, built and found."""
+"""Every package is a correct ament_python package: its files agree, and it is installed."""
 
 import configparser
 import re
@@ -26,7 +26,7 @@ EXECUTABLES = {
 # The keys of rosdep (rosdep/python.yaml of ros/rosdistro); a ROS package is its own key.
 PYTHON3 = ("jinja2", "matplotlib", "numpy", "psutil", "pydantic", "rich", "scipy", "typer", "yaml")
 KEYS = {name: f"python3-{name}" for name in PYTHON3} | {"markupsafe": "python3-jinja2"}  # which depends on it
-# Those that have none, or (rosbags) one that calls pip alone, which Ubuntu 24.04 refuses for its own Python.
+# Without a key, or (rosbags) with one for pip, which Ubuntu 24.04 refuses for its own Python.
 WITHOUT_KEY = {
     "cma",
     "distributed",
@@ -67,8 +67,8 @@ def test_package_declares_all_that_it_imports(package: Path) -> None:
     root = ElementTree.parse(package / "package.xml").getroot()
     declared = {node.text for node in root.findall("exec_depend")}
     sources = [path for path in package.rglob("*.py") if path.name != "setup.py"]
-    foreign = set().union(*map(imported, sources)) - sys.stdlib_module_names - {package.name} - WITHOUT_KEY
-    assert {KEYS.get(name, name) for name in foreign} <= declared
+    external = set().union(*map(imported, sources)) - sys.stdlib_module_names - {package.name} - WITHOUT_KEY
+    assert {KEYS.get(name, name) for name in external} <= declared
 
 
 def test_readme_names_what_rosdep_cannot_install() -> None:
@@ -78,7 +78,7 @@ def test_readme_names_what_rosdep_cannot_install() -> None:
 
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda path: path.name)
 def test_package_installs_its_data_files(package: Path) -> None:
-    # what lies beside the sources is there in a symlinked build whether or not setup.py names it
+    # A symlinked build has all files of the package folder, whether or not setup.py names them.
     setup = (package / "setup.py").read_text(encoding="utf-8")
     named = {pattern for found in re.findall(r"package_data=\{[^}]*\}", setup) for pattern in re.findall(r'"([^"]+)"', found)}
     code = package / package.name

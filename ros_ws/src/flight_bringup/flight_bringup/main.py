@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The four nodes of a flight as objects in one process, in lockstep over the same topics."""
+"""The four nodes of a flight in one process, in lockstep over the same topics."""
 
 from flight_ros.startup import start_nodes
 
 
 def main() -> None:
-    """Its entry point."""
+    """Run them."""
     start_nodes(
         "aircraft_sim.node:AircraftNode",
         "reference_model.node:ReferenceModelNode",

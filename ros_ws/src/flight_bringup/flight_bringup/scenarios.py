@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The scenarios that come with the stack, and how a name finds its file."""
+"""The scenarios of the stack, and the file of a scenario's name."""
 
 from pathlib import Path
 
@@ -17,12 +17,12 @@ def share() -> Path:
 
 
 def scenarios() -> list[str]:
-    """Names of the scenarios that come with the stack."""
+    """Names of the scenarios in `config/`."""
     return sorted(path.stem for path in (share() / "config").glob("*.yaml"))
 
 
 def find_scenario(name: str) -> Scenario:
-    """A scenario by its name in the stack, or by the path of a file ending in .yaml. Raises ParameterError."""
+    """A scenario by its name in `config/`, or by the path of a file (.yaml). Raises ParameterError."""
     path = Path(name) if name.endswith(".yaml") else share() / "config" / f"{name}.yaml"
     require(is_file(path), "scenario", f"{name!r}", f"one of {', '.join(scenarios())}, or the path of a scenario file (.yaml)")
     return load_scenario(path.absolute())
