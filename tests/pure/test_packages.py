@@ -80,7 +80,7 @@ def test_readme_names_what_rosdep_cannot_install() -> None:
 def test_package_installs_its_data_files(package: Path) -> None:
     # A symlinked build has all files of the package folder, whether or not setup.py names them.
     setup = (package / "setup.py").read_text(encoding="utf-8")
-    named = {pattern for found in re.findall(r"package_data=\{[^}]*\}", setup) for pattern in re.findall(r'"([^"]+)"', found)}
+    named = {pattern for data in re.findall(r"package_data=\{[^}]*\}", setup) for pattern in re.findall(r'"([^"]+)"', data)}
     code = package / package.name
     data = {path for path in code.rglob("*") if path.is_file() and path.suffix not in {".py", ".pyc"}}
     assert data <= {path for pattern in named for path in code.glob(pattern)}

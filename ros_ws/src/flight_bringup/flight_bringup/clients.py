@@ -98,8 +98,8 @@ class FlightMonitor(_Client):
         for topic in (Y, Y_M):
             count = self._node.count_publishers(topic.name)
             domain = os.environ.get("ROS_DOMAIN_ID", "0")
-            found = f"{count} publishers of {topic.name} already"
-            require(count == 0, f"ROS_DOMAIN_ID {domain}", found, "a domain of its own for each flight: set ROS_DOMAIN_ID")
+            publishers = f"{count} publishers of {topic.name} already"
+            require(count == 0, f"ROS_DOMAIN_ID {domain}", publishers, "a domain of its own for each flight: set ROS_DOMAIN_ID")
 
 
 class EngagementClient(_Client):

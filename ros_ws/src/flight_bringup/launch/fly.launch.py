@@ -45,7 +45,7 @@ def generate_launch_description() -> LaunchDescription:
                 "lockstep",
                 default_value="",
                 choices=["", *BOOLEAN],
-                description="true: as fast as the machine allows, repeatable to the byte; empty: as the scenario says",
+                description="true: as fast as the machine allows, repeatable to the byte; empty: the value in the scenario",
             ),
             runs_argument(),
             namespace_argument(),
