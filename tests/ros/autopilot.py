@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A stand-in for ArduPilot's DDS interface, a process of its own: python -m tests.ros.autopilot SCENARIO RELEASE_AFTER.
+"""A simulated autopilot with ArduPilot's DDS interface, as a process: python -m tests.ros.autopilot SCENARIO RELEASE_AFTER.
 
-It flies what the scenario's aircraft section says at its rate, says it as AP_DDS does (ENU and FLU, best effort, of the last
-five) and takes Joy as AP_DDS does: axes scaled to full deflection, NaN gives a channel back at once, silence does after
-RELEASE_AFTER seconds; a channel that is given back is at trim. Nothing here is of the bridge. It prints "y STAMP q V p r"
-without noise, and "given back" when it has waited in vain.
+It simulates the aircraft section of the scenario at its rate and publishes y as AP_DDS does (ENU and FLU, best effort, depth
+five). It subscribes to Joy as AP_DDS does: axes are scaled to full deflection, NaN releases a channel at once, and all channels
+are released after RELEASE_AFTER seconds without Joy. A released channel is at trim. It imports nothing from the bridge. It
+prints "y STAMP q V p r" without noise, and "timeout" when the channels are released without Joy.
 """
 
 import math
@@ -30,7 +30,7 @@ FULL = math.radians(30.0)  # of the surfaces
 
 
 class Autopilot:
-    """The aircraft and its two ends."""
+    """The simulated aircraft, its publishers and its subscription."""
 
     def __init__(self, scenario: Path, release_after: float) -> None:
         self._simulator = Simulator(load_scenario(scenario).aircraft)
@@ -40,23 +40,23 @@ class Autopilot:
         self._airspeed = self.node.create_publisher(Vector3Stamped, "/ap/airspeed", QOS)
         self.node.create_subscription(Joy, "/ap/joy", self._on_joy, QOS)
         self._axes = [math.nan] * 4
-        self._heard = 0.0
+        self._received = 0.0
 
     def _on_joy(self, message: Joy) -> None:
-        if len(message.axes) >= 4:  # those with fewer are ignored
-            self._axes, self._heard = [float(axis) for axis in message.axes[:4]], time.monotonic()
+        if len(message.axes) >= 4:  # messages with fewer axes are ignored
+            self._axes, self._received = [float(axis) for axis in message.axes[:4]], time.monotonic()
 
     def _u(self) -> list[float]:
-        """Elevator, thrust, aileron, rudder from trim: rad, and throttle of which half is trim."""
-        if any(math.isfinite(axis) for axis in self._axes) and time.monotonic() - self._heard > self._release_after:
+        """Elevator, thrust, aileron, rudder from trim, in rad and as a fraction of full thrust; half throttle is trim."""
+        if any(math.isfinite(axis) for axis in self._axes) and time.monotonic() - self._received > self._release_after:
             self._axes = [math.nan] * 4
-            print("given back", flush=True)
+            print("timeout", flush=True)
         roll, pitch, throttle, yaw = self._axes
         u = [pitch * FULL, (throttle + 1.0) / 2.0 - 0.5, roll * FULL, yaw * FULL]
-        return [one if math.isfinite(one) else 0.0 for one in u]
+        return [value if math.isfinite(value) else 0.0 for value in u]
 
     def fly(self) -> None:
-        """Sample after sample, until it is ended."""
+        """Simulate and publish until the process ends."""
         period = self._simulator.period_ns / 1e9
         begin = time.monotonic()
         places = [self._simulator.truth_names.index(f"x.{name}") for name in ("q", "V", "p", "r")]
@@ -65,15 +65,17 @@ class Autopilot:
             while (rest := begin + number * period - time.monotonic()) > 0.0:
                 rclpy.spin_once(self.node, timeout_sec=rest)
             (sample,) = self._simulator.sample(number, np.array(self._u()))
-            self._say(*sample.value.tolist())
+            self._publish(*sample.value.tolist())
             truth = self._simulator.truth()[places]
             print("y", time.time_ns(), *truth.tolist(), flush=True)
-            number = max(number + 1, int((time.monotonic() - begin) / period))  # it may have been stopped for a while
+            number = max(
+                number + 1, int((time.monotonic() - begin) / period)
+            )  # samples are skipped after a stop of the process
 
-    def _say(self, q: float, V: float, p: float, r: float) -> None:
+    def _publish(self, q: float, V: float, p: float, r: float) -> None:
         twist, airspeed = TwistStamped(), Vector3Stamped()
         for message in (twist, airspeed):
-            message.header.stamp.sec = 12  # the time since boot, say: not to be relied upon
+            message.header.stamp.sec = 12  # like a time since boot: not the host's clock
             message.header.frame_id = "base_link"
         twist.twist.linear.y = SPEED + V  # north, in ENU
         twist.twist.angular.x, twist.twist.angular.y, twist.twist.angular.z = p, -q, -r

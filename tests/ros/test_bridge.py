@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The unchanged controller flies a stand-in for ArduPilot's DDS interface through the shipped map, over real DDS.
+"""The bridge, over DDS: the unchanged controller flies a simulated autopilot through the shipped map `ardupilot`.
 
-tests/ros/autopilot.py is no autopilot: it shows that frames, signs, rates, quality of service and the rules of engagement
-fit what the map says of ArduPilot, not that ArduPilot does what the map says.
+tests/ros/autopilot.py is no autopilot. These tests show that frames, signs, rates, quality of service and engagement agree with
+the map, not that the map agrees with ArduPilot.
 """
 
 import math
@@ -42,16 +42,16 @@ app = application([*COMMANDS])
 SCENARIO = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
 BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELEASE_AFTER = 1.0  # s, in place of the 3 s of RC_OVERRIDE_TIME
-NEUTRAL = 0.4  # s, where a test has neutral values sent
-FULL = math.radians(30.0)  # of a surface, as the map has it
-EARLY = 0.05  # s: the last u may be some periods older than what was taken for it
-MAX_AGE, RELEASE = 0.5, 0.5  # s; the first one in place of the map's 0.2 s, for machines on which other tests run too
-LATE = 0.2  # s that a busy machine may be late; without load it is a tick of 5 ms and one of the message's 20 ms
+NEUTRAL = 0.4  # s, in tests with neutral values
+FULL = math.radians(30.0)  # full deflection of a surface in the map
+EARLY = 0.05  # s; the last u may be some periods older than the instant that the test takes for it
+MAX_AGE, RELEASE = 0.5, 0.5  # s; MAX_AGE replaces the map's 0.2 s, for hosts under load
+LATE = 0.2  # s, scheduling delay of a host under load; without load a tick of 5 ms and a message period of 20 ms
 INPUTS = ("elevator", "thrust", "aileron", "rudder")
 
 
-class Sky:
-    """The processes around a bridge, and an ear at what the autopilot is sent."""
+class BridgeSetup:
+    """The processes around a bridge, and a subscription to the messages to the autopilot."""
 
     def __init__(self, start: Start, peer_node: Peer, folder: Path) -> None:
         self._start = start
@@ -68,27 +68,27 @@ class Sky:
         content = yaml.safe_load(Path(self.map).read_text(encoding="utf-8"))
         row = content
         for key in place:
-            row[key] = dict(row[key])  # merged keys share what they hold
+            row[key] = dict(row[key])  # merged keys share one object
             row = row[key]
         row.update(values)
         Path(self.map).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
     def autopilot(self) -> Process:
-        """The stand-in, started."""
+        """Start the simulated autopilot."""
         return self._start("tests.ros.autopilot", str(SCENARIO), str(RELEASE_AFTER))
 
     def bridge(self, *arguments: str) -> Process:
-        """The bridge by the shipped map but for its age limits, ready."""
+        """Start the bridge with the shipped map and longer age limits, and wait until it is ready."""
         process = self._start("autopilot_bridge.main", "--ros-args", "-p", f"map:={self.map}", *arguments)
         process.wait_for("ready")
         return process
 
     def node(self, name: str) -> Process:
-        """A node of the stack by its module, with the scenario's parameters."""
+        """Start a node of the stack by its module, with the scenario's parameters."""
         return self._start(name, "--ros-args", "--params-file", str(SCENARIO))
 
     def engage(self, *, on: bool = True) -> str:
-        """Why it was refused, empty where it was not."""
+        """Call the service; the reason of a refusal, empty where there is none."""
         return str(self.peer.call(SetBool, "bridge/engage", SetBool.Request(data=on)).message)
 
     def law(self, transition: int) -> None:
@@ -97,8 +97,8 @@ class Sky:
             ChangeState, "controller/change_state", ChangeState.Request(transition=Transition(id=transition))
         ).success
 
-    def take_over(self) -> None:
-        """As docs/autopilots.md says: deactivate, wait for trim, engage, activate."""
+    def engage_from_trim(self) -> None:
+        """Engage as in docs/autopilots.md: deactivate, wait for trim, engage, activate."""
         self.law(Transition.TRANSITION_DEACTIVATE)
         self.peer.received["u"].clear()
         self.peer.until(lambda: self.peer.received["u"] and not any(self.peer.received["u"][-1].position))
@@ -107,8 +107,8 @@ class Sky:
         self.joys.clear()
         self.peer.until(lambda: len(self.joys) > 5)
 
-    def take_over_by_command(self) -> None:
-        """The same by `rise-di engage`."""
+    def engage_by_command(self) -> None:
+        """Engage by `rise-di engage`."""
         command = self._start("flight_cli.cli", "engage")
         self.peer.until(lambda: command.popen.poll() is not None, timeout=60.0)
         assert command.end() == 0, command.output
@@ -116,15 +116,15 @@ class Sky:
         self.peer.until(lambda: len(self.joys) > 5)
 
     def spin(self, duration: float) -> None:
-        """Listen for so many s."""
+        """Receive messages for a duration in s."""
         end = time.monotonic() + duration
         self.peer.until(lambda: time.monotonic() > end, timeout=duration + 5.0)
 
     def after(self, t: float) -> tuple[list[float], list[float]]:
-        """When values and when NaN were sent, s after an instant of the system clock."""
+        """Times at which finite values and NaN were sent, s after an instant of the system clock."""
         sent = [(stamp(joy) - t, list(joy.axes)) for joy in self.joys]
-        flown = [at for at, axes in sent if all(map(math.isfinite, axes))]
-        return flown, [at for at, axes in sent if all(map(math.isnan, axes))]
+        finite = [at for at, axes in sent if all(map(math.isfinite, axes))]
+        return finite, [at for at, axes in sent if all(map(math.isnan, axes))]
 
 
 def stamp(message: Any) -> float:
@@ -132,158 +132,160 @@ def stamp(message: Any) -> float:
 
 
 @pytest.fixture
-def sky(start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Sky]:
+def setup(start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[BridgeSetup]:
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))  # for tests.ros.autopilot
     with peer(topics=("u", "y", "y_m", "internals", "bridge/would_send")) as peer_node:
-        yield Sky(start, peer_node, tmp_path)
+        yield BridgeSetup(start, peer_node, tmp_path)
 
 
-def true_error(autopilot: Process, sky: Sky) -> dict[str, Any]:
+def true_error(autopilot: Process, setup: BridgeSetup) -> dict[str, Any]:
     """The aircraft's y without noise less y_m, from 7 s of the reference model's time on, by output."""
     rows = np.array([[float(part) for part in line.split()[1:]] for line in autopilot.lines if line.startswith("y ")])
-    references = sky.peer.received["y_m"]
+    references = setup.peer.received["y_m"]
     t_m = np.array([stamp(message) for message in references])
     t = rows[:, 0] / NANOSECONDS
-    flown = (t > t_m[0] + 7.0) & (t < t_m[-1])
-    assert flown.sum() > 300  # of the 350 in 7 s
+    window = (t > t_m[0] + 7.0) & (t < t_m[-1])
+    assert window.sum() > 300  # of the 350 in 7 s
     y_m = {name: np.array([m.position[m.name.index(name)] for m in references]) for name in ("q", "V", "p", "r")}
-    return {name: rows[flown, 1 + k] - np.interp(t[flown], t_m, y_m[name]) for k, name in enumerate(y_m)}
+    return {name: rows[window, 1 + k] - np.interp(t[window], t_m, y_m[name]) for k, name in enumerate(y_m)}
 
 
-def test_the_unchanged_controller_tracks_through_the_map_and_a_killed_controller_releases_the_channels(sky: Sky) -> None:
-    assert CliRunner().invoke(app, ["check-signs", sky.map, "--scenario", str(SCENARIO)]).exit_code == 0
-    autopilot = sky.autopilot()
-    bridge = sky.bridge("-p", "dry_run:=false")
-    controller = sky.node("rise_di_controller.main")
+def test_the_unchanged_controller_tracks_through_the_map_and_a_killed_controller_releases_the_channels(
+    setup: BridgeSetup,
+) -> None:
+    assert CliRunner().invoke(app, ["check-signs", setup.map, "--scenario", str(SCENARIO)]).exit_code == 0
+    autopilot = setup.autopilot()
+    bridge = setup.bridge("-p", "dry_run:=false")
+    controller = setup.node("rise_di_controller.main")
     controller.wait_for("ready")
-    sky.node("reference_model.main")
-    sky.peer.until(lambda: sky.peer.received["u"])
-    assert not sky.joys  # nothing is sent before it is engaged
-    sky.take_over()
+    setup.node("reference_model.main")
+    setup.peer.until(lambda: setup.peer.received["u"])
+    assert not setup.joys  # nothing is sent before it is engaged
+    setup.engage_from_trim()
     bridge.wait_for("DISENGAGED -> ENGAGED")
-    begin = stamp(sky.peer.received["y_m"][0])
-    sky.peer.until(lambda: stamp(sky.peer.received["y_m"][-1]) > begin + 14.5)
-    error = true_error(autopilot, sky)
+    begin = stamp(setup.peer.received["y_m"][0])
+    setup.peer.until(lambda: stamp(setup.peer.received["y_m"][-1]) > begin + 14.5)
+    error = true_error(autopilot, setup)
     largest = {name: float(np.abs(one).max()) for name, one in error.items()}
     # Measured 0.033 rad/s, 0.19 m/s, 0.083 and 0.016 rad/s: the loop is little faster than the commands. An aircraft that stays
-    # in trim has errors of the size of the commands: 0.1 rad/s, 1 m/s, 0.2 rad/s, and 0.08 rad/s in the turns.
+    # at trim has errors of the size of the commands: 0.1 rad/s, 1 m/s, 0.2 rad/s, and 0.08 rad/s in the turns.
     for name, most in {"q": 0.07, "V": 0.5, "p": 0.15, "r": 0.05}.items():
         assert largest[name] < most, f"{name}: {largest}"
 
-    sky.joys.clear()
+    setup.joys.clear()
     controller.popen.kill()
-    dead = time.time()
+    killed = time.time()
     bridge.wait_for("RELEASE -> DISENGAGED: u is")
-    sky.spin(0.3)
-    flown, released = sky.after(dead)
-    assert max(flown) < MAX_AGE + LATE
-    assert MAX_AGE - 0.05 < min(released) < MAX_AGE + LATE  # the last u may be a period of 20 ms older than the death
+    setup.spin(0.3)
+    finite, released = setup.after(killed)
+    assert max(finite) < MAX_AGE + LATE
+    assert MAX_AGE - 0.05 < min(released) < MAX_AGE + LATE  # the last u may be a period of 20 ms older than the kill
     assert RELEASE - LATE < max(released) - min(released) < RELEASE + LATE
     assert len(released) > 10  # 25 at 50 Hz
 
 
-def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the_channels(sky: Sky) -> None:
-    autopilot = sky.autopilot()
-    bridge = sky.bridge("-p", "dry_run:=false")
-    sky.node("rise_di_controller.main").wait_for("ready")
-    sky.node("reference_model.main")
-    sky.peer.until(lambda: sky.peer.received["u"])
+def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the_channels(setup: BridgeSetup) -> None:
+    autopilot = setup.autopilot()
+    bridge = setup.bridge("-p", "dry_run:=false")
+    setup.node("rise_di_controller.main").wait_for("ready")
+    setup.node("reference_model.main")
+    setup.peer.until(lambda: setup.peer.received["u"])
 
-    gamepad = sky.peer.node.create_publisher(Joy, "/joy", 10)
-    sky.peer.until(lambda: gamepad.get_subscription_count() == 1)
+    gamepad = setup.peer.node.create_publisher(Joy, "/joy", 10)
+    setup.peer.until(lambda: gamepad.get_subscription_count() == 1)
     gamepad.publish(Joy(buttons=[1]))
-    sky.peer.until(lambda: sky.engage() == "pilot override active: gamepad")
+    setup.peer.until(lambda: setup.engage() == "pilot override active: gamepad")
     gamepad.publish(Joy(buttons=[0]))
-    sky.take_over()
+    setup.engage_from_trim()
     pressed = time.time()
     gamepad.publish(Joy(buttons=[1]))
     bridge.wait_for("ENGAGED -> RELEASE: pilot override by gamepad", timeout=2.0)
-    sky.spin(RELEASE + LATE)
-    flown, released = sky.after(pressed)
-    assert max(flown, default=0.0) < LATE  # at once
+    setup.spin(RELEASE + LATE)
+    finite, released = setup.after(pressed)
+    assert max(finite, default=0.0) < LATE  # at once
     assert min(released) < LATE
-    assert sky.engage() == "pilot override active: gamepad"
+    assert setup.engage() == "pilot override active: gamepad"
     gamepad.publish(Joy(buttons=[0]))
 
-    sky.take_over()
+    setup.engage_from_trim()
     autopilot.popen.send_signal(signal.SIGSTOP)
-    silent = time.time()
+    stopped = time.time()
     bridge.wait_for("RELEASE -> DISENGAGED: q is")
     autopilot.popen.send_signal(signal.SIGCONT)
-    sky.spin(0.1)
-    flown, released = sky.after(silent)
-    assert max(flown) < MAX_AGE + LATE
+    setup.spin(0.1)
+    finite, released = setup.after(stopped)
+    assert max(finite) < MAX_AGE + LATE
     assert max(released) < MAX_AGE + RELEASE + LATE
-    sky.joys.clear()
-    sky.spin(0.5)
-    assert not sky.joys  # y is there again; the bridge does not engage by itself
+    setup.joys.clear()
+    setup.spin(0.5)
+    assert not setup.joys  # y is fresh again; the bridge does not re-engage by itself
 
-    sky.take_over_by_command()
+    setup.engage_by_command()
     bridge.interrupt()
     assert bridge.end() == 0
-    sky.spin(0.1)
-    assert len(sky.joys) > 5
-    assert all(map(math.isnan, sky.joys[-1].axes))
+    setup.spin(0.1)
+    assert len(setup.joys) > 5
+    assert all(map(math.isnan, setup.joys[-1].axes))
 
-    other = sky.bridge("-p", "dry_run:=false")
-    sky.take_over()
-    before = autopilot.lines.count("given back")  # it may have done so when it woke up
+    other = setup.bridge("-p", "dry_run:=false")
+    setup.engage_from_trim()
+    before = autopilot.lines.count("timeout")  # it may have timed out while it was stopped
     other.popen.kill()
     killed = time.time()
-    sky.peer.until(lambda: autopilot.lines.count("given back") > before)  # by itself: nobody else can do it
+    setup.peer.until(lambda: autopilot.lines.count("timeout") > before)  # the autopilot's own timeout
     assert RELEASE_AFTER - LATE < time.time() - killed < RELEASE_AFTER + 0.5
-    flown, released = sky.after(killed)
-    assert max(flown, default=0.0) < LATE
+    finite, released = setup.after(killed)
+    assert max(finite, default=0.0) < LATE
     assert not released
 
 
-def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(sky: Sky) -> None:
-    """The controller lives and u comes again: what counts is the age of u, not who is there."""
-    sky.autopilot()
-    sky.change_map("silence", neutral=NEUTRAL)
-    bridge = sky.bridge("-p", "dry_run:=false")
-    commanded = 0.02  # rad of elevator, within a tenth of its limit, so that it engages
+def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(setup: BridgeSetup) -> None:
+    """The publisher of u stays alive and u returns: the age of u counts, not the presence of a publisher."""
+    setup.autopilot()
+    setup.change_map("silence", neutral=NEUTRAL)
+    bridge = setup.bridge("-p", "dry_run:=false")
+    commanded = 0.02  # rad of elevator, within a tenth of its limit, as engagement requires
     last = 0.0
 
     def command() -> None:
         nonlocal last
         last = time.time()
-        sky.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([commanded, 0.0, 0.0, 0.0]), "test"))
+        setup.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([commanded, 0.0, 0.0, 0.0]), "test"))
 
-    heard = sky.peer.received
-    sky.peer.until(lambda: heard["y"] and heard["bridge/would_send"], timeout=60.0, each=command)
-    client = sky.peer.node.create_client(SetBool, "bridge/engage")
-    sky.peer.until(client.service_is_ready, each=command)
+    received = setup.peer.received
+    setup.peer.until(lambda: received["y"] and received["bridge/would_send"], timeout=60.0, each=command)
+    client = setup.peer.node.create_client(SetBool, "bridge/engage")
+    setup.peer.until(client.service_is_ready, each=command)
     future = client.call_async(SetBool.Request(data=True))
-    sky.peer.until(future.done, each=command)
+    setup.peer.until(future.done, each=command)
     assert future.result().message == ""
-    sky.peer.until(lambda: len(sky.joys) > 10, each=command)
+    setup.peer.until(lambda: len(setup.joys) > 10, each=command)
     stale = last
 
-    sky.peer.until(lambda: any("RELEASE -> DISENGAGED: u is" in line for line in bridge.lines))
-    sky.spin(0.3)
-    sent = [(stamp(joy) - stale, [float(axis) for axis in joy.axes]) for joy in sky.joys]
-    flown = [at for at, axes in sent if axes[1] == pytest.approx(commanded / FULL, abs=1e-6)]
+    setup.peer.until(lambda: any("RELEASE -> DISENGAGED: u is" in line for line in bridge.lines))
+    setup.spin(0.3)
+    sent = [(stamp(joy) - stale, [float(axis) for axis in joy.axes]) for joy in setup.joys]
+    engaged = [at for at, axes in sent if axes[1] == pytest.approx(commanded / FULL, abs=1e-6)]
     neutral = [at for at, axes in sent if axes == [0.0, 0.0, 0.0, 0.0]]
     released = [at for at, axes in sent if all(map(math.isnan, axes))]
-    assert len(flown) + len(neutral) + len(released) == len(sent)  # nothing else is sent
-    assert flown[0] < neutral[0] < released[0]
-    assert MAX_AGE - EARLY < max(flown) < MAX_AGE + LATE
+    assert len(engaged) + len(neutral) + len(released) == len(sent)  # nothing else is sent
+    assert engaged[0] < neutral[0] < released[0]
+    assert MAX_AGE - EARLY < max(engaged) < MAX_AGE + LATE
     assert MAX_AGE - EARLY < min(neutral) < MAX_AGE + LATE
     assert MAX_AGE + NEUTRAL - EARLY < min(released) < MAX_AGE + NEUTRAL + 2 * LATE
     assert MAX_AGE + NEUTRAL + RELEASE - LATE < max(released) < MAX_AGE + NEUTRAL + RELEASE + 2 * LATE
 
-    sky.joys.clear()
+    setup.joys.clear()
     begin = time.monotonic()
-    sky.peer.until(lambda: time.monotonic() > begin + 0.5, each=command)
-    assert not sky.joys  # u is there again; the bridge does not engage by itself
+    setup.peer.until(lambda: time.monotonic() > begin + 0.5, each=command)
+    assert not setup.joys  # u is fresh again; the bridge does not re-engage by itself
     assert sum("-> ENGAGED" in line for line in bridge.lines) == 1
 
 
 def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_be_sent(
-    sky: Sky, start: Start, tmp_path: Path
+    setup: BridgeSetup, start: Start, tmp_path: Path
 ) -> None:
-    autopilot = sky.autopilot()
+    autopilot = setup.autopilot()
     bag = tmp_path / "bag"
     topics = ("/ap/twist/filtered", "/ap/airspeed")
     recorder = start(
@@ -291,8 +293,8 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
         *("--ros-args", "-p", f"directory:={bag}", "-p", f"topics:=[{', '.join(topics)}]", "-p", "rate:=50.0"),
     )
     recorder.wait_for("ready")
-    said = len(autopilot.lines)
-    sky.peer.until(lambda: len(autopilot.lines) > said + 150)  # 3 s
+    begin = len(autopilot.lines)
+    setup.peer.until(lambda: len(autopilot.lines) > begin + 150)  # 3 s
     recorder.interrupt()
     assert recorder.end() == 0, recorder.output
     autopilot.popen.kill()
@@ -300,31 +302,31 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
     rates = {(-one.twist.angular.y, one.twist.angular.x, -one.twist.angular.z) for one in recorded}
     assert len(recorded) > 100  # of 150
 
-    sky.bridge()
+    setup.bridge()
     player = start("flight_cli.cli", "play", str(bag), "--topics", ",".join(topics))
 
     def command() -> None:
-        sky.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.1, 0.0, 0.0, 0.0]), "test"))
+        setup.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.1, 0.0, 0.0, 0.0]), "test"))
 
-    sky.peer.until(lambda: player.popen.poll() is not None, timeout=60.0, each=command)
+    setup.peer.until(lambda: player.popen.poll() is not None, timeout=60.0, each=command)
     assert player.end() == 0, player.output
-    heard = sky.peer.received["y"]
-    assert len(heard) > 50  # as many as had both topics fresh when the bridge looked
-    assert all(list(y.name) == ["q", "V", "p", "r"] for y in heard)
-    assert {(y.position[0], y.position[2], y.position[3]) for y in heard} <= rates  # to the last bit
-    assert max(abs(y.position[1]) for y in heard) < 0.2  # m/s from trim: noise of 0.03 m/s
-    assert sky.peer.received["bridge/would_send"][-1].position[0] == pytest.approx(0.1 / FULL)
-    assert not sky.joys
+    received = setup.peer.received["y"]
+    assert len(received) > 50  # those with both topics fresh at a tick of the bridge
+    assert all(list(y.name) == ["q", "V", "p", "r"] for y in received)
+    assert {(y.position[0], y.position[2], y.position[3]) for y in received} <= rates  # to the last bit
+    assert max(abs(y.position[1]) for y in received) < 0.2  # m/s from trim: noise of 0.03 m/s
+    assert setup.peer.received["bridge/would_send"][-1].position[0] == pytest.approx(0.1 / FULL)
+    assert not setup.joys
 
 
 def test_rise_di_fly_starts_the_bridge_and_logs_the_topics_of_the_autopilot(
-    sky: Sky, start: Start, tmp_path: Path
+    setup: BridgeSetup, start: Start, tmp_path: Path
 ) -> None:
-    sky.autopilot()
-    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", sky.map, "--duration", "12", "--json")
-    sky.peer.until(lambda: sky.peer.received["bridge/would_send"], timeout=60.0)
+    setup.autopilot()
+    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "12", "--json")
+    setup.peer.until(lambda: setup.peer.received["bridge/would_send"], timeout=60.0)
     refused = start("flight_cli.cli", "engage")
-    sky.peer.until(lambda: flight.popen.poll() is not None, timeout=90.0)
+    setup.peer.until(lambda: flight.popen.poll() is not None, timeout=90.0)
     assert refused.end() == 1
     assert "error: not engaged: dry_run is true: nothing is sent" in refused.output
     assert flight.end() == 0, flight.output
@@ -332,36 +334,36 @@ def test_rise_di_fly_starts_the_bridge_and_logs_the_topics_of_the_autopilot(
     log = read_run(run)
     assert {"y", "y_m", "u", "internals", "bridge/would_send"} <= log.tape.signals.keys()
     assert "truth" not in log.tape
-    assert Path(sky.map).read_bytes() in [file.content for file in log.attachments]
+    assert Path(setup.map).read_bytes() in [file.content for file in log.attachments]
     counts = Counter(one.topic for one in stored_messages(run))
     assert counts["/ap/twist/filtered"] > 100  # of 600
     assert counts["/ap/joy"] == 0  # a dry run
-    assert not sky.joys
+    assert not setup.joys
 
 
-def test_a_map_with_a_wrong_sign_is_refused(sky: Sky, start: Start) -> None:
-    sky.change_map("inputs", "elevator", sign=-1)
-    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", sky.map, "--send")
+def test_a_map_with_a_wrong_sign_is_refused(setup: BridgeSetup, start: Start) -> None:
+    setup.change_map("inputs", "elevator", sign=-1)
+    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send")
     assert flight.end() == 2
     assert "with the map ardupilot D of q and elevator is -1, the controller has +1" in flight.output
 
 
-def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(sky: Sky) -> None:
-    sky.autopilot()
-    sky.bridge()
+def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeSetup) -> None:
+    setup.autopilot()
+    setup.bridge()
 
     def command() -> None:
-        sky.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.1, 0.1, 9.0, -0.1]), "test"))
+        setup.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.1, 0.1, 9.0, -0.1]), "test"))
 
-    heard = sky.peer.received["bridge/would_send"]
-    sky.peer.until(lambda: len(heard) > 20 and sky.peer.received["y"], each=command)
-    assert list(heard[-1].name) == ["joy.axes[1]", "joy.axes[2]", "joy.axes[0]", "joy.axes[3]"]
-    assert list(heard[-1].position) == pytest.approx([0.1 / FULL, 0.2, 0.5, -0.1 / FULL], rel=1e-5)  # aileron at its limit
-    assert list(sky.peer.received["y"][-1].name) == ["q", "V", "p", "r"]
-    assert np.abs(sky.peer.received["y"][-1].position).max() < 0.2  # in trim: noise of 0.03 m/s in V, little else
-    assert sky.engage() == "dry_run is true: nothing is sent"
-    sky.spin(0.3)
-    assert not sky.joys
+    received = setup.peer.received["bridge/would_send"]
+    setup.peer.until(lambda: len(received) > 20 and setup.peer.received["y"], each=command)
+    assert list(received[-1].name) == ["joy.axes[1]", "joy.axes[2]", "joy.axes[0]", "joy.axes[3]"]
+    assert list(received[-1].position) == pytest.approx([0.1 / FULL, 0.2, 0.5, -0.1 / FULL], rel=1e-5)  # aileron at its limit
+    assert list(setup.peer.received["y"][-1].name) == ["q", "V", "p", "r"]
+    assert np.abs(setup.peer.received["y"][-1].position).max() < 0.2  # at trim: noise of 0.03 m/s in V
+    assert setup.engage() == "dry_run is true: nothing is sent"
+    setup.spin(0.3)
+    assert not setup.joys
 
 
 def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Start) -> None:
@@ -382,10 +384,10 @@ def test_a_missing_message_package_ends_the_bridge_with_the_package_to_install(s
     assert "install ros-jazzy-px4-msgs" in bridge.output
 
 
-# Rows by real messages, there and back through the middleware's bytes.
+# Rows with real messages, after serialisation and deserialisation.
 
 
-def through_the_wire(message: Any) -> Any:
+def serialised(message: Any) -> Any:
     return deserialize_message(serialize_message(message), type(message))
 
 
@@ -416,7 +418,7 @@ ROWS: tuple[tuple[str, Callable[[], Any], dict[str, float]], ...] = (
 
 @pytest.mark.parametrize(("name", "make", "expected"), ROWS, ids=lambda one: getattr(one, "__name__", ""))
 def test_outputs_are_read_from_real_messages(name: str, make: Callable[[], Any], expected: dict[str, float]) -> None:
-    message = through_the_wire(make())
+    message = serialised(make())
     for channel, value in expected.items():
         row = load_map(name).outputs[channel]
         assert message_type(row.type) is type(message)
@@ -424,7 +426,7 @@ def test_outputs_are_read_from_real_messages(name: str, make: Callable[[], Any],
 
 
 def test_a_real_pressure_gives_the_speed() -> None:
-    message = through_the_wire(FluidPressure(fluid_pressure=0.5 * 1.225 * 30.0**2))
+    message = serialised(FluidPressure(fluid_pressure=0.5 * 1.225 * 30.0**2))
     assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == pytest.approx(30.0)
 
 
@@ -435,6 +437,4 @@ def test_inputs_are_written_into_a_real_joy() -> None:
         set_field(message, path, value)
     for row, u in zip(channel_map.inputs.values(), (0.1, 0.1, -0.1, 0.2), strict=True):
         set_field(message, row.field, to_raw(row.trim + u, row.line))
-    assert list(through_the_wire(message).axes) == pytest.approx(
-        [-0.1 / FULL, 0.1 / FULL, 0.2, 0.2 / FULL], rel=1e-5
-    )  # RC1 to 4
+    assert list(serialised(message).axes) == pytest.approx([-0.1 / FULL, 0.1 / FULL, 0.2, 0.2 / FULL], rel=1e-5)  # RC1 to 4

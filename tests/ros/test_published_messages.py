@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The maps of PX4, MAVROS and ROSflight with the real message packages, where somebody has installed them.
+"""The maps of PX4, MAVROS and ROSflight with the real message packages, where these are installed.
 
-None of them is on PyPI. On a full ROS 2: apt install ros-jazzy-mavros-msgs, and px4_msgs, rosflight_msgs and rosplane_msgs
-built in a workspace that is sourced. Without them tests/pure/test_channel_map.py tests each row on the published fields.
+None of them is on PyPI. On a full ROS 2: apt install ros-jazzy-mavros-msgs; build px4_msgs, rosflight_msgs and rosplane_msgs
+in a workspace that is sourced. Without them tests/pure/test_channel_map.py tests each row with the published fields.
 """
 
 import time
@@ -32,7 +32,7 @@ INPUTS = ("elevator", "thrust", "aileron", "rudder")
 
 
 def needs(*packages: str) -> None:
-    """Skip where a message package is not there, with what it is for."""
+    """Skip where a message package is not installed."""
     for package in packages:
         if find_spec(package) is None:
             pytest.skip(f"{package} is not installed and not on PyPI; its fields are checked as {PACKAGES[package]} has them")
@@ -112,12 +112,12 @@ def test_inputs_are_written_into_real_messages(name: str) -> None:
 
 
 class Px4:
-    """Says y as PX4 does, hears what PX4 takes."""
+    """Publishes y as PX4 does, and subscribes to the topics to which PX4 subscribes."""
 
     def __init__(self, peer_node: Peer) -> None:
-        self._node, self._someone = peer_node.node, peer_node
+        self._node, self._peer = peer_node.node, peer_node
         self._odometry, self._airspeed = self._make("VehicleOdometry"), self._make("AirspeedValidated")
-        self._sends = [
+        self._publishers = [
             (self._node.create_publisher(type(message), topic, BEST_EFFORT), message)
             for topic, message in (
                 ("/fmu/out/vehicle_odometry", self._odometry),
@@ -139,13 +139,13 @@ class Px4:
     def _make(self, name: str) -> Any:
         return getattr(import_module("px4_msgs.msg"), name)()
 
-    def say(self) -> None:
-        """One sample of y, nose up and a little fast, and of u: elevator 0.02 rad."""
+    def publish(self) -> None:
+        """Publish a sample of y, nose up and 2 m/s fast, and of u: elevator 0.02 rad."""
         frd(self._odometry)
         true_airspeed(self._airspeed)
-        for publisher, message in self._sends:
+        for publisher, message in self._publishers:
             publisher.publish(message)
-        self._someone.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.02, 0.0, 0.0, 0.0]), "test"))
+        self._peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.02, 0.0, 0.0, 0.0]), "test"))
 
 
 def spin(peer_node: Peer, duration: float) -> None:
@@ -154,27 +154,27 @@ def spin(peer_node: Peer, duration: float) -> None:
 
 
 def test_a_bridge_exchanges_the_messages_of_px4(start: Start) -> None:
-    """Heartbeats with fresh y and u, setpoints once engaged; no u ends both."""
+    """Offboard heartbeats with fresh y and u, setpoints while engaged; a stale u ends both."""
     needs("px4_msgs")
     bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false")
     bridge.wait_for("ready")
     with peer(topics=("y",)) as peer_node:
         px4 = Px4(peer_node)
-        peer_node.until(lambda: peer_node.received["y"] and len(px4.received["OffboardControlMode"]) > 2, each=px4.say)
+        peer_node.until(lambda: peer_node.received["y"] and len(px4.received["OffboardControlMode"]) > 2, each=px4.publish)
         y = peer_node.received["y"][-1]
         assert dict(zip(y.name, y.position, strict=True)) == pytest.approx({**MOTION, "V": 2.0}, abs=1e-6)
         assert not px4.received["VehicleTorqueSetpoint"]
         assert px4.received["OffboardControlMode"][-1].thrust_and_torque
         client = peer_node.node.create_client(SetBool, "bridge/engage")
-        peer_node.until(client.service_is_ready, each=px4.say)
+        peer_node.until(client.service_is_ready, each=px4.publish)
         future = client.call_async(SetBool.Request(data=True))
-        peer_node.until(future.done, each=px4.say)
+        peer_node.until(future.done, each=px4.publish)
         assert future.result().success, future.result().message
-        peer_node.until(lambda: len(px4.received["VehicleThrustSetpoint"]) > 5, each=px4.say)
+        peer_node.until(lambda: len(px4.received["VehicleThrustSetpoint"]) > 5, each=px4.publish)
         assert list(px4.received["VehicleTorqueSetpoint"][-1].xyz) == pytest.approx([0.0, 0.02 / 0.523599, 0.0], abs=1e-6)
         assert list(px4.received["VehicleThrustSetpoint"][-1].xyz) == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
         peer_node.until(lambda: any("-> DISENGAGED: " in line for line in bridge.lines))
-        spin(peer_node, 0.2)  # what was still under way
+        spin(peer_node, 0.2)  # for messages in transit
         for messages in px4.received.values():
             messages.clear()
         spin(peer_node, 0.5)

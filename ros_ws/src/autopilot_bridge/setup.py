@@ -5,7 +5,7 @@ from setuptools import setup
 setup(
     name="autopilot_bridge",
     version="0.1.0",
-    description="Takes the simulated aircraft's place: y from the topics of a real autopilot, u to them, by a channel map.",
+    description="Bridge to an autopilot, in place of the simulated aircraft: y and u through a channel map.",
     license="Apache-2.0",
     packages=["autopilot_bridge"],
     package_data={"autopilot_bridge": ["maps/*.yaml"]},

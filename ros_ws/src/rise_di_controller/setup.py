@@ -5,7 +5,7 @@ from setuptools import setup
 setup(
     name="rise_di_controller",
     version="0.1.0",
-    description="RISE dynamic inversion: the control law from the measured output alone, and its fixed-rate ROS 2 node.",
+    description="RISE dynamic inversion: a control law that uses the measured output only, its guard, and a ROS 2 node with a fixed rate.",
     license="Apache-2.0",
     packages=["rise_di_controller"],
     data_files=[

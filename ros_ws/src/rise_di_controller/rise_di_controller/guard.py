@@ -44,7 +44,7 @@ class Limits(NamedTuple):
 
 
 # Least distance of two samples from which a slope is taken, as a fraction of the extrapolation. Closer samples are noisier:
-# the extrapolation would amplify the noise of their difference by more than 20.
+# the extrapolation would amplify the noise of their difference more than 20 times.
 MIN_SLOPE_SPAN = 0.05
 
 # Samples kept of y and of y_m, so that y_m at the stamp of y is among them: 0.1 s at 1 kHz, more at lower rates.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control law, equations (20)-(22), as one pure step: from y and y_m alone, without A, B, f or any acceleration."""
+"""The control law, equations (20)-(22), as one pure step: from y and y_m only, without A, B, f or any acceleration."""
 
 from enum import IntEnum
 from typing import NamedTuple

@@ -143,7 +143,7 @@ class ControllerParameters(KeyedParameters):
     def digest(self) -> int:
         """Hash of the parameters of the law and its guard, 0 to 2^48 - 1, exact as a float64.
 
-        BLAKE2b of names and values. It changes with any bit of any gain. Parameters of the node alone are left out.
+        BLAKE2b of names and values. It changes with any bit of any gain. Parameters that concern only the node are left out.
         """
         content = self.model_dump(exclude={"lockstep", "y_rate", "autostart", "key_file"})
         return int.from_bytes(blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big")
