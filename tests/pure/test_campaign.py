@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Campaigns: statistics that do not grow, chunks that are the same wherever and in whatever order they fly, kill and resume."""
+"""Monte Carlo campaigns: statistics of constant size, chunks that do not depend on engine or order, kill and resume."""
 
 import json
 import signal
@@ -36,7 +36,7 @@ def definition(aircraft: int = 60, chunk: int = 20, sweep: Sweep | None = None) 
     return define(SHORT, aircraft, 0.3, 7, chunk, sweep)
 
 
-def flown(folder: Path, of: Definition) -> Campaign:
+def fly_campaign(folder: Path, of: Definition) -> Campaign:
     folder.mkdir()
     campaign = Campaign.begin(folder, of)
     assert sum(campaign.fly(engines.threads(2))) == of.aircraft * of.cases
@@ -47,7 +47,7 @@ def flown(folder: Path, of: Definition) -> Campaign:
 
 
 @given(VALUES, st.data())
-def test_a_figure_added_up_from_parts_is_that_of_the_whole(values: FloatArray, data: st.DataObject) -> None:
+def test_a_figure_summed_from_parts_is_that_of_the_whole(values: FloatArray, data: st.DataObject) -> None:
     cut = data.draw(st.integers(0, len(values)))
     whole, parts = Figure.of(values), Figure.of(values[:cut]) + Figure.of(values[cut:])
     assert parts.count == len(values)
@@ -59,19 +59,19 @@ def test_a_figure_added_up_from_parts_is_that_of_the_whole(values: FloatArray, d
 
 
 @given(VALUES, st.floats(0.01, 1.0))
-def test_a_quantile_is_right_to_the_width_of_a_bin(values: FloatArray, share: float) -> None:
+def test_a_quantile_is_accurate_to_the_width_of_a_bin(values: FloatArray, share: float) -> None:
     # inverted_cdf: the smallest value that so many reach. A bin is 10^(1/100) wide.
     exact = float(np.quantile(values, share, method="inverted_cdf"))
     assert Figure.of(values).quantile(share) == pytest.approx(exact, rel=10 ** (1 / 100) - 1.0)
 
 
-def test_a_figure_does_not_grow_with_the_flights() -> None:
+def test_the_size_of_a_figure_does_not_grow_with_the_flights() -> None:
     rng = np.random.default_rng(1)
     sizes = [len(Figure.of(np.exp(rng.normal(size=count))).model_dump_json()) for count in (10_000, 1_000_000)]
     assert sizes[1] < 2 * sizes[0]  # more bins at the tails, a digit or two more a bin
 
 
-def test_the_worst_are_kept_and_those_that_diverged_lead_them() -> None:
+def test_the_worst_flights_are_kept_with_the_diverged_ones_first() -> None:
     scores = np.arange(30.0)
     diverged = scores == 4.0
     halves = [Tally.of(first, diverged[first : first + 15], {"score": scores[first : first + 15]}) for first in (0, 15)]
@@ -82,7 +82,7 @@ def test_the_worst_are_kept_and_those_that_diverged_lead_them() -> None:
     assert total.figures["score"].count == 29
 
 
-def test_the_share_of_the_diverged_has_its_interval() -> None:
+def test_the_share_of_diverged_flights_has_a_confidence_interval() -> None:
     # Clopper-Pearson: of 0 in n, the upper end is 1 - 0.025^(1/n).
     share, low, high = Tally(flights=100).share(0)
     assert (share, low) == (0.0, 0.0)
@@ -100,8 +100,8 @@ def test_a_score_counts_errors_in_their_units() -> None:
 # Campaigns
 
 
-def test_an_aircraft_of_a_campaign_flies_again_alone_with_the_same_score(tmp_path: Path) -> None:
-    campaign = flown(tmp_path / "one", definition())
+def test_an_aircraft_of_a_campaign_has_the_same_score_in_the_single_process_simulation(tmp_path: Path) -> None:
+    campaign = fly_campaign(tmp_path / "one", definition())
     worst = campaign.tally(0).worst[0]
     path = tmp_path / "again.yaml"
     path.write_text(scenario_yaml(campaign.definition.aircraft_scenario(worst.number)), encoding="utf-8")
@@ -117,8 +117,8 @@ def test_an_aircraft_of_a_campaign_flies_again_alone_with_the_same_score(tmp_pat
     )  # as of single flights: tests of fleets
 
 
-def test_the_same_seed_gives_the_same_figures_whatever_the_order_and_the_engine(tmp_path: Path) -> None:
-    first, second = (flown(tmp_path / name, definition()) for name in ("first", "second"))
+def test_the_same_seed_gives_the_same_figures_in_any_order_and_engine(tmp_path: Path) -> None:
+    first, second = (fly_campaign(tmp_path / name, definition()) for name in ("first", "second"))
     assert first.tally(0).model_dump_json() == second.tally(0).model_dump_json()
 
     def backwards(work: engines.Work, jobs: Iterable[engines.Job]) -> Iterator[tuple[engines.Job, Any]]:
@@ -128,12 +128,12 @@ def test_the_same_seed_gives_the_same_figures_whatever_the_order_and_the_engine(
     third = Campaign.begin(tmp_path / "third", definition())
     list(third.fly(backwards))
     assert third.tally(0).model_dump_json() == first.tally(0).model_dump_json()
-    other = flown(tmp_path / "other", define(SHORT, 60, 0.3, 8, 20))
+    other = fly_campaign(tmp_path / "other", define(SHORT, 60, 0.3, 8, 20))
     assert other.tally(0).figures["score"].mean != first.tally(0).figures["score"].mean
 
 
-def test_a_campaign_that_was_stopped_goes_on_where_it_was(tmp_path: Path) -> None:
-    whole = flown(tmp_path / "whole", definition())
+def test_a_stopped_campaign_resumes_with_the_missing_chunks(tmp_path: Path) -> None:
+    whole = fly_campaign(tmp_path / "whole", definition())
     (tmp_path / "part").mkdir()
     part = Campaign.begin(tmp_path / "part", definition())
     next(part.fly(engines.threads(1)))
@@ -146,10 +146,10 @@ def test_a_campaign_that_was_stopped_goes_on_where_it_was(tmp_path: Path) -> Non
 
 
 def test_a_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
-    campaign = flown(tmp_path / "sweep", definition(20, 20, Sweep(parameter="beta", factors=(0.25, 1.0))))
+    campaign = fly_campaign(tmp_path / "sweep", definition(20, 20, Sweep(parameter="beta", factors=(0.25, 1.0))))
     weak, strong = (campaign.tally(case).figures["score"].mean for case in (0, 1))
     assert weak > 1.05 * strong  # beta far below the slew of the ideal control follows worse
-    plain = flown(tmp_path / "plain", definition(20, 20))
+    plain = fly_campaign(tmp_path / "plain", definition(20, 20))
     assert plain.tally(0) == campaign.tally(1)
 
 
@@ -160,7 +160,7 @@ def test_a_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
         (Sweep(parameter="beta", factors=(0.0,)), r"--sweep: found \(0.0,\), expected factors above 0"),
     ],
 )
-def test_a_sweep_that_makes_no_sense_is_refused(sweep: Sweep, sentence: str) -> None:
+def test_an_invalid_sweep_is_refused(sweep: Sweep, sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"^{sentence}"):
         definition(20, 20, sweep)
 
@@ -183,8 +183,8 @@ def new(aircraft: int, *more: str) -> tuple[str, ...]:
 
 
 def figures(process: "subprocess.Popen[str]") -> list[object]:
-    output, said = process.communicate(timeout=120)
-    assert process.returncode == 0, said
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
     cases = json.loads(output)["cases"]
     for case in cases:
         case.pop("fly_again")  # names the folder
@@ -192,7 +192,7 @@ def figures(process: "subprocess.Popen[str]") -> list[object]:
 
 
 def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") -> Path:
-    """Until so many chunks of the one campaign in `runs` are done; its folder."""
+    """Wait until so many chunks of the one campaign in `runs` are done; return its folder."""
     until = time.monotonic() + 120.0
     while time.monotonic() < until:
         found = list(runs.glob(f"*/{CHUNKS}/*.json"))
@@ -203,28 +203,28 @@ def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") ->
     pytest.fail(f"no {count} chunks within two minutes")
 
 
-def test_a_killed_campaign_resumes_to_the_figures_of_one_that_was_not(tmp_path: Path) -> None:
+def test_a_killed_campaign_resumes_to_the_figures_of_an_uninterrupted_one(tmp_path: Path) -> None:
     whole = figures(command(*new(400, "--runs", "whole"), cwd=tmp_path))
     stopped = command(*new(400, "--runs", "part", "--workers", "1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 2, stopped)
     stopped.send_signal(signal.SIGKILL)
     stopped.communicate()
     there = len(list((folder / CHUNKS).glob("*.json")))
-    assert 2 <= there < 20, "killed too late to show anything"
+    assert 2 <= there < 20, "the campaign ended before the kill"
     assert figures(command("--resume", str(folder), cwd=tmp_path)) == whole
 
 
-def test_ctrl_c_says_how_to_go_on(tmp_path: Path) -> None:
+def test_ctrl_c_prints_the_command_to_resume(tmp_path: Path) -> None:
     stopped = command(*new(4000, "--runs", "part", "--workers", "1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 1, stopped)
     stopped.send_signal(signal.SIGINT)
-    output, said = stopped.communicate(timeout=60)
-    assert stopped.returncode == 130, said
-    assert "Traceback" not in said
-    assert f"go on with: rise-di campaign --resume {folder.relative_to(tmp_path)}" in output + said
+    output, errors = stopped.communicate(timeout=60)
+    assert stopped.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert f"continue with: rise-di campaign --resume {folder.relative_to(tmp_path)}" in output + errors
 
 
-def test_two_processes_of_dask_give_the_same_figures_and_a_killed_one_costs_its_chunk_alone(tmp_path: Path) -> None:
+def test_two_dask_workers_give_the_same_figures_and_a_killed_one_repeats_only_its_chunks(tmp_path: Path) -> None:
     local = figures(command(*new(400, "--runs", "local"), cwd=tmp_path))
     spread = command(*new(400, "--runs", "spread", "--engine", "dask", "--workers", "2"), cwd=tmp_path)
     wait_for_chunks(tmp_path / "spread", 2, spread)

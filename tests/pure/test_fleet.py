@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fleets: each aircraft of one flies what the loop in one process flies, and knows nothing of the others."""
+"""Vectorised flights of N aircraft: each is the single-process simulation, independent of the others."""
 
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements
 
-NUMBERS = (0, 1)  # of the aircraft drawn
+NUMBERS = (0, 1)  # of the sampled aircraft
 SERVO = find_scenario("osprey_servo").vary(
     flight={"duration": 9.0},
     aircraft={
@@ -42,19 +42,19 @@ class Flight(NamedTuple):
     slew: FloatArray
 
 
-def flown(scenario: Scenario, part: float = 0.3, seed: int = 5) -> fleet.FleetResult:
-    """The aircraft NUMBERS of a seed, as a fleet."""
+def fly_fleet(scenario: Scenario, part: float = 0.3, seed: int = 5) -> fleet.FleetResult:
+    """The aircraft NUMBERS of a seed, in one fleet."""
     course = build_course(scenario)
     A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), part, part, seed, NUMBERS[0], len(NUMBERS))
-    ships = fleet.assemble(A, B, scenario.aircraft.plant(), course)
+    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course)
     control_law, params = rise_di.control_law(scenario.controller.law().sign), rise_di.params(scenario.controller)
-    return fleet.fly(ships, fleet.vehicle(scenario), course, control_law, params)
+    return fleet.fly(aircraft, fleet.vehicle(scenario), course, control_law, params)
 
 
 def alone(scenario: Scenario, number: int, part: float = 0.3, seed: int = 5) -> Flight:
-    """One of them in the loop in one process, seen at the ticks too."""
-    drawn = {"A": part, "B": part, "seed": seed, "number": number}
-    tape = simulate(scenario.vary(aircraft={"uncertainty": drawn}))
+    """One of them in the single-process simulation, evaluated at the ticks."""
+    uncertainty = {"A": part, "B": part, "seed": seed, "number": number}
+    tape = simulate(scenario.vary(aircraft={"uncertainty": uncertainty}))
     error, outputs = true_error(tape), scenario.controller.outputs
     assert error is not None
     period = round(1e9 / scenario.controller.rate)
@@ -112,11 +112,11 @@ FEEDFORWARD = with_feedforward(SERVO.controller, load_airframe("osprey")).model_
         ),
     ],
 )
-def test_each_aircraft_of_a_fleet_flies_what_it_flies_alone(scenario: Scenario) -> None:
-    # A fleet holds gravity's and the products' rest over a tick and the wind over a step of the integration (2 ms); the loop
-    # in one process follows them. In the gust that is 1e-4 of the error at most; 1e-3 bounds it. A coarse y now and then falls
-    # to the other side of a step, after which noise and gains make another u: 2e-2.
-    together, within = flown(scenario), 2e-2 if scenario.aircraft.sensors.quantisation else 1e-3
+def test_each_aircraft_of_a_fleet_flies_as_in_the_single_process_simulation(scenario: Scenario) -> None:
+    # A fleet holds the nonlinear remainder over a tick and the wind over a step of the integration (2 ms); the simulation
+    # does not. In the gust the difference is at most 1e-4 of the error; 1e-3 bounds it. A quantised y sometimes rounds to the
+    # next step, after which u differs: 2e-2.
+    together, within = fly_fleet(scenario), 2e-2 if scenario.aircraft.sensors.quantisation else 1e-3
     for place, number in enumerate(NUMBERS):
         one = alone(scenario, number)
         for name, values in one._asdict().items():
@@ -124,14 +124,14 @@ def test_each_aircraft_of_a_fleet_flies_what_it_flies_alone(scenario: Scenario) 
     assert not np.asarray(together.diverged).any()
 
 
-def test_every_aircraft_may_have_its_own_gains_wind_and_delay() -> None:
+def test_every_aircraft_can_have_its_own_gains_wind_and_delay() -> None:
     course, vehicle, plant = build_course(SERVO), fleet.vehicle(SERVO), SERVO.aircraft.plant()
     A, B = sampled_matrices(load_airframe("osprey"), 0.3, 0.3, 5, 0, 1)
     control_law, params = rise_di.control_law(SERVO.controller.law().sign), rise_di.params(SERVO.controller)
     wind, late = np.array([1.0, 0.0, 1.0, 1.0]), np.array([0, 0, 2, 0])
     beta = params.beta * np.array([1.0, 1.0, 1.0, 0.5])
-    ships = fleet.assemble(np.repeat(A, 4, 0), np.repeat(B, 4, 0), plant, course, wind, late)
-    together = fleet.fly(ships, vehicle, course, control_law, params._replace(beta=beta))
+    aircraft = fleet.assemble(np.repeat(A, 4, 0), np.repeat(B, 4, 0), plant, course, wind, late)
+    together = fleet.fly(aircraft, vehicle, course, control_law, params._replace(beta=beta))
     for k in range(4):
         single = fleet.assemble(A, B, plant, course, wind[k], late[k])
         apart = fleet.fly(single, vehicle, course, control_law, params._replace(beta=beta[:, k : k + 1]))
@@ -144,7 +144,7 @@ def test_every_aircraft_may_have_its_own_gains_wind_and_delay() -> None:
 
 
 def _pulse(delay: int) -> ControlLaw:
-    """A control_law that looks at nothing: one pulse of the elevator, so many ticks later."""
+    """An open-loop control law: one pulse of the elevator, delayed by so many ticks."""
 
     def start(seen: Measurements, params: Any) -> Array:
         return 0.0 * seen.y[:1] + 1.0
@@ -156,7 +156,7 @@ def _pulse(delay: int) -> ControlLaw:
     return ControlLaw(start, step)
 
 
-def test_a_late_u_acts_as_many_ticks_later() -> None:
+def test_a_late_u_acts_that_many_ticks_later() -> None:
     calm = SERVO.vary(aircraft={"gusts": {}}, flight={"duration": 2.0})
     course, vehicle, plant = build_course(calm), fleet.vehicle(calm), calm.aircraft.plant()
     A, B = sampled_matrices(load_airframe("osprey"), 0.0, 0.0, 1, 0, 1)
@@ -167,15 +167,15 @@ def test_a_late_u_acts_as_many_ticks_later() -> None:
     assert np.asarray(late.max)[0, 0] > 0.01  # it did move
 
 
-def test_an_aircraft_that_diverges_says_so_and_leaves_the_others_alone() -> None:
+def test_an_aircraft_that_diverges_is_marked_and_does_not_affect_the_others() -> None:
     course, vehicle, plant = build_course(SERVO), fleet.vehicle(SERVO), SERVO.aircraft.plant()
     A, B = sampled_matrices(load_airframe("osprey"), 0.0, 0.0, 1, 0, 2)
-    B = B * np.array([1.0, -1.0])[:, None, None]  # every sign wrong: the law drives it away
+    B = B * np.array([1.0, -1.0])[:, None, None]  # every sign is wrong: the loop is unstable
     vehicle = vehicle._replace(actuators=vehicle.actuators._replace(lower=None, upper=None, rate=None))
     params = rise_di.params(SERVO.controller)
     free = params.limits._replace(lower=-np.inf + 0.0 * params.D, upper=np.inf + 0.0 * params.D)
-    ships = fleet.assemble(A, B, plant, course)
-    both = fleet.fly(ships, vehicle, course, rise_di.control_law(SERVO.controller.law().sign), params._replace(limits=free))
+    aircraft = fleet.assemble(A, B, plant, course)
+    both = fleet.fly(aircraft, vehicle, course, rise_di.control_law(SERVO.controller.law().sign), params._replace(limits=free))
     assert np.asarray(both.diverged).tolist() == [False, True]
     assert np.isfinite(np.asarray(both.rms)[:, 0]).all()
 
@@ -187,7 +187,7 @@ def test_an_aircraft_that_diverges_says_so_and_leaves_the_others_alone() -> None
         ({"aircraft": {"sensors": {"delay": 0.004}}}, "sensors.delay: found 0.01 s"),
     ],
 )
-def test_what_a_fleet_cannot_fly_is_refused(sections: dict[str, Any], sentence: str) -> None:
+def test_a_scenario_that_a_fleet_cannot_fly_is_refused(sections: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"^{sentence}"):
         build_course(SERVO.vary(**sections))
 

@@ -359,7 +359,7 @@ def scalar(omega: float, T_eps: float) -> LawParams:
 
 
 def grows(params: LawParams, omega: float, lag: float, delay: float) -> bool:
-    """Whether y of y_dot = omega u_a behind a servo and a delay diverges under `law.step`; u delayed by whole quarter milliseconds.
+    """Whether y_dot = omega u_a behind a servo and a delay diverges under `law.step`; u delayed by whole quarter milliseconds.
 
     Between these instants plant and servo are solved exactly. e stays within 1e-3 eps, inside the width of the sign.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each law against something not written here: a closed form, another recursion, an exact integration of a known plant."""
+"""Each control law against an independent result: a closed form, another recursion, an exact integration of a known plant."""
 
 from typing import Any, NamedTuple
 
@@ -55,7 +55,7 @@ def osprey() -> NominalModel:
 
 
 def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:
-    """What a law sees of one aircraft; what is not named is 0, and x is y."""
+    """Measurements of one aircraft; the others are 0, and x is y."""
     y = np.atleast_1d(np.asarray(y, dtype=float))[:, None]
     zero = np.zeros_like(y)
     measured = Measurements(y, zero + y_m, zero, zero, zero, zero, y, y, zero)
@@ -109,7 +109,7 @@ def test_inversion_cancels_the_model_and_leaves_the_error_its_own_dynamics(
     np.testing.assert_allclose(y_dot - y_m_dot, -0.1 * K, atol=1e-12)
 
 
-def test_inversion_with_vanes_looks_at_the_air_and_without_at_the_ground(osprey: NominalModel) -> None:
+def test_inversion_with_vanes_uses_the_state_relative_to_the_air(osprey: NominalModel) -> None:
     x, air = np.zeros((8, 1)), np.zeros((8, 1))
     air[1] = 0.05
     params = inversion.inversion_params({"K": np.ones((4, 1))}, osprey)
@@ -123,14 +123,14 @@ def test_inversion_with_vanes_looks_at_the_air_and_without_at_the_ground(osprey:
     np.testing.assert_allclose(osprey.Omega @ u[True], -osprey.C @ osprey.A @ air, atol=1e-12)
 
 
-def test_the_integral_of_the_inversion_takes_a_constant_disturbance_away() -> None:
+def test_the_integral_of_the_inversion_rejects_a_constant_disturbance() -> None:
     model = integrator()
     control_law = inversion.control_law(model, vanes=False)
-    kept = fly(control_law, inversion.inversion_params(gains(K=8.0), model), 2000, 0.0, 1.0, model)
-    gone = fly(control_law, inversion.inversion_params(gains(K=8.0, Lambda=2.0), model), 2000, 0.0, 1.0, model)
-    # without the integral e rests where K e = d; sampled and held exactly as well, for y_dot is then 0
-    assert kept.y[-1] == pytest.approx(1.0 / 8.0, rel=1e-9)
-    assert abs(gone.y[-1]) < 1e-9
+    without = fly(control_law, inversion.inversion_params(gains(K=8.0), model), 2000, 0.0, 1.0, model)
+    with_integral = fly(control_law, inversion.inversion_params(gains(K=8.0, Lambda=2.0), model), 2000, 0.0, 1.0, model)
+    # without the integral K e = d at rest; sampling changes nothing, since y_dot is then 0
+    assert without.y[-1] == pytest.approx(1.0 / 8.0, rel=1e-9)
+    assert abs(with_integral.y[-1]) < 1e-9
 
 
 # LQI
@@ -156,7 +156,7 @@ def recursion(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray, steps:
     return np.asarray(np.linalg.solve(R + G.T @ P @ G, G.T @ P @ F))
 
 
-def test_lqi_is_what_a_long_finite_horizon_comes_to(osprey: NominalModel) -> None:
+def test_lqi_is_the_limit_of_a_long_finite_horizon(osprey: NominalModel) -> None:
     size, weights = osprey.C @ osprey.size, gains(integral=np.full((4, 1), 2.0), effort=np.full((4, 1), 0.1), fade=4.0)
     F, G, E = lqi.design(osprey, 4.0)
     found = lqi.lqi_gain(osprey, weights)[..., 0]
@@ -193,7 +193,7 @@ def test_the_acceleration_based_law_by_hand() -> None:
     assert u.item() == pytest.approx(-(3.0 * (0.2 + 0.06) + 0.625) / 2.0, rel=1e-12)
 
 
-def test_the_filtered_difference_of_a_ramp_comes_to_its_slope() -> None:
+def test_the_filtered_difference_of_a_ramp_converges_to_its_slope() -> None:
     model = integrator()
     control_law = mackunis.control_law(model, ideal=False)
     params = mackunis.mackunis_params(gains(K=1.0, Lambda=1.0, beta=1.0, softening=1.0, filter=12.6), model)
@@ -207,7 +207,7 @@ def test_the_filtered_difference_of_a_ramp_comes_to_its_slope() -> None:
 # L1
 
 
-def test_the_predictor_of_l1_knows_a_constant_disturbance_after_one_tick() -> None:
+def test_the_predictor_of_l1_estimates_a_constant_disturbance_in_one_tick() -> None:
     model = integrator()
     control_law, params = adaptive.l1(model, feedforward=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), model)
     flight = fly(control_law, params, 3, 0.1, 0.7, model)
@@ -215,7 +215,7 @@ def test_the_predictor_of_l1_knows_a_constant_disturbance_after_one_tick() -> No
     assert flight.state.sigma_hat.item() == pytest.approx(0.7 * x / (np.exp(x) - 1.0), rel=1e-9)
 
 
-def test_l1_rejects_what_its_filter_lets_through_with_a_wrong_input_gain() -> None:
+def test_l1_rejects_a_constant_disturbance_with_a_wrong_input_gain() -> None:
     model = integrator()
     control_law, params = adaptive.l1(model, feedforward=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), model)
     flight = fly(control_law, params, 1500, 0.0, 0.7, model, Omega=1.4 * model.Omega[0, 0])
@@ -224,7 +224,7 @@ def test_l1_rejects_what_its_filter_lets_through_with_a_wrong_input_gain() -> No
     assert flight.u[-1] == pytest.approx(-0.7 / (1.4 * model.Omega[0, 0]), rel=1e-6)
 
 
-def test_l1_with_feedforward_does_not_cancel_what_the_feedforward_cancels() -> None:
+def test_l1_with_feedforward_does_not_cancel_the_disturbance_twice() -> None:
     model = integrator()
     control_law, params = adaptive.l1(model, feedforward=True), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), model)
     y, state, u = 0.0, None, np.zeros(COLUMN)
@@ -242,7 +242,7 @@ def test_l1_with_feedforward_does_not_cancel_what_the_feedforward_cancels() -> N
 # MRAC
 
 
-def test_mrac_learns_what_the_model_is_short_of() -> None:
+def test_the_weights_of_mrac_converge_to_the_model_error() -> None:
     model = integrator()
     control_law = adaptive.mrac(model, vanes=False)
     params = adaptive.mrac_params(gains(K=2.0, adaptation=20.0, bias=20.0, leak=0.0), model)
@@ -251,13 +251,13 @@ def test_mrac_learns_what_the_model_is_short_of() -> None:
     assert flight.state[0, 1, 0] == pytest.approx(0.7, rel=1e-4)  # the weight of 1 is the disturbance
 
 
-def test_the_lyapunov_function_of_mrac_falls_by_what_the_theory_says() -> None:
+def test_the_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
     model = integrator(period=1e-4)
     control_law, K, gamma, d = adaptive.mrac(model, vanes=False), 2.0, 20.0, 0.7
     params = adaptive.mrac_params(gains(K=K, adaptation=gamma, bias=gamma, leak=0.0), model)
     W, y, u, values, decay = control_law.start(at(0.3), params), 0.3, np.zeros(COLUMN), [], 0.0
     for _ in range(10_000):
-        # what is to be learned: nothing of x, d of the constant
+        # the weights to be learned: 0 of x, d of the constant
         values.append(y**2 / 2.0 + (W[0, 0, 0] ** 2 + (W[0, 1, 0] - d) ** 2) / (2.0 * gamma) + decay)
         decay += K * y**2 * model.period
         W, u = control_law.step(W, at(y, u_before=u), np.array(model.period), params)
@@ -269,7 +269,7 @@ def test_the_lyapunov_function_of_mrac_falls_by_what_the_theory_says() -> None:
 # INDI
 
 
-def test_indi_needs_no_model_beside_the_input_gain() -> None:
+def test_indi_needs_no_model_except_the_input_gain() -> None:
     model = integrator()
     control_law = indi.control_law(model)
     params = indi.indi_params(gains(K=2.0, bandwidth=60.0, share=1.0), model)
@@ -283,20 +283,20 @@ def test_indi_needs_no_model_beside_the_input_gain() -> None:
 
 
 def reaching(e_0: float) -> float:
-    """When abs(e) is first below a ten-thousandth of its start for good, s."""
+    """Reaching time, s: from then on abs(e) stays below 1e-4 of its initial value."""
     model = integrator(period=2e-4)
     control_law, params = super_twisting.control_law(model), super_twisting.twisting_params(gains(root=3.0, beta=2.0), model)
     flight = fly(control_law, params, 15_000, e_0, 0.0, model)
     return float((np.flatnonzero(np.abs(flight.y) > 1e-4 * e_0)[-1] + 1) * model.period)
 
 
-def test_super_twisting_arrives_in_a_time_that_goes_with_the_root_of_the_start() -> None:
+def test_the_reaching_time_of_super_twisting_is_proportional_to_the_root_of_the_initial_error() -> None:
     # e(t) = c E(t / sqrt(c)) solves it for any c where E does: an exponential would take as long from anywhere.
     # 1 %: with steps of 0.2 ms the sliding is within 1e-7, the arrival within some ten steps of 1 s
     assert reaching(4.0) == pytest.approx(2.0 * reaching(1.0), rel=0.01)
 
 
-def test_super_twisting_holds_against_a_disturbance_that_grows() -> None:
+def test_super_twisting_rejects_a_ramp_disturbance() -> None:
     model = integrator(period=2e-4)
     control_law, params = super_twisting.control_law(model), super_twisting.twisting_params(gains(root=4.0, beta=3.0), model)
     flight = fly(control_law, params, 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model)  # d_dot = 2 < beta = 3
@@ -325,7 +325,7 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
 # The observer
 
 
-def test_the_observer_finds_the_states_the_wind_and_the_disturbance_of_the_aircraft_that_it_knows(osprey: NominalModel) -> None:
+def test_the_observer_converges_to_states_wind_and_disturbance_of_its_model(osprey: NominalModel) -> None:
     estimator = rise_observer.observer(osprey)
     _, corrections = rise_observer.observer_gains(estimator, osprey, initial_gains(LAWS["lqg"], osprey))
     correction = corrections[..., 0]
@@ -342,7 +342,7 @@ def test_the_observer_finds_the_states_the_wind_and_the_disturbance_of_the_aircr
     assert np.abs(np.linalg.eigvals(estimator.F - estimator.F @ correction @ estimator.H)).max() < 1.0
 
 
-def test_what_the_observer_adds_is_bounded_whatever_it_sees() -> None:
+def test_the_contribution_of_the_observer_is_bounded_for_any_measurement() -> None:
     model = integrator(limit=0.5)
     law = LAWS["rise_observer"]
     gains_ = initial_gains(law, model) | {"K": np.full(COLUMN, 1e-6), "beta": np.full(COLUMN, 1e-6)}
@@ -359,38 +359,42 @@ def test_what_the_observer_adds_is_bounded_whatever_it_sees() -> None:
     assert np.abs(np.diff([0.0, *added])).max() == pytest.approx(part * DT / rise_observer.RAMP_TIME, rel=1e-9)
 
 
-def test_without_an_observer_s_gain_it_is_the_law_with_feedforward(osprey: NominalModel) -> None:
+def test_with_zero_observer_gain_the_law_is_the_one_with_feedforward(osprey: NominalModel) -> None:
     law, plain = LAWS["rise_observer"], LAWS["rise_ff"]
     gains_ = initial_gains(law, osprey)
     params = law.params(gains_, osprey)
     params = params._replace(gain=0.0 * params.gain)
-    generator, pilots = np.random.default_rng(1), (law.control_law(osprey), plain.control_law(osprey))
+    generator, laws_ = np.random.default_rng(1), (law.control_law(osprey), plain.control_law(osprey))
     looks = [
         Measurements(*(0.01 * generator.standard_normal((8 if k in {6, 7} else 4, 1)) for k in range(9))) for _ in range(5)
     ]
-    states = [control_law.start(looks[0], given_) for control_law, given_ in zip(pilots, (params, params.rise), strict=True)]
+    states = [control_law.start(looks[0], given_) for control_law, given_ in zip(laws_, (params, params.rise), strict=True)]
     for measured in looks:
-        states[0], u = pilots[0].step(states[0], measured, np.array(DT), params)
-        states[1], without = pilots[1].step(states[1], measured, np.array(DT), params.rise)
+        states[0], u = laws_[0].step(states[0], measured, np.array(DT), params)
+        states[1], without = laws_[1].step(states[1], measured, np.array(DT), params.rise)
         assert np.array_equal(u, without)  # to the last bit
 
 
 # All of them
 
 
-def test_integrals_stop_where_they_push_on_and_go_where_they_come_back() -> None:
+def test_anti_windup_stops_an_integral_in_saturation_and_releases_it_on_the_way_back() -> None:
     before, after = np.zeros(3), np.ones(3)
-    assert conditional_integration(before, after, np.array([1.0, 1.0, 1.0]), np.array([0.5, -0.5, 0.0])).tolist() == [0.0, 1.0, 1.0]
+    assert conditional_integration(before, after, np.array([1.0, 1.0, 1.0]), np.array([0.5, -0.5, 0.0])).tolist() == [
+        0.0,
+        1.0,
+        1.0,
+    ]
 
 
 @pytest.mark.parametrize("name", list(LAWS))
-def test_every_law_keeps_its_limits_and_recovers_from_them(name: str) -> None:
+def test_every_law_keeps_its_limits_and_recovers_from_saturation(name: str) -> None:
     model = integrator(limit=0.5)
     law = LAWS[name]
     params = law.params(initial_gains(law, model), model)
     flight = fly(law.control_law(model), params, 3000, 0.0, lambda k: 2.0 if k < 1000 else 0.0, model)
     assert np.abs(flight.u).max() <= 0.5  # 0.5 of 2.0 / Omega = 1.0 that the disturbance would take
-    # pushed 10 away in 10 s, it comes back at Omega 0.5 = 1 /s for 10 s; a wound-up integral would not stop there
+    # the error is 10 after 10 s and then falls by Omega 0.5 = 1 /s for 10 s; with windup it would overshoot
     assert np.abs(flight.y[2800:]).max() < 0.2
 
 

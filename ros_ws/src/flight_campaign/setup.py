@@ -5,7 +5,7 @@ from setuptools import setup
 setup(
     name="flight_campaign",
     version="0.1.0",
-    description="Thousands of uncertain aircraft at once, and other control laws beside RISE-DI.",
+    description="Monte Carlo campaigns over thousands of uncertain aircraft, tuning and comparison of control laws.",
     license="Apache-2.0",
     packages=["flight_campaign"],
     package_data={"flight_campaign": ["tuned/*.yaml"]},

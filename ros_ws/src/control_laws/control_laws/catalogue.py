@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every law that is compared: what it measures, how it flies, which gains are tuned and from where the search starts."""
+"""Catalogue of the compared laws: their measurements, model data, tuned gains, and the initial gains of a search."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,7 +18,7 @@ Gains = dict[str, FloatArray]
 """Gains by name, shape (m, N), or (1, N) where one serves all channels; all of them positive."""
 
 INITIAL_CROSSOVER_LAG_PRODUCT = 0.4
-"""Bandwidth times the lag of the loop where a search starts."""
+"""rad, bandwidth times the lag of the loop at the start of a search: 23 degrees of phase at the crossover."""
 
 INITIAL_CHANNEL_GAINS = {
     "beta": 5.0,
@@ -31,10 +31,10 @@ INITIAL_CHANNEL_GAINS = {
     "integral": 2.0,
     "effort": 0.05,
 }
-"""Where a search starts in every channel, in scaled inputs and SI; K and Lambda start from the lag of the loop."""
+"""Initial gains of a search in every channel, in scaled inputs and SI; K and Lambda start from the lag of the loop."""
 
 INITIAL_COMMON_GAINS = {"softening": 3.0, "omega": 1.5, "filter": 12.6, "leak": 0.05, "fade": 4.0, "loose": 0.01}
-"""The same where one number serves all channels."""
+"""Initial gains that are common to all channels."""
 
 INITIAL_GUST_INTENSITY = 0.5
 """m/s per root s, the same for each axis of the wind."""
@@ -44,16 +44,16 @@ class Law(NamedTuple):
     """One law."""
 
     title: str
-    measurements: str  # of the flying aircraft, beside y_m
-    model_data: str  # what it is given of the nominal one, beside D and how much each input does
+    measurements: str  # of the aircraft, besides y_m
+    model_data: str  # of the nominal aircraft, besides D and the input scale
     control_law: Callable[[NominalModel], ControlLaw]
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of its gains
-    feedforward: bool = False  # whether it flies with the feedforward
+    feedforward: bool = False  # whether it uses the feedforward
 
 
 def initial_gains(law: Law, model: NominalModel) -> Gains:
-    """The gains where the search starts, shapes (m, 1) and (1, 1)."""
+    """Initial gains of the search, shapes (m, 1) and (1, 1)."""
     K = INITIAL_CROSSOVER_LAG_PRODUCT / model.total_lag[:, None]
     gains = {"K": K, "Lambda": K / 4.0}
     gains |= {name: np.full(K.shape, value) for name, value in INITIAL_CHANNEL_GAINS.items()}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Incremental nonlinear dynamic inversion. Sees y, y_m, the measured positions of the actuators and the nominal Omega."""
+"""Incremental nonlinear dynamic inversion (INDI) from y, y_m, the measured actuator positions and the nominal Omega."""
 
 from typing import NamedTuple
 
@@ -15,12 +15,12 @@ class IndiParams(NamedTuple):
 
     K: Array  # 1/s
     bandwidth: Array  # of both filters, rad/s
-    share: Array  # of Omega^-1 that an increment takes, 1 in the textbook
+    share: Array  # factor of Omega^-1 in an increment, 1 in the textbook
     limits: Limits
 
 
 class IndiState(NamedTuple):
-    """What it carries from tick to tick, (m, N)."""
+    """State of the law from tick to tick, (m, N)."""
 
     y: Array
     y_dot: Array  # filtered difference of y
@@ -28,12 +28,12 @@ class IndiState(NamedTuple):
 
 
 def control_law(model: NominalModel) -> ControlLaw:
-    """Each tick inverts the increment of y_dot alone: what the model is wrong about is in the measured y_dot already.
+    """Each tick inverts the increment of y_dot only; the measured y_dot contains the model error.
 
         y_dot_f    += a ((y - y_p) / dt - y_dot_f),  position_f += a (position - position_f),  a = 1 - exp(-bandwidth dt)
         u           = position_f + share Omega^-1 (y_m_dot - K e - y_dot_f)
 
-    Both filters are the same, so that y_dot_f and position_f belong to one instant; no integral, so nothing winds up.
+    Both filters are the same, so that y_dot_f and position_f belong to one instant. There is no integral, so no windup.
     Source: S. Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E. J. J. Smeur, Q. P. Chu, G. C. H. E. de Croon,
     JGCD 39(3), 2016, for the filters.
     """
@@ -47,8 +47,8 @@ def control_law(model: NominalModel) -> ControlLaw:
         a = filter_gain(params.bandwidth, dt)
         y_dot = state.y_dot + a * ((measured.y - state.y) / dt - state.y_dot)
         position = state.position + a * (measured.position - state.position)
-        wanted = measured.y_m_dot - params.K * (measured.y - measured.y_m) - y_dot
-        u, _ = saturate(position + params.share * (inverse @ wanted), measured, dt, params.limits)
+        nu = measured.y_m_dot - params.K * (measured.y - measured.y_m) - y_dot
+        u, _ = saturate(position + params.share * (inverse @ nu), measured, dt, params.limits)
         return IndiState(measured.y, y_dot, position), u
 
     return ControlLaw(start, step)

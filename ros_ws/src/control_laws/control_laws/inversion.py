@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Plain dynamic inversion: the model cancelled by a full state, poles of the errors placed. Sees x (or x_air) and a model."""
+"""Dynamic inversion from the full state x (or x_air): it cancels the nominal model and places the poles of the error."""
 
 from typing import NamedTuple
 
@@ -19,19 +19,20 @@ class InversionParams(NamedTuple):
 
 
 class InversionState(NamedTuple):
-    """What it carries from tick to tick, (m, N)."""
+    """State of the law from tick to tick, (m, N)."""
 
     e: Array
     integral_e: Array
 
 
 def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
-    """Inversion of the nominal model, with `vanes` about the state relative to the air.
+    """Inversion of the nominal model, with `vanes` from the state relative to the air.
 
         u = Omega^-1 (y_m_dot - C (A x + f(x)) - K (e + Lambda integral of e))
 
-    so that on the nominal aircraft without actuators e_dot = -K (e + Lambda integral of e) - C (what f is short of). The
-    integral is a trapezoid. Source: B. L. Stevens, F. L. Lewis, E. N. Johnson, "Aircraft Control and Simulation", 5.8.
+    Without actuators e_dot = -K (e + Lambda integral of e) + C (f of the aircraft - f of the model), for the nominal A and B.
+    The integral is a trapezoid with conditional integration (anti-windup). Source: B. L. Stevens, F. L. Lewis, E. N. Johnson,
+    "Aircraft Control and Simulation", 5.8.
     """
     drift, gravity = model.C @ model.A, model.C @ model.gravity
     Omega, inverse = model.Omega, model.inverse
@@ -46,9 +47,9 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
         e = measured.y - measured.y_m
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
-        known_part = drift @ x + gravity @ array_namespace(e).sin(x)
-        wanted = measured.y_m_dot - known_part - params.K * (e + params.Lambda * integral_e)
-        u, beyond = saturate(inverse @ wanted, measured, dt, params.limits)
+        model_part = drift @ x + gravity @ array_namespace(e).sin(x)
+        nu = measured.y_m_dot - model_part - params.K * (e + params.Lambda * integral_e)
+        u, beyond = saturate(inverse @ nu, measured, dt, params.limits)
         effect = -params.K * params.Lambda * increment
         return InversionState(e, conditional_integration(state.integral_e, integral_e, effect, Omega @ beyond)), u
 

@@ -1,20 +1,19 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Model following by linear-quadratic design with integral action. Sees the full state x (or x_air), y_m and a model."""
+"""LQI: model following by linear-quadratic design with integral action, from the full state x (or x_air) and y_m."""
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
 
 from control_laws.nominal_model import NominalModel, conditional_integration, saturate
-from control_laws.riccati import gain_of
+from control_laws.riccati import gain_of, zero_order_hold
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
 
 LEAK = 0.01
-"""1/s. Angles and y_m decay this slowly in the design model: what neither the inputs nor the cost can hold must end."""
+"""1/s, decay of the angles and of y_m in the design model: modes that inputs and cost do not reach have to be stable."""
 
 
 class LqiParams(NamedTuple):
@@ -25,7 +24,7 @@ class LqiParams(NamedTuple):
 
 
 class LqiState(NamedTuple):
-    """What it carries from tick to tick, (m, N)."""
+    """State of the law from tick to tick, (m, N)."""
 
     e: Array
     integral_e: Array
@@ -34,7 +33,8 @@ class LqiState(NamedTuple):
 def control_law(*, vanes: bool) -> ControlLaw:
     """State feedback and integral: u = -gain [x, y_m, y_m_dot, integral of e], with `vanes` x relative to the air.
 
-    The integral is a trapezoid; that of channel i waits where u_i is beyond a limit and it would push on.
+    The integral is a trapezoid with conditional integration (anti-windup): that of channel i stops while u_i is saturated and
+    the increment has the sign of the excess.
     """
 
     def start(measured: Measurements, params: LqiParams) -> LqiState:
@@ -58,7 +58,7 @@ def control_law(*, vanes: bool) -> ControlLaw:
 
 
 class Design(NamedTuple):
-    """The design model in discrete time: z+ = F z + G u, and what the cost counts, e and its integral, as E z."""
+    """The design model in discrete time: z+ = F z + G u; the cost is on e and its integral, E z."""
 
     F: FloatArray  # (n + 3 m, n + 3 m)
     G: FloatArray  # (n + 3 m, m)
@@ -68,10 +68,10 @@ class Design(NamedTuple):
 def design(model: NominalModel, fade: float) -> Design:
     """The nominal aircraft with the reference and the integral of e, sampled with u held over a period.
 
-        x_dot   = (A + gravity) x + B u      rows of angles: -LEAK angle, a disturbance that is measured
+        x_dot   = (A + gravity) x + B u      rows of angles: -LEAK angle, a measured disturbance
         y_m_dot = w - LEAK y_m,  w_dot = -fade w,  integral of e: C x - y_m
 
-    Angles integrate the very rates that are to follow: with their true rows the integral of e would not be controllable.
+    Angles integrate the controlled rates: with their true rows the integral of e would not be controllable.
     """
     n, m = model.B.shape
     free = 1.0 - model.kinematic[:, None]
@@ -82,29 +82,29 @@ def design(model: NominalModel, fade: float) -> Design:
     motion[np.ix_(integral, x)] = model.C
     motion[integral, y_m] = -1.0
     drive = np.vstack([free * model.B, np.zeros((3 * m, m))])
-    whole = expm(np.block([[motion, drive], [np.zeros((m, n + 4 * m))]]) * model.period)
+    F, G = zero_order_hold(motion, drive, model.period)
     E = np.zeros((2 * m, n + 3 * m))
     E[:m, x], E[np.arange(m), y_m], E[np.arange(m, 2 * m), integral] = model.C, -1.0, 1.0
-    return Design(whole[: n + 3 * m, : n + 3 * m], whole[: n + 3 * m, n + 3 * m :], E)
+    return Design(F, G, E)
 
 
 def lqi_gain(model: NominalModel, gains: dict[str, FloatArray]) -> FloatArray:
-    """The gain that is least in the sum of e'Q e + q'Q_i q + u'R u over z+ = F z + G u, of N sets of weights: (m, n + 3 m, N).
+    """The gain that minimises the sum of e'Q e + q'Q_i q + u'R u over z+ = F z + G u, for N sets of weights: (m, n + 3 m, N).
 
         Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,  q the integral of e
 
-    Arguments: `integral` (m, N), 1/s, `effort` (m, N), s: abs(e) worth an input of unit response, `fade` (1, N), 1/s. Source:
-    E. Kreindler, D. Rothschild, AIAA J. 14(7), 1976, for the model followed; B. D. O. Anderson, J. B. Moore,
-    "Optimal Control", ch. 9.
+    Arguments: `integral` (m, N), 1/s, `effort` (m, N), s: abs(e) that costs as much as an input of unit
+    response, `fade` (1, N), 1/s. Source: E. Kreindler, D. Rothschild, AIAA J. 14(7), 1976, for model following;
+    B. D. O. Anderson, J. B. Moore, "Optimal Control", ch. 9.
     """
     size = (model.C @ model.size)[:, None]
-    found = []
+    solved = []
     for k, fade in enumerate(gains["fade"][0]):
         F, G, E = design(model, float(fade))
         weights = np.concatenate([np.ones(len(size)), gains["integral"][:, k] ** 2]) / np.tile(size[:, 0] ** 2, 2)
         R = np.diag((gains["effort"][:, k] / model.input_scale / size[:, 0]) ** 2)
-        found.append(gain_of(F, G, E.T @ np.diag(weights) @ E, R))
-    return np.stack(found, axis=-1)
+        solved.append(gain_of(F, G, E.T @ np.diag(weights) @ E, R))
+    return np.stack(solved, axis=-1)
 
 
 def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The acceleration-based RISE inversion of MacKunis et al. Sees y, y_m, the nominal Omega and, in one form, a perfect y_dot."""
+"""The acceleration-based RISE inversion of MacKunis et al. from y, y_m, the nominal Omega, and in one form a perfect y_dot."""
 
 from typing import NamedTuple
 
@@ -17,12 +17,12 @@ class MacKunisParams(NamedTuple):
     Lambda: Array  # 1/s
     beta: Array  # units of y / s^2
     eps: Array  # half-width of the softened sign, units of y / s
-    bandwidth: Array  # of the filtered difference, rad/s; unused where y_dot is perfect
+    bandwidth: Array  # of the filtered difference, rad/s; unused with a perfect y_dot
     limits: Limits
 
 
 class MacKunisState(NamedTuple):
-    """What it carries from tick to tick, (m, N)."""
+    """State of the law from tick to tick, (m, N)."""
 
     e_0: Array
     e: Array
@@ -32,14 +32,14 @@ class MacKunisState(NamedTuple):
 
 
 def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
-    """The law that needs e_dot under its sign.
+    """The law with e_dot in its sign term.
 
         r          = e_dot + Lambda e
         Pi        += dt beta clip(r / eps, -1, 1)              the sign, softened: measured r is noisy
         integral_e += dt (e + e_p) / 2
         u          = -Omega^-1 (K (e - e_0 + Lambda integral_e) + Pi)
 
-    so that u_dot = -Omega^-1 (K r + beta sgn(r)). `ideal`: e_dot = y_dot - y_m_dot with the perfect derivative of C x; else
+    Then u_dot = -Omega^-1 (K r + beta sgn(r)). `ideal`: e_dot = y_dot - y_m_dot with the perfect derivative of C x; else
     a filtered difference, e_dot += (1 - exp(-bandwidth dt)) ((e - e_p) / dt - e_dot).
     Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010, its matrices replaced by those here.
     """
@@ -57,14 +57,14 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         e_dot = state.e_dot + filter_gain(params.bandwidth, dt) * ((e - state.e) / dt - state.e_dot)
         r = (measured.y_dot - measured.y_m_dot if ideal else e_dot) + params.Lambda * e
         one = xp.ones_like(e)
-        move = dt * params.beta * xp.minimum(xp.maximum(r / params.eps, -one), one)
+        Pi_step = dt * params.beta * xp.minimum(xp.maximum(r / params.eps, -one), one)
         increment = dt * (e + state.e) / 2.0
-        integral_e, Pi = state.integral_e + increment, state.Pi + move
-        wanted = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
-        u, beyond = saturate(inverse @ wanted, measured, dt, params.limits)
-        past = Omega @ beyond
-        integral_e = conditional_integration(state.integral_e, integral_e, -increment, past)
-        return MacKunisState(state.e_0, e, e_dot, integral_e, conditional_integration(state.Pi, Pi, -move, past)), u
+        integral_e, Pi = state.integral_e + increment, state.Pi + Pi_step
+        nu = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
+        u, beyond = saturate(inverse @ nu, measured, dt, params.limits)
+        excess = Omega @ beyond
+        integral_e = conditional_integration(state.integral_e, integral_e, -increment, excess)
+        return MacKunisState(state.e_0, e, e_dot, integral_e, conditional_integration(state.Pi, Pi, -Pi_step, excess)), u
 
     return ControlLaw(start, step)
 

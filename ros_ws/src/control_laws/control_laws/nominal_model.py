@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a model-based law knows of the aircraft, and what all laws share: limits and how their integrals stop at them.
+"""The nominal model of a model-based law, and what all laws share: saturation of u and anti-windup of their integrals.
 
 Arrays hold N aircraft in their last axis. Channels are in the law's order, states in the airframe's.
 """
@@ -16,22 +16,22 @@ from rise_di_controller.guard import Limits
 
 
 class NominalModel(NamedTuple):
-    """The nominal aircraft, SI, and the loop around it. No law sees more of it than its docstring says."""
+    """The nominal aircraft, SI, and the loop around it. The docstring of a law names the fields that the law uses."""
 
     A: FloatArray  # (n, n)
     B: FloatArray  # (n, m)
     C: FloatArray  # (m, n), picks the outputs
     gravity: FloatArray  # (n, n), f(x) = gravity @ sin(x)
-    wind: FloatArray  # (n, G), what 1 m/s of wind along each axis adds to x_dot
-    noise: FloatArray  # (m,) of the measured outputs, rms per sample; a tenth of the unit of a score where there is none
-    kinematic: FloatArray  # (n,) 1 where a state is an angle that integrates rates, such as theta, else 0
-    size: FloatArray  # (n,) 1 m/s or 0.1 rad (/s): what a state is counted in, so that one gain fits all of them
+    wind: FloatArray  # (n, G), contribution of 1 m/s of wind along each axis to x_dot
+    noise: FloatArray  # (m,) of the measured outputs, rms per sample; a tenth of the unit of a score without noise
+    kinematic: FloatArray  # (n,) 1 for an angle that integrates rates, such as theta, else 0
+    size: FloatArray  # (n,) unit of a state in adaptation and weights: 1 m/s or 0.1 rad (/s)
     input_scale: FloatArray  # (m,) u per scaled input
     D: FloatArray  # (m,) +1 or -1
     lag: FloatArray  # (m,) time constants of the actuators, s
     total_lag: FloatArray  # (m,) that of the loop: actuator + 1.5 periods + delay, s
     period: float  # of the law, s
-    lower: FloatArray  # (m,) limits of u, deviations from trim; infinite where there is none
+    lower: FloatArray  # (m,) limits of u, deviations from trim; infinite without one
     upper: FloatArray  # (m,)
     rate: FloatArray  # (m,) per s
 
@@ -48,25 +48,25 @@ class NominalModel(NamedTuple):
 
     @property
     def limits(self) -> Limits:
-        """The limits as laws take them, shape (m, 1)."""
+        """The limits as arguments of a law, shape (m, 1)."""
         return Limits(self.lower[:, None], self.upper[:, None], self.rate[:, None])
 
 
 def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:
-    """The u that is commanded and what of the u asked for lies beyond it, both shape (m, N)."""
+    """Saturation: the commanded u inside its limits, and the excess of the requested u, both shape (m, N)."""
     commanded = guard.saturate(u, measured.u_before, dt, limits)
     return commanded, u - commanded
 
 
 def conditional_integration(before: Array, after: Array, effect: Array, beyond: Array) -> Array:
-    """An integral that stops where it would push further against a limit: `before` where effect * beyond > 0, else `after`.
+    """Anti-windup by conditional integration: `before` where effect * beyond > 0, else `after`.
 
-    Conditional integration. Arguments: what the increment moves u (or the scaled input) by and what lies beyond the limit, in
-    the same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5.
+    Arguments: `effect`, change of u (or of the scaled input) by the increment; `beyond`, the excess over the limit; both in the
+    same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5.
     """
     return array_namespace(before).where(effect * beyond > 0.0, before, after)
 
 
 def filter_gain(rate: Array, dt: Array) -> Array:
-    """1 - exp(-rate dt): what a low-pass filter of first order takes of its input in one tick, exact for a held input."""
+    """1 - exp(-rate dt): gain of a low-pass filter of first order on its input in one tick, exact for a held input."""
     return -array_namespace(rate).expm1(-rate * dt)

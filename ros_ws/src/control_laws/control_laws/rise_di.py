@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""RISE dynamic inversion as a fleet flies it: the controller's guarded step, with feedforward or without; beta = 0 is a PI."""
+"""RISE dynamic inversion over N aircraft: the controller's step with anti-windup and feedforward; with beta = 0 a PI."""
 
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from rise_di_controller.params import ControllerParameters
 
 
 class RiseParams(NamedTuple):
-    """LawParams without the sign, which is part of the control_law, and the limits; each (m, 1), or (m, N)."""
+    """LawParams without the sign, which selects the control law, and the limits; each (m, 1), or (m, N)."""
 
     K: Array
     Lambda: Array
@@ -34,7 +34,7 @@ def control_law(sign: Sign) -> ControlLaw:
 
 
 def params(controller: ControllerParameters) -> RiseParams:
-    """Those of a controller, shape (m, 1)."""
+    """Parameters of a controller, shape (m, 1)."""
 
     def column(values: Any) -> Any:
         return np.asarray(values)[:, None]
@@ -45,7 +45,7 @@ def params(controller: ControllerParameters) -> RiseParams:
 
 
 def of_gains(gains: dict[str, FloatArray], model: NominalModel) -> RiseParams:
-    """Those of gains K, Lambda, beta (m, N) and softening or omega (1, N), the paper's in scaled inputs.
+    """Parameters from gains K, Lambda, beta (m, N) and softening or omega (1, N), the paper's in scaled inputs.
 
     eps = beta / K softening total_lag. Without beta, a PI controller: u = -input_scale D K (e - e_0 + Lambda integral_e).
     """
@@ -63,7 +63,9 @@ def _start(measured: Measurements, params: RiseParams) -> LawState:
 def _control_law(sign: Sign) -> ControlLaw:
     def step(state: LawState, measured: Measurements, dt: Array, params: RiseParams) -> tuple[LawState, Array]:
         of_law = LawParams(*params[:-1], sign)
-        after, _, u = step_with_anti_windup(state, measured.y, measured.y_m, dt, measured.u_ff, measured.u_before, of_law, params.limits)
+        after, _, u = step_with_anti_windup(
+            state, measured.y, measured.y_m, dt, measured.u_ff, measured.u_before, of_law, params.limits
+        )
         return after, u
 
     return ControlLaw(_start, step)

@@ -1,18 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""RISE-DI with an observer beside it: what it estimates of states, wind and disturbance is taken into the trim. Sees y alone.
+"""RISE-DI with an observer: the estimates of states, wind and disturbance, from y alone, correct the trim input.
 
-An extension of the paper, like the feedforward: it adds to the trim input and leaves the law as it is.
+This is an extension of the paper, like the feedforward: it adds to the trim input and does not change the law.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
 
 from control_laws import rise_di
 from control_laws.nominal_model import NominalModel
-from control_laws.riccati import diagonals, gain_of, riccati
+from control_laws.riccati import diagonals, gain_of, riccati, zero_order_hold
 from control_laws.rise_di import RiseParams
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller import guard
@@ -22,20 +21,20 @@ from rise_di_controller.guard import Limits
 from rise_di_controller.law import LawParams, LawState, Sign
 
 LEAK = 0.01
-"""1/s. Angles and disturbances decay this slowly in the observer's model, so that each of its modes can be measured or ends."""
+"""1/s, decay of angles and disturbances in the observer's model: each of its modes is then observable or stable."""
 
 GUST_TIME_CONSTANT = 0.6
-"""s, within which a wind is taken to change: the time to the peak of the 1-cosine gust, H / V0."""
+"""s, time constant of the wind in the model: the time to the peak of the 1-cosine gust, H / V0."""
 
 AUTHORITY_FRACTION, RAMP_TIME = 0.6, 0.1
-"""Part of the limits of u up to which the observer may add to the trim of RISE-DI, and s from 0 to there: what it adds is
-bounded, and so is its derivative, whatever it sees."""
+"""Bound of the observer's contribution to the trim, as a fraction of the limits of u, and the time from 0 to it, s. They bound
+the contribution and its derivative for any measurement."""
 
-ACTUATOR_NOISE = 1e-6  # rad or 1 per root s, noise of the actuators' positions: as good as none
+ACTUATOR_NOISE = 1e-6  # rad or 1 per root s, noise of the actuators' positions: negligible
 
 
 class ObserverParams(NamedTuple):
-    """Those of RISE-DI, and the two gains of the observer."""
+    """Parameters of RISE-DI, and the two gains of the observer."""
 
     rise: RiseParams
     gain: Array  # (m, s, N) u per estimated state
@@ -43,11 +42,11 @@ class ObserverParams(NamedTuple):
 
 
 class ObserverState(NamedTuple):
-    """What is carried from tick to tick."""
+    """State of the law and the observer from tick to tick."""
 
     law: LawState
     z: Array  # (s, N) predicted for the next tick
-    u_o: Array  # (m, N) what the observer adds to the trim
+    u_o: Array  # (m, N) the observer's contribution to the trim
 
 
 class ObserverModel(NamedTuple):
@@ -67,7 +66,7 @@ def observer(model: NominalModel) -> ObserverModel:
         dx_dot       = (A + gravity) dx + B position + wind_direction w + C' d
         position_dot = (u - u_ff - position) / lag,  w_dot = -w / GUST_TIME_CONSTANT,  d_dot = -LEAK d
 
-    Angles decay with LEAK besides. The reference's own motion is u_ff's: the model is that of small deviations from it.
+    Angles also decay with LEAK. u_ff produces the motion along the reference: the model is that of small deviations from it.
     """
     (n, m), G = model.B.shape, model.wind.shape[1]
     s = n + m + G + m
@@ -78,18 +77,20 @@ def observer(model: NominalModel) -> ObserverModel:
     motion[np.ix_(x, p)], motion[np.ix_(x, w)], motion[np.ix_(x, d)] = model.B, model.wind, model.C.T
     motion[p, p], motion[w, w], motion[d, d] = -1.0 / lag, -1.0 / GUST_TIME_CONSTANT, -LEAK
     drive[p, np.arange(m)] = 1.0 / lag
-    whole = expm(np.block([[motion, drive], [np.zeros((m, s + m))]]) * model.period)
+    F, G_u = zero_order_hold(motion, drive, model.period)
     H = np.zeros((m, s))
     H[:, x] = model.C
-    return ObserverModel(whole[:s, :s], whole[:s, s:], H)
+    return ObserverModel(F, G_u, H)
 
 
-def observer_gains(estimator: ObserverModel, model: NominalModel, gains: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Gain (m, s, N) and correction (s, m, N), the linear-quadratic ones of N sets of weights.
+def observer_gains(
+    estimator: ObserverModel, model: NominalModel, gains: dict[str, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Gain (m, s, N) and correction (s, m, N), linear-quadratic, for N sets of weights.
 
     Control: sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2 with `effort` (m, N), s. Estimate: the wind driven
     by white noise of `gust` (G, N), m/s per root s; the disturbances by `drift` (m, N), sizes / s per root s; the states by
-    `loose` (1, N), sizes per root s, for the model is not the aircraft; the noise of e as measured. Source: H. Kwakernaak,
+    `loose` (1, N), sizes per root s, for the model error; the noise of e as measured. Source: H. Kwakernaak,
     R. Sivan, "Linear Optimal Control Systems", ch. 5 and 6.
     """
     size, count = (model.C @ model.size)[:, None], gains["effort"].shape[1]
@@ -105,14 +106,14 @@ def observer_gains(estimator: ObserverModel, model: NominalModel, gains: dict[st
 
 
 def control_law(model: NominalModel, *, authority: float) -> ControlLaw:
-    """The law's step from a trim that the observer moves within a part of the limits.
+    """The law's step from a trim that the observer corrects within a fraction of the limits.
 
         z_hat = z + correction (e - H z)
         u_o   = -gain z_hat, held inside `authority` of the limits and of their upper ones / RAMP_TIME in rate
         u     = `step_with_anti_windup` from the trim u_ff + u_o
         z+    = F z_hat + G (u - u_ff)
 
-    with the u that was commanded, after its limits: nothing winds up. The law gets e as ever, not what is estimated.
+    Anti-windup: the observer takes u after saturation. The law takes the measured e, not the estimate.
     """
     estimator = observer(model)
 
@@ -124,19 +125,21 @@ def control_law(model: NominalModel, *, authority: float) -> ControlLaw:
     def step(state: ObserverState, measured: Measurements, dt: Array, params: ObserverParams) -> tuple[ObserverState, Array]:
         xp = array_namespace(measured.y)
         limits = params.rise.limits
-        off = measured.y - measured.y_m - estimator.H @ state.z
-        z = state.z + xp.sum(params.correction * off[None, :, :], axis=1)
+        innovation = measured.y - measured.y_m - estimator.H @ state.z
+        z = state.z + xp.sum(params.correction * innovation[None, :, :], axis=1)
         inside = Limits(authority * limits.lower, authority * limits.upper, authority / RAMP_TIME * limits.upper)
         u_o = guard.saturate(-xp.sum(params.gain * z[None, :, :], axis=1), state.u_o, dt, inside)
         law = LawParams(*params.rise[:-1], Sign.SOFT)
-        after, _, u = guard.step_with_anti_windup(state.law, measured.y, measured.y_m, dt, measured.u_ff + u_o, measured.u_before, law, limits)
+        after, _, u = guard.step_with_anti_windup(
+            state.law, measured.y, measured.y_m, dt, measured.u_ff + u_o, measured.u_before, law, limits
+        )
         return ObserverState(after, estimator.F @ z + estimator.G @ (u - measured.u_ff), u_o), u
 
     return ControlLaw(start, step)
 
 
 def observer_params(gains: dict[str, FloatArray], model: NominalModel) -> ObserverParams:
-    """Parameters from the gains of RISE-DI, where it has any, and from effort and drift (m, N), gust (G, N), loose (1, N)."""
+    """Parameters from the gains of RISE-DI, if there are any, and from effort and drift (m, N), gust (G, N), loose (1, N)."""
     none = 0.0 * gains["effort"]
     return ObserverParams(
         rise_di.of_gains({"K": none, "Lambda": none} | gains, model), *observer_gains(observer(model), model, gains)

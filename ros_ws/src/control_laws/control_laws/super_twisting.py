@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The super-twisting law on each output. Sees y, y_m and the nominal Omega."""
+"""The super-twisting law on each output, from y, y_m and the nominal Omega."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ def control_law(model: NominalModel) -> ControlLaw:
         z += -dt beta sgn(e)
         u  = Omega^-1 (y_m_dot - root sgn(e) sqrt(abs(e)) + z)
 
-    so that e_dot = -root sgn(e) sqrt(abs(e)) + z + d without actuators; for abs(d_dot) <= L it reaches 0 in finite time where
+    Without actuators e_dot = -root sgn(e) sqrt(abs(e)) + z + d. For abs(d_dot) <= L, e reaches 0 in finite time if
     beta > L and root^2 > 2 (beta + L)^2 / (beta - L). Source: A. Levant, Int. J. Control 58(6), 1993; J. A. Moreno,
     M. Osorio, IEEE TAC 57(4), 2012; Y. Shtessel et al., "Sliding Mode Control and Observation", 4.3.
     """
@@ -37,11 +37,11 @@ def control_law(model: NominalModel) -> ControlLaw:
     def step(state: Array, measured: Measurements, dt: Array, params: TwistingParams) -> tuple[Array, Array]:
         xp = array_namespace(measured.y)
         e = measured.y - measured.y_m
-        move = -dt * params.beta * xp.sign(e)
-        z = state + move
-        wanted = measured.y_m_dot - params.root * xp.sign(e) * xp.sqrt(xp.abs(e)) + z
-        u, beyond = saturate(inverse @ wanted, measured, dt, params.limits)
-        return conditional_integration(state, z, move, Omega @ beyond), u
+        increment = -dt * params.beta * xp.sign(e)
+        z = state + increment
+        nu = measured.y_m_dot - params.root * xp.sign(e) * xp.sqrt(xp.abs(e)) + z
+        u, beyond = saturate(inverse @ nu, measured, dt, params.limits)
+        return conditional_integration(state, z, increment, Omega @ beyond), u
 
     return ControlLaw(start, step)
 

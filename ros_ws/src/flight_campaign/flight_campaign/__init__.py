@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Thousands of uncertain aircraft at once, and other control laws beside RISE-DI."""
+"""Monte Carlo campaigns over thousands of uncertain aircraft, tuning and comparison of control laws."""

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What every aircraft of a fleet meets, tick by tick: the reference, the wind, the errors of the sensors, the feedforward.
+"""The benchmark course of all aircraft, tick by tick: reference, wind, errors of the sensors, feedforward.
 
-None of it depends on the aircraft. It is worked out once, with the functions that the loop in one process flies by.
+It does not depend on the aircraft. It is computed once, with the functions of the simulation in one process.
 """
 
 from typing import NamedTuple
@@ -24,10 +24,10 @@ from rise_di_controller.feedforward import Nominal
 from rise_di_controller.guard import DT_RANGE
 
 HOLD, ENGAGE, STEP = range(3)
-"""What a controller does at a tick: nothing, for no new y has come; it engages; it takes a step of its law."""
+"""Action of a controller at a tick: it holds u without a new y, it engages, or it takes a step of its law."""
 
 WIND_ANGLE = {"vertical": "alpha", "lateral": "beta"}
-"""Which angle a wind along an axis changes: alpha_air = alpha - w/V0, beta_air = beta - v/V0, small angles."""
+"""Angle that a wind along an axis changes: alpha_air = alpha - w/V0, beta_air = beta - v/V0, small angles."""
 
 
 class Course(NamedTuple):
@@ -35,27 +35,27 @@ class Course(NamedTuple):
 
     t: FloatArray  # (T,) s
     phase: NDArray[np.int32]  # (T,) HOLD, ENGAGE or STEP
-    dt: FloatArray  # (T,) s since the sample used before, inside the controller's range
+    dt: FloatArray  # (T,) s since the previous sample, inside the controller's range
     y_m: FloatArray  # (T, m) the reference at the tick
-    seen_y_m: FloatArray  # (T, m) the reference at the instant of the y that is used at the tick, and its derivative
-    seen_y_m_dot: FloatArray  # (T, m)
+    sampled_y_m: FloatArray  # (T, m) the reference at the stamp of the y of the tick, and its derivative
+    sampled_y_m_dot: FloatArray  # (T, m)
     u_ff: FloatArray  # (T, m) feedforward
-    error: FloatArray  # (T, m) what the sensors add to the y of the tick
+    error: FloatArray  # (T, m) sensor error of the y of the tick
     forcing: FloatArray  # (T, K r) mean of basis' @ f_time over each of the steps from here to the next tick
     forcing_now: FloatArray  # (T, r) at the tick
-    air: FloatArray  # (T, n) what the wind takes from alpha and beta, rad
-    basis: FloatArray  # (n, r) orthonormal, what f_time moves x_dot along
-    order: NDArray[np.int64]  # (m,) place of the law's outputs in y
-    late: int  # ticks by which a y is late
+    air: FloatArray  # (T, n) wind's contribution to alpha and beta, rad
+    basis: FloatArray  # (n, r) orthonormal directions of f_time in x_dot
+    order: NDArray[np.int64]  # (m,) indices of the law's outputs in y
+    late: int  # delay of y, ticks
     period: float  # s, of the ticks
     steps: int  # of the integration from tick to tick
 
 
 def build_course(scenario: Scenario, nominal: Nominal | None = None) -> Course:
-    """The course of a scenario; `nominal` is that of its feedforward, by default what its controller has.
+    """The course of a scenario; `nominal` is the model of its feedforward, by default that of its controller.
 
-    Raises ParameterError where the scenario has what a fleet cannot fly: an aircraft of JSBSim, a y that is late by part of a
-    tick, losses of a y that comes more often than the ticks, or losses that outlast the age limit.
+    Raises ParameterError for a scenario that a campaign cannot fly: an aircraft of JSBSim, a delay of y by a part of a tick,
+    dropouts of a y with another rate than the ticks, or dropouts longer than the age limit.
     """
     aircraft, controller = scenario.aircraft, scenario.controller
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
@@ -116,8 +116,8 @@ def _phases(
         if last is None:
             phase[k] = ENGAGE
         else:
-            lost = (k - last + late) * period
-            require(lost <= scenario.controller.max_age, "sensors.dropout", f"{lost:g} s without y", "less than max_age")
+            gap = (k - last + late) * period
+            require(gap <= scenario.controller.max_age, "sensors.dropout", f"{gap:g} s without y", "less than max_age")
             phase[k], dt[k] = STEP, min(max((k - last) * period, DT_RANGE[0] * period), DT_RANGE[1] * period)
         last = k
     return phase, dt
@@ -128,10 +128,10 @@ def _feedforward(nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArr
     if nominal is None:
         return u_ff
     state = feedforward.initial_state(y_m[0], nominal)
-    for k, doing in enumerate(phase):
-        if doing == ENGAGE:
+    for k, action in enumerate(phase):
+        if action == ENGAGE:
             state = feedforward.initial_state(y_m[k], nominal)
-        elif doing == STEP:
+        elif action == STEP:
             state, u_ff[k] = feedforward.step(state, y_m[k], dt[k], nominal)
         elif k:
             u_ff[k] = u_ff[k - 1]
@@ -139,22 +139,22 @@ def _feedforward(nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArr
 
 
 def _wind(ticks: int, steps: int, plant: PlantParams, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What drives x_dot in time: mean over each step (T K, n), at each tick (T, n); what the wind takes from the angles."""
+    """Forcing of x_dot in time: mean over each step (T K, n), at each tick (T, n); the wind's contribution to the angles."""
     forced = flown.forcing(0, ticks * steps, plant)
     direction = np.asarray(plant.aircraft.gust_direction)
-    blown = np.zeros((ticks * steps, direction.shape[1]))
+    gusting = np.zeros((ticks * steps, direction.shape[1]))
     if (air := plant.turbulence) is not None:
         z = turbulence.initial_state(air)
         normals = turbulence.normals(0, ticks * steps, air.seed)
         for k in range(ticks * steps):
-            blown[k] = turbulence.wind(z, air)
+            gusting[k] = turbulence.wind(z, air)
             z = turbulence.step(z, normals[k], air)
     rate = forced.rate
-    over_step = (rate[:-1:2] + 4.0 * rate[1::2] + rate[2::2]) / 6.0 + blown @ direction.T  # Simpson, as Runge-Kutta has it
-    wind = forced.wind[: -1 : 2 * steps] + blown[::steps]
+    over_step = (rate[:-1:2] + 4.0 * rate[1::2] + rate[2::2]) / 6.0 + gusting @ direction.T  # Simpson's rule, as in Runge-Kutta
+    wind = forced.wind[: -1 : 2 * steps] + gusting[::steps]
     angles = np.zeros((ticks, len(airframe.states)))
     for place, axis in enumerate(airframe.gusts):
         angle = WIND_ANGLE.get(axis)
         if angle in airframe.states:
             angles[:, airframe.index(angle)] = wind[:, place] / airframe.speed
-    return over_step, rate[: -1 : 2 * steps] + blown[::steps] @ direction.T, angles
+    return over_step, rate[: -1 : 2 * steps] + gusting[::steps] @ direction.T, angles

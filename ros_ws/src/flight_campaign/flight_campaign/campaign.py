@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A campaign: thousands of uncertain aircraft through one scenario, chunk by chunk; what is done stays done.
+"""Monte Carlo campaign: thousands of uncertain aircraft in one scenario, in chunks; an interrupted campaign can be resumed.
 
-The folder of a campaign holds its definition, a file for each chunk that was flown, and in the end its figures and its page.
+The folder of a campaign holds its definition, a file for each completed chunk, and at the end its figures and its report.
 """
 
 import os
@@ -35,14 +35,14 @@ SWEPT = ("k_g", "k_d", "Lambda", "beta", "input_scale", "omega", "softening")
 
 
 class Sweep(Parameters):
-    """One parameter of the controller times each of some factors; every aircraft flies with each."""
+    """Factors of one parameter of the controller; every aircraft flies with each of them."""
 
     parameter: str
     factors: tuple[float, ...] = Field(min_length=1)
 
 
 class Definition(Parameters):
-    """All that a campaign's figures depend on, but for the version of the stack and the machine's arithmetic."""
+    """All inputs of a campaign's figures, except the version of the stack and the machine's arithmetic."""
 
     name: str  # of the scenario
     sections: dict[str, object]  # of the scenario, every parameter
@@ -55,30 +55,30 @@ class Definition(Parameters):
     def scenario(self, case: int = 0) -> Scenario:
         """The scenario of a case of the sweep, the airframe as published."""
         sections = {name: schema.validate_mapping(_mapping(self.sections[name]), name) for name, schema in SCHEMAS.items()}
-        flown = Scenario(name=self.name, path=Path(self.name), **sections)  # type: ignore[arg-type]  # SCHEMAS says each type
-        check_together(flown)
+        scenario = Scenario(name=self.name, path=Path(self.name), **sections)  # type: ignore[arg-type]  # SCHEMAS says each type
+        check_together(scenario)
         if self.sweep is None:
-            return flown
-        value, factor = getattr(flown.controller, self.sweep.parameter), self.sweep.factors[case]
+            return scenario
+        value, factor = getattr(scenario.controller, self.sweep.parameter), self.sweep.factors[case]
         scaled = tuple(factor * one for one in value) if isinstance(value, tuple) else factor * value
-        return flown.vary(controller={self.sweep.parameter: scaled})
+        return scenario.vary(controller={self.sweep.parameter: scaled})
 
     def aircraft_scenario(self, number: int, case: int = 0) -> Scenario:
         """The scenario of one aircraft of the campaign, as `rise-di fly` flies it."""
-        drawn = {"A": self.uncertainty, "B": self.uncertainty, "seed": self.seed, "number": number}
-        return self.scenario(case).vary(aircraft={"uncertainty": drawn})
+        uncertainty = {"A": self.uncertainty, "B": self.uncertainty, "seed": self.seed, "number": number}
+        return self.scenario(case).vary(aircraft={"uncertainty": uncertainty})
 
     @property
     def cases(self) -> int:
-        """How many times each aircraft flies."""
+        """Number of flights of each aircraft."""
         return 1 if self.sweep is None else len(self.sweep.factors)
 
     def factor(self, case: int) -> float:
-        """By what the swept parameter is multiplied in a case."""
+        """Factor of the swept parameter in a case."""
         return 1.0 if self.sweep is None else self.sweep.factors[case]
 
     def size(self, job: Job) -> int:
-        """How many aircraft a chunk has."""
+        """Number of aircraft of a chunk."""
         return min(self.chunk, self.aircraft - job[1] * self.chunk)
 
     def jobs(self) -> Iterator[Job]:
@@ -95,10 +95,10 @@ def _mapping(values: object) -> dict[str, object]:
 def define(
     scenario: Scenario, aircraft: int, uncertainty: float, seed: int, chunk: int, sweep: Sweep | None = None
 ) -> Definition:
-    """The definition of a campaign over a scenario. Raises ParameterError where a fleet cannot fly it."""
+    """The definition of a campaign over a scenario. Raises ParameterError if a campaign cannot fly it."""
     if sweep is not None:
-        known = ", ".join(SWEPT)
-        require(sweep.parameter in SWEPT, "--sweep", sweep.parameter, f"a parameter of the controller: {known}")
+        names = ", ".join(SWEPT)
+        require(sweep.parameter in SWEPT, "--sweep", sweep.parameter, f"a parameter of the controller: {names}")
         require(all(factor > 0.0 for factor in sweep.factors), "--sweep", sweep.factors, "factors above 0")
     sections = {name: getattr(scenario, name).model_dump(mode="json") for name in SCHEMAS}
     values = {"name": scenario.name, "sections": sections, "aircraft": aircraft, "uncertainty": uncertainty, "seed": seed}
@@ -109,7 +109,7 @@ def define(
 
 
 class _Prepared(NamedTuple):
-    """What all chunks of a case share."""
+    """Data that all chunks of a case share."""
 
     scenario: Scenario
     course: Course
@@ -118,7 +118,7 @@ class _Prepared(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """How the aircraft of a chunk flew: what `Tally.of` takes."""
+    """Results of the aircraft of a chunk, arguments of `Tally.of`."""
 
     first: int  # number of the first
     diverged: FloatArray  # (N,)
@@ -126,13 +126,13 @@ class Chunk(NamedTuple):
 
 
 def fly_chunk(text: str, job: Job) -> str:
-    """Fly a chunk of a campaign: its definition as JSON, the job -> its Tally as JSON. It depends on nothing else."""
+    """Fly a chunk of a campaign: its definition as JSON, the job -> its Tally as JSON. It has no other inputs."""
     return Tally.of(*fly_chunk_figures(text, job)).model_dump_json()
 
 
 def fly_chunk_figures(text: str, job: Job) -> Chunk:
     """Fly a chunk of a campaign, aircraft by aircraft."""
-    from flight_campaign import fleet  # noqa: PLC0415 - JAX, which the command needs only once it flies
+    from flight_campaign import fleet  # noqa: PLC0415 - JAX, which the command needs only for flights
 
     definition = Definition.model_validate_json(text)
     case, chunk = job
@@ -140,16 +140,16 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     first = chunk * definition.chunk
     count = definition.size(job)
     part = definition.uncertainty
-    # The last chunk flies as many as the others, so that nothing is compiled again; those beyond the campaign are left out.
+    # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft are dropped.
     A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), part, part, definition.seed, first, definition.chunk)
-    flying = fleet.assemble(A, B, scenario.aircraft.plant(), course)
-    flown = fleet.fly(flying, vehicle, course, rise_di.control_law(scenario.controller.law().sign), params)
-    rms, largest, slew = (np.asarray(part)[:, :count] for part in (flown.rms, flown.max, flown.slew))
+    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course)
+    result = fleet.fly(aircraft, vehicle, course, rise_di.control_law(scenario.controller.law().sign), params)
+    rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs))}
     for kind, names, values in (("rms", outputs, rms), ("max", outputs, largest), ("slew", inputs, slew)):
         figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
-    return Chunk(first, np.asarray(flown.diverged)[:count], figures)
+    return Chunk(first, np.asarray(result.diverged)[:count], figures)
 
 
 @lru_cache(maxsize=8)
@@ -169,7 +169,7 @@ class Campaign:
 
     @classmethod
     def begin(cls, folder: Path, definition: Definition) -> "Campaign":
-        """A new one, in a folder that exists and is empty."""
+        """A new campaign in an existing, empty folder."""
         campaign = cls(folder, definition)
         (folder / CHUNKS).mkdir()
         _write(folder / DEFINITION, definition.model_dump_json(indent=1))
@@ -177,7 +177,7 @@ class Campaign:
 
     @classmethod
     def resume(cls, folder: Path) -> "Campaign":
-        """One that was begun. Raises ParameterError where the folder holds none."""
+        """The campaign of a folder. Raises ParameterError for a folder without one."""
         try:
             definition = Definition.model_validate_json((folder / DEFINITION).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
@@ -187,17 +187,17 @@ class Campaign:
         return cls(folder, definition)
 
     def missing(self) -> list[Job]:
-        """The chunks that are not there yet."""
+        """The chunks without a file."""
         return [job for job in self.definition.jobs() if not self._path(job).exists()]
 
     def fly(self, engine: Engine) -> Iterator[int]:
-        """Fly what is missing; how many flights each chunk that is done had."""
+        """Fly the missing chunks; yields the number of flights of each completed one."""
         for job, tally in engine(_Work(self._text), self.missing()):
             _write(self._path(job), tally)
             yield Tally.model_validate_json(tally).flights
 
     def tally(self, case: int) -> Tally:
-        """What is known of a case, added up in the order of the chunks, whatever order they were flown in."""
+        """Statistics of a case, summed in the order of the chunks."""
         total = Tally()
         for job in self.definition.jobs():
             if job[0] == case and (path := self._path(job)).exists():
@@ -210,7 +210,7 @@ class Campaign:
 
 
 class _Work:
-    """`fly_chunk` of one campaign, as it goes to other processes."""
+    """`fly_chunk` of one campaign, as a callable that other processes can load."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -220,8 +220,8 @@ class _Work:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file that is there as a whole or not at all."""
+    """Write a file atomically."""
     part = path.with_suffix(".part")
     with writing("", path, "a folder and a disk that can"):
         part.write_text(text, encoding="utf-8")
-        os.replace(part, path)  # noqa: PTH105 - atomic, over what may be there
+        os.replace(part, path)  # noqa: PTH105 - atomic, replaces a file

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a campaign: figures first, then how the errors are spread, and what the swept gain does to them."""
+"""The campaign report: tables, then histograms of the errors, and the score over the swept gain."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,21 +19,21 @@ from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, F
 from flight_core.vectors import FloatArray
 
 COARSE = PER_DECADE // 50
-"""Bins of the statistics in one of the picture, 5 % wide."""
+"""Bins of the statistics in one bin of a figure, 5 % wide."""
 
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 
 
 def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cases: Sequence[Mapping[str, Any]]) -> None:
-    """Write the page of a campaign: a tally a case, and the figures of each as the summary has them."""
+    """Write the report of a campaign: one tally and the figures of the summary for each case."""
     units = display_units(definition.scenario())
     labels = _labels(definition)
     title = f"Campaign {definition.name}"
     text = (
         f"{tallies[0].flights} aircraft, every entry of A and B within"
         f" ±{100 * definition.uncertainty:g} % of the airframe, seed {definition.seed}; the airframe's own gusts, the"
-        f" same noise for all; true errors, seen at the controller's ticks. Score: the sum over the channels of rms error in"
-        f" 10 mrad/s (p: 20) and 0.1 m/s; lost: a score above {LOSS_OF_TRACK_SCORE:g}."
+        f" same noise for all; true errors at the controller's ticks. Score: the sum over the channels of rms error in"
+        f" 10 mrad/s (p: 20) and 0.1 m/s; loss of track: a score above {LOSS_OF_TRACK_SCORE:g}."
     )
     tables = [_ends(labels, cases), *(_figures(label, one, units) for label, one in zip(labels, tallies, strict=True))]
     tables.append(_worst(labels, cases))
@@ -45,7 +45,7 @@ def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cas
             _spread(labels, tallies, [name for name in tallies[0].figures if name.startswith("rms.")], units),
             over_time=False,
         ),
-        Section("Sweep", "what the factor does to the score", _sweep(definition, tallies), over_time=False),
+        Section("Sweep", "score over the factor", _sweep(definition, tallies), over_time=False),
     ]
     page = Page(title, [Line(text)], [TableGroup(tables)], sections, SampleStore())
     path.write_text(page_html(page), encoding="utf-8")
@@ -66,20 +66,20 @@ def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
             of = case[word]
             row += [str(of["count"]), f"{100 * of['share']:.3g}", f"{100 * of['low']:.2g} to {100 * of['high']:.2g}"]
         rows.append(row)
-    return Table("How they ended", columns, rows)
+    return Table("Outcomes", columns, rows)
 
 
 def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> Table:
     columns = [Column("", head) for head in ("mean", *SPREAD, "worst")]
     rows = []
     for name, figure in tally.figures.items():
-        said, factor = _said(name, units)
+        label_, factor = _label(name, units)
         values = (figure.mean, *(figure.quantile(share) for share in SPREAD.values()), figure.largest)
-        rows.append([said, *(f"{value * factor:.3g}" for value in values)])
-    return Table(label, columns, rows, "of those that did not diverge; slew: mean abs(u_dot)")
+        rows.append([label_, *(f"{value * factor:.3g}" for value in values)])
+    return Table(label, columns, rows, "of flights that did not diverge; slew: mean abs(u_dot)")
 
 
-def _said(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
+def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
     """A figure's name with its unit, and the factor from SI."""
     kind, _, channel = name.partition(".")
     if not channel:
@@ -95,7 +95,7 @@ def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
         for label, case in zip(labels, cases, strict=True)
         for one in case["fly_again"]
     ]
-    return Table("The worst", columns, rows, "--lockstep in place of --in-process flies it over ROS 2 topics")
+    return Table("Worst flights", columns, rows, "--lockstep in place of --in-process flies it over ROS 2 topics")
 
 
 def _spread(
@@ -104,19 +104,19 @@ def _spread(
     columns = min(len(names), 2)
     figure = subplot_grid(len(names), columns, 190, vertical_spacing=0.2)
     for place, name in enumerate(names):
-        said, factor = _said(name, units)
+        label_, factor = _label(name, units)
         for label, tally, colour in zip(labels, tallies, COLOURS * len(labels), strict=False):
             x, y = _density(tally.figures.get(name, Figure()))
             line = go.Scatter(x=x * factor, y=100.0 * y, mode="lines", name=label, legendgroup=label, fill="tozeroy")
             line.update(line={"color": colour, "width": 1.4, "shape": "hvh"}, showlegend=place == 0 and len(labels) > 1)
             figure.add_trace(line.update(hovertemplate="%{y:.3g} % around %{x:.3g}"), **subplot(place, columns))
-        figure.update_xaxes(title_text=said, type="log", **subplot(place, columns))
+        figure.update_xaxes(title_text=label_, type="log", **subplot(place, columns))
     figure.update_yaxes(title_text="%", rangemode="tozero")
     return set_layout(figure, 190, below=44)
 
 
 def _density(figure: Figure) -> tuple[FloatArray, FloatArray]:
-    """Middles of coarse bins and the share of the flights in each."""
+    """Centres of coarse bins and the share of the flights in each."""
     if not figure.count:
         return np.zeros(0), np.zeros(0)
     places = np.array(list(figure.bins)) // COARSE

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the chunks of a campaign are flown: threads of this process, or the workers of dask. The chunks are the same."""
+"""Engines that run the chunks of a campaign: threads of this process, or dask workers. The results are the same."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -11,21 +11,21 @@ from typing import Any, Protocol
 
 from flight_core.parameters import ParameterError
 
-AHEAD = 2  # chunks a worker has waiting: enough to keep it busy, few enough that nothing grows with their number
+AHEAD = 2  # queued chunks a worker: enough to keep it busy, few enough for constant memory
 
 Job = tuple[int, ...]
 Work = Callable[[Job], Any]
 
 
 class Engine(Protocol):
-    """Flies jobs in any order."""
+    """Runs jobs in any order."""
 
     def __call__(self, work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
-        """Each job with its result, as they are done."""
+        """Each job with its result, in the order of completion."""
 
 
 def threads(workers: int | None = None) -> Engine:
-    """Threads of this process: compiled once, side by side, for the compiled loop leaves Python alone."""
+    """Threads of this process. The loop is compiled once and releases the interpreter lock, so threads run in parallel."""
     count = workers or os.cpu_count() or 1
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -46,10 +46,10 @@ def threads(workers: int | None = None) -> Engine:
 
 
 def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
-    """Processes of this machine, or the workers of a scheduler. A worker that dies costs its chunks again, no more."""
+    """Processes of this machine, or the workers of a scheduler. The chunks of a worker that dies run again."""
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
-        from distributed import Client, LocalCluster, as_completed  # noqa: PLC0415 - half a second, for this engine alone
+        from distributed import Client, LocalCluster, as_completed  # noqa: PLC0415 - half a second, only for this engine
 
         waiting, count = iter(jobs), workers or os.cpu_count() or 1
         with ExitStack() as stack:
@@ -58,7 +58,7 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                     cluster = stack.enter_context(LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None))
                 client = stack.enter_context(Client(scheduler or cluster, timeout="10s"))
             except OSError as error:
-                raise ParameterError(f"--scheduler: found {scheduler}, expected one of dask's that answers ({error})") from None
+                raise ParameterError(f"--scheduler: found {scheduler}, expected a reachable dask scheduler ({error})") from None
             ahead = AHEAD * max(count, len(client.scheduler_info()["workers"]))
             underway = {submit(client, work, job): job for job in islice(waiting, ahead)}
             done = as_completed(list(underway))
@@ -71,6 +71,6 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                 yield job, result
 
     def submit(client: Any, work: Work, job: Job) -> Any:
-        return client.submit(work, job, pure=False)  # never a result of before
+        return client.submit(work, job, pure=False)  # never a cached result
 
     return fly

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Many uncertain aircraft through one course at once, under any law: what the loop in one process flies, N at a time.
+"""Vectorised Monte Carlo simulation: N uncertain aircraft through one course under any law, as in the single-process loop.
 
-Every array holds the aircraft in its last axis, so that one line of the law or of the actuators moves all of them. Between two
-ticks of the controller an aircraft is linear but for a small rest: all steps of its integration are one product of matrices.
+The last axis of every array is the aircraft, so that one line of a law or of the actuators acts on all of them. Between two
+ticks of the controller an aircraft is linear up to a small remainder: all steps of its integration are one matrix product.
 """
 
 from functools import partial
@@ -30,43 +30,43 @@ jax.config.update("jax_enable_x64", True)  # float64 as everywhere else in the s
 
 
 class StateBlock(NamedTuple):
-    """States that move each other and what moves them, as places in x and in [x, p_1, ..., p_K, s]. Hashable."""
+    """Coupled states and the signals that act on them, as indices in x and in [x, p_1, ..., p_K, s]. Hashable."""
 
     rows: tuple[int, ...]
     columns: tuple[int, ...]
 
 
 class Fleet(NamedTuple):
-    """N aircraft over one tick of the controller, in K steps of the integration; q rates of the rest, r of the course.
+    """N aircraft over one tick of the controller, in K steps of the integration; q rows of the remainder, r of the forcing.
 
-    With p_k the actuators' positions at the end of step k, the rest s and the course's forcing w_k over step k, over one tick
+    With p_k the actuators' positions at the end of step k, the remainder s and the course's forcing w_k in step k, one tick is
 
         x+ = tick @ [x, p_1, ..., p_K, s] + wind forced @ [w_1, ..., w_K]
     """
 
     blocks: tuple[StateBlock, ...]
-    tick: tuple[Array, ...]  # (n, n + K m + q, N), block by block: what is 0 in all aircraft is left out
+    tick: tuple[Array, ...]  # (n, n + K m + q, N), by blocks, without entries that are 0 in all aircraft
     forced: Array  # (n, K r, N)
-    rate: Array  # (m, n + m, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, but for the rest
+    rate: Array  # (m, n + m, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, up to the remainder
     forced_rate: Array  # (m, r)
-    wind: Array  # (N,) share of the course's gusts and turbulence that each meets
-    late: Array  # (N,) whole ticks by which its u is late
+    wind: Array  # (N,) factor of the course's gusts and turbulence
+    late: Array  # (N,) delay of u, whole ticks
 
 
 class Vehicle(NamedTuple):
-    """What all aircraft of a fleet share."""
+    """Properties that all aircraft of a fleet share."""
 
-    outputs: Array  # (m,) places of the outputs in the state, in the law's order
-    inputs: Array  # (m,) places of the law's inputs in the airframe's order
-    felt: Array  # (c,) places of the states that make the rest
-    rest: Aircraft  # what of it makes the rest: f_state takes x[felt], gives what acts on `acting` states
+    outputs: Array  # (m,) indices of the outputs in the state, in the law's order
+    inputs: Array  # (m,) indices of the law's inputs in the airframe's order
+    remainder_states: Array  # (c,) indices of the states in the nonlinear remainder
+    remainder: Aircraft  # reduced to the remainder: f_state of x[remainder_states] gives the rows `remainder_rows`
     actuators: Actuators  # (m, 1), airframe's order
     quantum: Array | None  # (m, 1), law's order
     dt: float  # s, of a step of the integration
 
 
 def vehicle(scenario: Scenario) -> Vehicle:
-    """What all aircraft of a scenario share."""
+    """The shared properties of all aircraft of a scenario."""
     plant, channels = scenario.aircraft.plant(), scenario.aircraft.channels()
     aircraft, errors = plant.aircraft, scenario.aircraft.sensor_arrays()
     order = [list(channels.outputs).index(name) for name in scenario.controller.outputs]
@@ -74,7 +74,7 @@ def vehicle(scenario: Scenario) -> Vehicle:
     return Vehicle(
         np.argmax(aircraft.C[order], axis=1),
         np.array([list(channels.inputs).index(name) for name in scenario.controller.inputs]),
-        *_rest(aircraft),
+        *_reduced(aircraft),
         Actuators(*(None if one is None else one[:, None] for one in plant.actuators)),
         None if quantum is None else quantum[:, None],
         seconds(plant.step_ns),
@@ -82,12 +82,12 @@ def vehicle(scenario: Scenario) -> Vehicle:
 
 
 class FleetResult(NamedTuple):
-    """How N flights went, by channel in the law's order; seen at the controller's ticks. Errors are true ones, C x - y_m."""
+    """Metrics of N flights, by channel in the law's order, over the controller's ticks. Errors are the true ones, C x - y_m."""
 
     rms: Array  # (m, N)
     max: Array  # (m, N)
     slew: Array  # (m, N) mean abs(u_dot), units of u / s
-    diverged: Array  # (N,) bool: the state went beyond DIVERGENCE_LIMIT, the other figures mean nothing
+    diverged: Array  # (N,) bool: the state exceeded DIVERGENCE_LIMIT, the other figures are invalid
 
 
 def assemble(A: FloatArray, B: FloatArray, plant: PlantParams, course: Course, wind: Array = 1.0, late: Array = 0) -> Fleet:
@@ -95,11 +95,11 @@ def assemble(A: FloatArray, B: FloatArray, plant: PlantParams, course: Course, w
 
     With L = A + gravity, Phi and Gamma the matrices of one Runge-Kutta step of x_dot = L x + u with u held,
 
-        tick = [Phi^K, Phi^(K-1) Gamma B, ..., Gamma B, (Phi^(K-1) + ... + 1) Gamma rest]
+        tick = [Phi^K, Phi^(K-1) Gamma B, ..., Gamma B, (Phi^(K-1) + ... + 1) Gamma remainder]
         forced = [Phi^(K-1) Gamma basis, ..., Gamma basis]
 
-    The steps, and the actuators' positions in them, are those of `plant.advance`; the rest, which it follows through each step,
-    is held over a tick, and the forcing over a step. `wind` and `late` are those of Fleet, one value for all or one each.
+    The steps, and the actuators' positions in them, are those of `plant.advance`. The remainder is held over a tick, and the
+    forcing over a step. `wind` and `late` are those of Fleet, one value for all or one each.
     """
     dt, aircraft = seconds(plant.step_ns), plant.aircraft
     K, count = course.steps, len(A)
@@ -110,7 +110,7 @@ def assemble(A: FloatArray, B: FloatArray, plant: PlantParams, course: Course, w
     for _ in range(K):
         powers.append(Phi @ powers[-1])
     held = [powers[K - 1 - k] @ Gamma for k in range(K)]
-    tick = [powers[K], *(of_step @ B for of_step in held), sum(held)[..., acting(aircraft)]]
+    tick = [powers[K], *(of_step @ B for of_step in held), sum(held)[..., remainder_rows(aircraft)]]
     rate = np.concatenate([A + aircraft.gravity, B], axis=2)
     C = aircraft.C[course.order]
 
@@ -130,34 +130,34 @@ def assemble(A: FloatArray, B: FloatArray, plant: PlantParams, course: Course, w
     )
 
 
-def acting(aircraft: Aircraft) -> NDArray[np.int64]:
-    """Places of the states that f_state acts on, (q,)."""
+def remainder_rows(aircraft: Aircraft) -> NDArray[np.int64]:
+    """Indices of the states that f_state acts on, (q,)."""
     acts = aircraft.gravity.any(axis=1)
     if aircraft.coupling is not None:
         acts = acts | aircraft.coupling.gain.any(axis=1)
     return np.flatnonzero(acts)
 
 
-def of_rest(felt: Array, rest: Aircraft) -> Array:
-    """What f_state has beyond its linear part, (q, N): gravity @ (sin(x) - x) + gain @ (x[first] x[second])."""
-    return dynamics.f_state(felt, rest) - rest.gravity @ felt
+def remainder_of(states: Array, aircraft: Aircraft) -> Array:
+    """Nonlinear remainder of f_state, (q, N): gravity @ (sin(x) - x) + gain @ (x[first] x[second])."""
+    return dynamics.f_state(states, aircraft) - aircraft.gravity @ states
 
 
-def _rest(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
-    """Places of the states that make the rest, and the aircraft reduced to them and to `acting`."""
-    rows, coupling = acting(aircraft), aircraft.coupling
-    makes = aircraft.gravity.any(axis=0)
+def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
+    """Indices of the states in the remainder, and the aircraft reduced to them and to `remainder_rows`."""
+    rows, coupling = remainder_rows(aircraft), aircraft.coupling
+    in_remainder = aircraft.gravity.any(axis=0)
     if coupling is not None:
-        makes[[*coupling.first, *coupling.second]] = True
-    felt = np.flatnonzero(makes)
+        in_remainder[[*coupling.first, *coupling.second]] = True
+    states = np.flatnonzero(in_remainder)
     if coupling is not None:
-        first, second = (np.searchsorted(felt, place) for place in (coupling.first, coupling.second))
+        first, second = (np.searchsorted(states, place) for place in (coupling.first, coupling.second))
         coupling = Coupling(coupling.gain[rows], first, second)
-    return felt, aircraft._replace(gravity=aircraft.gravity[np.ix_(rows, felt)], coupling=coupling)
+    return states, aircraft._replace(gravity=aircraft.gravity[np.ix_(rows, states)], coupling=coupling)
 
 
 def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
-    """The connected parts of the states, `moves` of shape (n, columns); longitudinal and lateral motion, as a rule."""
+    """Connected components of the states, `moves` of shape (n, columns): in general longitudinal and lateral motion."""
     number, part = connected_components(moves[:, : len(moves)], directed=False)
     rows = [np.flatnonzero(part == k) for k in range(number)]
     return tuple(StateBlock(tuple(row.tolist()), tuple(np.flatnonzero(moves[row].any(axis=0)).tolist())) for row in rows)
@@ -170,8 +170,8 @@ def _linear(t: Any, x: Array, u: Array, L: Array) -> Array:
 def fly(fleet: Fleet, vehicle: Vehicle, course: Course, control_law: ControlLaw, params: Any) -> FleetResult:
     """Fly N aircraft through the course under one law, from trim at rest.
 
-    At each tick: the sensors, the law's step (or engagement, or nothing, as the course has it), the actuators through the K
-    steps to the next tick, the aircraft there. The rest s is taken at the middle of a tick, from this tick's and the last.
+    At each tick: sensors, step of the law (or engagement, or hold, by the course's phase), actuators over the K steps to the
+    next tick, aircraft. The remainder s at the middle of a tick is extrapolated from this tick and the previous one.
     Arguments: `params` of the law, (m, 1) or (m, N).
     """
     segments = Segments(*(jnp.asarray(getattr(course, name)) for name in Segments._fields))
@@ -198,8 +198,8 @@ class Segments(NamedTuple):
     phase: Array
     dt: Array
     y_m: Array
-    seen_y_m: Array
-    seen_y_m_dot: Array
+    sampled_y_m: Array
+    sampled_y_m_dot: Array
     u_ff: Array
     error: Array
     forcing: Array
@@ -208,19 +208,19 @@ class Segments(NamedTuple):
 
 
 class LoopState(NamedTuple):
-    """What is carried from tick to tick."""
+    """State of the closed loop from tick to tick."""
 
     x: Array  # (n, N)
     position: Array  # (m, N) airframe's order
-    rest: Array  # (q, N) of the tick before
+    remainder: Array  # (q, N) of the previous tick
     law: Any
     u: Array  # (m, N) law's order
     y_before: Array  # (y_late, m, N) newest first
     u_before: Array  # (u_late, m, N)
     squares: Array  # (m, N) sums over the ticks
     max: Array
-    moved: Array
-    flies: Array  # (N,)
+    travel: Array  # sum of abs(u - previous u)
+    bounded: Array  # (N,) whether the state stayed below DIVERGENCE_LIMIT
 
 
 @partial(jax.jit, static_argnames=("control_law", "blocks", "steps", "y_late", "u_late"))
@@ -238,23 +238,23 @@ def _fly(
     u_late: int,
 ) -> FleetResult:
     n, count, m = len(fleet.forced), len(fleet.wind), len(vehicle.outputs)
-    places = np.argsort([row for block in blocks for row in block.rows])  # of the states among those of the blocks
+    places = np.argsort([row for block in blocks for row in block.rows])  # of the states in the order of the blocks
 
-    def seen(now: LoopState, y: Array, segment: Segments) -> Measurements:
-        measured = now.x.at[vehicle.outputs].set(y)
+    def measure(now: LoopState, y: Array, segment: Segments) -> Measurements:
+        x = now.x.at[vehicle.outputs].set(y)
         forced = _product(fleet.forced_rate[..., None], segment.forcing_now)
         moving = _product(fleet.rate, [*now.x, *now.position]) + fleet.wind * forced
         position = now.position[vehicle.inputs]
-        reference = (segment.seen_y_m[:, None], segment.seen_y_m_dot[:, None], segment.u_ff[:, None])
-        return Measurements(y, *reference, now.u, position, measured, measured - fleet.wind * segment.air[:, None], moving)
+        reference = (segment.sampled_y_m[:, None], segment.sampled_y_m_dot[:, None], segment.u_ff[:, None])
+        return Measurements(y, *reference, now.u, position, x, x - fleet.wind * segment.air[:, None], moving)
 
-    # A branch looks for itself: what its law does not look at is then not worked out.
+    # Each branch calls `measure`: the compiler then removes the measurements that its law does not use.
     def engage(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
-        started = control_law.start(seen(now, y, segment), params)
+        started = control_law.start(measure(now, y, segment), params)
         return jax.tree.map(lambda one, like: jnp.broadcast_to(one, like.shape).astype(like.dtype), started, now.law), now.u
 
     def step(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
-        return control_law.step(now.law, seen(now, y, segment), segment.dt, params)
+        return control_law.step(now.law, measure(now, y, segment), segment.dt, params)
 
     def hold(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
         return now.law, now.u
@@ -274,8 +274,8 @@ def _fly(
             moved = actuators.step(position, command, vehicle.dt, vehicle.actuators)
             position = actuators.apply_faults(segment.t + k * vehicle.dt, position, moved, vehicle.actuators)
             positions.extend(position)
-        rest = of_rest(now.x[vehicle.felt], vehicle.rest)
-        moves = [*now.x, *positions, *(1.5 * rest - 0.5 * now.rest)]
+        remainder = remainder_of(now.x[vehicle.remainder_states], vehicle.remainder)
+        moves = [*now.x, *positions, *(1.5 * remainder - 0.5 * now.remainder)]
         parts = [_product(part, [moves[j] for j in block.columns]) for part, block in zip(fleet.tick, blocks, strict=True)]
         x = jnp.concatenate(parts)[places]
         x = jax.lax.cond(
@@ -287,15 +287,15 @@ def _fly(
         after = LoopState(
             x,
             position,
-            rest,
+            remainder,
             law,
             u,
             y_before,
             history[:u_late],
             now.squares + e * e,
             jnp.maximum(now.max, jnp.abs(e)),
-            now.moved + jnp.abs(u - now.u),
-            now.flies & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # False for NaN too
+            now.travel + jnp.abs(u - now.u),
+            now.bounded & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # False for NaN too
         )
         return after, None
 
@@ -304,7 +304,7 @@ def _fly(
     begin = LoopState(
         jnp.zeros((n, count)),
         none,
-        jnp.zeros((len(vehicle.rest.gravity), count)),
+        jnp.zeros((len(vehicle.remainder.gravity), count)),
         None,
         none,
         jnp.zeros((y_late, m, count)),
@@ -314,16 +314,16 @@ def _fly(
         none,
         jnp.ones(count, dtype=bool),
     )
-    looked = seen(begin, none, first)
-    states = jax.eval_shape(lambda: control_law.step(control_law.start(looked, params), looked, first.dt, params)[0])
+    measured = measure(begin, none, first)
+    states = jax.eval_shape(lambda: control_law.step(control_law.start(measured, params), measured, first.dt, params)[0])
     begin = begin._replace(law=jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), states))
     end, _ = jax.lax.scan(tick, begin, segments)
     ticks = len(segments.t)
-    return FleetResult(jnp.sqrt(end.squares / ticks), end.max, end.moved / ((ticks - 1) * period), ~end.flies)
+    return FleetResult(jnp.sqrt(end.squares / ticks), end.max, end.travel / ((ticks - 1) * period), ~end.bounded)
 
 
 def _product(matrices: Array, vector: Any) -> Array:
-    """Sum over j of matrices[:, j] vector[j]: a product of small matrices, an aircraft each, that compiles to one loop."""
+    """Sum over j of matrices[:, j] vector[j]: the matrix-vector product of each aircraft, compiled to one loop."""
     total = 0.0 * matrices[:, 0] if matrices.shape[1] else jnp.zeros((matrices.shape[0], matrices.shape[-1]))
     for j in range(matrices.shape[1]):
         total = total + matrices[:, j] * vector[j]
@@ -331,7 +331,7 @@ def _product(matrices: Array, vector: Any) -> Array:
 
 
 def _delayed(value: Array, before: Array, late: int) -> tuple[Array, Array]:
-    """The value of so many ticks ago, and the queue after this tick, newest first."""
+    """The value `late` ticks ago, and the queue after this tick, newest first."""
     if not late:
         return value, before
     return before[-1], jnp.concatenate([value[None], before[:-1]])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics that do not grow with the number of flights: moments, histograms and the worst few, added up chunk by chunk."""
+"""Monte Carlo statistics of constant size: moments, histograms and the worst flights, summed chunk by chunk."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,22 +13,22 @@ from flight_core.parameters import Parameters, require
 from flight_core.vectors import FloatArray
 
 PER_DECADE, DECADES = 100, (-8, 6)
-"""Bins of the histograms: 2.3 % wide, from 1e-8 to 1e6 in SI, which all errors of a flight lie in."""
+"""Bins of the histograms: 2.3 % wide, from 1e-8 to 1e6 in SI, the range of all errors of a flight."""
 
 EDGES = 10.0 ** (np.arange(DECADES[0] * PER_DECADE, DECADES[1] * PER_DECADE + 1) / PER_DECADE)
 
 SCORE_UNIT = {"rad/s": 0.010, "m/s": 0.1}
-"""What an rms error is counted in, by unit of the channel; p counts half, for its commands are larger."""
+"""Unit of an rms error in the score, by unit of the channel. p counts half, since its commands are larger."""
 
-SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel, in place of its unit's
+SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel; it replaces that of its unit
 
-LOSS_OF_TRACK_SCORE = 10.0  # a score above it: the aircraft no longer tracks; 1 to 4 is usual
+LOSS_OF_TRACK_SCORE = 10.0  # a higher score is a loss of track; 1 to 4 is usual
 QUANTILES = (0.5, 0.95, 0.99)
-WORST_KEPT = 10  # of the worst flights
+WORST_KEPT = 10  # number of worst flights in a tally
 
 
 class Figure(Parameters):
-    """One figure over many flights. Sums are exact in their order: the same chunks give the same bits."""
+    """One figure over many flights. Sums have a fixed order: the same chunks give the same bits."""
 
     count: int = 0
     mean: float = 0.0
@@ -36,7 +36,7 @@ class Figure(Parameters):
     largest: float = -1.0  # none yet
     bins: dict[int, int] = Field(
         default_factory=dict
-    )  # counts by place in EDGES, -1 below and len(EDGES) - 1 above; empty ones left out
+    )  # counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones
 
     @classmethod
     def of(cls, values: FloatArray) -> Self:
@@ -77,7 +77,7 @@ class Figure(Parameters):
         return math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
 
     def quantile(self, share: float) -> float:
-        """The value that a share of the flights stays below, to the width of a bin (2.3 %)."""
+        """The value below which a share of the flights lies, to the width of a bin (2.3 %)."""
         wanted, below = share * self.count, 0
         for place, found in self.bins.items():
             if below + found >= wanted:
@@ -88,18 +88,18 @@ class Figure(Parameters):
 
 
 class Worst(Parameters):
-    """A flight to look at: the number of its aircraft, and its score, none where it diverged."""
+    """One of the worst flights: number of its aircraft and its score, None if it diverged."""
 
     number: int
     score: float | None
 
 
 class Tally(Parameters):
-    """What is known of many flights."""
+    """Statistics of many flights."""
 
     flights: int = 0
     diverged: int = 0
-    lost: int = 0  # did not diverge, score above LOSS_OF_TRACK_SCORE
+    lost: int = 0  # loss of track: did not diverge, score above LOSS_OF_TRACK_SCORE
     figures: dict[str, Figure] = Field(
         default_factory=dict
     )  # by name: "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
@@ -108,15 +108,15 @@ class Tally(Parameters):
     @classmethod
     def of(cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]) -> Self:
         """Of the aircraft first, first + 1, ...; every figure of shape (N,), one of them the "score"."""
-        flew, score = ~np.asarray(diverged, dtype=bool), np.asarray(figures["score"])
-        rank = np.where(flew, score, np.inf)
+        bounded, score = ~np.asarray(diverged, dtype=bool), np.asarray(figures["score"])
+        rank = np.where(bounded, score, np.inf)
         order = np.argsort(-rank, kind="stable")[:WORST_KEPT]
         return cls(
-            flights=len(flew),
-            diverged=int((~flew).sum()),
-            lost=int((score[flew] > LOSS_OF_TRACK_SCORE).sum()),
-            figures={name: Figure.of(np.asarray(values)[flew]) for name, values in figures.items()},
-            worst=tuple(Worst(number=first + int(k), score=float(score[k]) if flew[k] else None) for k in order),
+            flights=len(bounded),
+            diverged=int((~bounded).sum()),
+            lost=int((score[bounded] > LOSS_OF_TRACK_SCORE).sum()),
+            figures={name: Figure.of(np.asarray(values)[bounded]) for name, values in figures.items()},
+            worst=tuple(Worst(number=first + int(k), score=float(score[k]) if bounded[k] else None) for k in order),
         )
 
     def __add__(self, other: Self) -> Self:
@@ -131,7 +131,7 @@ class Tally(Parameters):
         )
 
     def summary(self) -> dict[str, Any]:
-        """As figures for a file, SI."""
+        """The statistics as figures of a file, SI."""
         shares = {}
         for word, count in (("diverged", self.diverged), ("lost", self.lost)):
             share, low, high = self.share(count)
@@ -144,15 +144,15 @@ class Tally(Parameters):
         return {"flights": self.flights, **shares, "figures": named, "worst": [one.model_dump() for one in self.worst]}
 
     def share(self, of: int) -> tuple[float, float, float]:
-        """So many of the flights as a share, and its 95 % confidence interval (Clopper-Pearson), each 0 to 1."""
-        from scipy.stats import binomtest  # noqa: PLC0415 - half a second, for this alone
+        """A number of flights as a share of all, and its 95 % confidence interval (Clopper-Pearson), each 0 to 1."""
+        from scipy.stats import binomtest  # noqa: PLC0415 - half a second, only for this
 
         interval = binomtest(of, self.flights).proportion_ci(0.95, method="exact")
         return of / self.flights, float(interval.low), float(interval.high)
 
 
 def score_units(outputs: Sequence[str], units: Mapping[str, str]) -> FloatArray:
-    """What the rms error of each channel is counted in, SI, shape (m,). Raises ParameterError for a unit without one."""
+    """Unit of the rms error of each channel in the score, SI, shape (m,). Raises ParameterError for an unknown unit."""
     for name in outputs:
         require(
             units[name] in SCORE_UNIT, "outputs", f"{name} in {units[name]}", f"units a score counts: {', '.join(SCORE_UNIT)}"
