@@ -24,25 +24,7 @@ from rise_di_controller.guard import Mode
 from rise_di_controller.params import ControllerParameters
 
 # Parameters that may change in flight: gains and guard. Those that decide the sign or meaning of a channel may not.
-TUNABLE = frozenset(
-    (
-        "k_g",
-        "k_d",
-        "Lambda",
-        "beta",
-        "omega",
-        "sign",
-        "lag",
-        "delay",
-        "softening",
-        "max_age",
-        "hold",
-        "ramp",
-        "lower",
-        "upper",
-        "slew",
-    )
-)
+TUNABLE = frozenset("k_g k_d Lambda beta omega sign lag delay softening max_age hold ramp lower upper slew".split())
 
 
 class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
