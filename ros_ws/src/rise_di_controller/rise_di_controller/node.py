@@ -24,7 +24,9 @@ from rise_di_controller.guard import Mode
 from rise_di_controller.params import ControllerParameters
 
 # Parameters that may change in flight: gains and guard. Those that decide the sign or meaning of a channel may not.
-TUNABLE = frozenset("k_g k_d Lambda beta omega sign lag delay softening max_age hold ramp lower upper slew".split())
+TUNABLE = frozenset({"k_g", "k_d", "Lambda", "beta", "omega", "sign", "lag", "delay", "softening"}) | frozenset(
+    {"max_age", "hold", "ramp", "lower", "upper", "slew"}
+)
 
 
 class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
