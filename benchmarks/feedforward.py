@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the feedforward is worth with the same gains: osprey_servo on the published airframe and on uncertain ones.
+"""Effect of the feedforward with the same gains: osprey_servo on the published airframe and on uncertain ones.
 
 python -m benchmarks.feedforward --aircraft 200    # ten seconds
 """
@@ -20,7 +20,7 @@ from flight_campaign.campaign import define, fly_chunk
 from flight_campaign.statistics import Tally
 
 LEVELS = (0.3, 0.5)
-WIDTH = 128  # characters, the least that the table takes, also into a file
+WIDTH = 128  # characters, smallest width of the table
 
 
 def both(scenario: Scenario) -> tuple[Scenario, Scenario]:
@@ -30,8 +30,8 @@ def both(scenario: Scenario) -> tuple[Scenario, Scenario]:
     return scenario.vary(controller={"feedforward": None}), scenario.vary(controller=chosen.model_dump())
 
 
-def flown(scenario: Scenario, level: float, aircraft: int, seed: int) -> Tally:
-    """So many aircraft drawn around the airframe; the feedforward's model stays the airframe as published."""
+def fly_tally(scenario: Scenario, level: float, aircraft: int, seed: int) -> Tally:
+    """Statistics of so many uncertain aircraft; the feedforward's model is the airframe as published."""
     return Tally.model_validate_json(fly_chunk(define(scenario, aircraft, level, seed, aircraft).model_dump_json(), (0, 0)))
 
 
@@ -39,7 +39,7 @@ def main(
     aircraft: Annotated[int, typer.Option(min=1, help="Uncertain aircraft at each level.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain aircraft.")] = 1,
 ) -> None:
-    """Print scores and activity of u with and without feedforward, the same gains, on the same aircraft."""
+    """Print scores and activity of u with and without feedforward, for the same gains and aircraft."""
     scenario = find_scenario("osprey_servo")
     channels, units = scenario.aircraft.channels(), display_units(scenario)
     sets = {"nominal, calm air": (scenario.vary(aircraft={"gusts": {}}), 0.0, 1), "nominal": (scenario, 0.0, 1)}
@@ -52,7 +52,7 @@ def main(
     )
     for name, (base, level, count) in sets.items():
         for label, one in zip(("without", "with"), both(base), strict=True):
-            tally = flown(one, level, count, seed)
+            tally = fly_tally(one, level, count, seed)
             rms = np.array([tally.figures[f"rms.{channel}"].mean for channel in channels.outputs])
             slew = np.array([tally.figures[f"slew.{key}"].mean * units[key].factor for key in channels.inputs])
             score = tally.figures["score"]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What one tick costs: the law, the guarded law and the whole tick, beside a bare NumPy multiply-add of the same size.
+"""Time of one tick: the law, the law with anti-windup and the whole tick, relative to a NumPy multiply-add of the same size.
 
 .venv/bin/python benchmarks/law.py
 """
@@ -41,7 +41,7 @@ FLOOR = "NumPy a * x + b, the floor"
 
 
 def measure() -> dict[str, tuple[float, float, float]]:
-    """Median, 99.9th percentile and maximum in us of one law step, guarded step and whole tick, and of the floor."""
+    """Median, 99.9th percentile and maximum in us of a law step, a step with anti-windup, a tick, and the multiply-add."""
     controller = load_scenario(SCENARIO).controller
     law, limits = controller.law(), controller.guard()
     rng = np.random.default_rng(1)
@@ -50,7 +50,7 @@ def measure() -> dict[str, tuple[float, float, float]]:
     law_state = engage(y[0], y_m)
     engaged, _ = guard.tick(guard.initial_state(4), 0, StampedVector(0, y[0]), [StampedVector(0, y_m)], limits, law)
 
-    def guarded(k: int) -> object:
+    def with_anti_windup(k: int) -> object:
         return guard.step_with_anti_windup(law_state, y[k], y_m, dt, zero, zero, law, limits.limits)
 
     def whole_tick(k: int) -> object:
@@ -62,7 +62,7 @@ def measure() -> dict[str, tuple[float, float, float]]:
     return {
         FLOOR: percentiles(lambda k: law.K * y[k] + y_m),
         "law.step": percentiles(lambda k: step(law_state, y[k], y_m, dt, law)),
-        "guard.step_with_anti_windup": percentiles(guarded),
+        "guard.step_with_anti_windup": percentiles(with_anti_windup),
         "guard.tick": percentiles(whole_tick),
     }
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What tuned laws are worth where they were not tuned: other gusts, sines, turbulence, and an observer wrong about the wind.
+"""Scores of tuned laws on courses without tuning: other gusts, sines, turbulence, and an observer with a wrong wind model.
 
 python -m benchmarks.laws    # the gains of osprey_servo that ship, some minutes
 """
@@ -28,13 +28,13 @@ GUSTS = {
 }  # s, m/s, m: longer, upwards, from the left
 TURBULENCE = {"altitude": 100.0, "wind": 15.4, "seed": 3}  # m; m/s at 20 ft, moderate by MIL-F-8785C
 NOISE_SEED = 7
-WIDTH = 110  # characters, the least that the table takes, also into a file
+WIDTH = 110  # characters, smallest width of the table
 WRONG = (0.3, 0.5, 0.5, 1.0)
-"""By how much each entry of the observer's wind columns is off, drawn anew for each; 1 stands for none of them at all."""
+"""Largest relative error of each entry of the observer's wind columns, sampled for each; 1 stands for no wind model."""
 
 
 def courses(scenario: Scenario) -> dict[str, Scenario]:
-    """The scenario as it was tuned on, and others."""
+    """The scenario of the tuning, and others."""
     sensors: dict[str, Any] = scenario.aircraft.sensors.model_dump() | {"seed": NOISE_SEED}
     return {
         "as tuned": scenario,
@@ -45,11 +45,11 @@ def courses(scenario: Scenario) -> dict[str, Scenario]:
 
 
 def wrong_wind(benchmark: Benchmark) -> Iterator[tuple[str, Benchmark]]:
-    """The benchmark with an observer that knows the wind's columns wrongly; the aircraft stay."""
+    """The benchmark with errors in the wind columns of the observer's model; the aircraft do not change."""
     generator = np.random.default_rng(5)
     for part in WRONG:
         factor = 1.0 + part * generator.uniform(-1.0, 1.0, benchmark.model.wind.shape) if part < 1.0 else 0.0
-        name = f"wind wrong by up to {100.0 * part:g} %" if part < 1.0 else "no wind known"
+        name = f"wind wrong by up to {100.0 * part:g} %" if part < 1.0 else "no wind model"
         yield name, benchmark._replace(model=benchmark.model._replace(wind=benchmark.model.wind * factor))
 
 
@@ -57,17 +57,17 @@ def main(
     aircraft: Annotated[int, typer.Option(min=1, help="Uncertain aircraft at each level.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain aircraft.")] = 1,
 ) -> None:
-    """Print scores of laws tuned on osprey_servo's manoeuvre and gusts, on courses that they were not tuned on."""
+    """Print scores of laws tuned on osprey_servo, on courses that were not part of the tuning."""
     scenario = find_scenario("osprey_servo")
     tuned = load(tuned_file(scenario))
     chosen: dict[str, dict[str, TuningResult]] = {name: {"uncertain": tuned[name]["uncertain"]} for name in LAWS}
     chosen[OBSERVER] |= {"late": tuned[OBSERVER]["late"]}
-    flown: list[tuple[str, Benchmark, dict[str, dict[str, TuningResult]]]] = [
+    cases: list[tuple[str, Benchmark, dict[str, dict[str, TuningResult]]]] = [
         (name, build_benchmark(one), chosen) for name, one in courses(scenario).items()
     ]
-    flown += [(name, one, {OBSERVER: chosen[OBSERVER]}) for name, one in wrong_wind(build_benchmark(scenario))]
+    cases += [(name, one, {OBSERVER: chosen[OBSERVER]}) for name, one in wrong_wind(build_benchmark(scenario))]
     rows: list[tuple[str, LawResult]] = []
-    for name, benchmark, laws in track(flown, "courses", console=Console(stderr=True)):
+    for name, benchmark, laws in track(cases, "courses", console=Console(stderr=True)):
         rows += [(name, one) for one in compare(benchmark, laws, aircraft, LEVELS, seed)]
     levels = tuple(f"+-{100.0 * level:g} %" for level in LEVELS)
     title = f"Scores, mean (worst) of {aircraft} aircraft a level, seed {seed}"

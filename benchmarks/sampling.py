@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How the sign of equation (21) is best sampled: residual errors and chatter by scheme, period and world.
+"""Sampling of the sign in equation (21): residual errors and chatter by scheme, period and world.
 
 python benchmarks/sampling.py          # periods of 20, 10 and 5 ms, a minute or two
 python benchmarks/sampling.py --all    # 2 and 1 ms too
@@ -21,7 +21,7 @@ from rich.table import Table
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import error_figures, true_error
+from flight_analysis.metrics import error_metrics, true_error
 from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
@@ -30,11 +30,11 @@ from flight_core.vectors import FloatArray
 
 WORLDS = {"paper": "no actuators", "servo": "actuators with lag, rate limits and end stops"}
 PERIODS, SMALL_PERIODS = (0.02, 0.01, 0.005), (0.002, 0.001)  # s
-WIDTH = 128  # characters, the least that the tables take, also into a file
+WIDTH = 128  # characters, smallest width of the tables
 MAX_STABLE_STEP = 0.0025  # s, of the integration
 NO_SIGN = 1e-9  # times beta: the law is then a PI controller
 
-# Gains that show the sign term: bandwidths K = 25, 20, 12, 3 rad/s of q, p, r, V, and beta far above what calm air asks for.
+# Gains that show the sign term: bandwidths K = 25, 20, 12, 3 rad/s of q, p, r, V, and beta far above its bound in calm air.
 GAINS = {"k_g": 2.0, "k_d": [22.0, 17.0, 9.0], "Lambda": [3.0, 3.0, 2.0, 1.0], "delay": 0.0}
 BETA = {"elevator": 4.0, "thrust": 50.0, "aileron": 15.0, "rudder": 15.0}  # deg/s and %/s
 
@@ -44,7 +44,7 @@ SINES = {
     "p": {"amplitude": 0.25, "frequency": 0.8, "phase": 0.4},
     "r": {"amplitude": 0.02, "frequency": 1.3},
 }  # rad/s or m/s, rad/s, rad; the turn coordination adds to r
-REST, MOVING = (50.0, 60.0), (10.0, 60.0)  # s, where errors are taken: past the last gust, past the first transient
+REST, MOVING = (50.0, 60.0), (10.0, 60.0)  # s, windows of the errors: after the last gust, after the first transient
 
 GUST_BETA = (
     {"elevator": 30.0, "thrust": 130.0, "aileron": 15.0, "rudder": 60.0},
@@ -54,28 +54,28 @@ GUST_PERIODS = (0.01, 0.005)  # s
 
 
 class Case(NamedTuple):
-    """One flight and what is read off it."""
+    """One flight and the window of its figures."""
 
     scenario: Scenario
     window: tuple[float, float]  # s
 
 
 class Figures(NamedTuple):
-    """What one flight gives, channels in the airframe's order."""
+    """Figures of one flight, channels in the airframe's order."""
 
     rms: FloatArray  # (m,) of the true error, SI
     activity: FloatArray  # (m,) mean abs(u_dot), units of the airframe file / s
 
 
 def fly(case: Case) -> Figures:
-    """Fly a scenario in one process. Raises ParameterError for one that cannot be flown."""
+    """Simulate a scenario in one process. Raises ParameterError for an invalid one."""
     tape = simulate(case.scenario)
     error = true_error(tape)
     if error is None:
         raise ParameterError("truth: found no outputs in it, expected those of the simulated aircraft")
     start, stop = case.window
     t, t_u = error.stamp_ns / 1e9, tape.time("u")
-    rms = np.array([error_figures(error[name][(t >= start) & (t <= stop)]).rms for name in error.names])
+    rms = np.array([error_metrics(error[name][(t >= start) & (t <= stop)]).rms for name in error.names])
     units, inside = display_units(case.scenario), (t_u >= start) & (t_u <= stop)
     slew = [
         np.mean(np.abs(np.diff(tape["u"][name][inside]) / np.diff(t_u[inside]))) * units[name].factor
@@ -95,7 +95,7 @@ def scaled_beta(scenario: Scenario, rates: Mapping[str, float]) -> list[float]:
 
 
 def at_period(scenario: Scenario, period: float) -> Scenario:
-    """The scenario with aircraft, reference model and controller at one rate: nothing is late."""
+    """The scenario with aircraft, reference model and controller at one rate: no delays."""
     rate = 1.0 / period
     return scenario.vary(
         aircraft={"rate": rate, "step": period / ceil(period / MAX_STABLE_STEP), "sensors": {}},
@@ -126,17 +126,17 @@ def gust_scenario(base: Scenario, rates: Mapping[str, float], period: float, *, 
     """The scenario osprey_gust with the implicit sign at another beta and period."""
     moved = base.vary(controller={"beta": scaled_beta(base, rates), "sign": "implicit"})
     moved = at_period(moved if gusts else moved.vary(aircraft={"gusts": {}}), period)
-    # seen every millisecond, between the ticks too
+    # sampled every millisecond, also between the ticks
     return moved.vary(aircraft={"rate": 1000.0, "step": 0.001}, reference_model={"rate": 1000.0})
 
 
 def cells(values: FloatArray, factor: float = 1.0) -> str:
-    """Values to three digits, joined by strokes."""
+    """Values with three digits, joined by slashes."""
     return " / ".join(f"{value:.3g}" if abs(value) >= 5e-4 else "0" for value in values * factor)
 
 
 def new_table(title: str, columns: Sequence[str], texts: int) -> Table:
-    """A table whose first columns hold words, the others figures."""
+    """A table whose first columns hold text, the others figures."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index < texts else "right", no_wrap=True)
@@ -149,7 +149,7 @@ def main(
     ] = False,
     processes: Annotated[int, typer.Option(min=1, help="Flights at a time.")] = os.cpu_count() or 1,
 ) -> None:
-    """Print how each sampling of the sign fares: root mean square errors and mean slew of the inputs, by scheme and period."""
+    """Print rms errors and mean slew of the inputs for each sampling of the sign, by scheme and period."""
     console = Console()
     console.width = max(console.width, WIDTH)
     servo, gust = find_scenario("osprey_servo"), find_scenario("osprey_gust")
@@ -163,19 +163,19 @@ def main(
     gusty = [Case(gust_scenario(gust, *row, gusts=gusts), whole) for row in gust_rows for gusts in (True, False)]
     with ProcessPoolExecutor(processes) as pool:
         flights = pool.map(fly, sampling + gusty)
-        flown = list(track(flights, "flights", len(sampling + gusty), console=Console(stderr=True)))
-    pairs = list(zip(flown[::2], flown[1::2], strict=True))
+        results = list(track(flights, "flights", len(sampling + gusty), console=Console(stderr=True)))
+    pairs = list(zip(results[::2], results[1::2], strict=True))
     show(console.print, rows, pairs[: len(rows)], gust_rows, pairs[len(rows) :])
 
 
 def show(
-    put: Callable[[Table], None],
+    output: Callable[[Table], None],
     rows: Sequence[tuple[str, str, float]],
     pairs: Sequence[tuple[Figures, Figures]],
     gust_rows: Sequence[tuple[Mapping[str, float], float]],
     gust_pairs: Sequence[tuple[Figures, Figures]],
 ) -> None:
-    """Put out one table a world, and the table of the gusts."""
+    """Print one table a world, and the table of the gusts."""
     for world, meaning in WORLDS.items():
         table = new_table(
             f"{world} world ({meaning}): rms of the true error q / V / p / r in mrad/s and mm/s;"
@@ -186,7 +186,7 @@ def show(
         for (of, scheme, period), (rest, sine) in zip(rows, pairs, strict=True):
             if of == world:
                 table.add_row(scheme, f"{period * 1e3:g}", cells(rest.rms, 1e3), cells(sine.rms, 1e3), cells(rest.activity))
-        put(table)
+        output(table)
     table = new_table(
         "osprey_gust, implicit sign: rms of the true error q / V / p / r in mrad/s and mm/s;"
         "\nbeta of elevator / thrust / aileron / rudder in deg/s and %/s",
@@ -196,7 +196,7 @@ def show(
     for (rates, period), figures in zip(gust_rows, gust_pairs, strict=True):
         beta = cells(np.array(list(rates.values())))
         table.add_row(beta, f"{period * 1e3:g}", *(cells(one.rms, 1e3) for one in figures))
-    put(table)
+    output(table)
 
 
 if __name__ == "__main__":
