@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight over topics: what is recorded, how close it comes to the flight in one process, how it ends."""
+"""A flight over topics: its log, its accuracy beside a flight in one process, its end."""
 
 import json
 import signal
@@ -54,7 +54,7 @@ def children(process: Process) -> list[psutil.Process]:
 
 
 def wait_for_nodes(process: Process, run: Path) -> list[psutil.Process]:
-    """Until the controller flies; the four processes of the flight."""
+    """Wait until the controller engages; return the four processes of the flight."""
     deadline = time.monotonic() + 30.0
     while time.monotonic() < deadline:
         logs = list(run.glob("*/log/controller.log"))
@@ -74,8 +74,8 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
 ) -> None:
     scenario = load_scenario(short_scenario)
     bound = 1.5 * rms(tracking_error(simulate(scenario)).values)
-    # The bound speaks of the loop, not of the machine: a flight in which the machine held the controller back by more than a
-    # quarter of its period, or the aircraft by more than a sample, says nothing against it, and is flown again.
+    # The bound is for the loop, not for the host. A flight is repeated when host scheduling delays made the controller late by
+    # more than a quarter of its period, or the aircraft by more than a sample.
     all_late = True
     for _ in range(4):
         flight = fly(start, short_scenario)
@@ -84,32 +84,32 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
         tape = read_run(run).tape
         ticks = json.loads((run / "summary.json").read_text(encoding="utf-8"))["ticks"]
         late = ticks["late_max"] >= 0.0025 or ticks["without_new_y"] > 1
-        held_back = bool(late or np.diff(tape["y"].stamp_ns).max() > 4_000_000)
+        delayed = bool(late or np.diff(tape["y"].stamp_ns).max() > 4_000_000)
         all_late = all_late and late
-        flown = rms(tracking_error(tape).values)
-        if not held_back or (flown <= bound).all():
+        errors = rms(tracking_error(tape).values)
+        if not delayed or (errors <= bound).all():
             break
-    if all_late and not (flown <= bound).all():
-        pytest.skip("the machine held the controller's ticks back in four flights of four")
-    assert (flown <= bound).all(), f"{flown} over topics, at most {bound}"
+    if all_late and not (errors <= bound).all():
+        pytest.skip("host scheduling delayed the controller's ticks in four flights of four")
+    assert (errors <= bound).all(), f"{errors} over topics, at most {bound}"
 
     with AnyReader([run]) as reader:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
         connection, _, raw = next(reader.messages([c for c in reader.connections if c.topic == "/internals"]))
         internals: Any = reader.deserialize(raw, connection.msgtype)
-    # 500 Hz and 100 Hz over 12 s and some tenths at the end; the start may cost a few ticks
+    # 500 Hz and 100 Hz for 12 s and some tenths at the end; a few ticks may be missing at the start
     for topic, rate in (("/y", 500), ("/y_m", 500), ("/truth", 500), ("/u", 100), ("/internals", 100)):
         assert rate * DURATION * 0.98 <= counts[topic] <= rate * (DURATION + 2.0), topic
     assert counts["/diagnostics"] >= 4 * (DURATION - 1)
     assert internals.name[:2] == ["mode", "dt"]
     assert internals.header.frame_id.startswith("/controller#")
-    assert tape["y"].stamp_ns[0] == tape.start_ns  # the first sample of the flight is in the log
-    assert held_back or np.diff(tape["y"].stamp_ns).max() <= 20_000_000
-    # u carries the stamp of the y that it answers
+    assert tape["y"].stamp_ns[0] == tape.start_ns  # the log begins with the first sample
+    assert delayed or np.diff(tape["y"].stamp_ns).max() <= 20_000_000
+    # u carries the stamp of the y from which it was computed
     assert set(tape["u"].stamp_ns.tolist()) <= set(tape["y"].stamp_ns.tolist())
 
 
-def test_interrupt_ends_all_processes_and_keeps_what_was_flown(start: Start, short_scenario: Path, tmp_path: Path) -> None:
+def test_interrupt_ends_all_processes_and_keeps_the_log(start: Start, short_scenario: Path, tmp_path: Path) -> None:
     flight = fly(start, short_scenario)
     nodes = wait_for_nodes(flight, tmp_path / "runs")
     assert len(nodes) == 4
@@ -124,14 +124,14 @@ def test_interrupt_ends_all_processes_and_keeps_what_was_flown(start: Start, sho
     assert "q (mrad/s)" in flight.output
     run = (tmp_path / "runs" / "latest").resolve()
     assert (run / "metadata.yaml").is_file()
-    assert read_run(run).tape.notes == ()  # the file has its end
+    assert read_run(run).tape.notes == ()  # the file is not truncated
     with AnyReader([run]) as reader:
         assert reader.message_count > 0
     for log in (run / "log").glob("*.log"):
         assert "Traceback" not in log.read_text(encoding="utf-8")
 
 
-def test_a_second_interrupt_does_not_stop_the_stopping(start: Start, short_scenario: Path, tmp_path: Path) -> None:
+def test_a_second_interrupt_does_not_interrupt_the_shutdown(start: Start, short_scenario: Path, tmp_path: Path) -> None:
     flight = fly(start, short_scenario)
     nodes = wait_for_nodes(flight, tmp_path / "runs")
     flight.interrupt()
@@ -144,10 +144,10 @@ def test_a_second_interrupt_does_not_stop_the_stopping(start: Start, short_scena
     assert read_run(next((tmp_path / "runs").glob("*-short"))).tape.notes == ()  # the recorder closed its file
 
 
-@pytest.mark.parametrize("seconds", [0.3, 1.0])  # earlier it is the interpreter itself that is interrupted
-def test_an_interrupt_before_the_flight_is_quiet(seconds: float, start: Start, short_scenario: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("seconds", [0.3, 1.0])  # an earlier interrupt stops the interpreter itself
+def test_an_early_interrupt_causes_no_traceback(seconds: float, start: Start, short_scenario: Path, tmp_path: Path) -> None:
     flight = fly(start, short_scenario)
-    with pytest.raises(subprocess.TimeoutExpired):  # not an event to wait for: the instant is the case
+    with pytest.raises(subprocess.TimeoutExpired):  # the instant of the interrupt is the test case
         flight.popen.wait(seconds + 0.05)
     nodes = children(flight)
     flight.interrupt()
@@ -178,7 +178,7 @@ def test_a_flight_with_a_wrong_sign_ends_when_it_diverges(start: Start, short_sc
     assert "outcome: diverged at t = " in in_process.output
 
 
-def test_a_killed_node_ends_the_flight_by_name(start: Start, short_scenario: Path, tmp_path: Path) -> None:
+def test_a_killed_node_ends_the_flight_and_is_named(start: Start, short_scenario: Path, tmp_path: Path) -> None:
     flight = fly(start, short_scenario)
     nodes = wait_for_nodes(flight, tmp_path / "runs")
     next(node for node in nodes if "rise_di_controller.main" in node.cmdline()).kill()

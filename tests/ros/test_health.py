@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The health check of the containers tells a node that works from one that hangs, and from one that is not there."""
+"""Health check of the containers: a running node passes, a suspended and a missing node fail."""
 
 import signal
 import subprocess
@@ -15,20 +15,20 @@ HEALTH = Path(__file__).resolve().parents[2] / "docker" / "health.py"
 
 
 def check(*names: str) -> tuple[int, str]:
-    done = subprocess.run([sys.executable, str(HEALTH), *names], capture_output=True, text=True, timeout=30, check=False)
-    return done.returncode, done.stdout
+    result = subprocess.run([sys.executable, str(HEALTH), *names], capture_output=True, text=True, timeout=30, check=False)
+    return result.returncode, result.stdout
 
 
-def test_a_node_that_works_is_healthy_and_one_that_hangs_is_not(start: Start, osprey_gust: Scenario) -> None:
+def test_a_running_node_is_healthy_and_a_suspended_or_missing_one_is_not(start: Start, osprey_gust: Scenario) -> None:
     recorder = start("flight_recorder.main", "--ros-args", "--params-file", str(osprey_gust.path))
     recorder.wait_for("ready")
     assert check()[0] == 0
-    status, said = check("recorder")
+    status, output = check("recorder")
     assert status == 0
-    assert "recorder: recording to" in said
-    status, said = check("pilot")
+    assert "recorder: recording to" in output
+    status, output = check("absent")
     assert status == 1
-    assert "no report of pilot" in said
+    assert "no report of absent" in output
     recorder.popen.send_signal(signal.SIGSTOP)
     assert check("recorder")[0] == 1
     recorder.popen.send_signal(signal.SIGCONT)

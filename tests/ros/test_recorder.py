@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder: what it takes, what it says of what it cannot take, what is left when it is killed or the disk is full."""
+"""The recorder: recorded topics, QoS, missing topics, lost messages, a full disk, a killed recorder."""
 
 import json
 import re
@@ -54,7 +54,7 @@ def stop(process: Process) -> None:
     assert process.end() == 0, process.output
 
 
-def said(peer_node: Peer) -> tuple[int, str, dict[str, str]]:
+def diagnostics(peer_node: Peer) -> tuple[int, str, dict[str, str]]:
     """Level, sentence and figures of the recorder's newest diagnostics."""
     for message in reversed(peer_node.received["/diagnostics"]):
         if message.status[0].name == "/recorder":
@@ -64,45 +64,43 @@ def said(peer_node: Peer) -> tuple[int, str, dict[str, str]]:
 
 
 def recorded(peer_node: Peer, topic: str) -> int:
-    return int(said(peer_node)[2].get(f"messages {topic}", 0))
+    return int(diagnostics(peer_node)[2].get(f"messages {topic}", 0))
 
 
 def messages(run: Path) -> dict[str, list[tuple[int, bytes]]]:
     """Log time and bytes of all messages, by topic, as rosbags reads them."""
-    found: dict[str, list[tuple[int, bytes]]] = {}
+    by_topic: dict[str, list[tuple[int, bytes]]] = {}
     with AnyReader([run]) as reader:
         for one, stamp_ns, data in reader.messages():
-            found.setdefault(one.topic, []).append((stamp_ns, data))
+            by_topic.setdefault(one.topic, []).append((stamp_ns, data))
             reader.deserialize(data, one.msgtype)
-    return found
+    return by_topic
 
 
 def errors(process: Process) -> list[str]:
     return [line for line in process.lines if "[ERROR]" in line or line.startswith("error:")]
 
 
-# What it takes
+# Recorded topics
 
 
-def test_logs_and_changes_of_parameters_are_recorded(
-    start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
-) -> None:
-    peer_node.node.get_logger().info("said before there was a recorder")
+def test_rosout_and_parameter_events_are_recorded(start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path) -> None:
+    peer_node.node.get_logger().info("logged before the recorder started")
     process = recorder(start, osprey_gust, "run")
     peer_node.until(lambda: recorded(peer_node, "/rosout") > 1)
     peer_node.node.declare_parameter("gain", 3.0)
     peer_node.until(lambda: recorded(peer_node, "/parameter_events") > 0)
     stop(process)
     with AnyReader([tmp_path / "run"]) as reader:
-        found = [(one.topic, reader.deserialize(data, one.msgtype)) for one, _, data in reader.messages()]
-    texts = [message.msg for topic, message in found if topic == "/rosout"]  # type: ignore[attr-defined]
-    assert "said before there was a recorder" in texts
+        recorded_messages = [(one.topic, reader.deserialize(data, one.msgtype)) for one, _, data in reader.messages()]
+    texts = [message.msg for topic, message in recorded_messages if topic == "/rosout"]  # type: ignore[attr-defined]
+    assert "logged before the recorder started" in texts
     assert any("recording to" in text for text in texts)
-    events = [message for topic, message in found if topic == "/parameter_events"]
+    events = [message for topic, message in recorded_messages if topic == "/parameter_events"]
     assert [one.name for event in events for one in event.new_parameters if event.node == "/peer"] == ["gain"]  # type: ignore[attr-defined]
 
 
-def test_further_topics_are_recorded_whatever_their_publishers_offer(
+def test_further_topics_are_recorded_with_any_offered_qos(
     start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
 ) -> None:
     latched = peer_node.node.create_publisher(String, "/latched", LATCHED)
@@ -115,14 +113,14 @@ def test_further_topics_are_recorded_whatever_their_publishers_offer(
     peer_node.until(lambda: recorded(peer_node, "/late") > 2, each=lambda: late.publish(Temperature(temperature=1.0)))
     peer_node.until(lambda: recorded(peer_node, "/latched") > 0)
     stop(process)
-    found = messages(tmp_path / "run")
-    assert len(found["/latched"]) == 1  # sent before the recorder was there
-    assert len(found["/relative/pressure"]) > 2
-    assert len(found["/late"]) > 2
+    by_topic = messages(tmp_path / "run")
+    assert len(by_topic["/latched"]) == 1  # published before the recorder started
+    assert len(by_topic["/relative/pressure"]) > 2
+    assert len(by_topic["/late"]) > 2
     assert errors(process) == []
 
 
-def test_a_weaker_publisher_that_comes_later_is_recorded_too(
+def test_a_later_publisher_with_a_weaker_qos_is_recorded(
     start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
 ) -> None:
     strong = peer_node.node.create_publisher(String, "/mixed", LATCHED)
@@ -138,10 +136,10 @@ def test_a_weaker_publisher_that_comes_later_is_recorded_too(
     assert sum(b"weak" in text for text in texts) > 2
 
 
-def test_a_topic_that_never_appears_is_named(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
+def test_a_topic_without_a_publisher_is_named(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
     process = recorder(start, osprey_gust, "run", "topics:=[/never]")
     process.wait_for("no publisher of /never; recording starts with the first one")
-    peer_node.until(lambda: said(peer_node)[2].get("missing /never") == "no publisher")
+    peer_node.until(lambda: diagnostics(peer_node)[2].get("missing /never") == "no publisher")
     stop(process)
     assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: it had no publisher" in line)
 
@@ -149,7 +147,7 @@ def test_a_topic_that_never_appears_is_named(start: Start, osprey_gust: Scenario
 def test_a_topic_whose_type_is_not_installed_is_named(
     start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
 ) -> None:
-    # The recorder runs in this folder, whose packages come first: there lifecycle_msgs has no messages.
+    # The recorder runs in this folder. Its packages precede the installed ones, and its lifecycle_msgs has no messages.
     (tmp_path / "lifecycle_msgs").mkdir()
     (tmp_path / "lifecycle_msgs" / "__init__.py").touch()
     peer_node.node.create_publisher(State, "/strange", LATCHED)
@@ -165,14 +163,14 @@ def test_a_publisher_of_another_type_is_named(start: Start, osprey_gust: Scenari
     stop(process)
 
 
-def test_a_topic_that_cannot_be_one_is_refused(start: Start, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_an_invalid_topic_name_is_rejected(start: Start, osprey_gust: Scenario, tmp_path: Path) -> None:
     process = recorder(start, osprey_gust, "run", "topics:=[a topic]")
     assert process.end() == 2
     assert errors(process) == ["error: recorder.topics: found 'a topic', expected the name of a topic"]
     assert not (tmp_path / "run").exists()
 
 
-def test_what_is_lost_is_counted_and_said(start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path) -> None:
+def test_lost_messages_are_counted_and_reported(start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path) -> None:
     process = recorder(start, osprey_gust, "run")
     process.wait_for("ready")
     names, sent = [f"x.{k}" for k in range(100)], 0
@@ -185,18 +183,18 @@ def test_what_is_lost_is_counted_and_said(start: Start, osprey_gust: Scenario, p
             sent += 1
             publisher.publish(to_message(sent, names, np.full(100, float(sent)), "peer"))
 
-    def send_to_one_that_stands_still(count: int) -> None:
+    def send_to_a_suspended_recorder(count: int) -> None:
         recording = psutil.Process(process.popen.pid)
         recording.suspend()
         send(count)
         recording.resume()
 
-    send_to_one_that_stands_still(1500)  # a publisher keeps 2000
+    send_to_a_suspended_recorder(1500)  # a publisher keeps a history of 2000
     peer_node.until(lambda: recorded(peer_node, "/truth") == sent)
-    assert "lost /truth" not in said(peer_node)[2]
-    send_to_one_that_stands_still(8000)  # and what the socket holds is less than the rest
-    peer_node.until(lambda: int(said(peer_node)[2].get("lost /truth", 0)) > 0)
-    peer_node.until(lambda: sent == recorded(peer_node, "/truth") + int(said(peer_node)[2]["lost /truth"]))
+    assert "lost /truth" not in diagnostics(peer_node)[2]
+    send_to_a_suspended_recorder(8000)  # more than that history and the socket buffer hold
+    peer_node.until(lambda: int(diagnostics(peer_node)[2].get("lost /truth", 0)) > 0)
+    peer_node.until(lambda: sent == recorded(peer_node, "/truth") + int(diagnostics(peer_node)[2]["lost /truth"]))
     stop(process)
     run = read_run(tmp_path / "run")
     lost = int(run.metadata["rise_di_lost"]["/truth"])
@@ -205,7 +203,7 @@ def test_what_is_lost_is_counted_and_said(start: Start, osprey_gust: Scenario, p
     assert f"/truth: the recorder lost {lost} messages" in run.tape.notes
 
 
-# A disk without space
+# A full disk
 
 
 @pytest.fixture
@@ -228,7 +226,7 @@ def publisher(domain: int) -> Iterator[subprocess.Popen[str]]:
     ("least", "reason"),
     [("0.0", "no space left for "), ("1.2", r"min_free: found \d\.\d MB free in .*, expected at least 1.2 MB")],
 )
-def test_a_full_disk_ends_the_log_with_one_error_and_not_the_flight(
+def test_a_full_disk_ends_the_recording_with_one_error_and_not_the_flight(
     least: str,
     reason: str,
     start: Start,
@@ -239,24 +237,24 @@ def test_a_full_disk_ends_the_log_with_one_error_and_not_the_flight(
 ) -> None:
     process = recorder(start, osprey_gust, disk / "run", f"min_free:={least}", "lockstep:=true")
     process.wait_for("recording ended")
-    peer_node.until(lambda: said(peer_node)[0] == 2)
-    _, sentence, figures = said(peer_node)
+    peer_node.until(lambda: diagnostics(peer_node)[0] == 2)
+    _, sentence, figures = diagnostics(peer_node)
     assert re.match(f"recording ended: {reason}", sentence)
-    # It goes on listening: in lockstep the aircraft would otherwise wait for it.
-    heard: list[object] = []
-    peer_node.node.create_subscription(Time, "recorded", heard.append, QoSProfile(depth=10))
-    peer_node.until(lambda: len(heard) > 5)
+    # The node goes on: in lockstep the aircraft waits for the topic `recorded`.
+    received: list[object] = []
+    peer_node.node.create_subscription(Time, "recorded", received.append, QoSProfile(depth=10))
+    peer_node.until(lambda: len(received) > 5)
     stop(process)
     assert len([line for line in errors(process) if "recording ended" in line]) == 1
     assert len(errors(process)) == 1
-    found = messages(disk / "run")
-    assert {topic: str(len(those)) for topic, those in found.items()} == {
+    by_topic = messages(disk / "run")
+    assert {topic: str(len(those)) for topic, those in by_topic.items()} == {
         key.removeprefix("messages "): value for key, value in figures.items() if key.startswith("messages ") and value != "0"
     }
     assert read_run(disk / "run").tape.notes == ()
 
 
-def test_too_little_space_at_the_start_is_refused(start: Start, osprey_gust: Scenario, disk: Path) -> None:
+def test_too_little_space_at_the_start_is_rejected(start: Start, osprey_gust: Scenario, disk: Path) -> None:
     process = recorder(start, osprey_gust, disk / "run")
     assert process.end() == 2
     assert re.fullmatch(
@@ -276,37 +274,37 @@ def wait_for_size(folder: Path, least: int, process: Process) -> None:
     while size(folder) < least:
         assert time.monotonic() < deadline, process.output
         assert process.popen.poll() is None, process.output
-        time.sleep(0.005)  # the file is the event; there is nothing to be told of it by
+        time.sleep(0.005)  # nothing signals the growth of a file
 
 
 def stamps_and_sequences(folder: Path) -> dict[str, tuple[list[int], list[int]]]:
-    """Stamps and sequences of what the file of a recorder holds, running or not, by topic."""
+    """Stamps and sequences in the file of a recorder, running or not, by topic."""
     names: dict[int, str] = {}
-    found: dict[str, tuple[list[int], list[int]]] = {}
+    by_topic: dict[str, tuple[list[int], list[int]]] = {}
     for path in folder.glob("*.mcap"):
         for record in Scan(path).records():
             if isinstance(record, Channel):
                 names[record.id] = record.topic
             elif isinstance(record, Message) and names[record.channel_id] in SIGNALS:
-                stamps, sequences = found.setdefault(names[record.channel_id], ([], []))
+                stamps, sequences = by_topic.setdefault(names[record.channel_id], ([], []))
                 stamps.append(stamp_of(record.data))
                 sequences.append(record.sequence)
-    return found
+    return by_topic
 
 
 SIGNALS = ("/y", "/y_m", "/u", "/internals", "/truth")
 
 
 def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
-    """How far the file of a recorder is behind what another process has received, on the topic on which it is furthest."""
-    received, found = witness.take(), stamps_and_sequences(folder)
-    if not received or set(found) != set(SIGNALS):
+    """Delay of a recorder's file behind the messages that another process received, of the topic with the largest delay, s."""
+    received, by_topic = witness.take(), stamps_and_sequences(folder)
+    if not received or set(by_topic) != set(SIGNALS):
         return float("inf")
     newest = stamp_of(received[-1].message)
-    return max(newest - stamps[-1] for stamps, _ in found.values()) / NANOSECONDS
+    return max(newest - stamps[-1] for stamps, _ in by_topic.values()) / NANOSECONDS
 
 
-def test_twenty_kills_cost_three_tenths_of_a_second_at_most(
+def test_twenty_killed_recorders_lose_at_most_three_tenths_of_a_second(
     start: Start, osprey_gust: Scenario, tmp_path: Path, publisher: subprocess.Popen[str], peer_node: Peer
 ) -> None:
     generator = np.random.default_rng(1)
@@ -316,19 +314,19 @@ def test_twenty_kills_cost_three_tenths_of_a_second_at_most(
     for k in range(20):
         process, folder = following, tmp_path / f"run{k}"
         wait_for_size(folder, 50_000, process)
-        while missing_seconds(folder, witness) > 0.2:  # it first takes the 2 s that the publishers have kept
+        while missing_seconds(folder, witness) > 0.2:  # at first it receives the history of 2 s that the publishers keep
             assert process.popen.poll() is None, process.output
         begin = {topic: sequences[-1] for topic, (_, sequences) in stamps_and_sequences(folder).items()}
         if k < 19:
-            following = recorder(start, osprey_gust, f"run{k + 1}")  # starts meanwhile
-        with pytest.raises(subprocess.TimeoutExpired):  # not an event to wait for: the instant is the case
+            following = recorder(start, osprey_gust, f"run{k + 1}")  # starts in the meantime
+        with pytest.raises(subprocess.TimeoutExpired):  # the random instant of the kill is the test case
             process.popen.wait(float(generator.uniform(0.0, 0.3)))
         process.popen.kill()
         missing.append(missing_seconds(folder, witness))
         assert process.end() == -signal.SIGKILL
         for topic, (_, sequences) in stamps_and_sequences(folder).items():
             since = [one for one in sequences if one >= begin[topic]]
-            assert since == list(range(since[0], since[-1] + 1)), topic  # nothing is missing before
+            assert since == list(range(since[0], since[-1] + 1)), topic  # no gap before the end
         assert not (folder / "metadata.yaml").exists()
         tape = read_run(folder).tape
         end = max(tape.time(name)[-1] for name in tape.signals)
@@ -338,7 +336,7 @@ def test_twenty_kills_cost_three_tenths_of_a_second_at_most(
     assert max(missing) < 0.3, missing
 
 
-def test_a_flight_whose_recorder_is_killed_has_a_report_and_a_log_that_can_be_repaired(
+def test_a_flight_with_a_killed_recorder_has_a_report_and_a_repairable_log(
     start: Start, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     flight = start("flight_cli.cli", "fly", str(osprey_gust.path), "--duration", "30")
@@ -374,5 +372,5 @@ def test_a_flight_whose_recorder_is_killed_has_a_report_and_a_log_that_can_be_re
 
 
 @pytest.mark.parametrize(("rate", "depth"), [(0.1, 1), (100.0, 200), (500.0, 1000), (1000.0, 2000), (5000.0, 2000)])
-def test_a_publisher_keeps_what_two_seconds_hold_for_a_recorder(rate: float, depth: int) -> None:
+def test_a_publisher_keeps_a_history_of_two_seconds_for_a_recorder(rate: float, depth: int) -> None:
     assert publisher_qos(period_ns(rate, "rate")).depth == depth

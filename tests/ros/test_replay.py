@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights over real DDS computed again from their logs: every bit, whatever happened to the controller or to the recorder."""
+"""Replay of flights over real DDS from their logs: bit by bit, after faults of the controller and of the recorder too."""
 
 import json
 from collections.abc import Iterator
@@ -31,12 +31,12 @@ def peer_node() -> Iterator[Peer]:
 
 
 def replayed(start: Start, run: Path, *settings: str, status: int = 0) -> dict[str, Any]:
-    """What `rise-di replay` says of a run."""
+    """The JSON output of `rise-di replay`."""
     process = start("flight_cli.cli", "replay", str(run), "--json", *settings)
     assert process.end() == status, process.output
-    found: dict[str, Any] = json.loads(process.output)
-    assert found["equal"] is (status == 0)
-    return found
+    output: dict[str, Any] = json.loads(process.output)
+    assert output["equal"] is (status == 0)
+    return output
 
 
 def fly(start: Start, scenario: Path, *options: str) -> Process:
@@ -44,32 +44,32 @@ def fly(start: Start, scenario: Path, *options: str) -> Process:
 
 
 def with_limits(path: Path) -> Path:
-    """The scenario with feedforward and with limits of magnitude and rate that it reaches."""
+    """The scenario with feedforward, and with magnitude and rate limits at which u saturates."""
     controller = with_feedforward(load_scenario(path).controller, load_airframe("osprey"))
     limits = {"lower": [-0.05] * 4, "upper": [0.01] * 4, "slew": [0.3] * 4}
     tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    plain = json.loads(json.dumps(nest(dict(flatten(controller.model_dump())))))
-    tree["/**/controller"]["ros__parameters"] = plain | limits
+    as_json = json.loads(json.dumps(nest(dict(flatten(controller.model_dump())))))
+    tree["/**/controller"]["ros__parameters"] = as_json | limits
     path.write_text(yaml.safe_dump(tree), encoding="utf-8")
     return path
 
 
 @pytest.mark.parametrize("options", [("--lockstep",), ("--one-process",)])
-def test_lockstep_with_feedforward_limits_and_lost_samples_comes_again(
+def test_lockstep_with_feedforward_saturation_and_lost_samples_is_replayed(
     options: tuple[str, ...], start: Start, tmp_path: Path
 ) -> None:
     flight = fly(start, with_limits(scenario_file(tmp_path, 4.0, aircraft=ROUGH)), *options)
     assert flight.end(timeout=120) == 0, flight.output
     run = tmp_path / "runs" / "latest"
-    found = replayed(start, run)
-    assert found["ticks"] == found["checked"] > 300
-    assert found["notes"] == []
+    output = replayed(start, run)
+    assert output["ticks"] == output["checked"] > 300
+    assert output["notes"] == []
     log = read_run(run).tape["internals"]
     assert set(log.group("limited").values.ravel()) == {0.0, 1.0, 2.0}
     assert log.group("u_ff").values.any()
 
 
-def test_a_flight_in_real_time_comes_again_through_changes_outages_and_a_busy_machine(
+def test_a_flight_in_real_time_is_replayed_with_parameter_changes_outages_and_a_busy_host(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
     flight = fly(start, scenario_file(tmp_path, 120.0, "osprey_gust"))  # ended below
@@ -91,22 +91,22 @@ def test_a_flight_in_real_time_comes_again_through_changes_outages_and_a_busy_ma
     peer_node.until(lambda: modes() == [Mode.INACTIVE])
     more(20)
     assert transition(peer_node, Transition.TRANSITION_CLEANUP)
-    assert transition(peer_node, Transition.TRANSITION_CONFIGURE)  # the law starts anew from the u that it was at
+    assert transition(peer_node, Transition.TRANSITION_CONFIGURE)  # the law re-engages from its last u
     assert transition(peer_node, Transition.TRANSITION_ACTIVATE)
     peer_node.until(lambda: modes() == [Mode.ENGAGED])
     more(50)
     flight.interrupt()
     assert flight.end(timeout=60) == 130, flight.output
     run = tmp_path / "runs" / "latest"
-    found = replayed(start, run)
-    assert found["ticks"] == found["checked"] > 150
-    changes = [note.split(": ")[1] for note in found["notes"] if note.startswith("parameters changed before tick")]
+    output = replayed(start, run)
+    assert output["ticks"] == output["checked"] > 150
+    changes = [note.split(": ")[1] for note in output["notes"] if note.startswith("parameters changed before tick")]
     assert changes == ["Lambda, k_g", "upper"]
-    # and one bit of one gain is found in it
+    # a change of one bit in one gain is detected
     assert replayed(start, run, "--set", "controller.k_g=1.0000000000000002", status=1)["open_loop"]
 
 
-def test_what_a_killed_recorder_left_comes_again(start: Start, tmp_path: Path) -> None:
+def test_the_log_of_a_killed_recorder_is_replayed(start: Start, tmp_path: Path) -> None:
     flight = fly(start, scenario_file(tmp_path, 30.0, "osprey_gust"), "--lockstep")
     log: list[Path] = []
 
@@ -118,19 +118,19 @@ def test_what_a_killed_recorder_left_comes_again(start: Start, tmp_path: Path) -
         peer_node.until(written, timeout=60.0)
     next(one for one in flight.children() if "flight_recorder.main" in one.cmdline()).kill()
     assert flight.end(timeout=60) == 3, flight.output
-    found = replayed(start, log[0].parent)
-    assert found["ticks"] == found["checked"] > 100
-    assert any("is truncated" in note for note in found["notes"])
+    output = replayed(start, log[0].parent)
+    assert output["ticks"] == output["checked"] > 100
+    assert any("is truncated" in note for note in output["notes"])
 
 
-def test_a_recorder_that_comes_late_leaves_its_first_tick_unchecked_and_says_what_is_missing(
+def test_a_late_recorder_leaves_its_first_tick_unchecked_and_notes_the_missing_samples(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
     scenario = scenario_file(tmp_path, 1e3, "osprey_gust")
     for module in ("rise_di_controller", "aircraft_sim", "reference_model"):
         start(f"{module}.main", "--ros-args", "--params-file", str(scenario))
-    more_than_kept = PUBLISH.depth + 200
-    peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_kept, timeout=90.0)
+    more_than_history = PUBLISH.depth + 200
+    peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_history, timeout=90.0)
     recorder = start(
         *("flight_recorder.main", "--ros-args", "--params-file", str(scenario)),
         *("-p", f"scenario_file:={scenario}", "-p", "directory:=run"),
@@ -140,6 +140,6 @@ def test_a_recorder_that_comes_late_leaves_its_first_tick_unchecked_and_says_wha
     peer_node.until(lambda: len(peer_node.received["internals"]) > count + 200)
     recorder.interrupt()
     assert recorder.end() == 0, recorder.output
-    found = replayed(start, tmp_path / "run")
-    assert found["checked"] == found["ticks"] - 1 > 200
-    assert any(note.startswith("the log begins with sample ") for note in found["notes"])
+    output = replayed(start, tmp_path / "run")
+    assert output["checked"] == output["ticks"] - 1 > 200
+    assert any(note.startswith("the log begins with sample ") for note in output["notes"])
