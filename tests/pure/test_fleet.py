@@ -91,7 +91,7 @@ FEEDFORWARD = with_feedforward(SERVO.controller, load_airframe("osprey")).model_
             id="bias, drift, coarse and late y",
         ),
         pytest.param(
-            SERVO.vary(aircraft={**AT_TICKS["aircraft"], "sensors": {"dropout": 0.3, "seed": 3}}), id="three in ten y lost"
+            SERVO.vary(aircraft={**AT_TICKS["aircraft"], "sensors": {"dropout": 0.3, "seed": 3}}), id="dropout of 30 % of y"
         ),
         pytest.param(
             SERVO.vary(
@@ -135,7 +135,7 @@ def test_every_aircraft_can_have_its_own_gains_wind_and_delay() -> None:
     for k in range(4):
         single = fleet.assemble(A, B, plant, course, wind[k], late[k])
         apart = fleet.fly(single, vehicle, course, control_law, params._replace(beta=beta[:, k : k + 1]))
-        # The same operations; only their order in sums may differ with the width of the machine's vectors.
+        # The same operations; only their order in sums may differ with the vector width of the CPU.
         assert np.asarray(together.rms)[:, k] == pytest.approx(np.asarray(apart.rms)[:, 0], rel=1e-9)
     rms = np.asarray(together.rms)
     assert rms[0, 1] < 0.5 * rms[0, 0]  # without the gust q has its largest error no more
@@ -146,19 +146,19 @@ def test_every_aircraft_can_have_its_own_gains_wind_and_delay() -> None:
 def _pulse(delay: int) -> ControlLaw:
     """An open-loop control law: one pulse of the elevator, delayed by so many ticks."""
 
-    def start(seen: Measurements, params: Any) -> Array:
-        return 0.0 * seen.y[:1] + 1.0
+    def start(measured: Measurements, params: Any) -> Array:
+        return 0.0 * measured.y[:1] + 1.0
 
-    def step(state: Array, seen: Measurements, dt: Array, params: Any) -> tuple[Array, Array]:
+    def step(state: Array, measured: Measurements, dt: Array, params: Any) -> tuple[Array, Array]:
         inside = (state >= 10.0 + delay) & (state < 30.0 + delay)
-        return state + 1.0, 0.0 * seen.y + 0.05 * inside * np.array([[1.0], [0.0], [0.0], [0.0]])
+        return state + 1.0, 0.0 * measured.y + 0.05 * inside * np.array([[1.0], [0.0], [0.0], [0.0]])
 
     return ControlLaw(start, step)
 
 
 def test_a_late_u_acts_that_many_ticks_later() -> None:
-    calm = SERVO.vary(aircraft={"gusts": {}}, flight={"duration": 2.0})
-    course, vehicle, plant = build_course(calm), fleet.vehicle(calm), calm.aircraft.plant()
+    undisturbed = SERVO.vary(aircraft={"gusts": {}}, flight={"duration": 2.0})
+    course, vehicle, plant = build_course(undisturbed), fleet.vehicle(undisturbed), undisturbed.aircraft.plant()
     A, B = sampled_matrices(load_airframe("osprey"), 0.0, 0.0, 1, 0, 1)
     late = fleet.fly(fleet.assemble(A, B, plant, course, late=3), vehicle, course, _pulse(0), ())
     later = fleet.fly(fleet.assemble(A, B, plant, course), vehicle, course, _pulse(3), ())

@@ -153,7 +153,7 @@ def test_bounds_of_U_are_those_of_the_worst_sample() -> None:
 
 
 def test_n_d_is_minus_D_U_v_dot() -> None:
-    # M Omega v_dot with M = S^-1, whatever Omega: what the ideal control has to cancel
+    # M Omega v_dot with M = S^-1, for any Omega: the disturbance that the ideal control cancels
     Omega, v_dot = np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([[0.3, -0.7], [1.0, 2.0]])
     expected = [-np.linalg.solve(decompose(Omega).S, Omega @ row) for row in v_dot]
     np.testing.assert_allclose(gain_conditions.N_d(Omega, v_dot), expected, atol=1e-12)
@@ -172,7 +172,7 @@ def test_the_slew_of_the_ideal_control_of_the_osprey_is_that_of_earlier_measurem
 
 
 def test_u_of_a_loop_with_small_error_is_the_ideal_control(osprey_gust: Scenario) -> None:
-    # The rate of u of the flown law is the reference: the implicit sign holds e below 1e-3, so u is u* but for sampling.
+    # The rate of u in the simulation is the reference: the implicit sign keeps e below 1e-3, so u is u* up to sampling.
     short = osprey_gust.vary(flight={"duration": 4.0})
     airframe = load_airframe("osprey")
     found = selection.study_airframe(airframe, selection.manoeuvre(short, airframe), samples=0)
@@ -208,7 +208,7 @@ def test_the_engineering_gains_of_the_osprey_are_close_to_those_tuned_by_hand(se
     controller = selected.engineering.controller
     params = controller.law()
     assert controller.outputs == ("q", "p", "r", "V")  # the slowest last, as (22) wants it
-    # Chosen by hand and flown: K = (18, 18, 9, 2). The crossover lag products are those of these gains, rounded: 2 %.
+    # Tuned by hand in flight: K = (18, 18, 9, 2). The crossover lag products are those of these gains, rounded: 2 %.
     np.testing.assert_allclose(params.K, [18.0, 18.0, 9.0, 2.0], rtol=0.02)
     np.testing.assert_allclose(params.Lambda, [5.0, 5.0, 3.0, 0.5], rtol=0.25)  # a quarter of K, by hand up to a third
     np.testing.assert_allclose(params.eps * params.K / params.beta, 2.75 * np.array([0.035, 0.035, 0.035, 0.115]))  # T_eps

@@ -114,7 +114,7 @@ def test_drift_and_even_parts_of_the_response_cancel() -> None:
 
 
 def test_the_largest_step_determines_omega_behind_a_dead_zone() -> None:
-    # Half a dead zone of 0.06 hides the step of 0.05 and takes 30 % of that of 0.2: the slope seen is 0.7 of the true one.
+    # Half a dead zone of 0.06 hides the step of 0.05 and removes 30 % of that of 0.2: the slope is 0.7 of the true one.
     straight = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
 
     def dead(u: FloatArray, duration: float) -> FloatArray:
@@ -169,7 +169,7 @@ def test_the_commanded_airspeed_needs_a_third_of_the_throttle(speed: float, auth
     steepest = float(np.max(np.abs(np.diff(samples)))) * params.rate
     assert steepest <= min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e) * 1.001
     assert steepest == pytest.approx(min(AUTHORITY_FRACTION * authority, 1.2 * HEIGHTS["V"] / math.e), rel=0.02)
-    assert max(params.pulses["q"].value) * speed <= GRAVITY * (1.0 + 1e-9)  # no more than 1 g beside its own
+    assert max(params.pulses["q"].value) * speed <= GRAVITY * (1.0 + 1e-9)  # at most 1 g in addition to gravity
 
 
 @pytest.mark.parametrize(("altitude", "keys"), [(100.0, {"wind"}), (500.0, {"wind", "sigma"}), (3000.0, {"sigma"})])

@@ -3,8 +3,8 @@
 # ruff: noqa: N802 - V1, V2, P, K are the paper's names
 """The theorem's Lyapunov functions along flights of the law as it is sampled.
 
-In continuous time V2_dot = -z'Qz exactly, so V2 falls wherever `decay` is positive definite, whatever beta is. What beta
-decides is P: it stays above zero, and so V2 bounds e and r, only where (29), (30) hold.
+In continuous time V2_dot = -z'Qz exactly, so V2 falls if `decay_matrix` is positive definite, for any beta. beta
+determines P: P stays above zero, and V2 bounds e and r, only if (29), (30) hold.
 """
 
 from dataclasses import replace
@@ -34,7 +34,7 @@ from rise_di_controller.decomposition import decompose
 from rise_di_controller.law import LawParams, Sign
 
 PERIODS = (0.02, 0.01, 0.005, 0.0025)
-TOO_SMALL = 0.05  # times beta: 0.25 and 0.15, where (29), (30) ask for 1.7 and 1.7
+TOO_SMALL = 0.05  # times beta: 0.25 and 0.15, where (29), (30) require 1.7 and 1.7
 
 
 def fly_example(dt: float, duration: float, **gains: Any) -> tuple[Example, LawParams, Evidence]:
@@ -131,7 +131,7 @@ def test_with_beta_too_small_P_falls_below_every_constant_and_e_stays() -> None:
     assert tail(bad.e, bad.t, 20.0) > 0.25  # measured 0.31
     assert bad.P[-1] < -lemma_2(case.plant, good, params)  # the constant that carries the good gains: -9.1 against 5.4
     half = len(bad.t) // 2
-    assert bad.P[-1] - bad.P[half] < 0.5 * (bad.P[half] - bad.P[0])  # and it goes on falling: -5.5, -9.1
+    assert bad.P[-1] - bad.P[half] < 0.5 * (bad.P[half] - bad.P[0])  # and it keeps falling: -5.5, -9.1
     with pytest.raises(ValueError, match=r"beta\[0\]: found 0.25, expected at least"):
         lemma_2(case.plant, bad, weak)
 

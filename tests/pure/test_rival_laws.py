@@ -165,7 +165,7 @@ def test_lqi_is_the_limit_of_a_long_finite_horizon(osprey: NominalModel) -> None
     # what decays with LEAK alone, 0.01 1/s, is not in the gain; the loop's own modes have 50 s to end
     np.testing.assert_allclose(found, recursion(F, G, Q, R, 5000), rtol=1e-6, atol=1e-6)
     slow = np.sort(np.abs(np.linalg.eigvals(F - G @ found)))
-    # two angles and four references decay with LEAK, whatever the gain; all other modes of the loop are faster than 0.3 1/s
+    # two angles and four references decay with LEAK for any gain; all other modes of the loop are faster than 0.3 1/s
     assert np.all(slow[-6:] == pytest.approx(np.exp(-lqi.LEAK * osprey.period), abs=1e-6))
     assert slow[-7] < np.exp(-0.3 * osprey.period)
 
@@ -229,7 +229,7 @@ def test_l1_with_feedforward_does_not_cancel_the_disturbance_twice() -> None:
     control_law, params = adaptive.l1(model, feedforward=True), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), model)
     y, state, u = 0.0, None, np.zeros(COLUMN)
     d, y_m_dot = 0.7, 0.5
-    u_ff = np.full(COLUMN, (y_m_dot - d) / model.Omega[0, 0])  # a model that knows d
+    u_ff = np.full(COLUMN, (y_m_dot - d) / model.Omega[0, 0])  # a model with d
     for k in range(500):
         measured = at(y, y_m_dot * k * DT, y_m_dot=np.full(COLUMN, y_m_dot), u_ff=u_ff, u_before=u)
         state = control_law.start(measured, params) if state is None else state
@@ -336,7 +336,7 @@ def test_the_observer_converges_to_states_wind_and_disturbance_of_its_model(ospr
         z_hat = z_hat + correction @ (estimator.H @ (z - z_hat))
         z, z_hat = estimator.F @ z + estimator.G @ u, estimator.F @ z_hat + estimator.G @ u
     # angles and disturbances that only together move V end within 1 / LEAK = 100 s, so exp(-0.3) of them is left after 30 s;
-    # what moves the outputs is known: the prediction of e a second ahead
+    # the combination that acts on the outputs is observable: compare the prediction of e one second ahead
     ahead = np.linalg.matrix_power(estimator.F, 100)
     assert np.abs(estimator.H @ ahead @ (z - z_hat)).max() < 1e-4
     assert np.abs(np.linalg.eigvals(estimator.F - estimator.F @ correction @ estimator.H)).max() < 1.0

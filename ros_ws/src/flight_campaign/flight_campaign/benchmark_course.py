@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aircraft_sim import plant as flown
+from aircraft_sim import plant as plant_model
 from aircraft_sim import sensors, turbulence
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.plant import PlantParams
@@ -68,7 +68,7 @@ def build_course(scenario: Scenario, nominal: Nominal | None = None) -> Course:
     errors = aircraft.sensor_arrays()
     late = divide(errors.delay_ns, tick_ns, "sensors.delay", "a tick") if errors.delay_ns else 0
     lossless = errors.dropout == 0.0 or tick_ns == sample_ns
-    require(lossless, "aircraft.rate", f"{aircraft.rate:g} Hz", f"controller.rate ({controller.rate:g} Hz) where y is lost")
+    require(lossless, "aircraft.rate", f"{aircraft.rate:g} Hz", f"controller.rate ({controller.rate:g} Hz) with dropouts")
     error, drift = np.zeros((ticks, len(outputs))), sensors.initial_drift(errors)
     for k in range(ticks):
         error[k], drift = sensors.error(k * (tick_ns // sample_ns), drift, errors)
@@ -140,7 +140,7 @@ def _feedforward(nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArr
 
 def _wind(ticks: int, steps: int, plant: PlantParams, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Forcing of x_dot in time: mean over each step (T K, n), at each tick (T, n); the wind's contribution to the angles."""
-    forced = flown.forcing(0, ticks * steps, plant)
+    forced = plant_model.forcing(0, ticks * steps, plant)
     direction = np.asarray(plant.aircraft.gust_direction)
     gusting = np.zeros((ticks * steps, direction.shape[1]))
     if (air := plant.turbulence) is not None:

@@ -42,7 +42,7 @@ class Sweep(Parameters):
 
 
 class Definition(Parameters):
-    """All inputs of a campaign's figures, except the version of the stack and the machine's arithmetic."""
+    """All inputs of a campaign's figures, except the version of the stack and the arithmetic of the CPU."""
 
     name: str  # of the scenario
     sections: dict[str, object]  # of the scenario, every parameter
@@ -55,7 +55,7 @@ class Definition(Parameters):
     def scenario(self, case: int = 0) -> Scenario:
         """The scenario of a case of the sweep, the airframe as published."""
         sections = {name: schema.validate_mapping(_mapping(self.sections[name]), name) for name, schema in SCHEMAS.items()}
-        scenario = Scenario(name=self.name, path=Path(self.name), **sections)  # type: ignore[arg-type]  # SCHEMAS says each type
+        scenario = Scenario(name=self.name, path=Path(self.name), **sections)  # type: ignore[arg-type]  # the types are those of SCHEMAS
         check_together(scenario)
         if self.sweep is None:
             return scenario

@@ -58,7 +58,7 @@ def _labels(definition: Definition) -> list[str]:
 
 
 def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
-    columns = [Column(word, head) for word in ("diverged", "lost") for head in ("aircraft", "%", "95 % interval")]
+    columns = [Column(word, head) for word in ("diverged", "loss of track") for head in ("aircraft", "%", "95 % interval")]
     rows = []
     for label, case in zip(labels, cases, strict=True):
         row = [label]

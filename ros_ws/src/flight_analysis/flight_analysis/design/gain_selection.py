@@ -428,7 +428,7 @@ def assess_gains(study: Study, controller: ControllerParameters, setting: LoopSe
     Theorem: "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of (29), (30), steps 2 and
     3 are the largest over the samples for which both hold. "V2_dot" is the smallest eigenvalue of Q in V2_dot = -z'Qz over
     these samples; steps 2 and 3 are sufficient for Q > 0. Loop: `check_loop`, the fraction of the samples for which the linear
-    loop is stable, and its delay margin on the nominal airframe, which should be at least one period, for one lost tick. With
+    loop is stable, and its delay margin on the nominal airframe, which should be at least one period: a missed tick. With
     the implicit sign the linear loop is the one inside the width of the sign, dt^2 omega beta. Its margin is then the delay at
     which chatter begins, and at most half a period.
     """
