@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""docs/evidence.md from measurements: runs what has not been measured yet, keeps each result, writes the page from the results.
+"""Writes docs/evidence.md from measurements: runs the missing ones, stores each result, renders the page from the results.
 
-    make evidence                              # what is missing, then the page
-    make evidence ARGS="--again faults"        # this one anew; "speed" is all that begins so; may be given several times
-    make evidence ARGS=--quick                 # short versions, which the page marks
-    make evidence ARGS=--render                # the page alone, from what is there
+    make evidence                              # the missing measurements, then the page
+    make evidence ARGS="--again faults"        # measure this one again; "speed" is all that begin so; repeatable
+    make evidence ARGS=--quick                 # short versions; the page marks them
+    make evidence ARGS=--render                # only the page, from the stored results
 
-Results are kept in build/evidence/, one file each with its command, date, machine, and how busy that was before. A measurement
-that fails is kept as failed, and the page says so; nothing on the page is written by hand but the words around the figures.
+build/evidence/ holds one file for each result, with its command, date, host, and the load of the host before. A failed
+measurement is stored as failed and marked on the page. The text around the figures is in evidence.md.j2.
 """
 
 import argparse
@@ -30,63 +30,61 @@ import psutil
 from benchmarks.evidence_page import SPEED, Measurement, Result, render
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-KEPT = REPOSITORY / "build" / "evidence"
+RESULTS = REPOSITORY / "build" / "evidence"
 PAGE = REPOSITORY / "docs" / "evidence.md"
 
-LOOK = 2.0  # s, before a measurement, at how busy the machine is
+LOAD_INTERVAL = 2.0  # s before a measurement, over which the load of the host is measured
 
-FILE, SHORT = "FILE", "python"  # as commands are shown
-
-
-PYTEST = (SHORT, "-m", "pytest", "-q", f"--junitxml={FILE}")
+FILE, PYTHON = "FILE", "python"  # placeholders in commands
+PYTEST = (PYTHON, "-m", "pytest", "-q", f"--junitxml={FILE}")
 QUICK_SECONDS = 2.0
 
 
 def _speed(group: str) -> Measurement:
     what, seconds = SPEED[group]
-    command = (SHORT, "-m", "benchmarks.speed", "--only", group, "--json", FILE, "--seconds")
+    command = (PYTHON, "-m", "benchmarks.speed", "--only", group, "--json", FILE, "--seconds")
     takes = {"law": "10 s", "ticks": "8 min", "latency": "3 min"}.get(group, "1 min")
     return Measurement(f"speed-{group}", (*command, f"{seconds:g}"), (*command, f"{QUICK_SECONDS:g}"), what, takes, timed=True)
 
 
 def _own(task: str, *options: str) -> tuple[str, ...]:
-    return (SHORT, "-m", "benchmarks.evidence", "--do", task, "--json", FILE, *options)
+    return (PYTHON, "-m", "benchmarks.evidence", "--do", task, "--json", FILE, *options)
 
 
-FAULTS = (SHORT, "-m", "benchmarks.faults", "--json", FILE, "--times")
-CAMPAIGN = (SHORT, "-m", "benchmarks.campaign", "--json", FILE)
+FAULTS = (PYTHON, "-m", "benchmarks.faults", "--json", FILE, "--times")
+CAMPAIGN = (PYTHON, "-m", "benchmarks.campaign", "--json", FILE)
 FLEET = ("rise-di", "campaign", "osprey_servo", "--uncertainty", "0.3", "--seed", "7", "--json", "--aircraft")
 COMPARE = ("rise-di", "compare", "osprey_servo", "--tuning", "nominal,uncertain,late", "--json", FILE, "--aircraft")
 
 MEASUREMENTS = (
     *(_speed(group) for group in SPEED),
-    Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), "faults put into a flight over DDS", "20 min", timed=True),
+    Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), "faults injected into a flight over DDS", "20 min", timed=True),
     Measurement(
         "security",
         (*PYTEST, "tests/ros/test_security.py", "tests/ros/test_policy.py"),
         (*PYTEST, "tests/ros/test_security.py"),
-        "who can hear y and have a u flown",
+        "who can receive y and command u",
         "2 min",
     ),
-    Measurement("fuzz", (*PYTEST, "tests/fuzz"), (*PYTEST, "tests/fuzz"), "inputs from outside, by hypothesis", "2 min"),
+    Measurement("fuzz", (*PYTEST, "tests/fuzz"), (*PYTEST, "tests/fuzz"), "external input, fuzzed by hypothesis", "2 min"),
     Measurement(
         "fuzz-coverage",
         _own("fuzz", "--seconds", "120"),
         _own("fuzz", "--seconds", "5"),
-        "readers of files and messages, guided by the lines that they run",
+        "readers of files and messages, coverage-guided fuzzing",
         "12 min",
     ),
     Measurement(
         "campaign",
         CAMPAIGN,
         (*CAMPAIGN, "--aircraft", "2000", "--chunk", "200", "--exact", "1"),
-        "speed and exactness of campaigns",
+        "speed and accuracy of campaigns",
         "3 min",
         timed=True,
     ),
     Measurement("campaign-fleet", (*FLEET, "10000"), (*FLEET, "1000"), "uncertain aircraft flown by the same law", "1 min"),
     Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), "other laws on the same aircraft and course", "5 min"),
-    Measurement("replay", _own("replay"), _own("replay", "--seconds", "5"), "every scenario flown and recomputed", "2 min"),
+    Measurement("replay", _own("replay"), _own("replay", "--seconds", "5"), "every scenario flown and replayed", "2 min"),
 )
 
 
@@ -94,24 +92,24 @@ MEASUREMENTS = (
 
 
 def measure(one: Measurement, *, quick: bool) -> Result:
-    """Run it, and what it left behind, with what is known of the run."""
-    shown = one.quick if quick else one.command
-    busy = psutil.cpu_percent(interval=LOOK) / 100.0
+    """Run a measurement; its result with command, date, revision, host and status."""
+    parts = one.quick if quick else one.command
+    busy = psutil.cpu_percent(interval=LOAD_INTERVAL) / 100.0
     begin, date = time.monotonic(), datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     with tempfile.TemporaryDirectory() as folder:
-        left = Path(folder) / ("left.xml" if "--junitxml=FILE" in shown else "left.json")
-        programs = {SHORT: sys.executable, "rise-di": str(Path(sys.executable).parent / "rise-di")}
-        command = [programs.get(part, part.replace(FILE, str(left))) for part in shown]
-        if shown[:2] == FLEET[:2]:
+        file = Path(folder) / ("result.xml" if "--junitxml=FILE" in parts else "result.json")
+        programs = {PYTHON: sys.executable, "rise-di": str(Path(sys.executable).parent / "rise-di")}
+        command = [programs.get(part, part.replace(FILE, str(file))) for part in parts]
+        if parts[:2] == FLEET[:2]:
             command += ["--runs", folder]
-        log = KEPT / f"{one.name}.log"
+        log = RESULTS / f"{one.name}.log"
         with log.open("w", encoding="utf-8") as stream:
             ran = subprocess.run(command, cwd=REPOSITORY, check=False, stdout=subprocess.PIPE, stderr=stream, text=True)  # noqa: S603
             stream.write(ran.stdout)
-        result = read(left, ran.stdout)
+        result = read(file, ran.stdout)
     return {
         "name": one.name,
-        "command": " ".join(shown),
+        "command": " ".join(parts),
         "quick": quick,
         "date": date,
         "revision": revision(),
@@ -123,30 +121,30 @@ def measure(one: Measurement, *, quick: bool) -> Result:
     }
 
 
-def read(left: Path, output: str) -> Any:
-    """What a program left: its JSON file, the cases of its JUnit file, else its output as JSON; None where it is none."""
+def read(file: Path, output: str) -> Any:
+    """The result of a program: its JSON file, the cases of its JUnit file, else its output as JSON; None if none is valid."""
     try:
-        if left.suffix == ".xml":
-            return cases(left.read_text(encoding="utf-8"))
-        return json.loads(left.read_text(encoding="utf-8") if left.exists() else output)
+        if file.suffix == ".xml":
+            return cases(file.read_text(encoding="utf-8"))
+        return json.loads(file.read_text(encoding="utf-8") if file.exists() else output)
     except (OSError, ValueError, ElementTree.ParseError):
         return None
 
 
 def cases(junit: str) -> list[dict[str, Any]]:
     """Test cases of a JUnit file: name, outcome ("passed", "failed", "skipped"), seconds."""
-    found = []
+    outcomes = []
     for case in ElementTree.fromstring(junit).iter("testcase"):  # noqa: S314 - pytest's own
         kinds = {child.tag for child in case}
         outcome = "failed" if kinds & {"failure", "error"} else "skipped" if "skipped" in kinds else "passed"
-        found.append({"name": case.get("name", ""), "outcome": outcome, "seconds": float(case.get("time", "0"))})
-    return found
+        outcomes.append({"name": case.get("name", ""), "outcome": outcome, "seconds": float(case.get("time", "0"))})
+    return outcomes
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on."""
-    about = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
-    model = re.search(r"^model name\s*: (.+)$", about, re.MULTILINE)
+    """The host of the measurement."""
+    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
+    model = re.search(r"^model name\s*: (.+)$", cpuinfo, re.MULTILINE)
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     return {
         "processor": model.group(1) if model else platform.machine(),
@@ -158,12 +156,12 @@ def machine() -> dict[str, Any]:
 
 
 def revision() -> str:
-    """The commit, and whether anything but the page differs from it."""
-    changed = _said("git", "status", "--porcelain", "--", ".", f":(exclude){PAGE.relative_to(REPOSITORY)}")
-    return _said("git", "describe", "--always") + ("-dirty" if changed else "")
+    """The commit, with -dirty if any file but the page differs from it."""
+    changed = _output("git", "status", "--porcelain", "--", ".", f":(exclude){PAGE.relative_to(REPOSITORY)}")
+    return _output("git", "describe", "--always") + ("-dirty" if changed else "")
 
 
-def _said(*command: str) -> str:
+def _output(*command: str) -> str:
     ran = subprocess.run(command, cwd=REPOSITORY, check=False, capture_output=True, text=True)  # noqa: S603
     return ran.stdout.strip()
 
@@ -172,89 +170,89 @@ def replays(seconds: float | None) -> dict[str, Any]:
     """Fly every scenario in lockstep over topics, recorded, and recompute its u from its log."""
     from flight_bringup.scenarios import scenarios  # noqa: PLC0415 - not needed to write the page
 
-    rise_di, found = str(Path(sys.executable).parent / "rise-di"), {}
+    rise_di, results = str(Path(sys.executable).parent / "rise-di"), {}
     duration = [] if seconds is None else ["--duration", f"{seconds:g}"]
     for name in scenarios():
         with tempfile.TemporaryDirectory() as runs:
             fly = [rise_di, "fly", name, "--one-process", "--runs", runs, "--json", *duration]
-            flown = subprocess.run(fly, check=False, capture_output=True, text=True)  # noqa: S603 - this stack
-            again = [rise_di, "replay", str(Path(runs) / "latest"), "--json"]
-            replayed = subprocess.run(again, check=False, capture_output=True, text=True)  # noqa: S603 - this stack
+            flight = subprocess.run(fly, check=False, capture_output=True, text=True)  # noqa: S603 - this stack
+            replay = [rise_di, "replay", str(Path(runs) / "latest"), "--json"]
+            replayed = subprocess.run(replay, check=False, capture_output=True, text=True)  # noqa: S603 - this stack
             try:
-                found[name] = {"outcome": json.loads(flown.stdout)["outcome"]} | json.loads(replayed.stdout)
+                results[name] = {"outcome": json.loads(flight.stdout)["outcome"]} | json.loads(replayed.stdout)
             except (ValueError, KeyError):
-                found[name] = {"outcome": (flown.stderr + replayed.stderr).strip().splitlines()[-1:]}
-    return found
+                results[name] = {"outcome": (flight.stderr + replayed.stderr).strip().splitlines()[-1:]}
+    return results
 
 
 def fuzz(seconds: float) -> dict[str, Any]:
-    """Every target of benchmarks/fuzz.py for so long: what its fuzzer says of itself, and whether it found anything."""
+    """Fuzz every target of benchmarks/fuzz.py for `seconds`: statistics of the fuzzer and its exit status."""
     from tests.fuzz.targets import TARGETS  # noqa: PLC0415 - not needed to write the page
 
-    found = {}
+    results = {}
     for target in TARGETS:
         command = [sys.executable, "-m", "benchmarks.fuzz", target, "--seconds", f"{seconds:.0f}"]
         ran = subprocess.run(command, cwd=REPOSITORY, check=False, capture_output=True, text=True)  # noqa: S603 - this repository
         stats = re.findall(r"^stat::(\w+):\s+(\d+)", ran.stderr, re.MULTILINE)
         covered = re.findall(r"cov: (\d+)", ran.stderr)
-        found[target] = {"status": ran.returncode, "covered": int(covered[-1]) if covered else None}
-        found[target] |= {name: int(value) for name, value in stats}
-    return found
+        results[target] = {"status": ran.returncode, "covered": int(covered[-1]) if covered else None}
+        results[target] |= {name: int(value) for name, value in stats}
+    return results
 
 
 # The command
 
 
 def load() -> dict[str, Result]:
-    """The results that are there, by name."""
-    found = {}
+    """The stored results, by name."""
+    results = {}
     for one in MEASUREMENTS:
-        path = KEPT / f"{one.name}.json"
+        path = RESULTS / f"{one.name}.json"
         if path.exists():
-            found[one.name] = json.loads(path.read_text(encoding="utf-8"))
-    return found
+            results[one.name] = json.loads(path.read_text(encoding="utf-8"))
+    return results
 
 
-def wanted(names: Sequence[str], there: Mapping[str, Result], *, quick: bool) -> list[Measurement]:
-    """What is to be measured: what is missing, failed or, unless `quick`, a short version, and what is asked for anew."""
+def wanted(names: Sequence[str], stored: Mapping[str, Result], *, quick: bool) -> list[Measurement]:
+    """Measurements to run: missing, failed, short (unless `quick`), and those whose names begin with one of `names`."""
 
     def stale(one: Measurement) -> bool:
-        result = there.get(one.name)
+        result = stored.get(one.name)
         return result is None or result["result"] is None or (result["quick"] and not quick)
 
     return [one for one in MEASUREMENTS if stale(one) or one.name.startswith(tuple(names))]
 
 
 def main() -> int:
-    """Measure, keep, write the page."""
+    """Measure, store, render the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--again", action="append", default=[], metavar="NAME", help="measure anew what begins so, that alone")
+    parser.add_argument("--again", action="append", default=[], metavar="NAME", help="only measure again what begins so")
     parser.add_argument("--quick", action="store_true", help="short versions")
-    parser.add_argument("--render", action="store_true", help="write the page from what is there")
+    parser.add_argument("--render", action="store_true", help="write the page from the stored results")
     parser.add_argument("--do", choices=("replay", "fuzz"), help=argparse.SUPPRESS)
     parser.add_argument("--json", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--seconds", type=float, help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.do is not None:
-        did = replays(asked.seconds) if asked.do == "replay" else fuzz(asked.seconds or 60.0)
-        asked.json.write_text(json.dumps(did, indent=1), encoding="utf-8")
+    options = parser.parse_args()
+    if options.do is not None:
+        result = replays(options.seconds) if options.do == "replay" else fuzz(options.seconds or 60.0)
+        options.json.write_text(json.dumps(result, indent=1), encoding="utf-8")
         return 0
-    unknown = [name for name in asked.again if not any(one.name.startswith(name) for one in MEASUREMENTS)]
+    unknown = [name for name in options.again if not any(one.name.startswith(name) for one in MEASUREMENTS)]
     if unknown:
         parser.error(f"--again: found {unknown[0]!r}, expected one of {', '.join(one.name for one in MEASUREMENTS)}")
-    KEPT.mkdir(parents=True, exist_ok=True)
+    RESULTS.mkdir(parents=True, exist_ok=True)
     results = load()
-    todo = [] if asked.render else wanted(asked.again, results, quick=asked.quick)
-    if asked.again:
-        todo = [one for one in todo if one.name.startswith(tuple(asked.again))]
+    todo = [] if options.render else wanted(options.again, results, quick=options.quick)
+    if options.again:
+        todo = [one for one in todo if one.name.startswith(tuple(options.again))]
     failed = False
     for number, one in enumerate(todo, 1):
-        takes = "" if asked.quick else f" (about {one.takes})"
+        takes = "" if options.quick else f" (about {one.takes})"
         print(f"[{number} of {len(todo)}] {one.name}: {one.what}{takes} ...", end=" ", flush=True)
-        result = measure(one, quick=asked.quick)
-        (KEPT / f"{one.name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        result = measure(one, quick=options.quick)
+        (RESULTS / f"{one.name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
         results[one.name] = result
-        PAGE.write_text(render(MEASUREMENTS, results), encoding="utf-8")  # as far as it is: a long run may be broken off
+        PAGE.write_text(render(MEASUREMENTS, results), encoding="utf-8")  # after each result: a long run may be interrupted
         ended = "done" if result["status"] == 0 else f"exit status {result['status']}, see build/evidence/{one.name}.log"
         failed = failed or result["status"] != 0
         print(f"{ended}, {result['seconds']:.0f} s", flush=True)

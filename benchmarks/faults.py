@@ -4,10 +4,10 @@
 
     .venv/bin/python -m benchmarks.faults [--times 10] [--json FILE] [--only "killed or stopped"]
 
-Reaction: from the fault to the first that anybody notices it. Recovery: from the fault's end, of a killed node from its being
-ready, to the law flying again. An instant is that at which the middleware had the message that tells of it. Where the machine
-held a process of the flight back for longer than QUIET, the times are the machine's too: those runs count, their times do
-not, unless there are no others; then the row is marked.
+Reaction: from the fault to its first detection by a node. Recovery: from the end of the fault (of a killed node: from ready)
+until the law flies again. An instant is the reception time of the message that shows the event. Where the host delayed a
+process of the flight by more than MAX_HOST_DELAY, the run counts but its times do not. If all runs are so, they count and
+the row is marked.
 """
 
 import json
@@ -25,34 +25,34 @@ from rich.table import Table
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CAMPAIGN = REPOSITORY / "tests" / "ros" / "faults"
-QUIET = 0.02  # s
+MAX_HOST_DELAY = 0.02  # s
 
 Row = dict[str, Any]
 
 
 def fly(times: int, seed: int, only: str) -> list[Row]:
-    """All cases, each so many times in a row; a row a time."""
+    """Inject every case `times` times in a row; one row for each injection."""
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "rows.jsonl"
         options = [f"--faults-table={table}", f"--faults-times={times}", f"--faults-seed={seed}", f"--timeout={120 * times}"]
         command = [sys.executable, "-m", "pytest", "-q", str(CAMPAIGN), *options, *(["-k", only] if only else [])]
         subprocess.run(command, cwd=REPOSITORY, check=False, stdout=sys.stderr)  # noqa: S603 - our own interpreter
         if not table.exists():
-            sys.exit("error: no case was flown")
+            sys.exit("error: no case matches")
         return [json.loads(line) for line in table.read_text(encoding="utf-8").splitlines()]
 
 
 def summarise(rows: Sequence[Row]) -> list[Row]:
-    """One row a case: injected, detected, passed, median and worst of each time in s."""
+    """One row for each case: injected, detected, passed, median and worst of each time in s."""
     cases: dict[str, list[Row]] = {}
     for row in rows:
         cases.setdefault(row["case"], []).append(row)
-    return [_summary(case, those) for case, those in cases.items()]
+    return [_summary(case, runs) for case, runs in cases.items()]
 
 
 def _summary(case: str, rows: Sequence[Row]) -> Row:
     passed = [row for row in rows if row["passed"]]
-    quiet = [row for row in passed if row["held_back"] <= QUIET]
+    quiet = [row for row in passed if row["held_back"] <= MAX_HOST_DELAY]
     judged = quiet or passed
     summary: Row = {"case": case, "u": rows[0]["does"], "injected": len(rows), "passed": len(passed), "quiet": len(quiet)}
     summary["detected"] = sum(row["reaction"] is not None for row in passed) if rows[0]["expected"] else None
@@ -63,8 +63,8 @@ def _summary(case: str, rows: Sequence[Row]) -> Row:
     return summary
 
 
-def shown(summaries: Sequence[Row]) -> Table:
-    """For a terminal; ms."""
+def to_table(summaries: Sequence[Row]) -> Table:
+    """The table for a terminal, ms."""
     table = Table(title="Faults, times in ms, median / worst")
     for name, justify in (("fault", "left"), ("injected", "right"), ("detected", "right")):
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
@@ -75,9 +75,9 @@ def shown(summaries: Sequence[Row]) -> Table:
         busy = "" if one["quiet"] else " *"
         detected = "-" if one["detected"] is None else str(one["detected"])
         table.add_row(one["case"] + busy, str(one["injected"]), detected, str(one["passed"]), *times)
-    table.caption = "traffic: from ready to the first of all that a killed node says; "
-    table.caption += "pause: the longest of a topic that is to go on; "
-    table.caption += f"*: in no run was the machine free enough (a process held back by {1e3 * QUIET:g} ms at most)"
+    table.caption = "traffic: from ready until a killed node publishes all its topics; "
+    table.caption += "pause: the longest of a topic that continues; "
+    table.caption += f"*: every run had host delays of more than {1e3 * MAX_HOST_DELAY:g} ms"
     return table
 
 
@@ -86,17 +86,17 @@ def _milliseconds(times: Row | None) -> str:
 
 
 def main(
-    times: Annotated[int, typer.Option(min=1, help="How often each fault is done in a row.")] = 10,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first time; they count up.")] = 1,
+    times: Annotated[int, typer.Option(min=1, help="Number of injections of each fault.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first injection; the others count up.")] = 1,
     only: Annotated[str, typer.Option(help="Cases by parts of their names, as pytest's -k takes them.")] = "",
-    file: Annotated[Path | None, typer.Option("--json", help="Where to write the table for machines.")] = None,
+    file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
 ) -> None:
-    """Fly the fault campaign and print its table; exit status 1 where a case did not pass each time."""
+    """Run the fault campaign and print its table; exit status 1 if a case did not pass each time."""
     summaries = summarise(fly(times, seed, only))
     if file is not None:
         file.write_text(json.dumps(summaries, indent=2) + "\n", encoding="utf-8")
     console = Console()
-    Console(width=None if console.is_terminal else 160).print(shown(summaries))
+    Console(width=None if console.is_terminal else 160).print(to_table(summaries))
     if any(one["passed"] < times for one in summaries):
         raise typer.Exit(1)
 

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Coverage-guided fuzzing of what reads input from outside (tests/fuzz/targets.py), with atheris.
+"""Coverage-guided fuzzing of all readers of external input (tests/fuzz/targets.py), with atheris.
 
 python -m benchmarks.fuzz mcap --seconds 60          # mcap, metadata, scenario, airframe, map or message
-python -m benchmarks.fuzz mcap --replay FILE ...     # these inputs once each, under the same limits, without atheris
+python -m benchmarks.fuzz mcap --replay FILE ...     # each input once, under the same limits, without atheris
 
-A fuzzer begins with the inputs of the stack's own writers and those of tests/corpus/<target>/. It ends, with a status that is
-not 0, at an input that raises, hangs or takes too much memory, and keeps it in runs/fuzz/<target>/: mend, and put it into the
-corpus.
+A fuzzer starts from outputs of the stack's own writers and from tests/corpus/<target>/. At an input that raises, hangs or takes
+too much memory it ends with a status other than 0 and keeps the input in runs/fuzz/<target>/. Fix the reader and add the
+input to the corpus.
 """
 
 import argparse
@@ -20,12 +20,12 @@ from types import FrameType
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CORPUS = REPOSITORY / "tests" / "corpus"
-FOUND = REPOSITORY / "runs" / "fuzz"
+FINDINGS = REPOSITORY / "runs" / "fuzz"
 
-SECONDS_AN_INPUT = 20  # inputs are a few kB; of the processor in a replay, else of a machine that may be busy
-MEMORY_MB = 1500  # of the process; the readers' libraries alone take 250
-LONGEST = 16 * 1024  # bytes of an input
-INSTRUMENTED = ["aircraft_sim", "autopilot_bridge", "flight_analysis", "flight_core", "flight_recorder", "mcap", "rosbags"]
+TIMEOUT = 20  # s an input of a few kB; processor time in a replay, wall time when fuzzing
+MEMORY_MB = 1500  # of the process; the libraries of the readers take 250
+MAX_LENGTH = 16 * 1024  # bytes of an input
+STACK = ["aircraft_sim", "autopilot_bridge", "flight_analysis", "flight_core", "flight_log", "flight_recorder"]
 
 
 def main() -> None:
@@ -33,27 +33,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("target", help="mcap, metadata, scenario, airframe, map or message")
     parser.add_argument("--seconds", type=int, default=60, help="how long to fuzz")
-    parser.add_argument("--replay", type=Path, nargs="*", help="inputs to try once each, instead of fuzzing")
-    parser.add_argument("--keep", action="store_true", help="keep new inputs in runs/fuzz/<target>/inputs, to go on from")
-    asked = parser.parse_args()
-    if asked.replay is not None:
-        replay(asked.target, asked.replay)
+    parser.add_argument("--replay", type=Path, nargs="*", help="read each of these inputs once instead of fuzzing")
+    parser.add_argument("--keep", action="store_true", help="keep new inputs in runs/fuzz/<target>/inputs for the next run")
+    arguments = parser.parse_args()
+    if arguments.replay is not None:
+        replay(arguments.target, arguments.replay)
     else:
-        fuzz(asked.target, asked.seconds, keep=asked.keep)
+        fuzz(arguments.target, arguments.seconds, keep=arguments.keep)
 
 
 def replay(target: str, files: list[Path]) -> None:
-    """Try inputs once each. Raises what a target raises, MemoryError and TimeoutError."""
-    from tests.fuzz.targets import TARGETS  # noqa: PLC0415 - it is instrumented when fuzzing
+    """Read each input once. Raises the errors of a target, MemoryError and TimeoutError."""
+    from tests.fuzz.targets import TARGETS  # noqa: PLC0415 - instrumented when fuzzing
 
-    def late(number: int, frame: FrameType | None) -> None:
-        raise TimeoutError(f"more than {SECONDS_AN_INPUT} s of the processor")
+    def expire(number: int, frame: FrameType | None) -> None:
+        raise TimeoutError(f"more than {TIMEOUT} s of processor time")
 
-    signal.signal(signal.SIGPROF, late)
+    signal.signal(signal.SIGPROF, expire)
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MB << 20, MEMORY_MB << 20))
     with tempfile.TemporaryDirectory(prefix="fuzz") as folder:
         for file in files:
-            signal.setitimer(signal.ITIMER_PROF, SECONDS_AN_INPUT)
+            signal.setitimer(signal.ITIMER_PROF, TIMEOUT)
             try:
                 TARGETS[target](file.read_bytes(), Path(folder))
             except Exception:
@@ -64,29 +64,29 @@ def replay(target: str, files: list[Path]) -> None:
 
 
 def fuzz(target: str, seconds: int, *, keep: bool) -> None:
-    """Fuzz for so long; never returns."""
-    import atheris  # noqa: PLC0415 - a replay does without it
+    """Fuzz for `seconds`; never returns."""
+    import atheris  # noqa: PLC0415 - a replay does not need it
 
-    with atheris.instrument_imports(include=INSTRUMENTED):
+    with atheris.instrument_imports(include=[*STACK, "mcap", "rosbags"]):
         from tests.fuzz.targets import SEEDS, TARGETS  # noqa: PLC0415 - as above
 
-    found = FOUND / target
-    found.mkdir(parents=True, exist_ok=True)
-    inputs = found / "inputs" if keep else Path(tempfile.mkdtemp(prefix=f"fuzz-{target}-"))
+    findings = FINDINGS / target
+    findings.mkdir(parents=True, exist_ok=True)
+    inputs = findings / "inputs" if keep else Path(tempfile.mkdtemp(prefix=f"fuzz-{target}-"))
     inputs.mkdir(parents=True, exist_ok=True)
     for k, seed in enumerate(SEEDS[target]()):
         (inputs / f"seed-{k}").write_bytes(seed)
-    given = [str(inputs), *(str(path) for path in [CORPUS / target] if path.is_dir())]
+    corpora = [str(inputs), *(str(path) for path in [CORPUS / target] if path.is_dir())]
     folder = Path(tempfile.mkdtemp(prefix="fuzz", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))  # noqa: S108 - for speed
     options = {
         "max_total_time": seconds,
-        "timeout": SECONDS_AN_INPUT,
+        "timeout": TIMEOUT,
         "rss_limit_mb": MEMORY_MB,
-        "max_len": LONGEST,
-        "artifact_prefix": f"{found}/",
+        "max_len": MAX_LENGTH,
+        "artifact_prefix": f"{findings}/",
         "print_final_stats": 1,
     }
-    arguments = [sys.argv[0], *(f"-{name}={value}" for name, value in options.items()), *given]
+    arguments = [sys.argv[0], *(f"-{name}={value}" for name, value in options.items()), *corpora]
     atheris.Setup(arguments, lambda data: TARGETS[target](data, folder))
     atheris.Fuzz()
 

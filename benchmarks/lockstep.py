@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How fast a lockstep flight goes, beside the bare echo of the same message on the same machine.
+"""Speed of a lockstep flight, compared with a bare echo of the same message on the same host.
 
 The scenario osprey_gust with aircraft and reference model at the 100 Hz of the controller (Runge-Kutta step 10 ms), recorded:
 
     four processes   aircraft, reference model, controller, recorder
     one process      the same four as objects in one process
     without ROS      the same parts in one loop
-    bare echo        a vector of four channels to another process and back, nothing else, by the same publisher and subscription
+    bare echo        a vector of four channels to another process and back, by the same publisher and subscription
 
     .venv/bin/python benchmarks/lockstep.py [--duration 60] [--repeat 3]
 """
@@ -41,8 +41,8 @@ from flight_ros.topics import LOCKSTEP, PUBLISH, U, Y
 ECHOES = 5000
 
 
-def at_the_rate_of_the_controller(folder: Path, duration: float) -> Scenario:
-    """The scenario osprey_gust with one sample of aircraft and reference a tick."""
+def scenario_at_controller_rate(folder: Path, duration: float) -> Scenario:
+    """The scenario osprey_gust with one sample of aircraft and reference model a tick."""
     tree = yaml.safe_load(find_scenario("osprey_gust").path.read_text(encoding="utf-8"))
     tree["/**/flight"]["ros__parameters"]["duration"] = duration
     tree["/**/aircraft"]["ros__parameters"] |= {"rate": 100.0, "step": 0.01}
@@ -52,9 +52,9 @@ def at_the_rate_of_the_controller(folder: Path, duration: float) -> Scenario:
     return load_scenario(path)
 
 
-def flown_steps_per_second(scenario: Scenario, run: Path, *, one_process: bool) -> float:
+def flight_steps_per_second(scenario: Scenario, run: Path, *, one_process: bool) -> float:
     """Steps of the controller per second of a lockstep flight, between its first and its last u in the log."""
-    outcome = fly_over_topics(scenario, run, lambda t, shown: None, lockstep=True, one_process=one_process)
+    outcome = fly_over_topics(scenario, run, lambda t, u: None, lockstep=True, one_process=one_process)
     if outcome != "completed":
         sys.exit(f"error: {outcome}")
     topics: dict[int, str] = {}
@@ -68,15 +68,15 @@ def flown_steps_per_second(scenario: Scenario, run: Path, *, one_process: bool) 
     return (len(times) - 1) / ((times[-1] - times[0]) / 1e9)
 
 
-def looped_steps_per_second(scenario: Scenario) -> float:
-    """The same without ROS."""
+def loop_steps_per_second(scenario: Scenario) -> float:
+    """Steps of the controller per second of the loop without ROS."""
     begin = time.perf_counter()
     tape = simulate(scenario)
     return (len(tape["u"].stamp_ns) - 1) / (time.perf_counter() - begin)
 
 
 def echo() -> None:
-    """The other end: whatever comes on y goes back on u, until the parent closes the pipe."""
+    """The other process: it publishes each message of y on u until the parent closes the pipe."""
     os.set_blocking(sys.stdin.fileno(), False)
     context, node = _node("echo")
     subscription, publisher = PolledSubscription(node, Y, LOCKSTEP, raw=True), node.create_publisher(U.type, U.name, PUBLISH)
@@ -89,16 +89,16 @@ def echo() -> None:
     context.try_shutdown()
 
 
-def echoed_steps_per_second() -> float:
+def echo_steps_per_second() -> float:
     """Round trips per second of four channels to another process and back."""
-    context, node = _node("asker")
+    context, node = _node("requester")
     subscription, publisher = PolledSubscription(node, U, LOCKSTEP, raw=True), node.create_publisher(Y.type, Y.name, PUBLISH)
-    waiter, encoder, values = WaitSet([subscription.entity], context), Encoder(("q", "V", "p", "r"), "asker"), np.zeros(4)
+    waiter, encoder, values = WaitSet([subscription.entity], context), Encoder(("q", "V", "p", "r"), "requester"), np.zeros(4)
     other = subprocess.Popen([sys.executable, __file__, "--echo"], stdin=subprocess.PIPE)  # noqa: S603 - this file
     try:
         begin = 0.0
         for k in range(ECHOES):
-            if k == 1:  # the first one waits for the other process
+            if k == 1:  # the first round trip includes discovery
                 begin = time.perf_counter()
             publisher.publish(encoder.encode(k, values))
             while not list(subscription.take(1)):
@@ -118,28 +118,28 @@ def _node(name: str) -> tuple[Context, Node]:
 
 
 def main() -> None:
-    """Run all of it, interleaved, and print medians."""
+    """Measure all four, interleaved, and print medians."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--duration", type=float, default=60.0, help="flight time, s")
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--echo", action="store_true", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.echo:
+    options = parser.parse_args()
+    if options.echo:
         echo()
         return
-    found: dict[str, list[float]] = {"bare echo": [], "four processes": [], "one process": [], "without ROS": []}
+    rates_of: dict[str, list[float]] = {"bare echo": [], "four processes": [], "one process": [], "without ROS": []}
     with tempfile.TemporaryDirectory() as folder:
-        scenario = at_the_rate_of_the_controller(Path(folder), arguments.duration)
-        for k in range(arguments.repeat):
-            found["bare echo"].append(echoed_steps_per_second())
+        scenario = scenario_at_controller_rate(Path(folder), options.duration)
+        for k in range(options.repeat):
+            rates_of["bare echo"].append(echo_steps_per_second())
             for name in ("four processes", "one process"):
                 run = Path(folder) / f"{name} {k}"
-                found[name].append(flown_steps_per_second(scenario, run, one_process=name == "one process"))
-            found["without ROS"].append(looped_steps_per_second(scenario))
-    floor = float(np.median(found["bare echo"]))
-    print(f"median of {arguments.repeat}, {arguments.duration:g} s of flight each")
+                rates_of[name].append(flight_steps_per_second(scenario, run, one_process=name == "one process"))
+            rates_of["without ROS"].append(loop_steps_per_second(scenario))
+    floor = float(np.median(rates_of["bare echo"]))
+    print(f"median of {options.repeat}, {options.duration:g} s of flight each")
     print(f"{'':16}{'steps/s':>9}{'to the echo':>13}{'times real time':>17}")
-    for name, rates in found.items():
+    for name, rates in rates_of.items():
         rate = float(np.median(rates))
         real_time = "" if name == "bare echo" else f"{rate / scenario.controller.rate:.1f}"
         print(f"{name:16}{rate:9.0f}{rate / floor:13.2f}{real_time:>17}")

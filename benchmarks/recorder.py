@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the recorder costs and loses at 1 kHz on six topics, and how large its file is beside that of rosbags' own Writer.
+"""CPU time and losses of the recorder at 1 kHz on six topics, and the size of its file compared with that of rosbags' Writer.
 
 Another process publishes y, y_m, u, u_m, internals and truth, as wide and as noisy as those of the scenario osprey_servo. Then
 the same messages, in the order recorded, go through rosbags.rosbag2.Writer: plain, and with its chunks compressed.
@@ -37,18 +37,18 @@ TOPICS = (Y, Y_M, U, U_M, INTERNALS, TRUTH)
 
 
 def publish(rate: float, duration: float) -> None:
-    """Publish on each topic until the duration is over, or SIGTERM; say "matched" first, and how many were sent at the end."""
+    """Publish on each topic for the duration or until SIGTERM. Print "matched" first and the number sent at the end."""
     tape = simulate(find_scenario("osprey_servo").vary(flight={"duration": 5.0}))
     transport.prepare()
     context = Context()
     rclpy.init(context=context)
     node = Node("publisher", context=context)
 
-    def flown(topic: Topic) -> tuple[Encoder, list[FloatArray]]:
+    def samples(topic: Topic) -> tuple[Encoder, list[FloatArray]]:
         signal_ = tape["y_m" if topic is U_M else topic.name]
         return Encoder(signal_.names, "/publisher"), list(signal_.values)
 
-    sources = [(node.create_publisher(topic.type, topic.name, PUBLISH), *flown(topic)) for topic in TOPICS]
+    sources = [(node.create_publisher(topic.type, topic.name, PUBLISH), *samples(topic)) for topic in TOPICS]
     ended = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.append(True))
@@ -75,10 +75,10 @@ def publish(rate: float, duration: float) -> None:
 
 
 def record(run: Path, rate: float, duration: float) -> tuple[dict[str, float], float]:
-    """What was sent, and the processor time of the recorder from the first message to the last, s."""
+    """The publisher's counts, and the processor time of the recorder from the first message to the last, s."""
     scenario = find_scenario("osprey_servo").path
-    told = ("--ros-args", "--params-file", str(scenario), "-p", f"directory:={run}")
-    recorder = psutil.Popen([sys.executable, "-m", "flight_recorder.main", *told], stderr=subprocess.DEVNULL)
+    options = ("--ros-args", "--params-file", str(scenario), "-p", f"directory:={run}")
+    recorder = psutil.Popen([sys.executable, "-m", "flight_recorder.main", *options], stderr=subprocess.DEVNULL)
     command = [sys.executable, __file__, "--publish", f"--rate={rate}", f"--duration={duration}"]
     publisher = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: S603 - this file
     try:
@@ -114,7 +114,7 @@ def written_by_rosbags(run: Path, folder: Path, compression: CompressionMode) ->
 
 
 def main() -> None:
-    """Record, count, weigh."""
+    """Record, and print counts and sizes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--duration", type=float, default=60.0, help="how long to publish, s")
     parser.add_argument("--rate", type=float, default=1000.0, help="of each topic, Hz")
@@ -136,8 +136,8 @@ def main() -> None:
         print(f"recorder: {100 * processor / sent['seconds']:.1f} % of one core, {1e6 * processor / kept:.1f} us a message")
         print(f"bytes a message: {size / kept:.1f}")
         for compression in (CompressionMode.NONE, CompressionMode.STORAGE):
-            weight = written_by_rosbags(run, Path(folder) / compression.name, compression)
-            print(f"  rosbags Writer, {compression.name.lower()}: {weight:.1f}")
+            mean_size = written_by_rosbags(run, Path(folder) / compression.name, compression)
+            print(f"  rosbags Writer, {compression.name.lower()}: {mean_size:.1f}")
 
 
 if __name__ == "__main__":

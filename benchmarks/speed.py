@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How fast the stack is, each figure beside its floor: the least that does the same on the same machine, in the same run.
+"""Speed of the stack, each figure compared with its floor: the least program that does the same on this host in the same run.
 
     python -m benchmarks.speed [--only node] [--seconds 10] [--json FILE]
 
-Ratios travel from machine to machine, the figures do not; and neither holds on a machine that is busy with other work.
-The floors: one NumPy operation, a subscription of rclpy whose callback publishes what it got (an echo), an empty timer of
-rclpy, a loop that only sleeps, a node of rclpy that only spins, the writer of rosbags.
+Ratios carry over to other hosts, the figures do not. Neither is valid on a host that is busy with other work.
+The floors: one NumPy operation, a subscription of rclpy whose callback publishes the message again (an echo), an empty timer
+of rclpy, a loop that only sleeps, a node of rclpy that only spins, the writer of rosbags.
 """
 
 import argparse
@@ -28,7 +28,7 @@ import numpy as np
 import psutil
 import rclpy
 from benchmarks import campaign, law, lockstep, recorder
-from benchmarks.held import Intervals, missed_by_itself
+from benchmarks.host_delays import Intervals, missed_excluding_delays
 from benchmarks.sampling import new_table
 from rclpy.context import Context
 from rclpy.node import Node
@@ -54,16 +54,16 @@ RATES = (100, 500, 1000)  # Hz
 EXECUTORS = ("single", "multi", "events")
 PRIORITY = 50  # SCHED_FIFO, as that of ros2_control
 FLOOR_SECONDS = 15.0  # floors are measured no longer than this
-NODE_RATE = 500.0  # Hz, at which the callback of a node is timed
-WARM_UP = 1.0  # s, left out of what is measured of a process
+NODE_RATE = 500.0  # Hz, at which callbacks are timed
+WARM_UP = 1.0  # s, excluded from the measurement of a process
 MATCHED_WITHIN = 20.0  # s
 ENDS_WITHIN = 10.0  # s
-BY_ITSELF = "by itself"  # column: ticks missed while the machine ran
+OWN_MISSES = "missed excluding host delays"  # a column
 
 
 @dataclass(frozen=True)
 class Goal:
-    """What a figure is to be at most, itself or as a multiple of the floor's."""
+    """The maximum of a figure, or of its ratio to the floor."""
 
     column: str
     at_most: float
@@ -72,12 +72,12 @@ class Goal:
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of one thing, by column."""
+    """A row of a table: figures by column."""
 
     group: str
     what: str
     figures: Mapping[str, float]
-    floor: str = ""  # `what` of the row that it is measured beside; that row's own where it is a floor, empty without one
+    floor: str = ""  # `what` of the row of its floor; its own for a floor, empty without one
     goals: Sequence[Goal] = field(default=())
 
 
@@ -88,13 +88,13 @@ def us(values: Sequence[float] | FloatArray) -> dict[str, float]:
 
 
 class Child:
-    """One of benchmarks/speed_nodes.py, or a module with a point in its name, as a process. A context manager that ends it."""
+    """A role of benchmarks/speed_nodes.py, or a module (with a dot in its name), as a process; a context manager."""
 
     def __init__(self, role: str, *arguments: str, within: Sequence[str] = ()) -> None:
         self.begin = time.monotonic()
-        words = (role,) if "." in role else ("benchmarks.speed_nodes", role)
+        module = (role,) if "." in role else ("benchmarks.speed_nodes", role)
         self.popen = psutil.Popen(
-            [*within, sys.executable, "-m", *words, *arguments],
+            [*within, sys.executable, "-m", *module, *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
@@ -105,7 +105,7 @@ class Child:
 
     def __exit__(self, *_: object) -> None:
         if self.popen.poll() is None:
-            self.popen.terminate()  # one that is killed seems to be there for two more seconds
+            self.popen.terminate()  # a killed peer remains in the graph for two more seconds
         try:
             self.popen.communicate(timeout=ENDS_WITHIN)
         except subprocess.TimeoutExpired:
@@ -113,26 +113,26 @@ class Child:
             self.popen.communicate()
 
     def cpu_ns(self) -> int:
-        """Time that its threads have run, those that have ended left out, ns."""
+        """Processor time of its running threads, ns."""
         return threads_ns(self.popen.pid)
 
     def figures(self, timeout: float = 20.0) -> dict[str, Any]:
-        """Wait for its end, and what it says. Raises RuntimeError where that is nothing."""
-        said, _ = self.popen.communicate(timeout=timeout)
-        lines = [line for line in said.splitlines() if line.startswith("{")]
+        """Wait for its end and return its JSON output. Raises RuntimeError without any."""
+        output, _ = self.popen.communicate(timeout=timeout)
+        lines = [line for line in output.splitlines() if line.startswith("{")]
         if not lines:
-            raise RuntimeError(f"{' '.join(self.popen.args)} ended with status {self.popen.returncode} and said nothing")
-        found: dict[str, Any] = json.loads(lines[-1])
-        return found
+            raise RuntimeError(f"{' '.join(self.popen.args)} ended with status {self.popen.returncode} and without output")
+        figures: dict[str, Any] = json.loads(lines[-1])
+        return figures
 
     def stop(self) -> dict[str, Any]:
-        """Tell it to end, and what it says then."""
+        """Send SIGTERM and return its JSON output."""
         self.popen.terminate()
         return self.figures()
 
 
 def threads_ns(pid: int) -> int:
-    """Time that the threads of a process have run, ns, from the scheduler's own books: psutil has hundredths of a second."""
+    """Processor time of the threads of a process, ns, from the kernel's schedstat: psutil resolves 10 ms only."""
     total = 0
     for task in Path(f"/proc/{pid}/task").iterdir():
         with contextlib.suppress(FileNotFoundError):
@@ -141,7 +141,7 @@ def threads_ns(pid: int) -> int:
 
 
 class Peer:
-    """Publishes y and y_m at a rate as aircraft and reference model do, and hears u and internals. A context manager."""
+    """Publishes y and y_m at a rate as aircraft and reference model do, and receives u and internals; a context manager."""
 
     def __init__(self) -> None:
         transport.prepare()
@@ -164,10 +164,7 @@ class Peer:
         self._context.try_shutdown()
 
     def drive(self, hz: float, seconds: float, child: Child) -> "Driven":
-        """Drive a process for so long, from its first answer and a while for it to warm up on.
-
-        Raises RuntimeError where none comes.
-        """
+        """Publish to a process for `seconds` after its first answer and WARM_UP. Raises RuntimeError without an answer."""
         ticker, k, begin = Ticker(period_ns(hz, "hz"), time.monotonic_ns()), 0, time.monotonic()
         first, first_u, since_ns = 0.0, 0.0, time.time_ns()
         driven = Driven()
@@ -182,18 +179,18 @@ class Peer:
             self._y.publish(self._y_encoder.encode(now_ns, self._values[k % len(self._values)]))
             k += 1
             for received in self._u.take():
-                if (stamp_ns := stamp_of(received.message)) >= since_ns:  # else of the process before
+                if (stamp_ns := stamp_of(received.message)) >= since_ns:  # else it answers an earlier process
                     first_u = first_u or received.received_ns / NANOSECONDS
-                    driven.heard[stamp_ns] = received.received_ns
+                    driven.received[stamp_ns] = received.received_ns
             for received in self._internals.take():
                 sample = self._decoder.decode(received.message)
                 if sample is not None:
                     driven.age[sample.stamp_ns], driven.late[sample.stamp_ns] = sample.value.tolist()
-            if not first and driven.heard and time.time() > first_u + WARM_UP:
+            if not first and driven.received and time.time() > first_u + WARM_UP:
                 first = time.monotonic() - WARM_UP
                 driven.clear()
                 driven.start, cpu_ns, cpu_at = first_u, child.cpu_ns(), time.monotonic()
-            if not driven.heard and not first and time.monotonic() > begin + MATCHED_WITHIN:
+            if not driven.received and not first and time.monotonic() > begin + MATCHED_WITHIN:
                 raise RuntimeError(f"no answer within {MATCHED_WITHIN:g} s")
         driven.cpu = (child.cpu_ns() - cpu_ns) / 1e9 / (time.monotonic() - cpu_at)
         driven.seconds = time.monotonic() - cpu_at
@@ -201,42 +198,42 @@ class Peer:
 
 
 class Driven:
-    """What came of driving a process; by stamp of the y."""
+    """Answers of a process, by stamp of the y."""
 
     def __init__(self) -> None:
-        self.heard: dict[int, int] = {}  # when u had come, ns
+        self.received: dict[int, int] = {}  # when u was received, ns
         self.age: dict[int, float] = {}  # of y at the tick, s
-        self.late: dict[int, float] = {}  # the tick, s
+        self.late: dict[int, float] = {}  # lateness of the tick, s
         self.cpu = 0.0  # share of one core
         self.seconds = 0.0
         self.start = 0.0  # system time of the first u, s
 
     def clear(self) -> None:
-        """Forget what was so far."""
-        for one in (self.heard, self.age, self.late):
+        """Discard the answers so far."""
+        for one in (self.received, self.age, self.late):
             one.clear()
 
     @property
     def round_trips(self) -> list[int]:
-        """From y sent to u there, ns."""
-        return [at - stamp for stamp, at in self.heard.items()]
+        """From y sent to u received, ns."""
+        return [at - stamp for stamp, at in self.received.items()]
 
     @property
     def answers(self) -> list[float]:
-        """From the tick's beginning to u there, ns."""
-        return [at - stamp - 1e9 * self.age[stamp] for stamp, at in self.heard.items() if stamp in self.age]
+        """From the beginning of the tick to u received, ns."""
+        return [at - stamp - 1e9 * self.age[stamp] for stamp, at in self.received.items() if stamp in self.age]
 
     @property
     def cpu_each(self) -> float:
-        """Processor time of the whole process an answer, us."""
-        return 1e6 * self.cpu * self.seconds / max(len(self.heard), 1)
+        """Processor time of the process for each answer, us."""
+        return 1e6 * self.cpu * self.seconds / max(len(self.received), 1)
 
 
 @contextlib.contextmanager
-def flown(hz: float, folder: Path, role: str = "controller") -> Iterator[Child]:
-    """The controller's node at a rate."""
+def controller_at(hz: float, folder: Path, role: str = "controller") -> Iterator[Child]:
+    """The process of the controller at a rate."""
     file = folder / f"at_{hz:g}_hz.yaml"
-    others = {"rate": max(hz, 500.0)}  # at least as fast as the controller, as a scenario demands; they do not fly here
+    others = {"rate": max(hz, 500.0)}  # at least as fast as the controller, as a scenario demands; they do not run here
     rates = {"aircraft": others | {"step": 0.001}, "reference_model": others, "controller": {"rate": hz}}
     file.write_text(scenario_yaml(find_scenario(SCENARIO).vary(**rates)), encoding="utf-8")
     with Child(role, "--ros-args", "--params-file", str(file)) as child:
@@ -250,20 +247,20 @@ def law_rows() -> Iterator[Row]:
 
 
 def node_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """The controller's tick and an echo's callback, both from a y that is there to it published."""
+    """The controller's tick and an echo's callback, from a y that has arrived to the message published."""
     length = min(seconds, 4.0)
     took: dict[str, list[dict[str, float]]] = {}
     with Peer() as peer:
-        for _ in range(3):  # in turn, for the machine's speed drifts
+        for _ in range(3):  # alternating, since the speed of the host drifts
             for executor in EXECUTORS:
                 with Child("timed_echo", "--executor", executor, "--hz", f"{NODE_RATE}") as child:
                     peer.drive(NODE_RATE, length, child)
                     took.setdefault(f"bare echo, {executor}", []).append(child.stop())
-            with flown(NODE_RATE, folder) as child:
+            with controller_at(NODE_RATE, folder) as child:
                 peer.drive(NODE_RATE, length, child)
-                found = child.stop()
-            took.setdefault("controller, to u published", []).append(found)
-            whole = {name: found[f"whole {name}"] for name in ("p50", "p99")}
+                figures = child.stop()
+            took.setdefault("controller, until u is published", []).append(figures)
+            whole = {name: figures[f"whole {name}"] for name in ("p50", "p99")}
             took.setdefault("controller, whole tick with internals", []).append(whole)
     for name, runs in took.items():
         figures = {f"{column} (us)": float(np.median([run[column] for run in runs])) for column in ("p50", "p99")}
@@ -272,7 +269,7 @@ def node_rows(seconds: float, folder: Path) -> Iterator[Row]:
 
 
 def latency_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """From y sent to u there, over DDS, and what each answer costs the process that gives it."""
+    """From y sent to u received, over DDS, and the processor time for each answer."""
     with Peer() as peer:
         for hz in RATES:
             floor = f"bare echo, single, {hz} Hz"
@@ -280,14 +277,14 @@ def latency_rows(seconds: float, folder: Path) -> Iterator[Row]:
                 with Child("echo", "--executor", executor) as child:
                     driven = peer.drive(hz, min(seconds, FLOOR_SECONDS), child)
                 yield Row("latency", f"bare echo, {executor}, {hz} Hz", _latency(driven, driven.round_trips), floor)
-            with flown(hz, folder) as child:
+            with controller_at(hz, folder) as child:
                 driven = peer.drive(hz, seconds, child)
             goals = (Goal("CPU (us each)", 2.0, of_floor=True),)
             yield Row("latency", f"controller, tick to u, {hz} Hz", _latency(driven, driven.answers), floor, goals)
             yield Row("latency", f"controller, y to u with the wait for the tick, {hz} Hz", us(driven.round_trips), floor)
             yield Row(
                 "latency",
-                f"controller, its tick after the deadline, {hz} Hz",
+                f"controller, lateness of the tick, {hz} Hz",
                 us([1e9 * late for late in driven.late.values()]),
             )
 
@@ -297,22 +294,22 @@ def _latency(driven: Driven, values: Sequence[float]) -> dict[str, float]:
 
 
 def tick_rows(seconds: float) -> Iterator[Row]:
-    """How late ticks begin, of a node of the stack that does nothing in them, beside rclpy's own timers."""
+    """Lateness of the ticks of an empty node of the stack, compared with rclpy's own timers."""
     short = min(seconds, FLOOR_SECONDS)
     chrt = shutil.which("chrt")
     if chrt is not None and subprocess.run([chrt, "-f", str(PRIORITY), "true"], check=False).returncode:  # noqa: S603
         chrt = None  # no right to real-time priority here
     for hz in RATES:
-        told = ("--hz", str(hz), "--seconds")
+        options = ("--hz", str(hz), "--seconds")
         floor = f"empty timer, single, {hz} Hz"
         for executor in EXECUTORS:
-            with Child("timer", *told, str(short), "--executor", executor) as child:
+            with Child("timer", *options, str(short), "--executor", executor) as child:
                 yield Row("ticks", f"empty timer, {executor}, {hz} Hz", *_ticks(child, short), floor)
-        with Child("bare_loop", *told, str(short)) as child:
+        with Child("bare_loop", *options, str(short)) as child:
             yield Row("ticks", f"loop that only sleeps, {hz} Hz", *_ticks(child, short), floor)
-        goals = {500: [Goal(BY_ITSELF if chrt else "missed", 0)], 1000: [Goal("p99 (us)", 100.0)]}.get(hz, [])
-        with sentinels(chrt is not None) as held, Child("ticker", *told, str(seconds)) as child:
-            figures = _ticks(child, seconds, held)
+        goals = {500: [Goal(OWN_MISSES if chrt else "missed", 0)], 1000: [Goal("p99 (us)", 100.0)]}.get(hz, [])
+        with delay_monitors(chrt is not None) as delays, Child("ticker", *options, str(seconds)) as child:
+            figures = _ticks(child, seconds, delays)
         yield Row("ticks", f"the stack's loop, {hz} Hz", *figures, floor, goals)
     if chrt is None:
         return
@@ -327,33 +324,35 @@ def tick_rows(seconds: float) -> Iterator[Row]:
 
 
 @contextlib.contextmanager
-def sentinels(allowed: bool) -> Iterator[Callable[[], Intervals] | None]:
-    """When the machine was held back, by a process on each core that goes before all others; None if not allowed."""
+def delay_monitors(allowed: bool) -> Iterator[Callable[[], Intervals] | None]:
+    """Host delays, measured by a process of the highest priority on each core; None if not allowed."""
     if not allowed:
         yield None
         return
     with contextlib.ExitStack() as stack:
-        watching = [stack.enter_context(Child("sentinel", "--core", str(core))) for core in sorted(os.sched_getaffinity(0))]
-        yield lambda: [tuple(one) for child in watching for one in child.stop()["held"]]
+        monitors = [
+            stack.enter_context(Child("delay_monitor", "--core", str(core))) for core in sorted(os.sched_getaffinity(0))
+        ]
+        yield lambda: [tuple(one) for child in monitors for one in child.stop()["delays"]]
 
 
-def _ticks(child: Child, seconds: float, held: Callable[[], Intervals] | None = None) -> tuple[dict[str, float]]:
+def _ticks(child: Child, seconds: float, delays: Callable[[], Intervals] | None = None) -> tuple[dict[str, float]]:
     time.sleep(seconds / 2.0)
     cpu_ns, at = child.cpu_ns(), time.monotonic()
-    time.sleep(seconds / 2.0)  # and then, having started later, it still runs
+    time.sleep(seconds / 2.0)  # it started later, so it still runs
     share = (child.cpu_ns() - cpu_ns) / 1e9 / (time.monotonic() - at)
-    found = child.figures(timeout=seconds + 20.0)
-    shown = {f"{name} (us)": found[name] for name in ("p50", "p99", "max")}
-    shown |= {"missed": found["missed"]}
-    if held is not None:
-        shown[BY_ITSELF] = missed_by_itself(found["skipped"], held(), found["period_ns"])
-    return (shown | {"ticks": found["ticks"], "CPU (%)": 100.0 * share},)
+    output = child.figures(timeout=seconds + 20.0)
+    figures = {f"{name} (us)": output[name] for name in ("p50", "p99", "max")}
+    figures |= {"missed": output["missed"]}
+    if delays is not None:
+        figures[OWN_MISSES] = missed_excluding_delays(output["skipped"], delays(), output["period_ns"])
+    return (figures | {"ticks": output["ticks"], "CPU (%)": 100.0 * share},)
 
 
 @contextlib.contextmanager
 def full_load() -> Iterator[None]:
-    """Every core busy with something else, at ordinary priority."""
-    # At ordinary priority also where this program runs at a real-time one: they would take the machine.
+    """Every core busy with other work at ordinary priority."""
+    # Also where this program runs at real-time priority: else they would block the host.
     spin = "import os\nos.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))\nwhile True: pass"
     busy = [subprocess.Popen([sys.executable, "-c", spin]) for _ in range(os.cpu_count() or 1)]  # noqa: S603
     try:
@@ -365,14 +364,14 @@ def full_load() -> Iterator[None]:
 
 
 def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """Share of a core and memory of each process of a flight in real time."""
+    """CPU and memory of each process of a flight in real time."""
     scenario = find_scenario(SCENARIO).vary(flight={"duration": seconds})
     run = folder / "flight"
     run.mkdir()
     with Child("idle") as child:
         time.sleep(WARM_UP + 1.0)
         yield Row("flight", "node that only spins", _use([child.popen.pid], 3.0)[0], "node that only spins")
-    path = folder / "flown.yaml"
+    path = folder / "scenario.yaml"
     path.write_text(scenario_yaml(scenario), encoding="utf-8")
     scenario = find_scenario(str(path))
     with (
@@ -388,11 +387,11 @@ def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
 def _use(pids: Sequence[int], seconds: float) -> list[dict[str, float]]:
     before, begin = [threads_ns(pid) for pid in pids], time.monotonic()
     time.sleep(seconds)
-    lasted = time.monotonic() - begin
-    shares = [(threads_ns(pid) - was) / 1e9 / lasted for pid, was in zip(pids, before, strict=True)]
+    elapsed = time.monotonic() - begin
+    shares = [(threads_ns(pid) - was) / 1e9 / elapsed for pid, was in zip(pids, before, strict=True)]
     memory = [psutil.Process(pid).memory_full_info() for pid in pids]
     return [
-        {"CPU (%)": 100.0 * share, "resident (MB)": of.rss / 1e6, "its own (MB)": of.uss / 1e6}
+        {"CPU (%)": 100.0 * share, "resident (MB)": of.rss / 1e6, "unique (MB)": of.uss / 1e6}
         for share, of in zip(shares, memory, strict=True)
     ]
 
@@ -408,62 +407,62 @@ def start_rows(folder: Path) -> Iterator[Row]:
         waits = []
         for _ in range(5):
             begin = time.time()
-            with flown(100.0, folder, CONTROLLER.module) as child:
+            with controller_at(100.0, folder, CONTROLLER.module) as child:
                 waits.append(peer.drive(100.0, 0.1, child).start - begin)
         yield Row("start", "controller, to its first u", {"seconds": float(np.median(waits))}, floor)
-    yield Row("start", "rise-di fly, to its first u", {"seconds": whole_flight()}, floor)
+    yield Row("start", "rise-di fly, to its first u", {"seconds": seconds_to_first_u()}, floor)
 
 
-def whole_flight() -> float:
+def seconds_to_first_u() -> float:
     """From the start of the command to the first u of its flight, s."""
     context = Context()
     rclpy.init(context=context)
-    node = Node("listener", context=context)
+    node = Node("subscriber", context=context)
     subscription = PolledSubscription(node, U, RECORD, raw=True)
     with tempfile.TemporaryDirectory() as runs:
         begin = time.time()
         command = [str(Path(sys.executable).parent / "rise-di"), "fly", SCENARIO, "--duration", "30", "--runs", runs]
         flight = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)  # noqa: S603 - this stack
         try:
-            while not (came := subscription.take()) and flight.poll() is None:
+            while not (received := subscription.take()) and flight.poll() is None:
                 time.sleep(0.005)
         finally:
             flight.send_signal(signal.SIGINT)
-            _, said = flight.communicate()
+            _, output = flight.communicate()
     node.destroy_node()
     context.try_shutdown()
-    if not came:
-        raise RuntimeError(f"rise-di fly ended before its first u: {said.strip().splitlines()[-1:]}")
-    return came[0].received_ns / NANOSECONDS - begin
+    if not received:
+        raise RuntimeError(f"rise-di fly ended before its first u: {output.strip().splitlines()[-1:]}")
+    return received[0].received_ns / NANOSECONDS - begin
 
 
 def lockstep_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """Steps a second of a flight that waits for nobody, over topics and without them."""
-    scenario = lockstep.at_the_rate_of_the_controller(folder, max(seconds, 10.0))
+    """Steps a second of lockstep flights, over topics and without them."""
+    scenario = lockstep.scenario_at_controller_rate(folder, max(seconds, 10.0))
     runs = iter(range(9))
     measured: dict[str, Callable[[], float]] = {
-        "bare echo, to another process and back": lockstep.echoed_steps_per_second,
-        "lockstep, four processes": lambda: lockstep.flown_steps_per_second(
+        "bare echo, to another process and back": lockstep.echo_steps_per_second,
+        "lockstep, four processes": lambda: lockstep.flight_steps_per_second(
             scenario, folder / f"four {next(runs)}", one_process=False
         ),
-        "lockstep, one process": lambda: lockstep.flown_steps_per_second(
+        "lockstep, one process": lambda: lockstep.flight_steps_per_second(
             scenario, folder / f"one {next(runs)}", one_process=True
         ),
-        "one loop without ROS": lambda: lockstep.looped_steps_per_second(scenario),
+        "one loop without ROS": lambda: lockstep.loop_steps_per_second(scenario),
     }
-    found: dict[str, list[float]] = {}
+    rates: dict[str, list[float]] = {}
     for _ in range(3):
         for name, measure in measured.items():
-            found.setdefault(name, []).append(measure())
+            rates.setdefault(name, []).append(measure())
     floor = next(iter(measured))
-    for name, speeds in found.items():
+    for name, speeds in rates.items():
         speed = float(np.median(speeds))
         real_time = {} if name == floor else {"times real time": speed / scenario.controller.rate}
         yield Row("lockstep", name, {"steps/s": speed} | real_time, floor)
 
 
 def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
-    """What the recorder costs, loses and takes up at 1 kHz on six topics, beside rosbags' writer fed from memory."""
+    """CPU time, losses and size of the recorder at 1 kHz on six topics, compared with rosbags' writer fed from memory."""
     run = folder / "recorded"
     sent, processor = recorder.record(run, 1000.0, seconds)
     names = {f"/{topic.name}" for topic in recorder.TOPICS}
@@ -487,7 +486,7 @@ def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
 
 
 def campaign_rows(seconds: float) -> Iterator[Row]:
-    """Flights of uncertain aircraft a second, many at once, beside one after the other in the loop."""
+    """Flights of uncertain aircraft a second, many at once, compared with one after the other in the loop."""
     scenario = find_scenario("osprey_servo")
     floor, workers = "one flight in the loop", psutil.cpu_count() or 1
     aircraft = 4000 if seconds >= 10.0 else 1000
@@ -513,7 +512,7 @@ GROUPS: dict[str, Group] = {
 
 
 def show(console: Console, name: str, rows: Sequence[Row]) -> None:
-    """Print the rows of a group, ratios to the floor beside each figure."""
+    """Print the rows of a group, each figure with its ratio to the floor."""
     columns = list(dict.fromkeys(column for row in rows for column in row.figures))
     table = new_table(name, ("", *columns), texts=1)
     by_name = {row.what: row.figures for row in rows}
@@ -533,23 +532,23 @@ def show(console: Console, name: str, rows: Sequence[Row]) -> None:
 def main() -> None:
     """Measure, print, and write the figures to a file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", choices=GROUPS, help="this group alone")
+    parser.add_argument("--only", choices=GROUPS, help="measure only this group")
     parser.add_argument("--seconds", type=float, default=10.0, help="how long each figure of a running process is measured")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
-    asked = parser.parse_args()
-    # a domain of its own, among those whose ports Linux gives to nobody else
+    options = parser.parse_args()
+    # its own domain, among those whose ports are outside Linux's ephemeral range
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     os.environ.update(transport.environment())
     console = Console(width=None if sys.stdout.isatty() else 160)
-    found: list[Row] = []
-    for name in [asked.only] if asked.only else GROUPS:
+    measured: list[Row] = []
+    for name in [options.only] if options.only else GROUPS:
         with tempfile.TemporaryDirectory() as folder:
-            rows = list(GROUPS[name](asked.seconds, Path(folder)))
+            rows = list(GROUPS[name](options.seconds, Path(folder)))
         show(console, name, rows)
-        found += rows
-    if asked.json is not None:
-        plain: list[dict[str, Any]] = [asdict(row) for row in found]
-        asked.json.write_text(json.dumps({"seconds": asked.seconds, "rows": plain}, indent=1) + "\n", encoding="utf-8")
+        measured += rows
+    if options.json is not None:
+        as_json: list[dict[str, Any]] = [asdict(row) for row in measured]
+        options.json.write_text(json.dumps({"seconds": options.seconds, "rows": as_json}, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes that benchmarks/speed.py measures; each prints one line of JSON when it ends, by SIGTERM or by itself.
+"""The processes that benchmarks/speed.py measures. Each prints one line of JSON at its end or on SIGTERM.
 
 python -m benchmarks.speed_nodes ROLE [--executor single] [--hz 500] [--seconds 10]
 
-Executors are never spun without a timeout: without one the events executor of these wheels hangs.
+Executors are never spinner without a timeout: without one the events executor of these wheels hangs.
 """
 
 import argparse
@@ -38,13 +38,13 @@ EXECUTORS: dict[str, Callable[[], Any]] = {
     "multi": lambda: MultiThreadedExecutor(num_threads=2),
     "events": EventsExecutor,
 }
-ROLES = ("echo", "timed_echo", "idle", "timer", "bare_loop", "ticker", "sentinel", "controller")
-PAUSE = 0.1  # s, the longest that an executor waits
-SENTINEL_PERIOD = 0.0005  # s
+ROLES = ("echo", "timed_echo", "idle", "timer", "bare_loop", "ticker", "delay_monitor", "controller")
+PAUSE = 0.1  # s, the timeout of an executor
+MONITOR_PERIOD = 0.0005  # s
 
 
 def lateness(late_ns: list[int], missed: int) -> dict[str, float]:
-    """Percentiles of how late ticks were, us, the first ones left out: the process is still warming up."""
+    """Percentiles of the lateness of ticks, us, without the warm-up."""
     late = np.array(late_ns[len(late_ns) // 20 :]) / 1e3
     return {
         "p50": float(np.percentile(late, 50)),
@@ -56,13 +56,13 @@ def lateness(late_ns: list[int], missed: int) -> dict[str, float]:
 
 
 def times(took_ns: list[int]) -> dict[str, float]:
-    """Median and 99th percentile of what something took, us."""
+    """Median and 99th percentile of durations, us, without the warm-up."""
     took = np.array(took_ns[len(took_ns) // 20 :]) / 1e3
     return {"p50": float(np.percentile(took, 50)), "p99": float(np.percentile(took, 99)), "calls": len(took_ns)}
 
 
-def until_told() -> threading.Event:
-    """Set by SIGTERM or SIGINT."""
+def termination() -> threading.Event:
+    """An event that SIGTERM and SIGINT set."""
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
@@ -70,19 +70,19 @@ def until_told() -> threading.Event:
 
 
 def bare_node(name: str) -> Node:
-    """A node of rclpy as it comes, on the stack's transport."""
+    """A plain node of rclpy on the stack's transport."""
     transport.prepare()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     return Node(name)
 
 
 def echo(executor: str, hz: float, *, timed: bool) -> dict[str, float]:
-    """Whatever comes on y goes back on u, as the callback of a subscription.
+    """A subscription to y whose callback publishes each message on u.
 
-    Timed: the executor is looked after at a fixed rate, so that a message is there, and the time from there to the end of the
-    callback is taken; else it is spun as usual.
+    Timed: the executor spins once at a fixed rate, when a message has arrived, and the time to the end of the callback is
+    measured. Otherwise the executor spins as usual.
     """
-    ended, node = until_told(), bare_node("echo")
+    ended, node = termination(), bare_node("echo")
     publisher = node.create_publisher(U.type, U.name, PUBLISH)
     sent_ns = [0]
 
@@ -91,42 +91,42 @@ def echo(executor: str, hz: float, *, timed: bool) -> dict[str, float]:
         sent_ns[0] = time.perf_counter_ns()
 
     node.create_subscription(Y.type, Y.name, answer, NEWEST_SAMPLES)
-    spun = EXECUTORS[executor]()
-    spun.add_node(node)
+    spinner = EXECUTORS[executor]()
+    spinner.add_node(node)
     took: list[int] = []
     ticker, begin_ns = Ticker(round(NANOSECONDS / hz), time.monotonic_ns()), time.perf_counter_ns()
     while not ended.is_set():
         if not timed:
-            spun.spin_once(timeout_sec=PAUSE)
+            spinner.spin_once(timeout_sec=PAUSE)
             continue
         if (pause := ticker.remaining()) > 0:
             time.sleep(pause)
         ticker.due()
-        if sent_ns[0] > begin_ns:  # a message was there; looked at late, for an executor may have threads
+        if sent_ns[0] > begin_ns:  # a message had arrived; checked late, since an executor may have threads
             took.append(sent_ns[0] - begin_ns)
         begin_ns = time.perf_counter_ns()
-        spun.spin_once(timeout_sec=0.0)
+        spinner.spin_once(timeout_sec=0.0)
     node.destroy_node()
     rclpy.try_shutdown()
     return times(took) if took else {}
 
 
 def idle() -> dict[str, float]:
-    """A node that does nothing but spin."""
-    ended, node = until_told(), bare_node("idle")
-    spun = SingleThreadedExecutor()
-    spun.add_node(node)
+    """A node that only spins."""
+    ended, node = termination(), bare_node("idle")
+    spinner = SingleThreadedExecutor()
+    spinner.add_node(node)
     print("ready", flush=True)
     while not ended.is_set():
-        spun.spin_once(timeout_sec=PAUSE)
+        spinner.spin_once(timeout_sec=PAUSE)
     node.destroy_node()
     rclpy.try_shutdown()
     return {}
 
 
 def timer(executor: str, hz: float, seconds: float) -> dict[str, float]:
-    """An empty timer of rclpy, on the steady clock: how late its callback begins."""
-    ended, node = until_told(), bare_node("timer")
+    """Lateness of the callback of an empty timer of rclpy on the steady clock."""
+    ended, node = termination(), bare_node("timer")
     period_ns = round(NANOSECONDS / hz)
     late: list[int] = []
     at: list[int] = []
@@ -137,11 +137,11 @@ def timer(executor: str, hz: float, seconds: float) -> dict[str, float]:
         late.append(period_ns - left_ns)
 
     made = node.create_timer(1.0 / hz, tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
-    spun = EXECUTORS[executor]()
-    spun.add_node(node)
+    spinner = EXECUTORS[executor]()
+    spinner.add_node(node)
     end = time.monotonic() + seconds
     while time.monotonic() < end and not ended.is_set():
-        spun.spin_once(timeout_sec=PAUSE)
+        spinner.spin_once(timeout_sec=PAUSE)
     node.destroy_node()
     rclpy.try_shutdown()
     due = round((at[-1] - at[0]) / period_ns) + 1
@@ -149,7 +149,7 @@ def timer(executor: str, hz: float, seconds: float) -> dict[str, float]:
 
 
 def bare_loop(hz: float, seconds: float) -> dict[str, float]:
-    """Nothing but sleeping until the next deadline."""
+    """A loop that only sleeps until the next deadline."""
     ticker, late, missed = Ticker(round(NANOSECONDS / hz), time.monotonic_ns()), [], 0
     end = time.monotonic() + seconds
     while time.monotonic() < end:
@@ -162,9 +162,9 @@ def bare_loop(hz: float, seconds: float) -> dict[str, float]:
 
 
 def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
-    """An empty node of the stack, with all that its loop does beside the ticks: services, diagnostics, a look at the graph."""
+    """An empty node of the stack, with the services, diagnostics and graph checks of its loop."""
     late: list[int] = []
-    skipped: list[tuple[int, int]] = []  # from the first deadline that was missed until the tick that came, monotonic ns
+    skipped: list[tuple[int, int]] = []  # from the first missed deadline to the next tick, monotonic ns
     period = round(NANOSECONDS / hz)
 
     class Empty(FlightNode[NodeParameters]):
@@ -187,26 +187,26 @@ def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
     return lateness(late, missed) | {"skipped": skipped, "period_ns": period}
 
 
-def sentinel(core: int) -> dict[str, Any]:
-    """On one core, before everything else: intervals in which it did not run, monotonic ns; nothing ran then on that core.
+def delay_monitor(core: int) -> dict[str, Any]:
+    """Host delays of one core: intervals in which a process of the highest priority did not run, monotonic ns.
 
-    What holds it back is the kernel or, in a virtual machine, the host that runs something else.
+    The kernel delays it or, in a virtual machine, its host (steal time).
     """
     os.sched_setaffinity(0, {core})
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_max(os.SCHED_FIFO)))
-    ended, held = until_told(), []
+    ended, delays = termination(), []
     last_ns = time.monotonic_ns()
     while not ended.is_set():
-        time.sleep(SENTINEL_PERIOD)
+        time.sleep(MONITOR_PERIOD)
         now_ns = time.monotonic_ns()
-        if now_ns - last_ns > 1.5e9 * SENTINEL_PERIOD:  # being woken takes it a twentieth to a fifth of a period
-            held.append((last_ns, now_ns))
+        if now_ns - last_ns > 1.5e9 * MONITOR_PERIOD:  # a wake-up takes a twentieth to a fifth of a period
+            delays.append((last_ns, now_ns))
         last_ns = now_ns
-    return {"held": held}
+    return {"delays": delays}
 
 
 def controller() -> dict[str, float]:
-    """The controller's node: what its tick takes, from before y is taken until u is published, and until the tick ends."""
+    """The controller's node: time from the beginning of a tick until u is published, and until its end."""
     until_u: list[int] = []
     whole: list[int] = []
 
@@ -235,25 +235,25 @@ def controller() -> dict[str, float]:
 
 
 def main() -> None:
-    """Do as one of them."""
+    """Run one role."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("role", choices=ROLES)
     parser.add_argument("--executor", choices=EXECUTORS, default="single")
     parser.add_argument("--hz", type=float, default=500.0)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--core", type=int, default=0)
-    asked, _ = parser.parse_known_args()  # the rest is for ROS
+    options, _ = parser.parse_known_args()  # the others are arguments of ROS
     roles: dict[str, Callable[[], dict[str, Any]]] = {
-        "echo": lambda: echo(asked.executor, asked.hz, timed=False),
-        "timed_echo": lambda: echo(asked.executor, asked.hz, timed=True),
+        "echo": lambda: echo(options.executor, options.hz, timed=False),
+        "timed_echo": lambda: echo(options.executor, options.hz, timed=True),
         "idle": idle,
-        "timer": lambda: timer(asked.executor, asked.hz, asked.seconds),
-        "bare_loop": lambda: bare_loop(asked.hz, asked.seconds),
-        "ticker": lambda: ticker_node(asked.hz, asked.seconds),
-        "sentinel": lambda: sentinel(asked.core),
+        "timer": lambda: timer(options.executor, options.hz, options.seconds),
+        "bare_loop": lambda: bare_loop(options.hz, options.seconds),
+        "ticker": lambda: ticker_node(options.hz, options.seconds),
+        "delay_monitor": lambda: delay_monitor(options.core),
         "controller": controller,
     }
-    print(json.dumps(roles[asked.role]()), flush=True)
+    print(json.dumps(roles[options.role]()), flush=True)
 
 
 if __name__ == "__main__":

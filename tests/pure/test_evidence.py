@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of evidence is made of results alone, and says what is missing, short, failed or not to be relied on."""
+"""The evidence page: every figure comes from a result, and missing, short, failed and unreliable measurements are marked."""
 
 import json
 import re
@@ -43,7 +43,7 @@ NODE = [
 TIMES = {"median": 0.1234, "worst": 0.2341}
 FAULT = {
     "case": "controller killed",
-    "u": "held",
+    "u": "held, then ramped",
     "injected": 10,
     "detected": 10,
     "passed": 10,
@@ -70,7 +70,7 @@ SHARE = {"count": 3, "share": 3e-4, "low": 1e-4, "high": 9e-4}
 RESULTS = {
     "speed-node": result("speed-node", {"seconds": 10.0, "rows": NODE}),
     "faults": result("faults", [FAULT]),
-    "security": result("security", [{"name": "test_an_outsider_hears_nothing", "outcome": "passed", "seconds": 1.0}]),
+    "security": result("security", [{"name": "test_an_attacker_receives_nothing", "outcome": "passed", "seconds": 1.0}]),
     "fuzz-coverage": result(
         "fuzz-coverage",
         {"mcap": {"status": 0, "covered": 1234, "number_of_executed_units": 98765, "peak_rss_mb": 321}},
@@ -96,22 +96,22 @@ RESULTS = {
 
 
 def page(**changes: Result) -> str:
-    """With the lines of a paragraph joined again."""
+    """The page, each paragraph on one line."""
     return re.sub(r"(?<=[^\n|])\n *(?=[^\s|#-])", " ", render(MEASUREMENTS, RESULTS | changes))
 
 
-def test_no_line_of_words_is_longer_than_the_width_and_no_command_is_broken() -> None:
+def test_no_line_of_prose_is_longer_than_the_width_and_no_command_is_broken() -> None:
     for line in render(MEASUREMENTS, RESULTS).splitlines():
         assert len(line) <= WIDTH or line.startswith(("|", "    ")), line
         assert line.count("`") % 2 == 0, line
 
 
-def test_each_section_is_there() -> None:
+def test_the_page_has_every_section() -> None:
     titles = re.findall(r"^## (.+)$", page(), re.MULTILINE)
     assert titles == ["Faults", "Speed", "Security", "Campaign", "Other laws", "Log"]
 
 
-def test_without_results_it_holds_no_figure_and_says_which_command_makes_each() -> None:
+def test_without_results_the_page_holds_no_figure_but_the_command_for_each() -> None:
     empty = render(MEASUREMENTS, {})
     assert "Nothing has been measured yet." in empty
     for one in MEASUREMENTS:
@@ -119,22 +119,22 @@ def test_without_results_it_holds_no_figure_and_says_which_command_makes_each() 
     assert not [line for line in empty.splitlines() if line.startswith("|")]
 
 
-def test_each_table_stands_under_the_command_that_made_it() -> None:
+def test_each_table_stands_below_its_command() -> None:
     for name in RESULTS:
         assert f"\n    measure {name}    # 2020-01-02 03:04 UTC, abc1234\n" in page()
 
 
-def test_a_figure_of_the_machine_is_a_ratio_to_its_floor_with_the_figure_in_parentheses() -> None:
+def test_a_figure_that_depends_on_the_host_is_a_ratio_to_its_baseline_with_the_figure_in_parentheses() -> None:
     assert "| controller, u alone | 1.25 (50) | 4 (320) |" in page()  # 50 / 40 and 320 / 80
     assert "| *bare echo, single* | 1 (40) | 1 (80) |" in page()
 
 
-def test_a_count_is_no_ratio() -> None:
+def test_a_count_is_not_a_ratio() -> None:
     rows = [row("timer", {"missed": 4}, "timer"), row("loop", {"missed": 2}, "timer")]
     assert "| loop | 2 |" in page(**{"speed-node": result("speed-node", {"rows": rows})})
 
 
-@pytest.mark.parametrize(("p50", "verdict"), [(80.0, ": met."), (80.1, ": **not met**.")])
+@pytest.mark.parametrize(("p50", "verdict"), [(80.0, " times, met."), (80.1, " times, **not met**.")])
 def test_a_goal_is_met_up_to_its_limit(p50: float, verdict: str) -> None:
     rows = [NODE[0], row("controller", {"p50 (us)": p50}, "bare echo, single", (TWICE,))]
     text = page(**{"speed-node": result("speed-node", {"rows": rows})})
@@ -142,12 +142,12 @@ def test_a_goal_is_met_up_to_its_limit(p50: float, verdict: str) -> None:
     assert line.endswith(verdict)
 
 
-def test_the_controller_is_also_set_beside_the_fastest_echo() -> None:
-    assert "Beside the fastest echo (bare echo, events), times in p50: controller, u alone 2.5." in page()  # 50 / 20
+def test_the_controller_is_also_compared_with_the_fastest_echo() -> None:
+    assert "Ratios of p50 to that of the fastest echo (bare echo, events): controller, u alone 2.5." in page()  # 50 / 20
 
 
-def test_the_page_changes_with_every_figure_of_every_result() -> None:
-    """But for those that it does not show."""
+def test_the_page_depends_on_every_figure_of_every_result() -> None:
+    """Except those that the page omits."""
     before, hidden = page(), {"seconds", "deviation", "status", "quiet"}
     for name, whole in RESULTS.items():
         for path in leaves(whole["result"]):
@@ -162,7 +162,7 @@ def test_the_page_changes_with_every_figure_of_every_result() -> None:
 
 
 def leaves(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Where the numbers of a tree are."""
+    """The paths of all numbers in a tree."""
     if isinstance(tree, dict | list | tuple):
         pairs = tree.items() if isinstance(tree, dict) else enumerate(tree)
         return [found for key, value in pairs for found in leaves(value, (*path, key))]
@@ -170,76 +170,76 @@ def leaves(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "expected"),
     [
         ({"quick": True}, "**A short version**, not to be quoted"),
-        ({"busy": BUSY + 0.4}, "**The machine was busy** when this began, 50 % of its processors in use"),
+        ({"busy": BUSY + 0.4}, "**The host was busy** at the start, 50 % of its processors in use"),
         ({"result": None, "status": 2}, "**Failed**, with exit status 2"),
         ({"status": 1}, "**Exit status 1.**"),
     ],
 )
-def test_it_says_what_takes_from_the_worth_of_a_measurement(changes: dict[str, Any], said: str) -> None:
-    assert said not in page()
-    assert said in page(faults=RESULTS["faults"] | changes)
+def test_a_measurement_with_reduced_validity_is_marked(changes: dict[str, Any], expected: str) -> None:
+    assert expected not in page()
+    assert expected in page(faults=RESULTS["faults"] | changes)
 
 
 def test_a_killed_node_is_timed_from_its_start_and_from_its_being_ready() -> None:
-    assert "traffic within 0.5 s of its start. Found 0.51 s at worst: **not met**." in page()
-    assert "traffic within 0.5 s of its being ready. Found 0.234 s at worst: met." in page()
+    assert "traffic within 0.5 s of its start. Measured: 0.51 s at worst, **not met**." in page()
+    assert "traffic within 0.5 s of being ready. Measured: 0.234 s at worst, met." in page()
     assert "which publishers keep, 400 / 620 ms after being ready." in page()
 
 
-def test_only_what_is_timed_is_spoiled_by_a_busy_machine() -> None:
-    assert "machine was busy" not in page(replay=RESULTS["replay"] | {"busy": 1.0})
+def test_a_busy_host_is_marked_only_for_timed_measurements() -> None:
+    assert "host was busy" not in page(replay=RESULTS["replay"] | {"busy": 1.0})
 
 
-def test_a_fault_that_did_not_pass_each_time_stands_out() -> None:
+def test_a_fault_that_did_not_pass_each_time_is_bold() -> None:
     assert "1 of 1 cases passed every time; 10 of 10 faults" in page()
     text = page(faults=result("faults", [FAULT | {"passed": 9}], status=1))
     assert "0 of 1 cases passed every time; 9 of 10 faults" in text
     assert "| **9** |" in text
 
 
-def test_a_test_that_failed_stands_out() -> None:
-    failed = [{"name": "test_an_outsider_hears_nothing[far]", "outcome": "failed", "seconds": 1.0}]
-    assert "| an outsider hears nothing | passed |" in page()
-    assert "| an outsider hears nothing | **failed** |" in page(security=result("security", failed, status=1))
+def test_a_failed_test_is_bold() -> None:
+    failed = [{"name": "test_an_attacker_receives_nothing[far]", "outcome": "failed", "seconds": 1.0}]
+    assert "| an attacker receives nothing | passed |" in page()
+    assert "| an attacker receives nothing | **failed** |" in page(security=result("security", failed, status=1))
 
 
-def test_a_scenario_that_does_not_replay_stands_out() -> None:
+def test_a_scenario_that_replays_differently_is_bold() -> None:
     differing = {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": False, "differing": 17}
     assert "**17 ticks differ**" in page(replay=result("replay", {"osprey_gust": differing}))
     assert "**no flight**" in page(replay=result("replay", {"osprey_gust": {"outcome": ["error: no aircraft"]}}))
 
 
-def test_the_lowest_score_among_laws_that_see_the_same_is_bold() -> None:
+def test_the_lowest_score_among_laws_with_the_same_measurements_is_bold() -> None:
     assert "| rise | y | **1.61** |" in page()
     assert "| pi | y | 1.72 |" in page()
 
 
-def test_a_law_that_diverges_has_no_number() -> None:
+def test_the_score_of_a_diverged_law_is_a_word() -> None:
     lost = LAW | {"law": "di", "levels": [LEVEL | {"mean": None, "worst": None}]}
     assert "| di | y | **1.61** | diverged (diverged) |" in page(
         compare=result("compare", {"aircraft": 200, "seed": 1, "laws": [LAW, lost]})
     )
 
 
-def test_cells_of_each_table_are_as_many_as_its_headings() -> None:
+def test_each_table_has_as_many_cells_as_headings() -> None:
     for table in re.findall(r"(?:^\|.*\n)+", page(), re.MULTILINE):
         assert len({line.replace("\\|", "").count("|") for line in table.splitlines()}) == 1, table
 
 
-def test_what_is_missing_failed_or_short_is_measured_and_nothing_else() -> None:
-    there = {one.name: result(one.name, []) for one in MEASUREMENTS}
-    assert wanted([], there, quick=False) == []
-    assert [one.name for one in wanted(["speed-"], there, quick=False)] == [f"speed-{group}" for group in SPEED]
-    del there["faults"]
-    there |= {"compare": result("compare", None, status=1), "security": result("security", [], quick=True)}
-    assert [one.name for one in wanted([], there, quick=False)] == ["faults", "security", "compare"]
-    assert [one.name for one in wanted([], there, quick=True)] == ["faults", "compare"]
+def test_exactly_the_missing_failed_and_short_measurements_run() -> None:
+    stored = {one.name: result(one.name, []) for one in MEASUREMENTS}
+    assert wanted([], stored, quick=False) == []
+    assert [one.name for one in wanted(["speed-"], stored, quick=False)] == [f"speed-{group}" for group in SPEED]
+    del stored["faults"]
+    stored |= {"compare": result("compare", None, status=1), "security": result("security", [], quick=True)}
+    assert [one.name for one in wanted([], stored, quick=False)] == ["faults", "security", "compare"]
+    assert [one.name for one in wanted([], stored, quick=True)] == ["faults", "compare"]
 
 
-def test_every_measuring_program_is_there() -> None:
+def test_every_measuring_program_exists() -> None:
     repository = Path(__file__).parents[2]
     for one in MEASUREMENTS:
         for command in (one.command, one.quick):
@@ -249,7 +249,7 @@ def test_every_measuring_program_is_there() -> None:
                 assert not part.startswith("tests/") or (repository / part).exists(), part
 
 
-def test_outcomes_of_tests_are_read_from_their_file() -> None:
+def test_outcomes_of_tests_are_read_from_the_junit_file() -> None:
     junit = """<testsuites><testsuite>
         <testcase name="test_a" time="0.5"/>
         <testcase name="test_b[x]" time="1"><failure>no</failure></testcase>
@@ -265,7 +265,7 @@ def test_outcomes_of_tests_are_read_from_their_file() -> None:
     ]
 
 
-def test_what_a_program_leaves_is_its_file_else_what_it_prints_else_nothing(tmp_path: Path) -> None:
+def test_a_result_is_the_file_of_a_program_else_its_output_else_none(tmp_path: Path) -> None:
     left = tmp_path / "left.json"
     assert read(left, '{"a": 1}') == {"a": 1}
     assert read(left, "Traceback") is None

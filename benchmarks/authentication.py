@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a signature costs: a sample of u as bytes and back, without a key and with one, best of many.
+"""Time of message authentication: encoding and decoding a sample of u without and with a key, the least of many runs.
 
-python -m benchmarks.seal
+python -m benchmarks.authentication
 """
 
 from timeit import repeat
@@ -20,13 +20,13 @@ CALLS, TIMES = 5000, 15
 def main() -> None:
     """Print us a message."""
     print(f"{'':10}{'bytes':>8}{'encode us':>12}{'decode us':>12}")
-    for name, seals in (
+    for name, authenticators in (
         ("no key", (None, None)),
         ("key", tuple(MessageAuthenticator(bytes(32), "/u", None) for _ in range(2))),
     ):
-        encoder, decoder = Encoder(INPUTS, "/controller#4711", seals[0]), Decoder(INPUTS, seals[1])
+        encoder, decoder = Encoder(INPUTS, "/controller#4711", authenticators[0]), Decoder(INPUTS, authenticators[1])
         message = encoder.encode(1, VALUES)
-        decoder.decode(message)  # learns the layout
+        decoder.decode(message)  # the first message fixes the layout
 
         def encode(encoder: Encoder = encoder) -> None:
             encoder.encode(2, VALUES)
