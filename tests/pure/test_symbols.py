@@ -23,41 +23,65 @@ from rise_di_controller.law import LawParams, LawState
 
 ROOT = Path(__file__).resolve().parents[2]
 TOPICS = ROOT / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "topics.py"
-COLUMNS = {
-    "equation": ("equation", "statement", "code", "shape", "unit", "topic or parameter", "test"),
-    "symbol": ("symbol", "meaning", "code", "shape", "unit", "topic or parameter", "test"),
-}
+COLUMNS = ("code", "shape", "unit", "topic or parameter")  # behind equation, statement or symbol, meaning
 EQUATIONS = {*range(1, 33), 40, 46, 47, 48}  # the others are steps of the proofs, as the page says
 
 
 class Row(NamedTuple):
-    """A row of one of the two tables; names are what stands in backticks."""
+    """A row of one of the two tables with the rows that continue it; names are what stands in backticks."""
 
     table: str
     head: str
-    code: tuple[str, ...]
+    code: tuple[str, ...]  # full dotted names
     shown: tuple[str, ...]  # topic fields, parameters and commands
-    tests: tuple[str, ...]
+    tests: tuple[str, ...]  # file::function
 
 
 def quoted(cell: str) -> tuple[str, ...]:
     return tuple(re.findall(r"`([^`]+)`", cell))
 
 
+def modules_of(text: str) -> dict[str, str]:
+    """The package of each module that the names of code begin with."""
+    legend = re.search(r"- \*\*Code\.\*\*(.*?)(?=\n- )", text, re.DOTALL)
+    assert legend is not None
+    return dict(re.findall(r"`(\w+)`\s+in\s+`([\w.]+)`", legend[1]))
+
+
+def listed_tests(text: str) -> list[tuple[str, tuple[str, ...]]]:
+    """The tests of each row, in the order of the tables."""
+    items = re.findall(r"^- (.*?)(?=\n- |\n\n|\Z)", text.partition("\n## Tests\n")[2], re.DOTALL | re.MULTILINE)
+    heads = [item.partition(": `")[0] for item in items]
+    named = [[name.partition("::") for name in quoted(item[len(head) :])] for head, item in zip(heads, items, strict=True)]
+    return [
+        (head, tuple(f"{file if '/' in file else f'tests/pure/test_{file}.py'}::test_{name}" for file, _, name in names))
+        for head, names in zip(heads, named, strict=True)
+    ]
+
+
 def rows_of(text: str) -> list[Row]:
     """Rows of the tables of a page."""
-    rows, table = [], ""
-    for line in text.splitlines():
+    rows: list[list[Any]] = []
+    table = ""
+    for line in text.partition("\n## Tests\n")[0].splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if not line.startswith("|"):
             table = ""
         elif not table:
             table = cells[0]
-            assert tuple(cells) == COLUMNS[table]
+            assert tuple(cells[2:]) == COLUMNS
         elif set(line) != {"|", "-"}:
-            assert len(cells) == 7, f"{cells[0]}: {len(cells)} cells, for a | stands in one of them"
-            rows.append(Row(table, cells[0], quoted(cells[2]), quoted(cells[5]), quoted(cells[6])))
-    return rows
+            assert len(cells) == 6, f"{cells[0]}: {len(cells)} cells, for a | stands in one of them"
+            if cells[0]:
+                rows.append([table, cells[0], (), ()])
+            rows[-1][2] += quoted(cells[2])
+            rows[-1][3] += quoted(cells[5])
+    modules, tests = modules_of(text), listed_tests(text)
+    assert [head for head, _ in tests] == [head for _, head, _, _ in rows]
+    return [
+        Row(table, head, tuple(f"{modules[name.split('.')[0]]}.{name}" for name in code), shown, named)
+        for (table, head, code, shown), (_, named) in zip(rows, tests, strict=True)
+    ]
 
 
 PAGE = (ROOT / "docs" / "symbols.md").read_text(encoding="utf-8")
