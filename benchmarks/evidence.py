@@ -8,7 +8,7 @@
     make evidence ARGS=--render                # only the page, from the stored results
 
 build/evidence/ holds one file for each result, with its command, date, host, and the load of the host before. A failed
-measurement is stored as failed and marked on the page. The text around the figures is in evidence.md.j2.
+measurement is stored as failed and marked on the page. The text around the figures is in evidence.md.jinja.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rendering of docs/evidence.md: the template evidence.md.j2, filled with results of benchmarks/evidence.py."""
+"""Rendering of docs/evidence.md: the template evidence.md.jinja, filled with results of benchmarks/evidence.py."""
 
 import math
 import re
@@ -47,7 +47,7 @@ SPEED = {
 
 def render(measurements: Sequence[Measurement], results: Mapping[str, Result]) -> str:
     """The page from the results by name of the measurement; lines of prose are at most WIDTH long."""
-    page = TEMPLATES.get_template("evidence.md.j2").render(
+    page = TEMPLATES.get_template("evidence.md.jinja").render(
         measurements={one.name: one for one in measurements},
         results=results,
         value=lambda name: results[name]["result"] if name in results else None,
