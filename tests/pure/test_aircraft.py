@@ -11,45 +11,35 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from tests.builders import MS, aircraft_parameters
 
 from aircraft_sim import actuators, dynamics, truth, turbulence
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.disturbance import Gusts, one_minus_cosine
 from aircraft_sim.dynamics import Aircraft
-from aircraft_sim.params import AircraftParameters
-from aircraft_sim.plant import AircraftState, PlantParams, advance, initial_state
+from aircraft_sim.plant import AircraftState, advance, initial_state
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 
-MS = 1_000_000
-
 
 def osprey(**gusts: dict[str, float]) -> Aircraft:
-    return plant(**gusts).aircraft
-
-
-def plant(**gusts: dict[str, float]) -> PlantParams:
-    values = {"airframe": "osprey", "rate": 500.0, "step": 0.002, "gusts": gusts}
-    return AircraftParameters.validate_mapping(values, "aircraft").plant()
+    return aircraft_parameters(gusts=gusts).plant().aircraft
 
 
 def final_state(x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, aircraft: Aircraft) -> FloatArray:
     """State x after `duration_ns` with u held and ideal actuators."""
-    params = plant()._replace(aircraft=aircraft, step_ns=step_ns)
+    params = aircraft_parameters().plant()._replace(aircraft=aircraft, step_ns=step_ns)
     end = advance(0, AircraftState(x, np.zeros_like(u)), u, duration_ns, params)
     return np.asarray(end.x)
-
-
-def linear(aircraft: Aircraft) -> Aircraft:
-    return aircraft._replace(gravity=np.zeros_like(aircraft.gravity))
 
 
 def test_without_f_the_plant_follows_the_matrix_exponential() -> None:
     # x(t) = exp([[A, B], [0, 0]] t) [x0; u] exactly for a held u. Runge-Kutta with 2 ms and poles up to 13 rad/s leaves
     # (0.026)^5 / 120 a step, about 1e-9 over a second.
-    aircraft = linear(osprey())
+    aircraft = osprey()
+    aircraft = aircraft._replace(gravity=np.zeros_like(aircraft.gravity))
     x_0, u = np.linspace(-0.1, 0.1, 8), np.array([0.02, 0.1, -0.01, 0.03])
     block = np.block([[aircraft.A, aircraft.B], [np.zeros((4, 12))]])
     exact = (expm(block * 1.0) @ np.concatenate([x_0, u]))[:8]
@@ -68,13 +58,7 @@ def test_the_plant_agrees_with_an_adaptive_integrator_through_a_gust() -> None:
     aircraft = osprey(vertical={"start": 0.2, "speed": 10.12, "length": 15.24})
     u = np.array([0.01, 0.0, 0.02, 0.0])
     reference = solve_ivp(
-        lambda t, x: dynamics.x_dot(t, x, u, aircraft),
-        (0.0, 2.0),
-        np.zeros(8),
-        method="DOP853",
-        rtol=1e-11,
-        atol=1e-12,
-        max_step=0.01,
+        lambda t, x: dynamics.x_dot(t, x, u, aircraft), (0.0, 2.0), np.zeros(8), "DOP853", rtol=1e-11, atol=1e-12, max_step=0.01
     )
     end = final_state(np.zeros(8), u, 2 * NANOSECONDS, 2 * MS, aircraft)
     # The gust's second derivative jumps at its ends: Runge-Kutta loses an order there.
@@ -121,13 +105,7 @@ def test_inputs_of_the_airframe_are_converted_to_si_once() -> None:
 
 
 def test_truth_holds_the_state_the_disturbance_and_the_actuators() -> None:
-    values = {
-        "airframe": "osprey",
-        "rate": 500.0,
-        "step": 0.002,
-        "gusts": {"vertical": {"start": 0.0, "speed": 2.0, "length": 10.0}},
-    }
-    parameters = AircraftParameters.validate_mapping(values, "aircraft")
+    parameters = aircraft_parameters(gusts={"vertical": {"start": 0.0, "speed": 2.0, "length": 10.0}})
     names = truth.names(parameters.load()[0])
     state = AircraftState(np.arange(8.0) / 100, np.array([0.1, 0.2, 0.3, 0.4]))
     now = dynamics.at_times(np.array([0.4]), parameters.plant().aircraft)
@@ -155,8 +133,7 @@ EVERYTHING = {
 
 def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() -> None:
     # x_dot is the definition; advance computes f_time at all instants together. Measured difference 1e-16 over 20 steps.
-    values = {"airframe": "osprey", "rate": 25.0, "step": 0.002} | EVERYTHING
-    params = AircraftParameters.validate_mapping(values, "aircraft").plant()
+    params = aircraft_parameters(rate=25.0, **EVERYTHING).plant()
     filters = params.turbulence
     assert filters is not None
     u, T = np.array([0.05, 0.1, -0.04, 0.03]), 20
@@ -177,27 +154,18 @@ def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() ->
 
 
 def test_equation_1_is_the_sum_of_its_parts() -> None:
-    aircraft = AircraftParameters.validate_mapping(
-        {"airframe": "osprey", "rate": 25.0, "step": 0.002} | EVERYTHING, "a"
-    ).load()[1]
+    aircraft = aircraft_parameters(rate=25.0, **EVERYTHING).load()[1]
     x, u, turbulent = np.linspace(-0.3, 0.3, 8), np.array([0.01, 0.1, 0.02, 0.03]), np.array([0.5, -1.0, 2.0])
     x_dot = dynamics.x_dot(0.3, x, u, aircraft, turbulent)
     assert x_dot == pytest.approx(aircraft.A @ x + dynamics.f(0.3, x, aircraft, turbulent) + aircraft.B @ u, abs=1e-14)
-    undisturbed = dynamics.f(0.3, x, aircraft)
-    assert dynamics.f(0.3, x, aircraft, turbulent) - undisturbed == pytest.approx(
-        aircraft.gust_direction @ turbulent, abs=1e-14
-    )
+    difference = dynamics.f(0.3, x, aircraft, turbulent) - dynamics.f(0.3, x, aircraft)
+    assert difference == pytest.approx(aircraft.gust_direction @ turbulent, abs=1e-14)
 
 
 def test_f_of_states_in_columns_is_f_of_each_state() -> None:
-    aircraft = plant(vertical={"start": 0.0, "speed": 10.0, "length": 15.0}).aircraft
-    coupling = AircraftParameters.validate_mapping(
-        {"airframe": "osprey", "rate": 25.0, "step": 0.002, "inertial_coupling": 1.0}, "aircraft"
-    )
-    batched = aircraft._replace(
-        coupling=coupling.load()[1].coupling, gusts=Gusts(*(values[:, None] for values in aircraft.gusts))
-    )
-    single = batched._replace(gusts=aircraft.gusts)
+    gusts = {"vertical": {"start": 0.0, "speed": 10.0, "length": 15.0}}
+    single = aircraft_parameters(gusts=gusts, inertial_coupling=1.0).load()[1]
+    batched = single._replace(gusts=Gusts(*(values[:, None] for values in single.gusts)))
     columns = np.random.default_rng(1).uniform(-1.0, 1.0, (8, 5))
     f = dynamics.f(0.3, columns, batched)
     for k in range(5):

@@ -2,13 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Invalid parameters: one sentence that names the key, what was found and what is expected."""
 
+import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.builders import aircraft_parameters
 
-from aircraft_sim.airframe import LIBRARY, load_airframe
+from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_bringup.scenarios import find_scenario
 from flight_core.files import read_yaml, writing
@@ -26,10 +29,7 @@ BAD = {
     ("D: [1, 1, 1, 1]", "D: 1"): "controller.D: found 1, expected a list of values",
     ("k_d: [16.0, 16.0, 7.0]", "k_d: [16.0, .nan, 7.0]"): "controller.k_d[1]: found nan, expected a finite number",
     ("k_d: [16.0, 16.0, 7.0]", "k_d: [16.0, 16.0]"): "controller.k_d: found 2 values, expected 3, one for each of q, p, r",
-    (
-        "damping: [0.9, 1.0,",
-        "damping: [0.9, -1.0,",
-    ): "second_order.damping: found an eigenvalue of A_m with real part",
+    ("damping: [0.9, 1.0,", "damping: [0.9, -1.0,"): "second_order.damping: found an eigenvalue of A_m with real part",
     ("rate: 100.0                # Hz\n    outputs", "rate: 300.0\n    outputs"): (
         "controller.rate: found 300 Hz, expected a rate whose period is a whole number of nanoseconds"
     ),
@@ -41,23 +41,14 @@ BAD = {
     ("[q, p, r, V]", "[q, p, r, W]"): "controller.outputs: found q, p, r, W, expected the channels of the airframe osprey",
     ("rudder, thrust]", "rudder, flaps]"): "controller.inputs: found elevator, aileron, rudder, flaps, expected the channels",
     ("sign: auto", "sign: smooth"): "controller.sign: found 'smooth', expected 'auto', 'literal', 'implicit' or 'soft'",
-    (
-        "vertical: {start",
-        "upward: {start",
-    ): "gusts: found 'upward', expected a gust of the airframe osprey: vertical, lateral",
+    ("vertical: {start", "upward: {start"): "gusts: found 'upward', expected a gust of the airframe osprey: vertical, lateral",
     ("length: 15.24}   #", "length: 0.0}   #"): "aircraft.gusts.vertical.length: found 0.0, expected greater than 0",
     ("stop: [4.0, 8.0", "stop: [1.0, 8.0"): "reference_model.pulses.q.stop[0]: found 1.0, expected later than start[0] = 2 s",
     ("rise: 0.1", "rise: 0.0"): "reference_model.rise: found 0.0, expected greater than 0",
-    (
-        "bank_rate: p",
-        "bank_rate: roll",
-    ): "coordinated_turn.bank_rate: found channel 'roll', expected one of q, V, p, r",
+    ("bank_rate: p", "bank_rate: roll"): "coordinated_turn.bank_rate: found channel 'roll', expected one of q, V, p, r",
     ("duration: 60.0", "duration: long"): "flight.duration: found 'long', expected a number",
     ("/**/recorder", "/**/recoder"): "bad.yaml: recoder: found a section, expected only flight, aircraft,",
-    (
-        "/**/recorder:\n  ros__parameters:",
-        "/**/recorder:\n  parameters:",
-    ): "recorder: found no mapping under ros__parameters",
+    ("/**/recorder:\n  ros__parameters:", "/**/recorder:\n  parameters:"): "recorder: found no mapping under ros__parameters",
     ("duration: 60.0", "duration: [60.0"): "bad.yaml: not valid YAML",
     ("duration: 60.0", "duration: 2001-99-99"): "bad.yaml: not valid YAML",
     ("duration: 60.0", "duration: 0b_"): "bad.yaml: not valid YAML",
@@ -97,6 +88,101 @@ def test_an_invalid_scenario_is_one_sentence(
     message = str(rejected.value)
     assert sentence in message
     assert "\n" not in message
+
+
+# Section of the aircraft -> its values and the sentence of the error, a pattern.
+GUST, STEP, SINE = {"start": 0.0, "speed": 1.0, "length": 9.0}, {"start": 0.0, "value": 1.0, "rise": 0.0}, {"amplitude": 1.0}
+PRODUCT = {"into": "p", "product": ["q", "p"], "gain": 1.0}
+FOUR = "found 1 values, expected 4, one for each of"
+BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
+    "actuators": [
+        ({"lag": [0.02]}, rf"\.lag: {FOUR} elevator, thrust, aileron, rudder"),
+        ({"lag": [-0.02, 0.0, 0.0, 0.0]}, r"\.lag\[0\]: found -0.02, expected greater than or equal to 0"),
+        ({"upper": [-0.1, 1.0, 1.0, 1.0]}, r"\.upper\[0\]: found -0.1, expected greater than or equal to 0"),
+        ({"lower": [0.1, -1.0, -1.0, -1.0]}, r"\.lower\[0\]: found 0.1, expected less than or equal to 0"),
+        ({"rate": [1.0, math.nan, 1.0, 1.0]}, r"\.rate\[1\]: found nan, expected greater than 0"),
+        ({"dead_zone": [0.1]}, rf"\.dead_zone: {FOUR} elevator, thrust"),
+        ({"dead_zone": [-0.1] * 4}, r"\.dead_zone\[0\]: found -0.1, expected greater than or equal to 0"),
+        ({"stuck_at": [-1.0] * 4}, r"\.stuck_at\[0\]: found -1.0, expected greater than or equal to 0"),
+        ({"lost_at": [math.nan] * 4}, r"\.lost_at\[0\]: found nan, expected greater than or equal to 0"),
+        ({"lags": [0.02]}, r"\.lags: unknown key, expected lag perhaps"),
+    ],
+    "sensors": [
+        ({"delay": 0.003}, r"\.delay: found 0\.003 s, expected a whole multiple of 1 / rate \(0\.002 s\)"),
+        ({"delay": -0.002}, r"\.delay: found -0.002, expected greater than or equal to 0"),
+        ({"noise": [0.1]}, rf"\.noise: {FOUR} q, V, p, r"),
+        ({"noise": [0.1, -0.1, 0.1, 0.1]}, r"\.noise\[1\]: found -0.1, expected greater than or equal to 0"),
+        ({"dropout": 1.0}, r"\.dropout: found 1.0, expected less than 1"),
+        ({"seed": 1.5}, r"\.seed: found 1.5, expected an? .*integer"),
+        ({"nois": [0.0017, 0.03, 0.0017, 0.0017]}, r"\.nois: unknown key, expected noise perhaps"),
+        ({"bias": [0.1]}, rf"\.bias: {FOUR} q, V, p, r"),
+        ({"drift": [0.1] * 3 + [-0.1]}, r"\.drift\[3\]: found -0.1, expected greater than or equal to 0"),
+        ({"quantisation": [-0.1] * 4}, r"\.quantisation\[0\]: found -0.1, expected greater than or equal to 0"),
+    ],
+    "uncertainty": [
+        ({"A": 1.0}, r"\.A: found 1.0, expected less than 1"),
+        ({"B": -0.1}, r"\.B: found -0.1, expected greater than or equal to 0"),
+        ({"seed": -1}, r"\.seed: found -1, expected greater than or equal to 0"),
+        ({"C": 0.1}, r"\.C: unknown key, expected one of A, B, number, seed"),
+    ],
+    "turbulence": [
+        ({"altitude": 3.0, "wind": 7.7}, r"\.altitude: found 3\.0, expected greater than or equal to 3\.048"),
+        ({"altitude": 100.0}, r"\.wind: found none, expected a value at 100 m: it acts below 609\.6 m"),
+        ({"altitude": 400.0, "wind": 7.7}, r"\.sigma: found none, expected a value at 400 m: it acts above 304\.8 m"),
+        (
+            {"altitude": 100.0, "wind": 7.7, "sigma": 1.0},
+            r"\.sigma: found 1 m/s, expected none at 100 m: it acts above 304\.8 m",
+        ),
+        ({"altitude": 700.0, "wind": 7.7, "sigma": 1.0}, r"\.wind: found 7\.7 m/s, expected none at 700 m"),
+        ({"altitude": 100.0, "wind": -1.0}, r"\.wind: found -1\.0, expected greater than or equal to 0"),
+        ({"altitude": 100.0, "winds": 1.0}, r"\.winds: unknown key, expected wind perhaps"),
+    ],
+    "gusts": [({"up": GUST}, ": found 'up', expected a gust of the airframe osprey: vertical, lateral, longitudinal")],
+    "bias": [
+        ({"h": STEP}, r"\.h: found 'h', expected a state of osprey: V, alpha"),
+        ({"q": {"start": 0.0, "value": 1.0}}, r"\.q\.rise: missing, expected a value"),
+        ({"q": STEP | {"rise": -1.0}}, r"\.q\.rise: found -1\.0, expected greater than or equal to 0"),
+    ],
+    "sines": [
+        ({"y": SINE | {"frequency": 1.0}}, r"\.y: found 'y', expected a state of osprey: V, alpha"),
+        ({"q": SINE | {"frequency": 0.0}}, r"\.q\.frequency: found 0\.0, expected greater than 0"),
+    ],
+    "inertial_coupling": [(1.5, r": found 1\.5, expected less than or equal to 1")],
+}
+
+
+@pytest.mark.parametrize(
+    ("section", "values", "sentence"), [(section, *row) for section, rows in BAD_AIRCRAFT.items() for row in rows]
+)
+def test_an_invalid_section_of_the_aircraft_is_refused_by_name(section: str, values: Any, sentence: str) -> None:
+    with pytest.raises(ParameterError, match=rf"^aircraft\.{section}{sentence}"):
+        aircraft_parameters(rate=500.0, **{section: values})
+
+
+@pytest.mark.parametrize(
+    ("section", "values", "sentence"),
+    [
+        ("turbulence", {"altitude": 100.0, "wind": 7.7}, "found a section, expected none: the airframe f16_lateral has"),
+        ("inertial_coupling", 0.5, r"found 0\.5, expected 0: the airframe f16_lateral has no inertial_coupling"),
+    ],
+)
+def test_a_section_without_data_in_the_airframe_is_refused(section: str, values: Any, sentence: str) -> None:
+    with pytest.raises(ParameterError, match=rf"^aircraft\.{section}: {sentence}"):
+        aircraft_parameters(airframe="f16_lateral", **{section: values})
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"gusts": {"up": {"q": 1.0}}}, r"gusts\.up: found 'up', expected an axis of the wind: longitudinal, lateral, vert"),
+        ({"inertial_coupling": [PRODUCT | {"product": ["q"]}]}, r"\[0\]\.product: found 1 states, expected two of them"),
+        ({"inertial_coupling": [PRODUCT | {"product": ["q", "w"]}]}, r"\[0\]\.product\[1\]: found 'w', expected a state"),
+        ({"inertial_coupling": [PRODUCT | {"into": "w"}]}, r"\[0\]\.into: found 'w', expected a state"),
+    ],
+)
+def test_an_invalid_airframe_is_refused_by_name(values: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=rf"^airframe\..*{sentence}"):
+        Airframe.validate_mapping(load_airframe("osprey").model_dump() | values, "airframe")
 
 
 def test_an_integer_is_accepted_as_a_number(osprey_gust: Scenario) -> None:
@@ -156,13 +242,8 @@ def test_a_name_cannot_be_a_value_and_a_group() -> None:
 
 
 def test_a_period_is_a_whole_number_of_nanoseconds() -> None:
-    assert [period_ns(rate, "rate") for rate in (1.0, 100.0, 500.0, 1000.0, 62.5)] == [
-        10**9,
-        10**7,
-        2 * 10**6,
-        10**6,
-        16 * 10**6,
-    ]
+    periods = [period_ns(rate, "rate") for rate in (1.0, 100.0, 500.0, 1000.0, 62.5)]
+    assert periods == [10**9, 10**7, 2 * 10**6, 10**6, 16 * 10**6]
     for rate in (3.0, 300.0, 999.0):
         with pytest.raises(ParameterError, match=f"rate: found {rate:g} Hz"):
             period_ns(rate, "rate")

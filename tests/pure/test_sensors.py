@@ -6,22 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.builders import MS, aircraft_parameters, rms
 
 from aircraft_sim import sensors as sensor_maths
-from aircraft_sim.params import AircraftParameters
 from aircraft_sim.sensors import DelayLine, Drift, Sensors, arrives, initial_drift, measure, noise, transmit, walk
 from aircraft_sim.simulator import Simulator, StateSpaceModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import best_error, error_metrics, tracking_error, true_error
+from flight_analysis.metrics import best_error, tracking_error, true_error
 from flight_bringup.scenarios import find_scenario
-from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard
 
-MS = 1_000_000
-FACTORS = {"q": 1e3, "V": 1.0, "p": 1e3, "r": 1e3}  # mrad/s, m/s
 NOISE = [0.0017, 0.03, 0.0017, 0.0017]
 COUNT = 20_000  # samples
 
@@ -130,8 +127,7 @@ def test_after_missed_ticks_due_samples_arrive_together_oldest_first() -> None:
 
 
 def test_a_sample_is_the_output_with_its_noise_or_is_dropped() -> None:
-    values = {"airframe": "osprey", "rate": 100.0, "step": 0.01, "sensors": {"noise": NOISE, "dropout": 0.5}}
-    parameters = AircraftParameters.validate_mapping(values, "aircraft")
+    parameters = aircraft_parameters(step=0.01, sensors={"noise": NOISE, "dropout": 0.5})
     simulator, model = Simulator(parameters), StateSpaceModel(parameters)
     u = np.array([0.01, 0.1, 0.02, 0.03])
     arrivals = []
@@ -210,8 +206,7 @@ def test_the_variance_of_the_drift_grows_with_time_at_any_rate() -> None:
     # 0.2 SI per sqrt(s) gives variance 0.04 t. 400 walks at two rates: chi-square of 400 has a standard deviation of 7 %; the
     # limit of four of them holds in 99.99 % of seeds.
     for rate, samples in ((10.0, 20), (40.0, 80)):
-        values = {"airframe": "osprey", "rate": rate, "step": 0.005, "sensors": {"drift": [0.2, 0.0, 0.4, 0.0]}}
-        params = AircraftParameters.validate_mapping(values, "aircraft").sensor_arrays()
+        params = aircraft_parameters(rate=rate, step=0.005, sensors={"drift": [0.2, 0.0, 0.4, 0.0]}).sensor_arrays()
         ends = np.array([walk(samples, initial_drift(params), params._replace(seed=seed)).value for seed in range(400)])
         variance = np.mean(ends**2, axis=0)
         assert variance[[0, 2]] == pytest.approx([0.04 * 2.0, 0.16 * 2.0], rel=0.28)
@@ -223,27 +218,6 @@ def test_ideal_sensors_give_y_to_the_last_bit() -> None:
     measured = measure(3, y, initial_drift(sensors([0.0] * 4)), sensors([0.0] * 4))
     assert measured.y.tobytes() == y.tobytes()
     assert (measured.error == 0.0).all()
-
-
-@pytest.mark.parametrize(
-    ("section", "sentence"),
-    [
-        ({"delay": 0.003}, r"aircraft.sensors.delay: found 0.003 s, expected a whole multiple of 1 / rate \(0.002 s\)"),
-        ({"delay": -0.002}, "aircraft.sensors.delay: found -0.002, expected greater than or equal to 0"),
-        ({"noise": [0.1]}, "aircraft.sensors.noise: found 1 values, expected 4, one for each of q, V, p, r"),
-        ({"noise": [0.1, -0.1, 0.1, 0.1]}, r"aircraft.sensors.noise\[1\]: found -0.1, expected greater than or equal to 0"),
-        ({"dropout": 1.0}, "aircraft.sensors.dropout: found 1.0, expected less than 1"),
-        ({"seed": 1.5}, "aircraft.sensors.seed: found 1.5, expected an? .*integer"),
-        ({"nois": NOISE}, "aircraft.sensors.nois: unknown key, expected noise perhaps"),
-        ({"bias": [0.1]}, "aircraft.sensors.bias: found 1 values, expected 4, one for each of q, V, p, r"),
-        ({"drift": [0.1] * 3 + [-0.1]}, r"aircraft.sensors.drift\[3\]: found -0.1, expected greater than or equal to 0"),
-        ({"quantisation": [-0.1] * 4}, r"aircraft.sensors.quantisation\[0\]: found -0.1, expected greater than or equal to 0"),
-    ],
-)
-def test_invalid_sensor_parameters_are_refused_by_name(section: dict[str, Any], sentence: str) -> None:
-    values = {"airframe": "osprey", "rate": 500.0, "step": 0.002, "sensors": section}
-    with pytest.raises(ParameterError, match=sentence):
-        AircraftParameters.validate_mapping(values, "aircraft")
 
 
 # Flights of osprey_servo. With aircraft and controller both at 100 Hz a dropped sample is a missed tick. The expected figures
@@ -259,13 +233,6 @@ def servo() -> Scenario:
 
 def with_sensors(scenario: Scenario, **sensors: Any) -> Scenario:
     return scenario.vary(aircraft={"sensors": scenario.aircraft.sensors.model_dump() | sensors})
-
-
-def rms(tape: Tape) -> FloatArray:
-    """Root mean square of the true error over the whole flight, q, V, p, r in mrad/s and m/s."""
-    error = true_error(tape)
-    assert error is not None
-    return np.array([error_metrics(error[name]).rms * factor for name, factor in FACTORS.items()])
 
 
 def test_truth_holds_the_noise_of_every_sample_even_of_dropped_ones(servo: Scenario) -> None:

@@ -13,21 +13,19 @@ from scipy.integrate import quad
 from scipy.linalg import expm
 from scipy.signal import get_window
 from scipy.stats import chi2
+from tests.builders import MS, aircraft_parameters, truth_of
 
 from aircraft_sim import plant, turbulence
 from aircraft_sim.disturbance import AXES
-from aircraft_sim.params import AircraftParameters
-from aircraft_sim.plant import PlantParams
 from aircraft_sim.simulator import Simulator
 from aircraft_sim.turbulence import Dryden, Turbulence, dryden, filters
-from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
 FEET, KNOTS = 0.3048, 0.514444  # m, m/s
 V0 = 25.0
-MS = 1_000_000
 SMALL = Dryden(np.array([60.0, 60.0, 25.0]), np.array([1.1, 1.1, 0.8]))  # about 60 ft above the ground in 15 kt
 ALL = (0, 1, 2)
+TURBULENCE = {"altitude": 30.0, "wind": 7.7}
 
 
 def spectrum(omega: FloatArray, axis: int, model: Dryden) -> FloatArray:
@@ -189,9 +187,8 @@ def periodogram_ratio(sampled: tuple[float, FloatArray], axis: int, model: Dryde
     dt, winds = sampled
     window: FloatArray = np.asarray(get_window("hann", STEPS), dtype=np.float64)
     bins = np.unique(np.round(np.geomspace(STEPS / 100, 0.45 * STEPS, 12)).astype(int))
-    periodogram = (
-        np.mean(np.abs(np.fft.rfft(winds[axis] * window, axis=1)[:, bins]) ** 2, axis=0) * dt / np.pi / np.sum(window**2)
-    )
+    power = np.mean(np.abs(np.fft.rfft(winds[axis] * window, axis=1)[:, bins]) ** 2, axis=0)
+    periodogram = power * dt / np.pi / np.sum(window**2)
     return np.asarray(periodogram / expected_periodogram(2.0 * np.pi * bins / (STEPS * dt), dt, axis, model, window))
 
 
@@ -242,13 +239,8 @@ def test_the_numbers_of_step_k_do_not_depend_on_the_range() -> None:
     assert (turbulence.normals(0, 300, 6) != whole).all()
 
 
-def turbulent(step_ms: float = 2.0, **values: Any) -> AircraftParameters:
-    section = {"airframe": "osprey", "rate": 100.0, "step": step_ms / 1e3, "turbulence": {"altitude": 30.0, "wind": 7.7}}
-    return AircraftParameters.validate_mapping(section | values, "aircraft")
-
-
 def test_the_turbulence_does_not_depend_on_how_the_flight_is_divided() -> None:
-    params, u = turbulent().plant(), np.array([0.01, 0.1, 0.0, 0.0])
+    params, u = aircraft_parameters(turbulence=TURBULENCE).plant(), np.array([0.01, 0.1, 0.0, 0.0])
     whole = plant.advance(0, plant.initial_state(params), u, 400 * MS, params)
     cut = plant.initial_state(params)
     for k in range(40):
@@ -257,7 +249,7 @@ def test_the_turbulence_does_not_depend_on_how_the_flight_is_divided() -> None:
     assert whole.turbulence is not None
     assert cut.turbulence.tobytes() == whole.turbulence.tobytes()
     assert cut.x == pytest.approx(whole.x, abs=1e-14)  # the instants are rounded differently
-    first, second = Simulator(turbulent()), Simulator(turbulent())
+    first, second = (Simulator(aircraft_parameters(turbulence=TURBULENCE)) for _ in range(2))
     for number in range(20):
         for simulator in (first, second):
             simulator.sample(number, u)
@@ -266,7 +258,7 @@ def test_the_turbulence_does_not_depend_on_how_the_flight_is_divided() -> None:
 
 def test_given_numbers_replace_those_of_the_seed() -> None:
     # Campaigns on other array types need this: the seed takes NumPy.
-    params, u = turbulent().plant(), np.zeros(4)
+    params, u = aircraft_parameters(turbulence=TURBULENCE).plant(), np.zeros(4)
     assert params.turbulence is not None
     state = plant.initial_state(params)
     own = plant.advance(0, state, u, 20 * MS, params)
@@ -276,14 +268,15 @@ def test_given_numbers_replace_those_of_the_seed() -> None:
 
 
 def test_truth_holds_the_wind_that_acts_from_now_on_and_f_includes_it() -> None:
-    parameters = turbulent(gusts={"vertical": {"start": 0.0, "speed": 2.0, "length": 2.5}})
+    gusts = {"vertical": {"start": 0.0, "speed": 2.0, "length": 2.5}}
+    parameters = aircraft_parameters(turbulence=TURBULENCE, gusts=gusts)
     simulator, params = Simulator(parameters), parameters.plant()
     air = params.turbulence
     assert air is not None
     z = turbulence.initial_state(air)
     for number in range(3):
         simulator.sample(number, np.zeros(4))
-        true = dict(zip(simulator.truth_names, simulator.truth(), strict=True))
+        true = truth_of(simulator)
         winds = dict(zip(parameters.sampled_airframe().gusts, turbulence.wind(z, air), strict=True))
         gust = 1.0 - math.cos(math.pi * 0.01 * number * 25.0 / 2.5)
         assert true["gust.lateral"] == winds["lateral"] != 0.0
@@ -297,45 +290,12 @@ def test_the_wind_of_an_axis_does_not_depend_on_the_other_axes() -> None:
     # Each axis has its own noise, used by the airframe or not.
     model = dryden(30.0, 7.7, 0.0)
     whole, lateral = filters(model, V0, 0.01, ALL, 1), filters(model, V0, 0.01, [AXES.index("lateral")], 1)
-    assert (
-        turbulence.wind(turbulence.initial_state(whole), whole)[1]
-        == turbulence.wind(turbulence.initial_state(lateral), lateral)[0]
-    )
-
-
-def plant_params(section: dict[str, Any], airframe: str = "osprey") -> PlantParams:
-    values = {"airframe": airframe, "rate": 100.0, "step": 0.002, "turbulence": section}
-    return AircraftParameters.validate_mapping(values, "aircraft").plant()
+    winds, wind = (turbulence.wind(turbulence.initial_state(params), params) for params in (whole, lateral))
+    assert winds[1] == wind[0]
 
 
 def test_without_intensity_there_is_no_turbulence() -> None:
-    assert plant_params({"altitude": 100.0, "wind": 0.0}).turbulence is None
-    assert plant_params({"altitude": 400.0, "wind": 0.0, "sigma": 0.0}).turbulence is None
-    assert isinstance(plant_params({"altitude": 400.0, "wind": 0.0, "sigma": 0.1}).turbulence, Turbulence)
-
-
-@pytest.mark.parametrize(
-    ("section", "sentence"),
-    [
-        ({"altitude": 3.0, "wind": 7.7}, r"turbulence\.altitude: found 3\.0, expected greater than or equal to 3\.048"),
-        ({"altitude": 100.0}, r"turbulence\.wind: found none, expected a value at 100 m: it acts below 609\.6 m"),
-        ({"altitude": 400.0, "wind": 7.7}, r"turbulence\.sigma: found none, expected a value at 400 m: it acts above 304\.8 m"),
-        (
-            {"altitude": 100.0, "wind": 7.7, "sigma": 1.0},
-            r"turbulence\.sigma: found 1 m/s, expected none at 100 m: it acts above 304\.8 m",
-        ),
-        ({"altitude": 700.0, "wind": 7.7, "sigma": 1.0}, r"turbulence\.wind: found 7\.7 m/s, expected none at 700 m"),
-        ({"altitude": 100.0, "wind": -1.0}, r"turbulence\.wind: found -1\.0, expected greater than or equal to 0"),
-        ({"altitude": 100.0, "winds": 1.0}, r"turbulence\.winds: unknown key, expected wind perhaps"),
-    ],
-)
-def test_invalid_turbulence_is_refused_by_name(section: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ParameterError, match=f"^aircraft.{sentence}"):
-        plant_params(section)
-
-
-def test_turbulence_on_an_airframe_without_gusts_is_refused() -> None:
-    with pytest.raises(
-        ParameterError, match=r"^aircraft\.turbulence: found a section, expected none: the airframe f16_lateral has"
-    ):
-        plant_params({"altitude": 100.0, "wind": 7.7}, "f16_lateral")
+    for calm in ({"altitude": 100.0, "wind": 0.0}, {"altitude": 400.0, "wind": 0.0, "sigma": 0.0}):
+        assert aircraft_parameters(turbulence=calm).plant().turbulence is None
+    light = {"altitude": 400.0, "wind": 0.0, "sigma": 0.1}
+    assert isinstance(aircraft_parameters(turbulence=light).plant().turbulence, Turbulence)

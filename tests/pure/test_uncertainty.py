@@ -3,18 +3,16 @@
 """Uncertain aircraft of Monte Carlo campaigns: distribution around the published airframe, repeatability by seed."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import kstest
+from tests.builders import aircraft_parameters
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
-from aircraft_sim.params import AircraftParameters
 from aircraft_sim.uncertainty import as_yaml, nominal_and_sampled, sample_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
 OSPREY = load_airframe("osprey")
@@ -46,8 +44,7 @@ def test_a_sampled_airframe_keeps_zeros_angles_and_everything_but_a_and_b() -> N
     rows = [OSPREY.index(state) for state in OSPREY.states if state not in {"theta", "phi"}]
     assert 0.2 < np.abs(relative_change(sampled.matrix_a()[rows], A[rows])).max() < 0.3
     assert 0.1 < np.abs(relative_change(sampled.matrix_b()[rows], B[rows])).max() < 0.2
-    kept = OSPREY.model_dump(exclude={"A", "B"})
-    assert sampled.model_dump(exclude={"A", "B"}) == kept
+    assert sampled.model_dump(exclude={"A", "B"}) == OSPREY.model_dump(exclude={"A", "B"})
 
 
 def test_one_uncertainty_leaves_the_other_matrix_as_published() -> None:
@@ -57,13 +54,9 @@ def test_one_uncertainty_leaves_the_other_matrix_as_published() -> None:
 
 
 def test_a_seed_determines_the_aircraft() -> None:
-    assert (
-        sample_airframe(OSPREY, 0.3, 0.3, seed=7)
-        == sample_airframe(OSPREY, 0.3, 0.3, seed=7)
-        != sample_airframe(OSPREY, 0.3, 0.3, seed=8)
-    )
+    sampled, again, other = (sample_airframe(OSPREY, 0.3, 0.3, seed) for seed in (7, 7, 8))
+    assert sampled == again != other
     A, B = nominal_and_sampled(OSPREY, 0.3, 1, seed=7)
-    sampled = sample_airframe(OSPREY, 0.3, 0.3, seed=7)
     assert sampled.matrix_a() == pytest.approx(A[1], rel=1e-15)  # rounding of the conversion to the file's units
     assert sampled.matrix_b() == pytest.approx(B[1], rel=1e-15)
 
@@ -78,11 +71,6 @@ def test_the_yaml_text_of_an_airframe_reads_back_to_the_last_bit(name: str, tmp_
         assert again.matrix_a().tobytes() == airframe.matrix_a().tobytes()
 
 
-def parameters(**section: Any) -> AircraftParameters:
-    values = {"airframe": "osprey", "rate": 100.0, "step": 0.002, "uncertainty": section}
-    return AircraftParameters.validate_mapping(values, "aircraft")
-
-
 def test_a_sampled_airframe_flies_like_its_yaml_text(osprey_gust: Scenario, tmp_path: Path) -> None:
     # The log holds the text. A flight of it has the same bits.
     short = osprey_gust.vary(flight={"duration": 3.0})
@@ -95,19 +83,5 @@ def test_a_sampled_airframe_flies_like_its_yaml_text(osprey_gust: Scenario, tmp_
 
 
 def test_without_the_section_the_published_airframe_flies() -> None:
-    assert parameters().sampled_airframe() == OSPREY
-    assert isinstance(parameters(A=0.1).sampled_airframe(), Airframe)
-
-
-@pytest.mark.parametrize(
-    ("section", "sentence"),
-    [
-        ({"A": 1.0}, "aircraft.uncertainty.A: found 1.0, expected less than 1"),
-        ({"B": -0.1}, "aircraft.uncertainty.B: found -0.1, expected greater than or equal to 0"),
-        ({"seed": -1}, "aircraft.uncertainty.seed: found -1, expected greater than or equal to 0"),
-        ({"C": 0.1}, "aircraft.uncertainty.C: unknown key, expected one of A, B, number, seed"),
-    ],
-)
-def test_uncertainty_that_does_not_fit_is_refused_by_name(section: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ParameterError, match=f"^{sentence}"):
-        parameters(**section)
+    assert aircraft_parameters(uncertainty={}).sampled_airframe() == OSPREY
+    assert isinstance(aircraft_parameters(uncertainty={"A": 0.1}).sampled_airframe(), Airframe)

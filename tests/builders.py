@@ -1,0 +1,32 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Builders that several tests share: parameters and truth of the simulated aircraft, errors of a flight."""
+
+from typing import Any
+
+import numpy as np
+
+from aircraft_sim.params import AircraftParameters
+from aircraft_sim.simulator import Simulator
+from flight_analysis.metrics import error_metrics, true_error
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
+
+MS = 1_000_000  # ns
+
+
+def aircraft_parameters(**values: Any) -> AircraftParameters:
+    """The osprey at 100 Hz with steps of 2 ms, with these values instead or in addition."""
+    return AircraftParameters.validate_mapping({"airframe": "osprey", "rate": 100.0, "step": 0.002} | values, "aircraft")
+
+
+def truth_of(simulator: Simulator) -> dict[str, float]:
+    """The current truth by channel."""
+    return dict(zip(simulator.truth_names, simulator.truth(), strict=True))
+
+
+def rms(tape: Tape) -> FloatArray:
+    """Root mean square of the true error over the whole flight, q, V, p, r in mrad/s and m/s."""
+    error = true_error(tape)
+    assert error is not None
+    return np.array([error_metrics(error[name]).rms * (1.0 if name == "V" else 1e3) for name in ("q", "V", "p", "r")])
