@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The faults: what is done to the flight, who notices and how, what u does meanwhile, how soon all is as before."""
+"""The faults: injection, detection (by which node, how, within what time), response of u, and time of recovery.
+
+Among them: nodes killed and stopped (failsafe, re-engagement), message storms and conflicting publishers (publisher lock),
+malformed samples, incompatible QoS, overruns, a full disk and steps of the clock.
+"""
 
 import math
 import os
@@ -15,17 +19,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import psutil
 from mcap.records import Message
 from numpy.random import Generator
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
-from tests.ros.faults.flight import APART, INPUTS, MAX_AGE, OUTPUTS, SAYS, SILENCE, Flight, logged
+from tests.ros.faults.flight import INPUTS, MAX_AGE, OUTPUTS, OWN_SESSION, PUBLISHED, U_MAX_AGE, Flight, logged
 from tests.ros.peer import peer
 from tests.small_disk import fill, small_disk
 
@@ -36,138 +42,140 @@ from flight_ros.messages import to_message
 from rise_di_controller.guard import Mode
 
 SLACK = 0.05
-"""s. From a node's tick to the probe, over the middleware's threads: some milliseconds each. Where the machine holds processes
-back, `Flight.held_back` comes on top."""
+"""s. From a node's tick to the probe, over the threads of the middleware: some milliseconds each. Host scheduling delays
+(`Flight.host_delay`) are allowed in addition."""
 
-REFUSED, UNFIT = 2.1, 5.1  # s, after which a refusal, and who does not fit, are said again; and a tenth
+REFUSAL_PERIOD, QOS_PERIOD = 2.1, 5.1  # s, after which a refusal and incompatible QoS are logged again; with 0.1 s to spare
 
 REPORT = 1.0  # s, the period of the diagnostics
 
-FOUND = 0.5  # s, in which a newcomer has announced itself to all
+DISCOVERY = 0.5  # s, of a new node by all others
 
-BACK = 0.5  # s, from being ready to full traffic, and until a recorder also has what publishers have kept
+RESTART = 0.5  # s, from being ready to full traffic, and until a recorder has received the history of the publishers
 
-STOPPED = 1.2  # s: beyond the age limits, hold and ramp
-
-STORM_RATE, STORM = 10_000.0, 2.0  # Hz, s
+STOP = 1.2  # s: beyond the age limits, hold and ramp
 
 
-class Does(Enum):
-    """What u does while the fault lasts."""
+class Response(Enum):
+    """The response of u to the fault."""
 
-    FLIES = "unchanged: the law flies on"
-    LETS_GO = "held, then ramped to trim by the controller"
-    IS_LET_GO = "held, then ramped to trim by the aircraft"
+    UNCHANGED = "unchanged: the law flies on"
+    CONTROLLER_FAILSAFE = "held, then ramped to trim by the controller"
+    AIRCRAFT_FAILSAFE = "held, then ramped to trim by the aircraft"
     LATE = "the law flies, late"
 
 
-Noticed = Callable[[Flight], float | None]
+Detection = Callable[[Flight], float | None]
+Injection = Callable[[Flight, Generator], None]
 
 
 class Case(NamedTuple):
     """One fault."""
 
     name: str
-    inject: Callable[[Flight, Generator], None]  # all of it, until there is no fault any more
-    noticed: Noticed | None  # when the flight noticed, None where it has no reason to
-    within: float  # s, of the fault
-    does: Does
-    recovers: float  # s, from the end of the fault until the law flies
-    own_flight: bool = False  # with a clock that can be set
+    inject: Injection  # from the begin of the fault to its end
+    detection: Detection | None  # when the flight detected it; None where it has no means to
+    within: float = 0.0  # s, from the begin of the fault to its detection
+    response: Response = Response.UNCHANGED
+    recovery: float = 0.0  # s, from the end of the fault until the law is engaged
+    own_clock: bool = False  # in a flight with a clock that can be set
 
 
-# How a fault is noticed
+# Detection
 
 
-def says(role: str, pattern: str) -> Noticed:
-    """By a line in the log of a node, on /rosout."""
-    return lambda flight: flight.said(role, pattern, flight.begin - 0.1)
+def logs(role: str, pattern: str) -> Detection:
+    """By a log line of a node, on /rosout."""
+    return lambda flight: flight.first_line(role, pattern, flight.begin - 0.1)
 
 
-def enters(mode: Mode) -> Noticed:
+def enters(mode: Mode) -> Detection:
     """By the mode of the controller."""
 
-    def noticed(flight: Flight) -> float | None:
-        flown = flight.flown(flight.begin)
-        found = np.flatnonzero(flown.mode == mode)
-        return float(flown.t[found[0]]) if len(found) else None
+    def detection(flight: Flight) -> float | None:
+        ticks = flight.ticks(flight.begin)
+        in_mode = np.flatnonzero(ticks.mode == mode)
+        return float(ticks.t[in_mode[0]]) if len(in_mode) else None
 
-    return noticed
+    return detection
 
 
-def grows(role: str, key: str) -> Noticed:
+def counts(role: str, key: str) -> Detection:
     """By a counter in the diagnostics of a node."""
 
-    def noticed(flight: Flight) -> float | None:
-        figures = flight.figure(role, key, flight.begin - 2.5 * REPORT)
-        before = [value for at, value in figures if at < flight.begin]
-        return next((at for at, value in figures if at >= flight.begin and value > (before or [0.0])[-1]), None)
+    def detection(flight: Flight) -> float | None:
+        reports = flight.diagnostics(role, flight.begin - 2.5 * REPORT)
+        values = [(at, float(report[key])) for at, _, report in reports if key in report]
+        before = [value for at, value in values if at < flight.begin]
+        return next((at for at, value in values if at >= flight.begin and value > (before or [0.0])[-1]), None)
 
-    return noticed
-
-
-# What is done
+    return detection
 
 
-def refuses(topic: str, why: str) -> Noticed:
-    """By the refusal of a sample, with its reason."""
-    return says(TAKERS[topic], f"/{topic}: sample refused: .*{why}")
+def refusal(topic: str, reason: str) -> str:
+    """The pattern of the line that logs a refused sample."""
+    return f"/{topic}: sample refused: .*{reason}"
 
 
-def intrudes(topic: str, other: str) -> Noticed:
-    """By the refusal of the samples of a second publisher."""
-    return refuses(topic, rf"conflicting publisher /{other}(#\d+)? ignored")
+def conflicting(topic: str, publisher: str) -> Detection:
+    """By the line of the publisher lock that logs a conflicting publisher."""
+    return logs(CONSUMERS[topic], refusal(topic, rf"conflicting publisher /{publisher}(#\d+)? ignored"))
 
 
-def unsaid(flight: Flight, role: str, pattern: str, repeated: float) -> None:
-    """Wait until the same would be said again, at once."""
-    flight.until(lambda: flight.said(role, pattern, time.time() - repeated) is None, 10.0, "the last fault forgotten")
+# Injection
 
 
-def unrefused(flight: Flight, topic: str, why: str) -> None:
-    """Wait until the refusal of a sample would be said again, at once."""
-    unsaid(flight, TAKERS[topic], f"/{topic}: sample refused: .*{why}", REFUSED)
+def until_logged_again(flight: Flight, role: str, pattern: str, period: float) -> None:
+    """Wait until the rate limit of a log line is over, so that a node would log it again at once."""
+    flight.until(
+        lambda: flight.first_line(role, pattern, time.time() - period) is None, 10.0, "end of the rate limit of the log"
+    )
+
+
+def until_refusal_logged_again(flight: Flight, topic: str, reason: str) -> None:
+    until_logged_again(flight, CONSUMERS[topic], refusal(topic, reason), REFUSAL_PERIOD)
+
+
+def pause(flight: Flight, duration: float) -> None:
+    """Wait, s."""
+    until = time.monotonic() + duration
+    flight.until(lambda: time.monotonic() >= until, duration + 2.0, f"{duration:g} s")
 
 
 def at_random(flight: Flight, random: Generator) -> None:
-    """An instant anywhere within a tick of the controller."""
-    until = time.monotonic() + random.uniform(0.0, 0.01)
-    flight.until(lambda: time.monotonic() >= until, 1.0, "the instant of the fault")
+    """Wait for an instant anywhere within a tick of the controller."""
+    pause(flight, random.uniform(0.0, 0.01))
 
 
-def let_go(flight: Flight) -> None:
-    """Wait until u is at trim, as the aircraft's inputs say."""
-    flight.until(lambda: flight.moved(time.time() - 1.0)[1][-1:].tolist() == [[0.0] * len(INPUTS)], 10.0, "u at trim")
-
-
-def kill(role: str) -> Callable[[Flight, Generator], None]:
-    """SIGKILL, and a restart by hand when nothing flies any more."""
+def kill(role: str) -> Injection:
+    """SIGKILL, and a restart when u is at trim; of the recorder at once."""
 
     def inject(flight: Flight, random: Generator) -> None:
         at_random(flight, random)
-        begin = flight.fault()
+        begin = flight.begin_fault()
         flight.kill(role)
         if role in {"aircraft", "reference_model"}:
-            flight.until(lambda: flight.flown(begin).mode[-1:].tolist() == [Mode.TRIM], 10.0, "u at trim")
+            flight.until(lambda: flight.ticks(begin).mode[-1:].tolist() == [Mode.TRIM], 10.0, "u at trim")
         elif role == "controller":
-            let_go(flight)
+            trim = [[0.0] * len(INPUTS)]
+            flight.until(lambda: flight.actuator_positions(time.time() - 1.0)[1][-1:].tolist() == trim, 10.0, "inputs at trim")
         started = flight.start(role)
         flight.processes[role].wait_for("ready")
-        flight.over()
-        ready = flight.until(lambda: said_ready(flight, role, started), 5.0, f"{role} ready, on /rosout")
-        back = flight.until(lambda: full_traffic(flight, role, ready), 5.0, f"{role} back to full traffic")
-        back = max(back, ready)  # a recorder writes with its first tick what has come before that
+        flight.end_fault()
+        ready = flight.until(lambda: ready_stamp(flight, role, started), 5.0, f"{role} ready, on /rosout")
+        traffic = flight.until(lambda: full_traffic(flight, role, ready), 5.0, f"full traffic of {role}")
+        traffic = max(traffic, ready)  # the first tick of a recorder writes what it received before it was ready
         flight.end = ready
-        flight.measured |= {"ready_to_traffic": back - ready, "exec_to_traffic": back - started}
+        flight.measured |= {"ready_to_traffic": traffic - ready, "exec_to_traffic": traffic - started}
         if role == "recorder":
-            caught_up = flight.until(lambda: recorded_since(flight.runs[-1], ready), 5.0, "what is said now in the log")
+            caught_up = flight.until(lambda: recorded_since(flight.runs[-1], ready), 5.0, "new samples in the log")
             flight.measured["ready_to_caught_up"] = caught_up - ready
 
     return inject
 
 
-def said_ready(flight: Flight, role: str, begin: float) -> float | None:
-    """When a node stamped its line "ready"; it is heard a little later, once the probe has found the node."""
+def ready_stamp(flight: Flight, role: str, begin: float) -> float | None:
+    """The stamp of a node's line "ready". The line is received later, when the probe has discovered the node."""
     for one in flight.probe.since("/rosout", begin):
         if one.message.name == role and one.message.msg == "ready":
             stamp = one.message.stamp
@@ -176,44 +184,47 @@ def said_ready(flight: Flight, role: str, begin: float) -> float | None:
 
 
 def full_traffic(flight: Flight, role: str, begin: float) -> float | None:
-    """When the last of what a node says came for the first time; for the recorder, when all topics had begun to be written."""
+    """When the last of a node's topics had its first message; of the recorder, when the log had a message of every topic."""
     if role == "recorder":
         return recorded_since(flight.runs[-1], 0.0)
-    firsts = [flight.first(topic, begin) for topic in SAYS[role]]
+    firsts = [flight.first_message(topic, begin) for topic in PUBLISHED[role]]
     return None if None in firsts else max(first for first in firsts if first is not None)
 
 
 def recorded_since(run: Path, begin: float) -> float | None:
-    """When a recorder first wrote down something sent after an instant, on the topic on which that was latest."""
+    """When the log had a message of every topic that was sent after an instant."""
     firsts: dict[str, float] = {}
     for one in logged(run):
         if one.sent >= begin:
             firsts.setdefault(one.topic, one.written)
-    wanted = ("/y", "/y_m", "/u", "/internals", "/truth")
-    return max(firsts[topic] for topic in wanted) if set(wanted) <= set(firsts) else None
+    topics = ("/y", "/y_m", "/u", "/internals", "/truth")
+    return max(firsts[topic] for topic in topics) if set(topics) <= set(firsts) else None
 
 
-def stop(role: str) -> Callable[[Flight, Generator], None]:
+def stop(role: str) -> Injection:
     """SIGSTOP, then SIGCONT."""
 
     def inject(flight: Flight, random: Generator) -> None:
         at_random(flight, random)
-        begin = flight.fault()
+        flight.begin_fault()
         with flight.stopped(role):
-            flight.until(lambda: time.time() - begin >= STOPPED, 5.0, "the end of the stop")
-        flight.over()
+            pause(flight, STOP)
+        flight.end_fault()
 
     return inject
 
 
-def storm(topic: str) -> Callable[[Flight, Generator], None]:
-    """Ten thousand vectors a second from a foreign process, that look like those of the flight."""
+STORM_RATE, STORM_DURATION = 10_000.0, 2.0  # Hz, s
+
+
+def storm(topic: str) -> Injection:
+    """Ten thousand valid vectors a second from an unexpected publisher."""
 
     def inject(flight: Flight, random: Generator) -> None:
         seed = int(random.integers(2**31))
-        words = ("tests.ros.faults.foreign", "storm", topic, str(STORM_RATE), str(STORM), str(seed))
-        unrefused(flight, topic, "conflicting publisher")
-        process = Process(*words, cwd=REPOSITORY, within=APART)
+        words = ("tests.ros.faults.foreign", "storm", topic, str(STORM_RATE), str(STORM_DURATION), str(seed))
+        until_refusal_logged_again(flight, topic, "conflicting publisher")
+        process = Process(*words, cwd=REPOSITORY, within=OWN_SESSION)
         try:
             process.wait_for("begins at")
             flight.begin = float(process.lines[-1].split()[-1])
@@ -221,90 +232,88 @@ def storm(topic: str) -> Callable[[Flight, Generator], None]:
         finally:
             process.popen.kill()
             process.end()
-        flight.over()
+        flight.end_fault()
         sent = float(process.lines[-1].split()[1])
-        flight.measured["messages_per_second"] = sent / STORM
-        assert sent >= 0.5 * STORM_RATE * STORM, "the machine is too busy for a storm"
+        flight.measured["messages_per_second"] = sent / STORM_DURATION
+        assert sent >= 0.5 * STORM_RATE * STORM_DURATION, "the host is too busy for a storm"
 
     return inject
 
 
 NAMES = {"y": OUTPUTS, "y_m": OUTPUTS, "u": INPUTS}
-OWNERS = {"y": "aircraft", "y_m": "reference_model", "u": "controller"}
-TAKERS = {"y": "controller", "y_m": "controller", "u": "aircraft"}
+PUBLISHERS = {"y": "aircraft", "y_m": "reference_model", "u": "controller"}
+CONSUMERS = {"y": "controller", "y_m": "controller", "u": "aircraft"}
+
+Names = tuple[str, ...]
+BadSample = tuple[float, Names, FloatArray]  # the offset of its stamp from the present, s; names; values
 
 
-def not_a_number(stamp_ns: int, names: tuple[str, ...], sender: str, random: Generator) -> JointState:
-    return to_message(stamp_ns, names, one_is(math.nan, names, random), sender)
+def values(length: int, random: Generator) -> FloatArray:
+    return random.uniform(-1.0, 1.0, length)
 
 
-def infinite(stamp_ns: int, names: tuple[str, ...], sender: str, random: Generator) -> JointState:
-    return to_message(stamp_ns, names, one_is(random.choice((-math.inf, math.inf)), names, random), sender)
+def not_finite(value: float, names: Names, random: Generator) -> BadSample:
+    bad = values(len(names), random)
+    bad[random.integers(len(names))] = value
+    return 0.0, names, bad
 
 
-def wrong_names(stamp_ns: int, names: tuple[str, ...], sender: str, random: Generator) -> JointState:
-    others = list(names)
-    others[random.integers(len(names))] = random.choice(("", "x", f"{names[0]} ", "q_deg", "\N{GREEK SMALL LETTER DELTA}"))
-    return to_message(stamp_ns, others, random.uniform(-1.0, 1.0, len(names)), sender)
+def infinite(names: Names, random: Generator) -> BadSample:
+    return not_finite(random.choice((-math.inf, math.inf)), names, random)
 
 
-def wrong_length(stamp_ns: int, names: tuple[str, ...], sender: str, random: Generator) -> JointState:
+def wrong_names(names: Names, random: Generator) -> BadSample:
+    bad = list(names)
+    bad[random.integers(len(names))] = random.choice(("", "x", f"{names[0]} ", "q_deg", "\N{GREEK SMALL LETTER DELTA}"))
+    return 0.0, tuple(bad), values(len(names), random)
+
+
+def wrong_length(names: Names, random: Generator) -> BadSample:
     length = random.choice((0, 1, len(names) - 1, len(names) + 1, 1000))
-    return to_message(stamp_ns, names, random.uniform(-1.0, 1.0, length), sender)
+    return 0.0, names, values(length, random)
 
 
-def past(stamp_ns: int, names: tuple[str, ...], sender: str, random: Generator) -> JointState:
-    early = nanoseconds(10.0 ** random.uniform(0.0, 8.0))
-    return to_message(stamp_ns - early, names, random.uniform(-1.0, 1.0, len(names)), sender)
+def wrong_stamp(sign: float, names: Names, random: Generator) -> BadSample:
+    return sign * 10.0 ** random.uniform(0.0, 8.0), names, values(len(names), random)
 
 
-def future(stamp_ns: int, names: tuple[str, ...], sender: str, random: Generator) -> JointState:
-    ahead = nanoseconds(10.0 ** random.uniform(0.0, 8.0))
-    return to_message(stamp_ns + ahead, names, random.uniform(-1.0, 1.0, len(names)), sender)
-
-
-def one_is(value: float, names: tuple[str, ...], random: Generator) -> FloatArray:
-    values = random.uniform(-1.0, 1.0, len(names))
-    values[random.integers(len(names))] = value
-    return values
-
-
-BAD = {
-    "NaN": (not_a_number, "finite", "is not finite"),
+BAD: dict[str, tuple[Callable[[Names, Generator], BadSample], str, str]] = {  # sample, key of the counter, log line
+    "NaN": (partial(not_finite, math.nan), "finite", "is not finite"),
     "wrong names": (wrong_names, "name", "expected once among"),
     "wrong length": (wrong_length, "length", "names for"),
-    "past stamps": (past, "order", "(after|before) the last one"),
-    "future stamps": (future, "future", "ahead of the clock"),
+    "past stamps": (partial(wrong_stamp, -1.0), "order", "(after|before) the last one"),
+    "future stamps": (partial(wrong_stamp, 1.0), "future", "ahead of the clock"),
     "Inf": (infinite, "finite", "is not finite"),
 }
 BAD_COUNT = 20
 
 
-def malformed(topic: str, kind: str) -> Callable[[Flight, Generator], None]:
-    """Twenty bad samples that bear the name of the node that flies."""
+def malformed(topic: str, kind: str) -> Injection:
+    """Twenty bad samples with the `frame_id` of the expected publisher."""
     make, reason, sentence = BAD[kind]
 
     def inject(flight: Flight, random: Generator) -> None:
-        taker, key = TAKERS[topic], f"refused {topic}: {reason}"
+        consumer, key = CONSUMERS[topic], f"refused {topic}: {reason}"
         with relay(topic) as publish:
-            unrefused(flight, topic, sentence)
-            before = flight.count(taker, key)
-            flight.fault()
+            until_refusal_logged_again(flight, topic, sentence)
+            before = flight.count(consumer, key)
+            flight.begin_fault()
             for k in range(BAD_COUNT):
-                publish(make(time.time_ns(), NAMES[topic], flight.instance(OWNERS[topic]), random))
-                at = flight.begin + 0.01 * k  # two ticks are never without good samples between bad ones
+                offset, names, bad = make(NAMES[topic], random)
+                publish(to_message(time.time_ns() + nanoseconds(offset), names, bad, flight.instance(PUBLISHERS[topic])))
+                at = flight.begin + 0.01 * k  # good samples arrive between the bad ones
                 flight.until(lambda at=at: time.time() >= at, 1.0, "the next bad sample")  # type: ignore[misc]
-            flight.over()
-            least = before + BAD_COUNT // 2  # best effort: a machine that is held up may lose some
-            flight.until(lambda: flight.count(taker, key) >= least, 10.0, f"{BAD_COUNT // 2} more of {key!r}")
+            flight.end_fault()
+            least = before + BAD_COUNT // 2  # best effort: a busy host may lose some
+            flight.until(lambda: flight.count(consumer, key) >= least, 10.0, f"{BAD_COUNT // 2} more of {key!r}")
 
     return inject
 
 
 @contextmanager
 def relay(topic: str) -> Iterator[Callable[[JointState], None]]:
-    """A further publisher of a topic, a process of its own as any would be, found by all who listen."""
-    process = Process("tests.ros.faults.foreign", "relay", topic, cwd=REPOSITORY, within=APART, stdin=subprocess.PIPE)
+    """A second publisher of a topic in a process of its own, discovered by all subscribers."""
+    process = Process("tests.ros.faults.foreign", "relay", topic, cwd=REPOSITORY, within=OWN_SESSION, stdin=subprocess.PIPE)
     stdin = process.popen.stdin
     assert stdin is not None
 
@@ -322,129 +331,139 @@ def relay(topic: str) -> Iterator[Callable[[JointState], None]]:
         process.end()
 
 
-def second(role: str, topic: str) -> Callable[[Flight, Generator], None]:
-    """A second node of the same kind, that publishes for two seconds."""
+def second(role: str, topic: str) -> Injection:
+    """A second node of the same role, which publishes for two seconds."""
 
     def inject(flight: Flight, random: Generator) -> None:
-        unrefused(flight, topic, "conflicting publisher")
-        started = flight.fault()
+        until_refusal_logged_again(flight, topic, "conflicting publisher")
+        started = flight.begin_fault()
         process = flight.node(role)
-        first = partial(flight.first_of, topic, f"/{role}#{process.popen.pid}", started)
-        heard = flight.until(first, 30.0, f"{topic} of a second {role}")
-        # the node may have found the newcomer before the probe has
-        flight.begin = min(heard, intrudes(topic, role)(flight) or heard)
-        flight.until(lambda: time.time() - flight.begin >= 2.0, 5.0, "two seconds with two")
+        first = partial(flight.first_message, topic, started, f"/{role}#{process.popen.pid}")
+        received = flight.until(first, 30.0, f"{topic} of a second {role}")
+        # the flight's node may have discovered the second publisher before the probe has
+        flight.begin = min(received, conflicting(topic, role)(flight) or received)
+        flight.until(lambda: time.time() - flight.begin >= 2.0, 5.0, "two seconds with two publishers")
         process.popen.terminate()
         assert process.end() == 0, process.output
-        flight.over()
+        flight.end_fault()
 
     return inject
 
 
-def weak_publisher(flight: Flight, random: Generator) -> None:
-    """A publisher of y that is best effort, which the recorder cannot take reliably."""
-    unsaid(flight, "recorder", QUALITY, UNFIT)
-    with peer(topics=()) as peer_node:
-        flight.fault()
-        peer_node.node.create_publisher(JointState, "y", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-        flight.until(lambda: WEAK(flight), 20.0, "the weak publisher named")
-    flight.over()
+def incompatible_qos(role: str, create: Callable[[Node], object], detection: Detection) -> Injection:
+    """A publisher or a subscriber whose quality of service is incompatible with that of a node."""
+
+    def inject(flight: Flight, random: Generator) -> None:
+        until_logged_again(flight, role, "quality of service", QOS_PERIOD)
+        with peer(topics=()) as peer_node:
+            flight.begin_fault()
+            create(peer_node.node)
+            flight.until(lambda: detection(flight), 20.0, "a report of the incompatible quality of service")
+        flight.end_fault()
+
+    return inject
 
 
-def demanding_listener(flight: Flight, random: Generator) -> None:
-    """A listener of u that asks for a deadline that the controller does not offer, and so never hears it."""
-    unsaid(flight, "controller", QUALITY, UNFIT)
-    with peer(topics=()) as peer_node:
-        flight.fault()
-        asked = QoSProfile(depth=1, deadline=Duration(seconds=0.02))
-        peer_node.node.create_subscription(JointState, "u", lambda _: None, asked)
-        flight.until(lambda: DEMANDING(flight), 20.0, "the demanding listener named")
-    flight.over()
+def best_effort_publisher(node: Node) -> object:
+    """A best effort publisher of y: the recorder requests a reliable one."""
+    return node.create_publisher(JointState, "y", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
 
 
-QUALITY = "quality of service"
-WEAK = says("recorder", r"/y: .*/peer .*[Rr]eliab")
-DEMANDING = says("controller", r"/u: .*/peer.*[Dd]eadline")
+def subscriber_with_deadline(node: Node) -> object:
+    """A subscriber of u that requests a deadline, which the controller does not offer."""
+    return node.create_subscription(JointState, "u", lambda _: None, QoSProfile(depth=1, deadline=Duration(seconds=0.02)))
 
 
-def step_of_clock(by: float) -> Callable[[Flight, Generator], None]:
-    """The system clock of all processes of the flight, set by so many seconds and, two seconds later, set right."""
+UNRELIABLE = logs("recorder", r"/y: .*/peer .*[Rr]eliab")
+DEADLINE = logs("controller", r"/u: .*/peer.*[Dd]eadline")
+weaker_qos = incompatible_qos("recorder", best_effort_publisher, UNRELIABLE)
+stronger_qos = incompatible_qos("controller", subscriber_with_deadline, DEADLINE)
+
+
+def step_of_clock(by: float) -> Injection:
+    """The system clock of all processes of the flight, set by so many seconds, and corrected three seconds later."""
 
     def inject(flight: Flight, random: Generator) -> None:
         at_random(flight, random)
-        begin = flight.fault()
+        flight.begin_fault()
         flight.set_clock(by)
-        flight.until(lambda: time.time() - begin >= 3.0, 5.0, "three seconds with the wrong clock")
+        pause(flight, 3.0)
         flight.set_clock(0.0)
-        flight.over()
-        flight.until(lambda: flight.said("controller", "it is correct again", flight.end), 5.0, "the right clock noticed")
+        flight.end_fault()
+        flight.until(
+            lambda: flight.first_line("controller", "it is correct again", flight.end), 5.0, "a report of the correction"
+        )
 
     return inject
 
 
 def starve(flight: Flight, random: Generator) -> None:
-    """All nodes on one core, together with six processes that want all of it."""
+    """All nodes on one core, together with six busy processes."""
     core = max(os.sched_getaffinity(0))
-    nodes = [flight.process(role) for role in flight.processes]
+    nodes = [psutil.Process(process.popen.pid) for process in flight.processes.values()]
     before = [node.cpu_affinity() for node in nodes]
     busy = [subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"], start_new_session=True) for _ in range(6)]
     try:
         for one in busy:
             os.sched_setaffinity(one.pid, {core})
-        begin = flight.fault()
+        flight.begin_fault()
         for node in nodes:
             node.cpu_affinity([core])
             for thread in node.threads():
                 os.sched_setaffinity(thread.id, {core})
-        flight.until(lambda: time.time() - begin >= 3.0, 5.0, "three hungry seconds")
+        pause(flight, 3.0)
     finally:
         for one in busy:
             one.kill()
             one.wait()
-        flight.over()
+        flight.end_fault()
         for node, cores in zip(nodes, before, strict=True):
             for thread in node.threads():
                 os.sched_setaffinity(thread.id, set(cores or ()))
 
 
 def full_disk(flight: Flight, random: Generator) -> None:
-    """The disk of the recorder runs full. It then records on another one."""
+    """The disk of the recorder runs full. Afterwards a new recorder uses another disk."""
     with small_disk(flight.folder / f"disk{len(flight.runs)}", 4_000_000) as folder:
         flight.processes["recorder"].popen.terminate()
         assert flight.processes["recorder"].end() == 0
         flight.runs.append(folder / "run")
         flight.start("recorder", f"directory:={flight.runs[-1]}", "min_free:=0.0")
         flight.processes["recorder"].wait_for("ready")
-        flight.until(lambda: recorded_since(folder / "run", 0.0), 5.0, "a recorder that records")
-        flight.fault()
+        flight.until(lambda: recorded_since(folder / "run", 0.0), 5.0, "all topics in the log")
+        flight.begin_fault()
         fill(folder / "other")
-        flight.until(lambda: flight.said("recorder", "recording ended", flight.begin), 5.0, "the full disk")
+        flight.until(lambda: flight.first_line("recorder", "recording ended", flight.begin), 5.0, "the end of the recording")
         flight.processes["recorder"].popen.terminate()
         assert flight.processes["recorder"].end() == 0
         (file,) = (folder / "run").glob("*.mcap")
         scan = Scan(file)
         times = [record.log_time for record in scan.records() if isinstance(record, Message)]
-        assert scan.complete, "the log on the full disk has its end"
-        assert flight.begin - seconds(max(times)) <= 0.3, "and all until then"
+        assert scan.complete, "the log on the full disk has its footer"
+        assert flight.begin - seconds(max(times)) <= 0.3, "and all messages until the fault"
         flight.runs.pop()
-        flight.over()
+        flight.end_fault()
     flight.start("recorder")
     flight.processes["recorder"].wait_for("ready")
 
 
-STORM_OF_PARAMETERS, UNDER_WAY = 2000, 8  # a service keeps ten requests
+CHANGES, IN_FLIGHT = 2000, 8  # requests; a service queues ten
 
 
 def parameters(flight: Flight, random: Generator) -> None:
-    """Two thousand changes of the controller's gains, half of them bad, the first one too; eight always under way."""
-    valid = random.random(STORM_OF_PARAMETERS) < 0.5
+    """Two thousand changes of the controller's gains, half of them invalid, also the first one; eight requests at once."""
+    valid = random.random(CHANGES) < 0.5
     valid[0] = False
     with peer(topics=()) as peer_node:
         client = peer_node.node.create_client(SetParameters, "controller/set_parameters")
+
+        def request(name: str, value: object) -> Any:
+            return client.call_async(SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()]))
+
         peer_node.until(client.service_is_ready)
-        first = client.call_async(SetParameters.Request(parameters=[number("k_g", 1.0)]))
-        peer_node.until(first.done)  # from then on each knows of the other
-        flight.fault()
+        first = request("k_g", 1.0)
+        peer_node.until(first.done)  # both ends of the service have discovered each other
+        flight.begin_fault()
         futures: list[Any] = []
         done = 0
 
@@ -452,88 +471,60 @@ def parameters(flight: Flight, random: Generator) -> None:
             nonlocal done
             while done < len(futures) and futures[done].done():
                 done += 1
-            while len(futures) < STORM_OF_PARAMETERS and len(futures) - done < UNDER_WAY:
-                change = good_change(random) if valid[len(futures)] else bad_change(random)
-                futures.append(client.call_async(SetParameters.Request(parameters=[change])))
+            while len(futures) < CHANGES and len(futures) - done < IN_FLIGHT:
+                futures.append(request(*(valid_change(random) if valid[len(futures)] else invalid_change(random))))
 
         feed()
-        peer_node.until(lambda: done == STORM_OF_PARAMETERS, 100.0, each=feed)
-        flight.over()
-        flight.measured["changes_per_second"] = STORM_OF_PARAMETERS / (flight.end - flight.begin)
+        peer_node.until(lambda: done == CHANGES, 100.0, each=feed)
+        flight.end_fault()
+        flight.measured["changes_per_second"] = CHANGES / (flight.end - flight.begin)
         accepted = [future.result().results[0].successful for future in futures]
         assert accepted == valid.tolist()
-        future = client.call_async(SetParameters.Request(parameters=[number("k_g", 1.0)]))
-        peer_node.until(future.done)
+        peer_node.until(request("k_g", 1.0).done)
 
 
-def number(name: str, value: float) -> Parameter:
-    return Parameter(name=name, value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value))
+def valid_change(random: Generator) -> tuple[str, object]:
+    """A gain within a tenth of its value."""
+    return "k_g", float(random.uniform(0.9, 1.1))
 
 
-def good_change(random: Generator) -> Parameter:
-    """A gain within a tenth of what it is."""
-    return number("k_g", float(random.uniform(0.9, 1.1)))
-
-
-def bad_change(random: Generator) -> Parameter:
-    """Out of range, not finite, read-only, unknown, or of another type."""
-    text = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="much")
-    short = ParameterValue(type=ParameterType.PARAMETER_DOUBLE_ARRAY, double_array_value=[1.0])
-    changes = (
-        number("k_g", -1.0),
-        number("k_g", math.nan),
-        number("k_g", math.inf),
-        number("rate", 200.0),
-        number("k_gg", 1.0),
-        Parameter(name="k_g", value=text),
-        Parameter(name="beta", value=short),
-    )
+def invalid_change(random: Generator) -> tuple[str, object]:
+    """Out of range, not finite, read-only, unknown, of another type, or of another length."""
+    gains = (("k_g", -1.0), ("k_g", math.nan), ("k_g", math.inf))
+    changes = (*gains, ("rate", 200.0), ("k_gg", 1.0), ("k_g", "much"), ("beta", [1.0]))
     return changes[random.integers(len(changes))]
 
 
 # The table
 
-HELD = SILENCE + 0.005  # s, and a tick, until the aircraft logs the timeout of u
+U_STALE = U_MAX_AGE + 0.005  # s, and a tick, until the aircraft logs the timeout of u
 STALE = MAX_AGE + 0.01  # s, and a tick, until the controller holds u
 
+STALE_INPUT = (enters(Mode.HOLD), STALE, Response.CONTROLLER_FAILSAFE)
+STALE_U = (logs("aircraft", "failsafe: u from"), U_STALE, Response.AIRCRAFT_FAILSAFE)
+
 CASES = (
-    Case("aircraft killed", kill("aircraft"), enters(Mode.HOLD), STALE, Does.LETS_GO, BACK),
-    Case("reference model killed", kill("reference_model"), enters(Mode.HOLD), STALE, Does.LETS_GO, BACK),
-    Case("controller killed", kill("controller"), says("aircraft", "failsafe: u from"), HELD, Does.IS_LET_GO, BACK),
-    Case("recorder killed", kill("recorder"), None, 0.0, Does.FLIES, 0.0),
-    Case("aircraft stopped", stop("aircraft"), enters(Mode.HOLD), STALE, Does.LETS_GO, 0.0),
-    Case("reference model stopped", stop("reference_model"), enters(Mode.HOLD), STALE, Does.LETS_GO, 0.0),
-    Case("controller stopped", stop("controller"), says("aircraft", "failsafe: u from"), HELD, Does.IS_LET_GO, 0.0),
-    Case("recorder stopped", stop("recorder"), None, 0.0, Does.FLIES, 0.0),
-    *(Case(f"storm on {topic}", storm(topic), intrudes(topic, "foreign"), 0.0, Does.FLIES, 0.0) for topic in NAMES),
+    Case("aircraft killed", kill("aircraft"), *STALE_INPUT, RESTART),
+    Case("reference model killed", kill("reference_model"), *STALE_INPUT, RESTART),
+    Case("controller killed", kill("controller"), *STALE_U, RESTART),
+    Case("recorder killed", kill("recorder"), None),
+    Case("aircraft stopped", stop("aircraft"), *STALE_INPUT),
+    Case("reference model stopped", stop("reference_model"), *STALE_INPUT),
+    Case("controller stopped", stop("controller"), *STALE_U),
+    Case("recorder stopped", stop("recorder"), None),
+    *(Case(f"storm on {topic}", storm(topic), conflicting(topic, "foreign")) for topic in NAMES),
     *(
-        Case(f"{kind} on {topic}", malformed(topic, kind), refuses(topic, BAD[kind][2]), 0.0, Does.FLIES, 0.0)
+        Case(f"{kind} on {topic}", malformed(topic, kind), logs(CONSUMERS[topic], refusal(topic, BAD[kind][2])))
         for topic in NAMES
         for kind in BAD
     ),
-    Case("second controller", second("controller", "u"), intrudes("u", "controller"), 0.0, Does.FLIES, 0.0),
-    Case("second aircraft", second("aircraft", "y"), intrudes("y", "aircraft"), 0.0, Does.FLIES, 0.0),
-    Case("weaker quality of service", weak_publisher, WEAK, REPORT + FOUND, Does.FLIES, 0.0),
-    Case("stronger quality of service", demanding_listener, DEMANDING, REPORT + FOUND, Does.FLIES, 0.0),
-    Case("CPU starved", starve, grows("aircraft", "missed ticks"), REPORT + 3.0, Does.LATE, 0.5),
-    Case("disk full", full_disk, says("recorder", "recording ended"), 0.1, Does.FLIES, 0.0),
-    Case("storm of parameters", parameters, says("controller", "parameters rejected"), 0.0, Does.FLIES, 0.0),
-    Case(
-        "clock set back",
-        step_of_clock(-5.0),
-        says("controller", "clock was set by -5"),
-        REPORT,
-        Does.FLIES,
-        0.0,
-        own_flight=True,
-    ),
-    Case(
-        "clock set forth",
-        step_of_clock(5.0),
-        says("controller", r"clock was set by \+5"),
-        REPORT,
-        Does.FLIES,
-        0.0,
-        own_flight=True,
-    ),
+    Case("second controller", second("controller", "u"), conflicting("u", "controller")),
+    Case("second aircraft", second("aircraft", "y"), conflicting("y", "aircraft")),
+    Case("weaker quality of service", weaker_qos, UNRELIABLE, REPORT + DISCOVERY),
+    Case("stronger quality of service", stronger_qos, DEADLINE, REPORT + DISCOVERY),
+    Case("CPU starved", starve, counts("aircraft", "missed ticks"), REPORT + 3.0, Response.LATE, 0.5),
+    Case("disk full", full_disk, logs("recorder", "recording ended"), 0.1),
+    Case("storm of parameters", parameters, logs("controller", "parameters rejected")),
+    Case("clock set back", step_of_clock(-5.0), logs("controller", "clock was set by -5"), REPORT, own_clock=True),
+    Case("clock set forth", step_of_clock(5.0), logs("controller", r"clock was set by \+5"), REPORT, own_clock=True),
 )

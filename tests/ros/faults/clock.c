@@ -1,9 +1,8 @@
 // SPDX-FileCopyrightText: RISE-DI contributors
 // SPDX-License-Identifier: Apache-2.0
 //
-// A system clock that can be stepped for some processes alone: LD_PRELOAD, and FAULTS_CLOCK names a file of 8 bytes, the step in ns.
-// What waits until an instant of the system clock waits as long as it would with a clock that was really set: until that clock
-// says so.
+// A system clock that can be stepped for single processes. The library is loaded by LD_PRELOAD. FAULTS_CLOCK names a file of
+// 8 bytes, the step in ns. A wait until an instant of the system clock ends when the stepped clock reaches that instant.
 
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -18,7 +17,7 @@
 #include <unistd.h>
 
 #define SECOND 1000000000LL
-#define SLICE 50000000LL  // how soon a wait notices that the clock was set
+#define SLICE 50000000LL  // within this time a wait detects a step of the clock
 
 static volatile int64_t *step;
 static int (*real_gettime)(clockid_t, struct timespec *);
@@ -66,6 +65,6 @@ int pthread_cond_timedwait(pthread_cond_t *restrict condition, pthread_mutex_t *
   int64_t left = ns(until) - (ns(&real) + *step);
   struct timespec slice = timespec_of(ns(&real) + (left < SLICE ? left : SLICE));
   int status = real_timedwait(condition, mutex, &slice);
-  // Woken early is allowed; late is the point.
+  // A spurious wakeup is allowed, a late one is not.
   return status == ETIMEDOUT && left > SLICE ? 0 : status;
 }

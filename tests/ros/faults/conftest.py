@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""One flight for all faults, as long as it survives them."""
+"""Fixtures of the fault tests: one flight for all faults, replaced when a fault ended it."""
 
 import json
 import os
@@ -19,14 +19,14 @@ Row = dict[str, str | int | float | bool | None]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--faults-table", type=Path, default=None, help="append a row a case to this file of JSON lines")
+    parser.addoption("--faults-table", type=Path, default=None, help="append a row for each fault to this file of JSON lines")
     parser.addoption("--faults-seed", type=int, default=1, help="seed of the faults")
-    parser.addoption("--faults-times", type=int, default=1, help="how often each fault is done in a row; seeds count up")
+    parser.addoption("--faults-times", type=int, default=1, help="how often each fault is injected in a row; seeds count up")
 
 
 @pytest.fixture(autouse=True)
 def domain(monkeypatch: pytest.MonkeyPatch) -> int:
-    """One ROS domain for all of them, in place of one for each test: they share a flight."""
+    """One ROS domain for all fault tests: they share a flight."""
     number = 1 + os.getpid() % 100
     monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
     return number
@@ -34,14 +34,14 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> int:
 
 @pytest.fixture(scope="session")
 def seeds(pytestconfig: pytest.Config) -> range:
-    """One for each time that a fault is done."""
+    """One for each injection of a fault."""
     first = int(pytestconfig.getoption("--faults-seed", 1))
     return range(first, first + int(pytestconfig.getoption("--faults-times", 1)))
 
 
 @pytest.fixture(scope="session")
 def record(pytestconfig: pytest.Config) -> Callable[[Row], None]:
-    """Append a row to the table, where there is one."""
+    """Append a row to the table of `--faults-table`."""
     path = pytestconfig.getoption("--faults-table", None)
 
     def append(row: Row) -> None:
@@ -52,50 +52,49 @@ def record(pytestconfig: pytest.Config) -> Callable[[Row], None]:
     return append
 
 
-class Hangar:
-    """Keeps the flights: one on the system's clock, one on a clock that can be set. A flight that a fault ended is replaced."""
+class Flights:
+    """The flight under test, on the clock of the system or on one that can be set. One runs at a time."""
 
     def __init__(self, folder: Path, scenario: Scenario) -> None:
-        self._folder, self._scenario, self._count = folder, scenario, 0
-        self._flights: dict[bool, Flight] = {}
-        self.flown: list[Flight] = []  # all that there were
+        self._folder, self._scenario = folder, scenario
+        self._running: dict[bool, Flight] = {}
+        self.all: list[Flight] = []  # including those that have ended
 
-    def flight(self, *, own_clock: bool) -> Flight:
-        """A flight that is steady, and near its trim: one that a fault has thrown off, and that tracks again, shows less."""
-        if own_clock in self._flights:
+    def steady(self, *, own_clock: bool) -> Flight:
+        """A flight that is steady and near trim: the running one, or a new one where a fault has upset that."""
+        if own_clock in self._running:
             with suppress(AssertionError):
-                self._flights[own_clock].until_steady(20.0)
-                assert self._flights[own_clock].is_near_trim()
-                return self._flights[own_clock]
-        self._flights[own_clock] = flight = self._fly(own_clock)
+                self._running[own_clock].until_steady(20.0)
+                assert self._running[own_clock].is_near_trim()
+                return self._running[own_clock]
+        flight = self._start(own_clock)
         try:
             flight.until_steady()
-            with suppress(AssertionError):  # on a busy machine it never rests
+            with suppress(AssertionError):  # on a busy host it is never at rest
                 flight.until(flight.is_at_rest, 15.0, "u at rest")
         except AssertionError:
-            self.scrap()
+            self.close()
             raise
         return flight
 
-    def _fly(self, own_clock: bool) -> Flight:
-        for other in list(self._flights):  # one at a time
-            self._flights.pop(other).close()
-        self._count += 1
-        folder = self._folder / f"flight{self._count}"
+    def _start(self, own_clock: bool) -> Flight:
+        self.close()
+        folder = self._folder / f"flight{len(self.all) + 1}"
         folder.mkdir()
-        self.flown.append(Flight(folder, self._scenario.path, _clock(folder) if own_clock else None))
-        return self.flown[-1]
+        flight = self._running[own_clock] = Flight(folder, self._scenario.path, _clock(folder) if own_clock else None)
+        self.all.append(flight)
+        return flight
 
-    def scrap(self) -> None:
-        """End all flights."""
-        for own_clock in list(self._flights):
-            self._flights.pop(own_clock).close()
+    def close(self) -> None:
+        """End the running flight."""
+        for own_clock in list(self._running):
+            self._running.pop(own_clock).close()
 
 
 def _clock(folder: Path) -> Path:
     compiler = shutil.which("cc")
     if compiler is None:
-        pytest.skip("no C compiler here for a clock that can be set")
+        pytest.skip("no C compiler for a clock that can be set")
     library = folder / "clock.so"
     source = Path(__file__).with_name("clock.c")
     subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl", "-lpthread"], check=True)
@@ -103,7 +102,7 @@ def _clock(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def hangar(tmp_path_factory: pytest.TempPathFactory, osprey_gust: Scenario) -> Iterator[Hangar]:
-    made = Hangar(tmp_path_factory.mktemp("faults"), osprey_gust)
+def flights(tmp_path_factory: pytest.TempPathFactory, osprey_gust: Scenario) -> Iterator[Flights]:
+    made = Flights(tmp_path_factory.mktemp("faults"), osprey_gust)
     yield made
-    made.scrap()
+    made.close()
