@@ -1,14 +1,19 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures of all tests: the default scenario."""
+"""Fixtures of all tests: the default scenario and the log of a flight."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.scenarios import find_scenario
+from flight_core.tape import Tape
+from flight_log.tape_writer import write_run
 
 # The time of an example depends on the host, not on the code under test.
 settings.register_profile("flight", deadline=None)
@@ -21,3 +26,24 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 def osprey_gust() -> Scenario:
     """The default scenario."""
     return find_scenario("osprey_gust")
+
+
+@pytest.fixture(scope="session")
+def tape(osprey_gust: Scenario) -> Tape:
+    """Two seconds of the default scenario in one process."""
+    return simulate(osprey_gust.vary(flight={"duration": 2.0}))
+
+
+@pytest.fixture(scope="session")
+def recorded(tape: Tape, osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of `tape` with the attachments of a flight."""
+    folder = tmp_path_factory.mktemp("recorded") / "run"
+    folder.mkdir()
+    write_run(tape, folder, attachments_for(osprey_gust.vary(flight={"duration": 2.0}), folder))
+    return folder
+
+
+@pytest.fixture
+def run(recorded: Path, tmp_path: Path) -> Path:
+    """A copy of `recorded` to damage."""
+    return Path(shutil.copytree(recorded, tmp_path / "run"))

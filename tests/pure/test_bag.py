@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writing and reading bags: with independent readers, truncated and damaged files, bags of other recorders."""
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,9 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from tests.joint_states import JOINT_STATE, STORE, vector
+from tests.recordings import summary_of, truncate
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
@@ -28,33 +27,6 @@ from flight_log.named_vectors import decoder
 from flight_log.scan import Scan
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
-
-
-@pytest.fixture(scope="module")
-def tape(osprey_gust: Scenario) -> Tape:
-    return simulate(osprey_gust.vary(flight={"duration": 2.0}))
-
-
-@pytest.fixture(scope="module")
-def recorded(tape: Tape, osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("recorded") / "run"
-    write_run(tape, folder, LogAttachments(osprey_gust.path))
-    return folder
-
-
-@pytest.fixture
-def run(recorded: Path, tmp_path: Path) -> Path:
-    """A copy to damage."""
-    shutil.copytree(recorded, tmp_path / "run")
-    return tmp_path / "run"
-
-
-def truncate(run: Path, fraction: float) -> None:
-    """Leave what a killed recorder leaves: the beginning of the file, and no metadata.yaml."""
-    file = run / "run_0.mcap"
-    content = file.read_bytes()
-    file.write_bytes(content[: int(len(content) * fraction)])
-    (run / "metadata.yaml").unlink()
 
 
 def test_a_written_tape_is_read_back_bit_by_bit(tape: Tape, recorded: Path) -> None:
@@ -78,10 +50,7 @@ def test_attachments_and_metadata_are_stored_unchanged(tape: Tape, osprey_gust: 
     write_run(tape, tmp_path / "run", LogAttachments(osprey_gust.path, (attached,), metadata))
     back = read_run(tmp_path / "run")
     assert back.attachments == (("airframe.yaml", attached.read_bytes()),)
-    assert {name: back.metadata[name] for name in ("host", "versions")} == {
-        "host": {"cores": "2", "kernel": "6.1 #1"},
-        "versions": {},
-    }
+    assert (back.metadata["host"], back.metadata["versions"]) == ({"cores": "2", "kernel": "6.1 #1"}, {})
 
 
 @pytest.mark.parametrize("text", ["host: 3\n", "- a\n", "host: {cores: 2}\n"])
@@ -94,9 +63,8 @@ def test_metadata_other_than_strings_are_rejected(text: str, tape: Tape, osprey_
 
 def test_rosbags_reads_every_topic(tape: Tape, recorded: Path) -> None:
     with AnyReader([recorded]) as reader:
-        assert {c.topic.lstrip("/"): c.msgcount for c in reader.connections} == {
-            n: len(s.stamp_ns) for n, s in tape.signals.items()
-        }
+        counts = {connection.topic.lstrip("/"): connection.msgcount for connection in reader.connections}
+        assert counts == {name: len(signal.stamp_ns) for name, signal in tape.signals.items()}
         connection, _, raw = next(reader.messages([c for c in reader.connections if c.topic == "/y"]))
         message: Any = reader.deserialize(raw, connection.msgtype)
         assert message.name == ["q", "V", "p", "r"]
@@ -114,15 +82,13 @@ def test_mcap_ros2_support_reads_every_message(tape: Tape, recorded: Path) -> No
 
 
 def test_the_file_is_a_ros2_profile_with_installed_definitions_and_hashes(recorded: Path) -> None:
+    summary = summary_of(recorded / "run_0.mcap")
+    assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+    hashes = {channel.metadata["topic_type_hash"] for channel in summary.channels.values()}
+    assert hashes == {definition(JOINT_STATE).type_hash}
     with (recorded / "run_0.mcap").open("rb") as stream:
         reader = make_reader(stream)
-        summary = reader.get_summary()
-        assert summary is not None
         assert reader.get_header().profile == "ros2"
-        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
-        assert {channel.metadata["topic_type_hash"] for channel in summary.channels.values()} == {
-            definition("sensor_msgs/msg/JointState").type_hash
-        }
         assert any(record.name == "rosbag2" for record in reader.iter_metadata())
 
 
@@ -149,10 +115,7 @@ def test_the_note_on_a_truncated_file_gives_the_missing_time_by_metadata_yaml(ta
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_damaged_chunk_is_left_out_and_all_others_are_read(number: int, tape: Tape, run: Path) -> None:
     file = run / "run_0.mcap"
-    with file.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    chunks = sorted(summary.chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
+    chunks = sorted(summary_of(file).chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
     assert len(chunks) > 2
     content = bytearray(file.read_bytes())
     content[chunks[number].chunk_start_offset + chunks[number].chunk_length - 100] ^= 1
@@ -219,11 +182,8 @@ def test_a_folder_without_a_bag_is_rejected(tmp_path: Path) -> None:
 
 
 def test_definitions_include_all_referenced_types() -> None:
-    text = definition("sensor_msgs/msg/JointState").text
-    assert [line.removeprefix("MSG: ") for line in text.splitlines() if line.startswith("MSG: ")] == [
-        "builtin_interfaces/Time",
-        "std_msgs/Header",
-    ]
+    lines = definition(JOINT_STATE).text.splitlines()
+    assert [line for line in lines if line.startswith("MSG: ")] == ["MSG: builtin_interfaces/Time", "MSG: std_msgs/Header"]
     with pytest.raises(ParameterError, match="install the package no_such_msgs"):
         definition("no_such_msgs/msg/Thing")
 
@@ -287,18 +247,13 @@ def test_a_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
 def test_two_aircraft_in_one_bag_are_selected_by_their_namespace(tmp_path: Path) -> None:
     topics = {"/one/y": SAMPLES, "/fleet/two/y": SAMPLES[:7], "/fleet/two/gps/speed": SAMPLES[:3], "/one/u": SAMPLES[:5]}
     record(tmp_path / "bag", topics, StoragePlugin.MCAP)
-    with pytest.raises(
-        ParameterError, match=r"bag: found aircraft in the namespaces /fleet/two, /one, expected that one of them"
-    ):
+    with pytest.raises(ParameterError, match="bag: found aircraft in the namespaces /fleet/two, /one, expected that one of"):
         read_run(tmp_path / "bag")
     with pytest.raises(ParameterError, match=r"namespaces /fleet/two, /one, expected one in '/three'"):
         read_run(tmp_path / "bag", "/three")
-    assert {name: len(signal.stamp_ns) for name, signal in read_run(tmp_path / "bag", "/one").tape.signals.items()} == {
-        "y": 50,
-        "u": 5,
-    }
-    two = read_run(tmp_path / "bag", "fleet/two/").tape
-    assert {name: len(signal.stamp_ns) for name, signal in two.signals.items()} == {"y": 7, "gps/speed": 3}
+    for namespace, counts in (("/one", {"y": 50, "u": 5}), ("fleet/two/", {"y": 7, "gps/speed": 3})):
+        signals = read_run(tmp_path / "bag", namespace).tape.signals
+        assert {name: len(signal.stamp_ns) for name, signal in signals.items()} == counts
 
 
 def test_an_aircraft_at_the_root_excludes_those_in_namespaces(tmp_path: Path) -> None:

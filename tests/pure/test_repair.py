@@ -5,7 +5,6 @@
 import fcntl
 import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,48 +12,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
+from tests.recordings import summary_of, truncate
 
-from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.run_folder import attachments_for
 from flight_core.parameters import ParameterError
 from flight_log.repair import repair
 from flight_log.tape_reader import read_run
-from flight_log.tape_writer import write_run
 
-DURATION = 2.0
-
-
-@pytest.fixture(scope="module")
-def recorded(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    scenario = osprey_gust.vary(flight={"duration": DURATION})
-    folder = tmp_path_factory.mktemp("recorded") / "run"
-    folder.mkdir()
-    write_run(simulate(scenario), folder, attachments_for(scenario, folder))
-    return folder
-
-
-@pytest.fixture
-def run(recorded: Path, tmp_path: Path) -> Path:
-    """A copy to damage."""
-    shutil.copytree(recorded, tmp_path / "run")
-    return tmp_path / "run"
+DURATION = 2.0  # s, of the log
 
 
 def state(folder: Path) -> dict[str, tuple[bytes, int]]:
     """Content and modification time of every file."""
     return {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
-
-
-def truncate(run: Path, fraction: float) -> bytes:
-    """Leave what a killed recorder leaves: the beginning of the file, which is returned, and no metadata.yaml."""
-    file = run / "run_0.mcap"
-    content = file.read_bytes()
-    file.write_bytes(content[: int(len(content) * fraction)])
-    (run / "metadata.yaml").unlink()
-    return file.read_bytes()
 
 
 def last(run: Path) -> float:
@@ -89,11 +59,9 @@ def test_a_repaired_truncated_log_is_read_in_full_by_rosbags(fraction: float, re
     assert after.tape.time("truth")[-1] == readable.tape.time("truth")[-1]
     assert (after.scenario, after.attachments) == (readable.scenario, readable.attachments)
     assert after.metadata["rise_di_host"] == readable.metadata["rise_di_host"]
-    with (run / "run_0.mcap").open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    assert summary.statistics is not None
-    assert summary.statistics.message_count == len(read)
+    statistics = summary_of(run / "run_0.mcap").statistics
+    assert statistics is not None
+    assert statistics.message_count == len(read)
     assert not list(run.glob("*.new"))
 
 
@@ -127,10 +95,7 @@ def test_a_missing_or_damaged_metadata_yaml_is_restored(content: str | None, rec
 
 def test_damage_inside_loses_only_its_chunk(recorded: Path, run: Path) -> None:
     file = run / "run_0.mcap"
-    with file.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    chunk = summary.chunk_indexes[1]
+    chunk = summary_of(file).chunk_indexes[1]
     content = bytearray(file.read_bytes())
     content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
     file.write_bytes(content)
@@ -204,14 +169,8 @@ def test_a_second_repair_keeps_the_first_damaged_file(run: Path) -> None:
 
 def test_the_command_prints_the_kept_messages_and_the_missing_time(run: Path) -> None:
     def command() -> str:
-        result = subprocess.run(
-            [sys.executable, "-m", "flight_cli.cli", "repair", "run"],
-            cwd=run.parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        return result.stdout
+        words = [sys.executable, "-m", "flight_cli.cli", "repair", "run"]
+        return subprocess.run(words, cwd=run.parent, capture_output=True, text=True, check=True).stdout
 
     assert command() == "run is intact: nothing to repair\n"
     metadata = (run / "metadata.yaml").read_bytes()

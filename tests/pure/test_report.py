@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 import pytest
+from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report import comparison, figures, plotting
@@ -35,8 +36,6 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.guard import Mode
 from rise_di_controller.internals import Saturation
 
-MS = 1_000_000
-EPOCH = 1_795_000_000_000_000_000  # a stamp of today
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
 DEG = np.pi / 180.0
 
@@ -46,31 +45,30 @@ def servo() -> Scenario:
     return find_scenario("osprey_servo")
 
 
-def signal(stamps_ms: list[float], **channels: list[float]) -> Signal:
-    stamps = EPOCH + np.array([round(stamp * MS) for stamp in stamps_ms], dtype=np.int64)
-    return Signal(stamps, tuple(channels), np.column_stack([np.array(values, dtype=float) for values in channels.values()]))
+def held(count: int = 101, /, **channels: Any) -> Signal:
+    """Channels at 100 Hz, of which most hold a value; `__` in a name stands for a dot."""
+    return signal([10.0 * k for k in range(count)], **{name.replace("__", "."): value for name, value in channels.items()})
 
 
-def ticks(count: int, **channels: list[float]) -> Signal:
+def ticks(count: int = 101, /, **channels: Any) -> Signal:
     """Internals of a controller at 100 Hz that was on time and never saturated, except in the channels given."""
-    default = {"mode": [float(Mode.ENGAGED)] * count, "dt": [0.01] * count, "late": [0.0] * count, "age": [0.0] * count}
-    limited = {f"limited.{name}": [float(Saturation.NO)] * count for name in INPUTS}
-    integrals = {f"{group}.{name}": [0.0] * count for group in ("integral_e", "Pi") for name in OUTPUTS}
-    return signal([10.0 * k for k in range(count)], **(default | limited | integrals | channels))
-
-
-def truth(count: int, **channels: float) -> Signal:
-    """Truth at 100 Hz with channels that hold a value."""
-    return signal(
-        [10.0 * k for k in range(count)], **{name.replace("__", "."): [value] * count for name, value in channels.items()}
-    )
+    limited = {f"limited.{name}": Saturation.NO for name in INPUTS}
+    integrals = {f"{group}.{name}": 0.0 for group in ("integral_e", "Pi") for name in OUTPUTS}
+    return held(count, **({"mode": Mode.ENGAGED, "dt": 0.01, "late": 0.0, "age": 0.0} | limited | integrals | channels))
 
 
 def flight(count: int = 101, **signals: Signal) -> Tape:
     """A flight at 100 Hz whose outputs are zero, with the signals given."""
-    stamps = [10.0 * k for k in range(count)]
-    zero = signal(stamps, **{name: [0.0] * count for name in OUTPUTS})
+    zero = held(count, **dict.fromkeys(OUTPUTS, 0.0))
     return Tape({"y": zero, "y_m": zero, **signals}, EPOCH)
+
+
+@pytest.fixture
+def complete() -> Tape:
+    """A flight with all signals of a simulation."""
+    states = dict.fromkeys(("x__q", "x__V", "x__p", "x__r", "actuator__elevator"), 0.0)
+    truth = held(**states, gust__vertical=2.0, noise__q=1e-3)
+    return flight(u=held(**dict.fromkeys(INPUTS, 0.1)), internals=ticks(late=1e-3), truth=truth)
 
 
 def context(tape: Tape, units: dict[str, DisplayUnit] | None = None) -> PlotContext:
@@ -105,13 +103,8 @@ def headings(page: str) -> list[str]:
 # The page
 
 
-def test_a_simulated_flight_has_every_figure(tmp_path: Path, servo: Scenario) -> None:
-    tape = flight(
-        u=signal([10.0 * k for k in range(101)], **{name: [0.1] * 101 for name in INPUTS}),
-        internals=ticks(101, late=[1e-3] * 101),
-        truth=truth(101, x__q=0.0, x__V=0.0, x__p=0.0, x__r=0.0, gust__vertical=2.0, actuator__elevator=0.0, noise__q=1e-3),
-    )
-    assert headings(page_of(tmp_path, servo, tape)) == [
+def test_a_simulated_flight_has_every_figure(tmp_path: Path, servo: Scenario, complete: Tape) -> None:
+    assert headings(page_of(tmp_path, servo, complete)) == [
         "Output y over the reference y_m",
         "Tracking error e = y - y_m",
         "Input u and the actuators",
@@ -132,7 +125,7 @@ def test_a_log_of_only_y_and_its_reference_has_a_report(tmp_path: Path, servo: S
 
 
 def test_a_flight_of_one_sample_has_a_report(tmp_path: Path, servo: Scenario) -> None:
-    one = flight(1, u=signal([0], **{name: [0.0] for name in INPUTS}), internals=ticks(1), truth=truth(1, x__q=0.0))
+    one = flight(1, u=held(1, **dict.fromkeys(INPUTS, 0.0)), internals=ticks(1), truth=held(1, x__q=0.0))
     assert len(headings(page_of(tmp_path, servo, one))) == 5  # y, e, u, states, integrals: no wind, no late tick
 
 
@@ -140,22 +133,15 @@ def test_the_page_of_a_minute_is_below_eight_megabytes(tmp_path: Path, servo: Sc
     # White noise on all channels at the rates of the scenario hardly compresses. plotly itself takes 2 MB. Measured 7.3 MB.
     random = np.random.default_rng(1)
 
-    def noise(rate: int, names: list[str]) -> Signal:
+    def noise(rate: int, *names: str) -> Signal:
         stamps = EPOCH + np.arange(60 * rate + 1, dtype=np.int64) * (1000 * MS // rate)
-        return Signal(stamps, tuple(names), random.standard_normal((len(stamps), len(names))))
+        return Signal(stamps, names, random.standard_normal((len(stamps), len(names))))
 
     states = ["V", "alpha", "q", "theta", "beta", "p", "r", "phi"]
     groups = {"x": states, "gust": ["a", "b", "c"], "actuator": INPUTS, "noise": OUTPUTS}
-    tape = Tape(
-        {
-            "y": noise(500, list(OUTPUTS)),
-            "y_m": noise(500, list(OUTPUTS)),
-            "u": noise(100, list(INPUTS)),
-            "truth": noise(500, [f"{group}.{name}" for group, names in groups.items() for name in names]),
-        },
-        EPOCH,
-    )
-    page = page_of(tmp_path, servo, tape)
+    signals = {"y": noise(500, *OUTPUTS), "y_m": noise(500, *OUTPUTS), "u": noise(100, *INPUTS)}
+    signals["truth"] = noise(500, *(f"{group}.{name}" for group, names in groups.items() for name in names))
+    page = page_of(tmp_path, servo, Tape(signals, EPOCH))
     assert len(page) < 8e6
     assert 'src="http' not in page
 
@@ -166,15 +152,10 @@ def test_text_of_a_log_is_escaped(tmp_path: Path, servo: Scenario) -> None:
     assert "<script>alert" not in page
 
 
-def test_every_colour_of_a_page_has_a_dark_counterpart(tmp_path: Path, servo: Scenario) -> None:
+def test_every_colour_of_a_page_has_a_dark_counterpart(tmp_path: Path, servo: Scenario, complete: Tape) -> None:
     # Colours of modes, saturations and gusts serve light and dark pages alike.
     shared = {*figures.MODE_COLOURS.values(), *figures.SATURATION_COLOURS.values(), figures.GUST}
-    tape = flight(
-        u=signal([10.0 * k for k in range(101)], **{name: [0.1] * 101 for name in INPUTS}),
-        internals=ticks(101, late=[1e-3] * 101),
-        truth=truth(101, x__q=0.0, x__V=0.0, x__p=0.0, x__r=0.0, gust__up=2.0, actuator__elevator=0.0, noise__q=1e-3),
-    )
-    specifications = re.findall(r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, tape))
+    specifications = re.findall(r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, complete))
     used = set(re.findall(r"#[0-9a-f]{6}", " ".join(specifications)))
     assert used - shared <= set(plotting.DARK | figures.DARK)
     assert len(used) > 5
@@ -184,11 +165,10 @@ def test_every_colour_of_a_page_has_a_dark_counterpart(tmp_path: Path, servo: Sc
 
 
 def test_each_event_is_listed_once_in_order_of_its_start() -> None:
-    mode = (
-        [Mode.ENGAGED] * 20 + [Mode.HOLD] * 10 + [Mode.ENGAGED] * 20 + [Mode.HOLD] * 5 + [Mode.RAMP] * 5 + [Mode.ENGAGED] * 41
-    )
+    modes = ((20, "ENGAGED"), (10, "HOLD"), (20, "ENGAGED"), (5, "HOLD"), (5, "RAMP"), (41, "ENGAGED"))
+    mode = [Mode[name] for count, name in modes for _ in range(count)]
     rate = [Saturation.NO] * 2 + [Saturation.RATE] * 3 + [Saturation.NO] * 90 + [Saturation.RATE] + [Saturation.NO] * 5
-    tape = flight(internals=ticks(101, mode=[float(one) for one in mode], **{"limited.thrust": [float(one) for one in rate]}))
+    tape = flight(internals=ticks(mode=mode, limited__thrust=rate))
     listed = events(tape, {"lateral": (0.9, 2.0), "vertical": (5.0, 6.0)})
     assert [(event.name, round(event.start, 3), round(event.stop, 3), event.extent) for event in listed] == [
         ("thrust saturated: rate", 0.02, 0.95, "4 of 101 ticks"),
@@ -215,7 +195,7 @@ def test_close_spans_are_merged_and_short_ones_lengthened() -> None:
 def test_every_mode_but_engaged_is_an_interval_with_its_name() -> None:
     assert set(figures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
     assert set(figures.SATURATION_COLOURS) == set(Saturation) - {Saturation.NO}
-    modes = [float(one) for one in Mode for _ in range(10)]
+    modes = [one for one in Mode for _ in range(10)]
     intervals = figures.mode_intervals(flight(60, internals=ticks(60, mode=modes)))
     assert {one.label: (round(one.start, 3), round(one.stop, 3)) for one in intervals} == {
         "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5), "inactive": (0.5, 0.59),
@@ -225,10 +205,8 @@ def test_every_mode_but_engaged_is_an_interval_with_its_name() -> None:
 def test_intervals_are_shaded_over_the_whole_height_of_a_figure() -> None:
     intervals = [Interval("hold", 0.2, 0.3, "#f2c230", False), Interval("a gust", 0.5, 0.6, "#7f7f7f", True)]
     drawn = figures.tracking_figure(context(flight())._replace(intervals=intervals))
-    assert [(shape.x0, shape.x1, shape.y0, shape.y1, shape.yref) for shape in drawn.layout.shapes] == [
-        (0.2, 0.3, 0, 1, "paper"),
-        (0.5, 0.6, 0, 1, "paper"),
-    ]
+    shapes = [(shape.x0, shape.x1, shape.y0, shape.y1, shape.yref) for shape in drawn.layout.shapes]
+    assert shapes == [(0.2, 0.3, 0, 1, "paper"), (0.5, 0.6, 0, 1, "paper")]
     assert [note.text for note in drawn.layout.annotations] == ["a gust"]
     assert len(traces(drawn, "hold")) == 1  # in the legend
 
@@ -236,10 +214,9 @@ def test_intervals_are_shaded_over_the_whole_height_of_a_figure() -> None:
 # The input
 
 
-def input_flight(**limited: list[float]) -> Tape:
+def input_flight(**limited: list[Saturation]) -> Tape:
     """The elevator at 2 deg, the other inputs at trim."""
-    u = {name: [0.0] * 101 for name in INPUTS} | {"elevator": [2.0 * DEG] * 101}
-    return flight(u=signal([10.0 * k for k in range(101)], **u), internals=ticks(101, **limited))
+    return flight(u=held(**dict.fromkeys(INPUTS, 0.0) | {"elevator": 2.0 * DEG}), internals=ticks(**limited))
 
 
 def test_limits_near_the_input_are_in_view_and_far_ones_are_not(servo: Scenario) -> None:
@@ -257,10 +234,8 @@ def test_limits_near_the_input_are_in_view_and_far_ones_are_not(servo: Scenario)
 
 def test_end_stops_are_drawn_where_actuators_are_simulated(servo: Scenario) -> None:
     # End stops are in the airframe's order, u in the law's: only thrust has 50 %.
-    tape = input_flight()
-    assert set(input_limits(servo, tape)) == {"limits of the controller"}
-    simulated = flight(truth=truth(101, actuator__elevator=0.0))
-    stops = input_limits(servo, simulated)["end stops"]
+    assert set(input_limits(servo, input_flight())) == {"limits of the controller"}
+    stops = input_limits(servo, flight(truth=held(actuator__elevator=0.0)))["end stops"]
     assert stops["thrust"] == (-0.5, 0.5)
     assert stops["elevator"] == pytest.approx((-30.0 * DEG, 30.0 * DEG), rel=1e-5)
 
@@ -272,11 +247,9 @@ def test_an_input_without_limits_has_no_lines(osprey_gust: Scenario) -> None:
 
 
 def test_saturation_of_an_input_is_marked_in_its_row_alone() -> None:
-    limited = [float(Saturation.NO)] * 101
-    limited[50:60] = [float(Saturation.MAGNITUDE)] * 10
-    limited[80] = float(Saturation.RATE)
-    tape = input_flight(**{"limited.aileron": limited})
-    figure = figures.input_figure(context(tape), {})
+    limited = [Saturation.NO] * 101
+    limited[50:60], limited[80] = [Saturation.MAGNITUDE] * 10, Saturation.RATE
+    figure = figures.input_figure(context(input_flight(limited__aileron=limited)), {})
     (magnitude,), (rate,) = traces(figure, "saturated: magnitude"), traces(figure, "saturated: rate")
     assert magnitude.yaxis == rate.yaxis == "y2"  # aileron is the second row
     assert magnitude.x[:2] == pytest.approx((0.5, 0.6))
@@ -284,8 +257,7 @@ def test_saturation_of_an_input_is_marked_in_its_row_alone() -> None:
 
 
 def test_the_actuator_is_drawn_over_the_command_by_name() -> None:
-    tape = input_flight()
-    lagging = flight(u=tape["u"], truth=truth(101, actuator__thrust=0.3, actuator__elevator=0.01))
+    lagging = flight(u=input_flight()["u"], truth=held(actuator__thrust=0.3, actuator__elevator=0.01))
     figure = figures.input_figure(context(lagging, {"elevator": DisplayUnit("deg", 1 / DEG)}), {})
     assert titles(figure) == ["elevator (deg)", "aileron", "rudder", "thrust"]
     by_axis = {trace.yaxis: trace.y[0] for trace in traces(figure, "actuator")}
@@ -297,45 +269,45 @@ def test_the_actuator_is_drawn_over_the_command_by_name() -> None:
 
 
 def test_all_states_are_drawn_in_their_unit_where_it_is_known() -> None:
-    tape = flight(truth=truth(101, x__q=0.25, x__altitude=1200.0))
+    tape = flight(truth=held(x__q=0.25, x__altitude=1200.0))
     figure = figures.state_figure(context(tape, {"q": DisplayUnit("mrad/s", 1e3)}))
     assert titles(figure) == ["q (mrad/s)", "altitude"]
     assert [trace.y[0] for trace in traces(figure, "x")] == [250.0, 1200.0]
 
 
 def test_ideal_sensors_and_still_air_have_no_figure() -> None:
-    ideal = context(flight(truth=truth(101, noise__q=0.0, gust__vertical=0.0, x__q=0.0)))
+    ideal = context(flight(truth=held(noise__q=0.0, gust__vertical=0.0, x__q=0.0)))
     assert figures.sensor_figure(ideal) is None
     assert figures.wind_figure(ideal) is None
-    real = context(flight(truth=truth(101, noise__q=0.0, noise__V=0.1, gust__vertical=0.0, gust__longitudinal=1.0)))
+    real = context(flight(truth=held(noise__q=0.0, noise__V=0.1, gust__vertical=0.0, gust__longitudinal=1.0)))
     assert titles(figures.sensor_figure(real)) == ["V"]
     assert titles(figures.wind_figure(real)) == ["longitudinal (m/s)"]
 
 
 def test_the_true_error_is_drawn_over_the_measured_one_where_they_differ() -> None:
     states = {f"x__{name}": 0.5 for name in OUTPUTS}
-    ideal = figures.error_figure(context(flight(truth=truth(101, **states, noise__q=0.0))))
+    ideal = figures.error_figure(context(flight(truth=held(**states, noise__q=0.0))))
     assert {trace.name for trace in ideal.data} == {"e"}
-    noisy = figures.error_figure(context(flight(truth=truth(101, **states, noise__q=0.1))))
+    noisy = figures.error_figure(context(flight(truth=held(**states, noise__q=0.1))))
     assert [traces(noisy, name)[0].y[0] for name in ("measured", "true")] == [0.0, 0.5]
 
 
 def test_ticks_have_a_figure_if_one_was_late_or_y_was_old_or_dt_changed() -> None:
-    assert figures.tick_figure(context(flight(internals=ticks(101)))) is None
-    for channel, values in (("late", [0.0] * 100 + [1e-4]), ("age", [2e-3] * 101), ("dt", [0.0] + [0.01] * 99 + [0.02])):
-        figure = figures.tick_figure(context(flight(internals=ticks(101, **{channel: values}))))
+    assert figures.tick_figure(context(flight(internals=ticks()))) is None
+    for channel, values in (("late", [0.0] * 100 + [1e-4]), ("age", 2e-3), ("dt", [0.0] + [0.01] * 99 + [0.02])):
+        figure = figures.tick_figure(context(flight(internals=ticks(**{channel: values}))))
         assert titles(figure) == ["late (ms)", "age (ms)", "dt (ms)"]
 
 
 def test_a_visible_noise_floor_is_drawn_on_both_sides_of_zero() -> None:
-    tape = flight(y=signal([0, 1000], **{name: [1.0, 0.0] for name in OUTPUTS}))
+    tape = flight(y=signal([0, 1000], **dict.fromkeys(OUTPUTS, (1.0, 0.0))))
     figure = figures.error_figure(context(tape), {"q": 0.5, "V": 1e-9})
     (floor,) = traces(figure, "noise floor")
     assert (floor.yaxis, set(floor.y)) == ("y", {0.5, -0.5})  # only that of q is visible
 
 
 def test_both_integrals_of_an_output_stand_side_by_side() -> None:
-    tape = flight(internals=ticks(101, **{"Pi.p": [0.0] * 100 + [3.0], "integral_e.p": [0.0] * 100 + [2.0]}))
+    tape = flight(internals=ticks(Pi__p=[0.0] * 100 + [3.0], integral_e__p=[0.0] * 100 + [2.0]))
     figure = figures.integral_figure(context(tape))
     assert figure is not None
     assert titles(figure)[4:6] == ["∫e p", "Pi p"]
@@ -343,20 +315,18 @@ def test_both_integrals_of_an_output_stand_side_by_side() -> None:
 
 
 def test_the_spectrum_of_a_commanded_sine_has_its_peak_there() -> None:
-    stamps = [10.0 * k for k in range(1001)]
-    sine = np.sin(2.0 * np.pi * 5.0 * np.array(stamps) / 1000.0)
-    u = signal(stamps, elevator=sine.tolist(), thrust=[0.0] * 1001)
-    figure = figures.spectrum_figure(context(flight(u=u), {"elevator": DisplayUnit("deg", 1 / DEG)}), 10 * MS)
+    u = held(1001, elevator=np.sin(2.0 * np.pi * 5.0 * np.arange(1001) / 100.0), thrust=0.0)
+    figure = figures.spectrum_figure({"u": (flight(u=u), 10 * MS)}, {"u": figures.PLANT}, {"elevator": DisplayUnit("deg", 1 / DEG)})
     assert figure is not None
     assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
     assert figure.data[0].x[np.argmax(figure.data[0].y)] == pytest.approx(5.0, abs=0.2)
-    assert figures.spectrum_figure(context(flight(u=u.until(EPOCH + 100 * MS))), 10 * MS) is None  # eleven samples
+    assert figures.spectrum_figure({"u": (flight(u=u.until(EPOCH + 100 * MS)), 10 * MS)}, {}, {}) is None  # eleven samples
 
 
 def test_timing_has_a_histogram_if_it_is_not_zero() -> None:
-    assert figures.timing_figure(context(flight(internals=ticks(101))), 10 * MS) is None
-    delayed = flight(internals=ticks(101), latency=signal([0, 10, 20], y_to_u=[1e-3, 1e-3, 3e-3]))
-    figure = figures.timing_figure(context(delayed), 10 * MS)
+    assert figures.timing_figure({"": (flight(internals=ticks()), 10 * MS)}, {"": figures.PLANT}) is None
+    delayed = flight(internals=ticks(), latency=signal([0, 10, 20], y_to_u=[1e-3, 1e-3, 3e-3]))
+    figure = figures.timing_figure({"": (delayed, 10 * MS)}, {"": figures.PLANT})
     assert figure is not None
     assert [axis.title.text for axis in figure.select_xaxes()] == ["y sent to u sent (ms)"]
     assert [count for count in figure.data[0].y if count] == [2.0, 1.0]
@@ -368,9 +338,9 @@ def test_timing_has_a_histogram_if_it_is_not_zero() -> None:
 @pytest.fixture(scope="module")
 def pair(servo: Scenario) -> list[RecordedFlight]:
     """Two flights: the second has half the error in q, and no p."""
-    y_m = signal([0, 1000], **{name: [1.0, 1.0] for name in OUTPUTS})
-    first = flight(y=signal([0, 1000], q=[1.2, 1.2], V=[1.0, 1.0], p=[1.0, 1.0], r=[1.0, 1.0]), y_m=y_m)
-    second = flight(y=signal([0, 1000], r=[1.0, 1.0], V=[1.0, 1.0], q=[1.1, 1.1]), y_m=y_m)
+    y_m = signal([0, 1000], **dict.fromkeys(OUTPUTS, 1.0))
+    first = flight(y=signal([0, 1000], q=1.2, V=1.0, p=1.0, r=1.0), y_m=y_m)
+    second = flight(y=signal([0, 1000], r=1.0, V=1.0, q=1.1), y_m=y_m)
     return [recorded("a", servo, first), recorded("b", servo, second)]
 
 
@@ -408,7 +378,7 @@ def test_curves_of_several_flights_are_drawn_over_one_reference(pair: list[Recor
 
 
 def test_each_distinct_reference_is_drawn(pair: list[RecordedFlight], servo: Scenario) -> None:
-    other = flight(y_m=signal([0, 1000], **{name: [0.0, 2.0] for name in OUTPUTS}))
+    other = flight(y_m=signal([0, 1000], **dict.fromkeys(OUTPUTS, (0.0, 2.0))))
     three = [*pair, recorded("c", servo, other)]
     drawn = comparison.tracking_figure(comparison.plot_context(three), three)
     assert [trace.name for trace in drawn.data if trace.yaxis == "y"] == ["y_m a", "y_m c", "a", "b", "c"]
@@ -416,16 +386,14 @@ def test_each_distinct_reference_is_drawn(pair: list[RecordedFlight], servo: Sce
 
 def test_each_flight_is_in_the_legend_once_whatever_its_channels(servo: Scenario) -> None:
     def only(*names: str) -> Tape:
-        y = signal([10.0 * k for k in range(101)], **{name: [1.0] * 101 for name in names})
+        y = held(**dict.fromkeys(names, 1.0))
         return Tape({"y": y, "y_m": y, "u": y, "latency": signal([0, 10], y_to_u=[1e-3, 2e-3])}, EPOCH)
 
     two = [recorded("a", servo, only("q", "V")), recorded("b", servo, only("V", "p"))]
     shared = comparison.plot_context(two)
-    for drawn in (
-        comparison.error_figure(shared, two),
-        comparison.spectrum_figure(shared, two),
-        comparison.timing_figure(two),
-    ):
+    runs, colours = {flight.name: (flight.tape, flight.period_ns) for flight in two}, comparison.colours(two)
+    spectrum = figures.spectrum_figure(runs, colours, shared.units)
+    for drawn in (comparison.error_figure(shared, two), spectrum, figures.timing_figure(runs, colours)):
         assert drawn is not None
         assert [trace.name for trace in drawn.data if trace.showlegend] == ["a", "b"]
 
@@ -435,9 +403,8 @@ def test_flights_of_equal_names_are_numbered(pair: list[RecordedFlight]) -> None
 
 
 def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> None:
-    path = tmp_path / "comparison.html"
-    write_page(path, pair)
-    page = path.read_text(encoding="utf-8")
+    write_page(tmp_path / "comparison.html", pair)
+    page = (tmp_path / "comparison.html").read_text(encoding="utf-8")
     assert "2 flights compared" in page
     assert '<td class="better">&times;0.500</td>' in page
     assert headings(page) == ["Tracking error", "Output y over the reference y_m", "Tracking error e = y - y_m"]
@@ -478,9 +445,8 @@ def test_values_have_three_digits() -> None:
 
 def test_a_curve_is_broken_at_a_gap_and_u_is_held() -> None:
     stamps = [10.0 * k for k in range(101) if not 30 <= k < 60]
-    gapped = signal(stamps, **{name: [1.0] * len(stamps) for name in OUTPUTS})
-    u = signal(stamps, **{name: [1.0] * len(stamps) for name in INPUTS})
-    tape = Tape({"y": gapped, "y_m": flight()["y"], "u": u}, EPOCH)
+    gapped, u = (signal(stamps, **dict.fromkeys(names, 1.0)) for names in (OUTPUTS, INPUTS))
+    tape = flight(y=gapped, u=u)
     y: FloatArray = traces(figures.tracking_figure(context(tape)), "y")[0].y
     assert np.flatnonzero(np.isnan(y)).tolist() == [30]
     assert not np.isnan(traces(figures.input_figure(context(tape), {}), "u")[0].y).any()

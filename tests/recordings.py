@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Builders that the tests of logs and reports share: signals, scenario files, damaged logs."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from mcap.reader import make_reader
+from mcap.summary import Summary
+from numpy.typing import ArrayLike
+
+from flight_core.tape import Signal
+
+MS = 1_000_000  # ns
+EPOCH = 1_795_000_000_000_000_000  # ns, a stamp of today, which float64 cannot hold to the ns; in seconds it resolves 0.2 us
+
+
+def signal(stamps_ms: Sequence[float], **channels: ArrayLike) -> Signal:
+    """Channels by stamps in ms after EPOCH. A number holds at all stamps."""
+    stamps = EPOCH + np.array([round(stamp * MS) for stamp in stamps_ms], dtype=np.int64)
+    values = [np.broadcast_to(np.asarray(one, dtype=float), stamps.shape) for one in channels.values()]
+    return Signal(stamps, tuple(channels), np.column_stack(values))
+
+
+def scenario_file(path: Path, base: Path, **sections: Mapping[str, Any]) -> Path:
+    """Write a scenario file with changes to the sections of another."""
+    tree = yaml.safe_load(base.read_text(encoding="utf-8"))
+    for name, changes in sections.items():
+        tree[f"/**/{name}"]["ros__parameters"] |= changes
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    return path
+
+
+def truncate(run: Path, fraction: float) -> bytes:
+    """Leave what a killed recorder leaves: the beginning of the file, which is returned, and no metadata.yaml."""
+    file = run / "run_0.mcap"
+    content = file.read_bytes()
+    beginning = content[: int(len(content) * fraction)]
+    file.write_bytes(beginning)
+    (run / "metadata.yaml").unlink()
+    return beginning
+
+
+def summary_of(file: Path) -> Summary:
+    """The summary section of an MCAP file, as the library mcap reads it."""
+    with file.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary
