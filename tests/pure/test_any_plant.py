@@ -12,16 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from tests import closed_loop
+from tests.closed_loop import law_params, still_air
 
-from aircraft_sim import dynamics, plant
-from aircraft_sim.actuators import Actuators
-from aircraft_sim.disturbance import Gusts
+from aircraft_sim import dynamics
 from aircraft_sim.dynamics import Aircraft
-from aircraft_sim.plant import AircraftState, PlantParams
 from flight_core.integrators import rk4
-from flight_core.rates import nanoseconds
 from flight_core.vectors import FloatArray
-from rise_di_controller import law as rise
 from rise_di_controller.decomposition import decompose, leading_minors, signs
 from rise_di_controller.law import LawParams, Sign, gain
 
@@ -71,15 +68,11 @@ def random_task(n: int, m: int, seed: int) -> Task:
     A = rng.standard_normal((n, n))
     A -= (max(abscissa(A), abscissa(A[m:, m:])) + MIN_DAMPING) * np.eye(n)
     rotation = np.linalg.qr(rng.standard_normal((n, n)))[0]
-    empty = np.zeros(0)
-    aircraft = Aircraft(
+    aircraft = still_air(
         A=rotation @ A @ rotation.T,
         B=rotation[:, :m] @ S @ np.diag(D) @ U,
         C=rotation[:, :m].T,
         gravity=0.1 / n * rng.uniform(-1.0, 1.0, (n, n)),  # f: at most 0.1 in each x_dot
-        gust_direction=np.zeros((n, 0)),
-        gusts=Gusts(empty, empty, empty),
-        speed=np.array(1.0),
     )
     reference = Sines(rng.uniform(0.2, 1.0, m), rng.uniform(0.5, 2.0, m), rng.uniform(0.0, 2.0 * np.pi, m))
     return Task(aircraft, D, rotation, reference, rng.choice([-1.0, 1.0], m) * rng.uniform(0.1, 0.3, m))
@@ -129,35 +122,14 @@ def gains(task: Task, sign: Sign) -> LawParams:
         beta[i] = 1.5 * zeta[i] + V[i, i + 1 :] @ beta[i + 1 :]
         k_d[i] = 1.0 + (m - 1) * V[i, i + 1 :] ** 2 @ K[i + 1 :] if i < m - 1 else 0.0
         K[i] = K_min + k_d[i]
-    return LawParams(
-        K=gain(np.array(K_min - 1.0), k_d[:-1]),
-        Lambda=np.full(m, 2.0),
-        beta=beta,
-        D=task.D,
-        input_scale=scale,
-        omega=np.full(m, 2.0),
-        eps=np.ones(m),
-        sign=sign,
-    )
+    return law_params(gain(np.array(K_min - 1.0), k_d[:-1]), 2.0, beta, task.D, sign, input_scale=scale, omega=2.0)
 
 
-def fly(task: Task, law: LawParams, dt: float, bound: float = 100.0) -> FloatArray:
-    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above the bound, which ends the flight."""
-    period_ns, m = nanoseconds(dt), len(task.D)
-    ideal = Actuators(np.zeros(m), np.full(m, -np.inf), np.full(m, np.inf), np.full(m, np.inf))
-    hardware = PlantParams(task.aircraft, ideal, period_ns)
-    y = task.reference.at(0.0) + task.e_0
-    aircraft_state, u = AircraftState(task.rotation[:, :m] @ y, np.zeros(m)), np.zeros(m)
-    state = rise.engage(y, task.reference.at(0.0))
-    errors = [state.e]
-    for k in range(round(DURATION / dt)):
-        aircraft_state = plant.advance(k * period_ns, aircraft_state, u, period_ns, hardware)
-        y = dynamics.y(aircraft_state.x, task.aircraft)
-        state, u = rise.step(state, y, task.reference.at((k + 1) * dt), np.array(dt), law)
-        errors.append(state.e)
-        if np.abs(state.e).max() > bound:
-            break
-    return np.array(errors)
+def fly(task: Task, law: LawParams, dt: float) -> FloatArray:
+    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above 100, which ends the flight."""
+    y_m = [task.reference.at(k * dt) for k in range(round(DURATION / dt) + 1)]
+    x_0 = task.rotation[:, : len(task.D)] @ (y_m[0] + task.e_0)
+    return closed_loop.fly(task.aircraft, law, y_m, dt, bound=100.0, x_0=x_0)
 
 
 def ultimate_bound(task: Task, law: LawParams, dt: float) -> float:

@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Guard of the law: alignment of y_m, engagement, failsafe, saturation, anti-windup and the log."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.closed_loop import law_params
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
@@ -13,16 +16,11 @@ from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard, internals
 from rise_di_controller.guard import ControllerState, Limits, Mode, align
 from rise_di_controller.internals import Saturation
-from rise_di_controller.law import LawParams, LawState, Sign, control, engage, retune, step
+from rise_di_controller.law import LawState, Sign, control, engage, retune, step
 from rise_di_controller.params import ControllerParameters
 
 MS = 1_000_000
 PARAMS = find_scenario("osprey_gust").controller
-
-
-@pytest.fixture
-def params() -> ControllerParameters:
-    return PARAMS
 
 
 def sample(ms: float, value: float = 0.0) -> StampedVector:
@@ -67,47 +65,52 @@ def test_a_straight_line_is_reproduced_at_any_instant(ms: float) -> None:
     assert value[0] == pytest.approx(round(ms * MS) / MS, abs=1e-9)
 
 
-def run(params: ControllerParameters, *ticks: tuple[float, StampedVector | None, list[StampedVector]]) -> list[ControllerState]:
-    state, states = guard.initial_state(4), []
-    for now_ms, y, y_m in ticks:
-        state, _ = guard.tick(state, round(now_ms * MS), y, y_m, params.guard(), params.law())
-        states.append(state)
-    return states
+def tick(
+    state: ControllerState,
+    ms: float,
+    y: StampedVector | None,
+    y_m: list[StampedVector],
+    params: ControllerParameters = PARAMS,
+    active: bool = True,
+) -> tuple[ControllerState, guard.TickInputs | None]:
+    return guard.tick(state, round(ms * MS), y, y_m, params.guard(), params.law(), active)
 
 
-def test_waits_until_both_signals_are_received_then_engages_with_zero_input(params: ControllerParameters) -> None:
-    modes = run(
-        params,
-        (0, None, []),
-        (10, sample(10, 1.0), []),
-        (20, None, [sample(20)]),
-        (30, sample(30, 1.0), [sample(20), sample(30)]),
-    )
+def run(
+    *ticks: tuple[float, StampedVector | None, list[StampedVector]], params: ControllerParameters = PARAMS
+) -> list[ControllerState]:
+    states = [guard.initial_state(4)]
+    for ms, y, y_m in ticks:
+        states.append(tick(states[-1], ms, y, y_m, params)[0])
+    return states[1:]
+
+
+def test_waits_until_both_signals_are_received_then_engages_with_zero_input() -> None:
+    both = (30, sample(30, 1.0), [sample(20), sample(30)])
+    modes = run((0, None, []), (10, sample(10, 1.0), []), (20, None, [sample(20)]), both)
     assert [state.mode for state in modes] == [Mode.WAITING, Mode.WAITING, Mode.WAITING, Mode.ENGAGED]
     assert modes[-1].u.tolist() == [0.0] * 4
 
 
-def test_each_new_sample_is_one_step_of_the_law_with_its_measured_dt(params: ControllerParameters) -> None:
-    first, second = run(params, (0, sample(0, 1.0), [sample(0)]), (12, sample(12, 1.1), [sample(12)]))[0:2]
+def test_each_new_sample_is_one_step_of_the_law_with_its_measured_dt() -> None:
+    first, second = run((0, sample(0, 1.0), [sample(0)]), (12, sample(12, 1.1), [sample(12)]))
     law_state = engage(np.full(4, 1.0), np.zeros(4))
-    _, u = step(law_state, np.full(4, 1.1), np.zeros(4), np.array(0.012), params.law())
+    _, u = step(law_state, np.full(4, 1.1), np.zeros(4), np.array(0.012), PARAMS.law())
     assert first.u.tolist() == [0.0] * 4
     assert second.u.tolist() == u.tolist()
 
 
 @pytest.mark.parametrize(("gap_ms", "dt_ms"), [(1, 2), (25, 25), (80, 80), (200, 100)])
-def test_the_measured_dt_is_clipped_between_a_fifth_and_ten_periods(
-    params: ControllerParameters, gap_ms: int, dt_ms: int
-) -> None:
-    state, _ = guard.tick(guard.initial_state(4), 0, sample(0, 1.0), [sample(0)], params.guard(), params.law())
-    _, inputs = guard.tick(state, gap_ms * MS, sample(gap_ms, 1.0), [sample(gap_ms)], params.guard(), params.law())
+def test_the_measured_dt_is_clipped_between_a_fifth_and_ten_periods(gap_ms: int, dt_ms: int) -> None:
+    (engaged,) = run((0, sample(0, 1.0), [sample(0)]))
+    _, inputs = tick(engaged, gap_ms, sample(gap_ms, 1.0), [sample(gap_ms)])
     assert inputs is not None
     assert inputs.dt == pytest.approx(dt_ms / 1000)
 
 
-def test_a_repeated_sample_changes_nothing(params: ControllerParameters) -> None:
+def test_a_repeated_sample_changes_nothing() -> None:
     y, y_m = sample(10, 1.0), [sample(10)]
-    states = run(params, (0, sample(0, 1.0), [sample(0)]), (10, y, y_m), (20, y, y_m))
+    states = run((0, sample(0, 1.0), [sample(0)]), (10, y, y_m), (20, y, y_m))
     assert states[2].u is states[1].u
     assert states[2].law is states[1].law
 
@@ -116,7 +119,6 @@ def test_the_failsafe_holds_then_ramps_to_trim_and_fresh_samples_re_engage_witho
     params = osprey_gust.vary(controller={"max_age": 0.1, "hold": 0.2, "ramp": 0.4}).controller
     y, y_m = sample(10, 1.1), [sample(10)]
     states = run(
-        params,
         (0, sample(0, 1.0), [sample(0)]),
         (10, y, y_m),
         (120, y, y_m),  # 110 ms old: stale
@@ -126,18 +128,10 @@ def test_the_failsafe_holds_then_ramps_to_trim_and_fresh_samples_re_engage_witho
         (610, sample(610, 1.3), [sample(610)]),
         (1800, y, y_m),
         (2500, y, y_m),
+        params=params,
     )
-    assert [state.mode.name for state in states] == [
-        "ENGAGED",
-        "ENGAGED",
-        "HOLD",
-        "HOLD",
-        "RAMP",
-        "ENGAGED",
-        "ENGAGED",
-        "HOLD",
-        "TRIM",
-    ]
+    modes = " ".join(state.mode.name for state in states)
+    assert modes == "ENGAGED ENGAGED HOLD HOLD RAMP ENGAGED ENGAGED HOLD TRIM"
     held = states[1].u
     assert (held != 0).all()
     assert (states[3].u == held).all()
@@ -155,12 +149,10 @@ def test_the_failsafe_holds_then_ramps_to_trim_and_fresh_samples_re_engage_witho
 @pytest.mark.parametrize("policy", ["trim", "hold"])
 def test_deactivation_holds_or_ramps_the_input_as_configured(policy: str, osprey_gust: Scenario) -> None:
     params = osprey_gust.vary(controller={"ramp": 0.4, "on_deactivate": policy}).controller
-    state = guard.initial_state(4)
-    states = []
+    states = [guard.initial_state(4)]
     for ms, active in ((0, True), (10, True), (20, False), (220, False), (620, False), (630, True)):
-        now = sample(ms, 1.0 + ms / 100)
-        state, _ = guard.tick(state, ms * MS, now, [sample(ms)], params.guard(), params.law(), active)
-        states.append(state)
+        states.append(tick(states[-1], ms, sample(ms, 1.0 + ms / 100), [sample(ms)], params, active)[0])
+    states = states[1:]
     assert [state.mode.name for state in states] == ["ENGAGED", "ENGAGED", "INACTIVE", "INACTIVE", "INACTIVE", "ENGAGED"]
     scales = [1.0, 1.0, 1.0] if policy == "hold" else [1.0, 0.5, 0.0]
     for state, expected in zip(states[2:5], scales, strict=True):
@@ -168,41 +160,33 @@ def test_deactivation_holds_or_ramps_the_input_as_configured(policy: str, osprey
     assert (states[5].u == states[4].u).all()  # bumpless re-engagement
 
 
-def test_a_controller_that_was_never_engaged_commands_nothing_when_inactive(params: ControllerParameters) -> None:
-    state, inputs = guard.tick(
-        guard.initial_state(4), 0, sample(0, 1.0), [sample(0)], params.guard(), params.law(), active=False
-    )
+def test_a_controller_that_was_never_engaged_commands_nothing_when_inactive() -> None:
+    state, inputs = tick(guard.initial_state(4), 0, sample(0, 1.0), [sample(0)], active=False)
     assert (state.mode, inputs) == (Mode.INACTIVE, None)
 
 
 @given(instants=st.lists(st.tuples(st.integers(1, 400), st.booleans(), st.floats(-1, 1)), min_size=2, max_size=40))
 def test_the_input_changes_only_by_a_step_of_the_law_or_by_the_ramp(instants: list[tuple[int, bool, float]]) -> None:
     # Fresh and stale samples at random: between two ticks u changes by a step of the law, by the ramp, or not at all.
-    state, now_ns = guard.initial_state(4), 0
-    y, y_m = sample(0, 0.0), [sample(0)]
+    state, ms = guard.initial_state(4), 0
+    y, y_m = sample(0), [sample(0)]
     for wait_ms, fresh, value in instants:
-        now_ns += wait_ms * MS
+        ms += wait_ms
         if fresh:
-            y, y_m = StampedVector(now_ns, np.full(4, value)), [StampedVector(now_ns, np.zeros(4))]
+            y, y_m = sample(ms, value), [sample(ms)]
         before = state
-        state, _ = guard.tick(state, now_ns, y, y_m, PARAMS.guard(), PARAMS.law())
+        state, _ = tick(state, ms, y, y_m)
         if state.mode is Mode.ENGAGED and before.mode is not Mode.ENGAGED:
             assert (state.u == before.u).all()
         elif state.mode in {Mode.HOLD, Mode.RAMP, Mode.TRIM}:
             assert (np.abs(state.u) <= np.abs(before.u)).all()
 
 
-NO_LIMITS = Limits(np.full(2, -np.inf), np.full(2, np.inf), np.full(2, np.inf))
-TWO = LawParams(
-    K=np.array([5.0, 2.0]),
-    Lambda=np.array([2.0, 1.0]),
-    beta=np.array([3.0, 1.0]),
-    D=np.array([1.0, -1.0]),
-    input_scale=np.array([0.5, 2.0]),
-    omega=np.array([1.0, 1.0]),
-    eps=np.array([0.1, 0.2]),
-    sign=Sign.IMPLICIT,
-)
+def limits_of(bound: float, rate: float = np.inf) -> Limits:
+    return Limits(np.full(2, -bound), np.full(2, bound), np.full(2, rate))
+
+
+TWO = law_params([5.0, 2.0], [2.0, 1.0], [3.0, 1.0], [1.0, -1.0], input_scale=[0.5, 2.0], eps=[0.1, 0.2])
 VALUES = st.floats(-10, 10)
 PAIRS = st.tuples(VALUES, VALUES).map(np.array)
 STATES = st.builds(LawState, PAIRS, PAIRS, PAIRS, PAIRS)
@@ -214,7 +198,7 @@ def test_anti_windup_without_saturation_leaves_the_law_to_the_last_bit(sign: Sig
     law = TWO._replace(sign=sign)
     zero, dt = np.zeros(2), np.array(0.01)
     after, u = step(state, y, zero, dt, law)
-    limited_state, u_free, limited = guard.step_with_anti_windup(state, y, zero, dt, zero, u, law, NO_LIMITS)
+    limited_state, u_free, limited = guard.step_with_anti_windup(state, y, zero, dt, zero, u, law, limits_of(np.inf))
     assert limited.tobytes() == u_free.tobytes() == (zero + u).tobytes()
     assert [part.tobytes() for part in limited_state] == [part.tobytes() for part in after]
 
@@ -223,7 +207,7 @@ def test_anti_windup_without_saturation_leaves_the_law_to_the_last_bit(sign: Sig
 def test_saturation_keeps_the_limits_and_leaves_an_input_inside_them_unchanged(
     u: FloatArray, before: FloatArray, bound: float, rate: float
 ) -> None:
-    limits = Limits(np.full(2, -bound), np.full(2, bound), np.full(2, rate))
+    limits = limits_of(bound, rate)
     before = np.clip(before, -bound, bound)
     limited = guard.saturate(u, before, np.array(0.01), limits)
     assert (np.abs(limited) <= bound).all()
@@ -233,8 +217,8 @@ def test_saturation_keeps_the_limits_and_leaves_an_input_inside_them_unchanged(
 
 
 def test_saturation_clips_an_input_that_starts_outside_its_limits() -> None:
-    limits = Limits(np.full(2, -1.0), np.full(2, 1.0), np.full(2, 10.0))
-    assert guard.saturate(np.array([5.0, -5.0]), np.array([3.0, -3.0]), np.array(0.01), limits).tolist() == [1.0, -1.0]
+    limited = guard.saturate(np.array([5.0, -5.0]), np.array([3.0, -3.0]), np.array(0.01), limits_of(1.0, 10.0))
+    assert limited.tolist() == [1.0, -1.0]
 
 
 @given(state=STATES, y=PAIRS, trim=PAIRS)
@@ -242,8 +226,7 @@ def test_saturation_clips_an_input_that_starts_outside_its_limits() -> None:
 def test_integrals_stop_only_in_the_direction_that_worsens_saturation(
     limited_in: str, state: LawState, y: FloatArray, trim: FloatArray
 ) -> None:
-    bound, rate = (1.0, np.inf) if limited_in == "magnitude" else (np.inf, 10.0)
-    limits = Limits(np.full(2, -bound), np.full(2, bound), np.full(2, rate))
+    limits = limits_of(1.0) if limited_in == "magnitude" else limits_of(np.inf, 10.0)
     zero, dt = np.zeros(2), np.array(0.01)
     free, u = step(state, y, zero, dt, TWO)
     limited_state, _, _ = guard.step_with_anti_windup(state, y, zero, dt, trim, zero, TWO, limits)
@@ -279,34 +262,29 @@ def test_new_gains_transfer_without_a_bump(state: LawState, k: float, Lambda: fl
     assert (retuned.e, retuned.e_0, retuned.integral_e) == (state.e, state.e_0, state.integral_e)
 
 
-def test_internals_hold_the_integrals_and_what_limited_each_input(params: ControllerParameters) -> None:
+def logged(state: ControllerState, inputs: guard.TickInputs, limits: Limits, *others: Any) -> dict[str, float]:
+    """The internals of a tick by name."""
+    values = internals.values(state, inputs, limits, *others)
+    return dict(zip(internals.names(PARAMS.outputs, PARAMS.inputs), values, strict=True))
+
+
+def test_internals_hold_the_integrals_and_what_limited_each_input() -> None:
     limits = Limits(np.full(4, -1.0), np.full(4, 1.0), np.full(4, np.inf))
     law_state = LawState(np.zeros(4), np.ones(4), np.full(4, 2.0), np.full(4, 3.0))
     state = guard.initial_state(4)._replace(
         law=law_state, u_free=np.array([0.5, 5.0, -5.0, 0.9]), u=np.array([0.5, 1.0, -1.0, 0.7]), u_trim=np.full(4, 0.1)
     )
-    inputs = guard.TickInputs(0, np.zeros(4), np.zeros(4), 0.0, 0.01)
-    values = dict(
-        zip(
-            internals.names(params.outputs, params.inputs), internals.values(state, inputs, limits, 0.0, 0.0, 7, 8), strict=True
-        )
-    )
+    values = logged(state, guard.TickInputs(0, np.zeros(4), np.zeros(4), 0.0, 0.01), limits, 0.0, 0.0, 7, 8)
     assert (values["e.q"], values["e_0.q"], values["integral_e.q"], values["Pi.q"]) == (1.0, 0.0, 2.0, 3.0)
     assert (values["u_free.aileron"], values["u.aileron"], values["u_trim.aileron"]) == (5.0, 1.0, 0.1)
-    limited = [values[f"limited.{name}"] for name in params.inputs]
+    limited = [values[f"limited.{name}"] for name in PARAMS.inputs]
     assert limited == [Saturation.NO, Saturation.MAGNITUDE, Saturation.MAGNITUDE, Saturation.RATE]
 
 
-def test_internals_are_named_after_the_outputs(params: ControllerParameters) -> None:
-    state, inputs = guard.tick(guard.initial_state(4), 0, sample(0, 1.5), [sample(0, 0.5)], params.guard(), params.law())
+def test_internals_are_named_after_the_outputs() -> None:
+    state, inputs = tick(guard.initial_state(4), 0, sample(0, 1.5), [sample(0, 0.5)])
     assert inputs is not None
-    values = dict(
-        zip(
-            internals.names(params.outputs, params.inputs),
-            internals.values(state, inputs, params.guard().limits, 1e-4, 2e-3, 1, 2**48 - 1),
-            strict=True,
-        )
-    )
+    values = logged(state, inputs, PARAMS.guard().limits, 1e-4, 2e-3, 1, 2**48 - 1)
     assert values["mode"] == Mode.ENGAGED
     assert (values["late"], values["age"], values["number"], values["dt"]) == (1e-4, 2e-3, 1.0, 0.0)
     assert int(values["parameters"]) == 2**48 - 1

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.closed_loop import law_params
 
 from flight_core.vectors import FloatArray
 from rise_di_controller.law import LawParams, LawState, Sign, engage, gain, step
@@ -17,16 +18,7 @@ DT = 0.1
 
 def one_channel(sign: Sign, D: float = -1.0) -> LawParams:
     """K = 2, Lambda = 3, beta = 4, input scale 1/2."""
-    return LawParams(
-        K=gain(np.array(1.0), np.array([])),
-        Lambda=np.array([3.0]),
-        beta=np.array([4.0]),
-        D=np.array([D]),
-        input_scale=np.array([0.5]),
-        omega=np.array([1.0]),
-        eps=np.array([0.1]),
-        sign=sign,
-    )
+    return law_params(gain(np.array(1.0), np.array([])), 3.0, 4.0, D, sign, input_scale=0.5, eps=0.1)
 
 
 def respond(params: LawParams, errors: list[float], dt: float = DT) -> list[float]:

@@ -16,23 +16,22 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from tests.closed_loop import law_params, reference_outputs
 
 from aircraft_sim import dynamics
 from aircraft_sim.params import AircraftParameters, Gust
 from flight_analysis.design.lyapunov import KnownPlant, decay_matrix, evidence, example, fly
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from reference_model.command import Profile, command
-from reference_model.model import Model, output, second_order, step, stepper
+from reference_model.command import Profile
+from reference_model.model import Model, second_order
 from rise_di_controller.decomposition import DecompositionError, decompose
 from rise_di_controller.law import LawParams, Sign, gain
 
 EXACT = 1e-11  # rounding in sums of some hundred terms of size 1 to 100
 DIFFERENCED = 1e-5  # central differences over 1 ms of a solution with an error of 1e-10; measured below 1e-6
 
-# ---------------------------------------------------------------------------------------------------------------------
 # A random plant under the continuous law
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 class Problem(NamedTuple):
@@ -66,11 +65,11 @@ class Problem(NamedTuple):
     def u_m_dot(self, t: float) -> FloatArray:
         return np.asarray(0.3 * self.nu * np.cos(self.nu * t + 1.0))
 
+    def plant(self) -> KnownPlant:
+        return KnownPlant(self.A, self.B, self.C, self.f)
 
-def law_of(p: Problem) -> LawParams:
-    """Parameters of the law with the gains of the problem and unscaled inputs."""
-    one = np.ones(len(p.D))
-    return example(1.0, 1.0).params._replace(K=p.K, Lambda=p.Lambda, beta=p.beta, D=p.D, input_scale=one, omega=one)
+    def law(self, sign: Sign = Sign.IMPLICIT) -> LawParams:
+        return law_params(self.K, self.Lambda, self.beta, self.D, sign)
 
 
 def random_problem(seed: int, n: int = 6, m: int = 3) -> Problem:
@@ -159,17 +158,17 @@ class Loop:
 
     def r_dot(self, t: float) -> FloatArray:
         """Equation (12)."""
+        return self.r_dot_without_u(t) + np.asarray(self.p.C @ self.p.B @ self.u_dot(t))
+
+    def r_dot_without_u(self, t: float) -> FloatArray:
         p = self.p
-        plant = p.C @ p.A @ self.x_dot(t) + p.C @ self.f_dot(t) + p.C @ p.B @ self.u_dot(t)
+        plant = p.C @ p.A @ self.x_dot(t) + p.C @ self.f_dot(t)
         model = p.C @ p.A_m @ self.x_m_dot(t) + p.C @ p.B_m @ p.u_m_dot(t)
         return np.asarray(plant - model + p.Lambda * self.e_dot(t))
 
     def N(self, t: float) -> FloatArray:
         """Equation (15)."""
-        p = self.p
-        plant = p.C @ p.A @ self.x_dot(t) + p.C @ self.f_dot(t)
-        model = p.C @ p.A_m @ self.x_m_dot(t) + p.C @ p.B_m @ p.u_m_dot(t)
-        return np.asarray(self.M @ (plant - model + p.Lambda * self.e_dot(t)) + self.e(t))
+        return np.asarray(self.M @ self.r_dot_without_u(t) + self.e(t))
 
     def split(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Equations (17), (18) with x_urho = 0, so c1 = 0 in (7): N_d, N~, and the term that the paper puts into N~.
@@ -185,8 +184,13 @@ class Loop:
         N_tilde = self.M @ (p.C @ p.A @ (shown @ x_dot - x_mo_dot) + p.Lambda * self.e_dot(t)) + self.e(t)
         return N_d, N_tilde, -self.M @ p.C @ p.A_m @ (x_m_dot - x_mo_dot)
 
-    def DUD(self) -> FloatArray:
-        return self.p.D[:, None] * self.p.U * self.p.D
+    def switched(self, t: float) -> FloatArray:
+        """D U D beta Sgn(e)."""
+        return np.asarray((self.p.D[:, None] * self.p.U * self.p.D) @ (self.p.beta * np.sign(self.e(t))))
+
+    def coupled(self, t: float) -> FloatArray:
+        """D (U - I) D K r."""
+        return np.asarray(self.p.D * ((self.p.U - np.eye(3)) @ (self.p.D * self.p.K * self.r(t))))
 
     def V1(self, t: float) -> float:
         """Equation (31)."""
@@ -200,16 +204,11 @@ def run(p: Problem, x_0: FloatArray, x_m0: FloatArray, duration: float) -> Loop:
     e_0 = p.C @ (x_0 - x_m0)
 
     def w_dot(t: float, w: FloatArray) -> FloatArray:
-        x, x_m, integral_e, Pi = np.split(w, [n, 2 * n, 2 * n + m])
-        e = p.C @ (x - x_m)
-        u = -p.D * (p.K * (e - e_0 + p.Lambda * integral_e)) - p.D * Pi
-        x_dot = p.A @ x + p.f(t, x) + p.B @ u
-        return np.concatenate([x_dot, p.A_m @ x_m + p.B_m @ p.u_m(t), e, p.beta * np.sign(e)])
+        now = Loop(p, e_0, lambda _: w)
+        return np.concatenate([now.x_dot(t), now.x_m_dot(t), now.e(t), p.beta * np.sign(now.e(t))])
 
     start = np.concatenate([x_0, x_m0, np.zeros(2 * m)])
-    solved = solve_ivp(
-        w_dot, (0.0, duration), start, method="DOP853", rtol=1e-10, atol=1e-10, max_step=0.005, dense_output=True
-    )
+    solved = solve_ivp(w_dot, (0.0, duration), start, "DOP853", dense_output=True, rtol=1e-10, atol=1e-10, max_step=0.005)
     assert solved.sol is not None
     return Loop(p, e_0, solved.sol)
 
@@ -238,9 +237,7 @@ def close(a: FloatArray | float, b: FloatArray | float, tolerance: float) -> boo
     return bool(np.max(np.abs(np.asarray(a) - b)) < tolerance * max(1.0, float(np.max(np.abs(b)))))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
 # Identities that hold
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 def test_e_dot_and_so_r_of_4_are_the_derivative_of_3(loop: Loop) -> None:
@@ -286,13 +283,9 @@ def test_23_is_the_derivative_of_20_with_21(loop: Loop) -> None:
 
 
 def test_closed_loop_24(loop: Loop) -> None:
-    p = loop.p
     for t in INSTANTS:
         N_d, N_tilde, term = loop.split(t)
-        e, r = loop.e(t), loop.r(t)
-        switched = loop.DUD() @ (p.beta * np.sign(e))
-        coupled = p.D * ((p.U - np.eye(3)) @ (p.D * p.K * r))
-        right = N_d + N_tilde + term - e - switched - coupled - p.K * r
+        right = N_d + N_tilde + term - loop.e(t) - loop.switched(t) - loop.coupled(t) - loop.p.K * loop.r(t)
         assert close(right, loop.M @ loop.r_dot(t), EXACT)
         assert close(right, loop.M @ differenced(loop.r, t), DIFFERENCED)
 
@@ -302,7 +295,7 @@ def test_25_and_26_give_Phi_without_its_last_entry(loop: Loop) -> None:
     for t in INSTANTS:
         r = loop.r(t)
         Phi = [p.D[i] * sum(p.D[j] * p.K[j] * p.U[i, j] * r[j] for j in range(i + 1, 3)) for i in range(2)]
-        assert close(np.array([*Phi, 0.0]), p.D * ((p.U - np.eye(3)) @ (p.D * p.K * r)), EXACT)
+        assert close(np.array([*Phi, 0.0]), loop.coupled(t), EXACT)
 
 
 def test_27_bounds_Phi_where_zeta_U_bounds_every_entry_of_U() -> None:
@@ -319,45 +312,38 @@ def test_27_bounds_Phi_where_zeta_U_bounds_every_entry_of_U() -> None:
 
 
 def test_V1_dot_of_32_has_the_gain_22_as_three_squares(loop: Loop) -> None:
-    p = loop.p
     k_g, k_d = 1.0, np.array([3.0, 1.5, 0.0])
     for t in INSTANTS:
         N_d, N_tilde, term = loop.split(t)
         e, r = loop.e(t), loop.r(t)
-        coupled = p.D * ((p.U - np.eye(3)) @ (p.D * p.K * r))
-        uncertain = r @ (N_d + N_tilde + term - loop.DUD() @ (p.beta * np.sign(e)) - coupled)
-        V1_dot = -e @ (p.Lambda * e) - r @ r - k_g * r @ r - k_d @ r**2 + uncertain
+        uncertain = r @ (N_d + N_tilde + term - loop.switched(t) - loop.coupled(t))
+        V1_dot = -e @ (loop.p.Lambda * e) - r @ r - k_g * r @ r - k_d @ r**2 + uncertain
         assert close(V1_dot, e @ loop.e_dot(t) + r @ loop.M @ loop.r_dot(t), EXACT)
         assert close(V1_dot, differenced(loop.V1, t), DIFFERENCED)
 
 
 def test_V2_dot_is_a_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> None:
     # The sum of (32) and -L (46), as in `flight_analysis.design.lyapunov.decay_matrix`, on a plant of this test.
-    p = loop.p
-    Q = decay_matrix(KnownPlant(p.A, p.B, p.C, p.f), law_of(p))
+    Q = decay_matrix(loop.p.plant(), loop.p.law())
     for t in INSTANTS:
         N_d, _, term = loop.split(t)
-        L = loop.r(t) @ (N_d + term - loop.DUD() @ (p.beta * np.sign(loop.e(t))))
+        L = loop.r(t) @ (N_d + term - loop.switched(t))
         assert close(differenced(loop.V1, t) - L, -loop.z(t) @ Q @ loop.z(t), DIFFERENCED)
 
 
 @pytest.mark.parametrize("sign", [Sign.LITERAL, Sign.IMPLICIT])
 def test_the_sampled_law_converges_to_20_with_its_period(loop: Loop, sign: Sign) -> None:
     # First order, because u is held over a period: half of the period halves the distance (measured 1.9 to 2.1).
-    p = loop.p
-    params = law_of(p)._replace(sign=sign)
     distance = []
     for ticks in (60, 120, 240):
         dt = DURATION / ticks
-        y_m = np.array([p.C @ loop.unpack(k * dt)[1] for k in range(ticks + 1)])
-        flight = fly(KnownPlant(p.A, p.B, p.C, p.f), y_m, dt, params, X_0)
+        y_m = np.array([loop.p.C @ loop.unpack(k * dt)[1] for k in range(ticks + 1)])
+        flight = fly(loop.p.plant(), y_m, dt, loop.p.law(sign), X_0)
         distance.append(float(np.max(np.abs(flight.x[-1] - loop.unpack(DURATION)[0]))))
     assert all(1.7 < before / after < 2.3 for before, after in pairwise(distance))
 
 
-# ---------------------------------------------------------------------------------------------------------------------
 # Errata and their repairs
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 def at_rest() -> Loop:
@@ -489,9 +475,7 @@ def test_a_matrix_without_a_leading_minor_has_no_decomposition_though_it_can_be_
     with pytest.raises(DecompositionError, match="leading minor 1"):
         decompose(np.array([[0.0, 1.0], [1.0, 0.0]]))
     S, D, U = decompose(np.array([[1.0, 0.0], [0.0, 1.0]]))  # the same channels with the other pairing
-    assert np.array_equal(S, np.eye(2))
-    assert np.array_equal(D, [1.0, 1.0])
-    assert np.array_equal(U, np.eye(2))
+    assert np.array_equal([S, np.diag(D), U], [np.eye(2)] * 3)
 
 
 def hidden_state(pole: float) -> tuple[float, float]:
@@ -499,8 +483,7 @@ def hidden_state(pole: float) -> tuple[float, float]:
     plant = KnownPlant(
         np.array([[0.0, 1.0], [1.0, pole]]), np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]]), lambda *_: np.zeros(2)
     )
-    one = np.ones(1)
-    params = example(1.0, 1.0).params._replace(K=8.0 * one, Lambda=one, beta=5.0 * one, D=one, input_scale=one, omega=2.0 * one)
+    params = law_params(8.0, 1.0, 5.0, omega=2.0)
     t = 0.01 * np.arange(1501)
     flight = fly(plant, np.sin(t)[:, None], 0.01, params, np.zeros(2))
     return float(np.max(np.abs(flight.x[:, 1]))), float(abs(flight.x[-1, 0] - np.sin(t[-1])))
@@ -529,17 +512,14 @@ def test_a_servo_between_u_and_the_plant_makes_Omega_zero() -> None:
 
 def behind_a_servo(T_eps: float) -> float:
     """The largest e over eps in the last of 10 s: y_dot = u behind a servo of 20 ms, softened sign, e(0) = eps / 2."""
-    tau, one, dt = 0.02, np.ones(1), 0.0005
+    tau, K, beta, dt = 0.02, 10.0, 3.0, 0.0005
     plant = KnownPlant(
         np.array([[0.0, 1.0], [0.0, -1.0 / tau]]), np.array([[0.0], [1.0 / tau]]), np.eye(1, 2), lambda *_: np.zeros(2)
     )
-    K, beta = 10.0 * one, 3.0 * one
     eps = beta / K * T_eps
-    params = example(dt, 1.0).params._replace(
-        K=K, Lambda=one, beta=beta, D=one, input_scale=one, omega=one, eps=eps, sign=Sign.SOFT
-    )
-    flight = fly(plant, np.zeros((20001, 1)), dt, params, np.array([eps[0] / 2.0, 0.0]))
-    return float(np.max(np.abs(flight.x[-2000:, 0])) / eps[0])
+    params = law_params(K, 1.0, beta, sign=Sign.SOFT, eps=eps)
+    flight = fly(plant, np.zeros((20001, 1)), dt, params, np.array([eps / 2.0, 0.0]))
+    return float(np.max(np.abs(flight.x[-2000:, 0])) / eps)
 
 
 def test_the_softened_sign_settles_behind_a_servo_within_the_limit_of_routh() -> None:
@@ -592,12 +572,9 @@ def largest_y_m_ddot(model: Model, rise: float) -> float:
     """The peak of abs(y_m_ddot) for a command that rises to one within `rise` seconds, by second differences."""
     one, zero = np.ones((1, 1)), np.zeros(1)
     climb = Profile(0.0 * one, one, np.array(rise), zero, zero + 1.0, zero, zero, zero)
-    dt, x_m, y_m = rise / 5.0, np.zeros(len(model.A_m)), [0.0]
-    steps = stepper(dt, model)
-    for k in range(round(0.5 / dt)):
-        x_m = step(x_m, np.concatenate([command((k + part) * dt, climb) for part in (0.0, 0.5, 1.0)]), steps)
-        y_m.append(float(output(x_m, model)[0]))
-    return float(np.max(np.abs(np.diff(y_m, 2)))) / dt**2
+    dt = rise / 5.0
+    y_m = reference_outputs(model, climb, dt, round(0.5 / dt))
+    return float(np.max(np.abs(np.diff(y_m, 2, axis=0)))) / dt**2
 
 
 def test_a_step_command_through_a_first_order_model_makes_N_d_unbounded() -> None:

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.signal import StateSpace, lsim
+from tests.closed_loop import reference_outputs
 
 from flight_core.integrators import rk4
 from flight_core.vectors import FloatArray
@@ -53,31 +54,21 @@ def test_a_coordinated_turn_follows_the_integral_of_the_bank_rate() -> None:
     sines = {"p": {"amplitude": 0.3, "frequency": 2.0, "phase": 0.4}}
     profile = parameters(pulses=PULSES, sines=sines, coordinated_turn=turn).profile()
     for t in (0.7, 1.05, 2.0, 5.0):
-        bank, _ = quad(
-            lambda s: float(command(s, profile)[1]), 0.0, t, points=[1.0, 1.1, 2.5, 2.6] if t > 2.6 else None, limit=200
-        )
+        edges = [1.0, 1.1, 2.5, 2.6] if t > 2.6 else None
+        bank, _ = quad(lambda s: float(command(s, profile)[1]), 0.0, t, points=edges, limit=200)
         # r = g / V0 sin(phi) is the turn rate without sideslip
         assert float(command(t, profile)[2]) == pytest.approx(9.81 / 25.0 * math.sin(bank), abs=1e-8)
 
 
 def simulate(params: ReferenceModelParameters, duration: float, dt: float) -> FloatArray:
-    matrices, profile = params.model(), params.profile()
-    x_m, steps = np.zeros(len(matrices.A_m)), model.stepper(dt, matrices)
-    outputs = [model.output(x_m, matrices)]
-    for k in range(round(duration / dt)):
-        u_m = np.concatenate([command((k + part) * dt, profile) for part in (0.0, 0.5, 1.0)])
-        x_m = model.step(x_m, u_m, steps)
-        outputs.append(model.output(x_m, matrices))
-    return np.array(outputs)
+    return reference_outputs(params.model(), params.profile(), dt, round(duration / dt))
 
 
 def test_equation_2_agrees_with_an_exact_linear_simulation() -> None:
     params = parameters(pulses=PULSES)
     matrices, profile = params.model(), params.profile()
     t = np.arange(0, 3001) * 0.002
-    u_m: FloatArray = np.array(
-        [command(s, profile) for s in t]
-    )  # piecewise linear with knots on the grid: lsim is exact for it
+    u_m = command(t, profile)  # piecewise linear with knots on the grid: lsim is exact for it
     _, exact, _ = lsim(StateSpace(matrices.A_m, matrices.B_m, matrices.C, np.zeros((3, 3))), u_m, t)  # type: ignore[call-overload]
     assert simulate(params, 6.0, 0.002) == pytest.approx(exact, abs=1e-9)
 

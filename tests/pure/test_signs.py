@@ -7,40 +7,25 @@ exchanged, and a plant whose Omega = C B has a positive diagonal and a negative 
 """
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from tests.closed_loop import CALM_SERVO, error, fly, law_params, reference_outputs, still_air
 
-from aircraft_sim import dynamics, plant
-from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import LIBRARY
-from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
-from aircraft_sim.plant import PlantParams
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import error_metrics, true_error
-from flight_bringup.scenarios import find_scenario
-from flight_core.rates import nanoseconds
-from flight_core.tape import Tape
+from flight_analysis.metrics import error_metrics
 from flight_core.vectors import FloatArray
-from reference_model import model
-from reference_model.command import command
-from reference_model.params import zero_state
-from rise_di_controller import law as rise
 from rise_di_controller.decomposition import decompose
-from rise_di_controller.law import LawParams, Sign
+from rise_di_controller.law import LawParams
 
-# Trailing edge down positive: scenario osprey_servo in calm air, without noise, at 100 Hz and in steps of 5 ms. The first
-# command of q rises at 2 s.
+# Trailing edge down positive. The first command of q rises at 2 s.
 
-SERVO = find_scenario("osprey_servo").vary(
-    aircraft={"sensors": {}, "gusts": {}, "rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
-)
-UNLIMITED = SERVO.vary(aircraft={"actuators": {}}, controller={"lower": None, "upper": None})
+UNLIMITED = CALM_SERVO.vary(aircraft={"actuators": {}}, controller={"lower": None, "upper": None})
 
 
 def trailing_edge_down(scenario: Scenario, folder: Path) -> Scenario:
@@ -55,28 +40,22 @@ def trailing_edge_down(scenario: Scenario, folder: Path) -> Scenario:
     return scenario.vary(aircraft={"airframe": str(path)})
 
 
-def q_error(tape: Tape) -> FloatArray:
-    error = true_error(tape)
-    assert error is not None
-    return error["q"]
-
-
 def first(t: FloatArray, values: FloatArray, bound: float) -> float:
     """The first instant at which abs(values) is above a bound; inf where there is none."""
     beyond = np.abs(values) > bound
     return float(t[beyond][0]) if beyond.any() else math.inf
 
 
-@pytest.mark.parametrize("scenario", [pytest.param(SERVO, id="servos"), pytest.param(UNLIMITED, id="no limits")])
+@pytest.mark.parametrize("scenario", [pytest.param(CALM_SERVO, id="servos"), pytest.param(UNLIMITED, id="no limits")])
 def test_an_elevator_with_trailing_edge_down_positive_tracks_with_the_right_d(scenario: Scenario, tmp_path: Path) -> None:
     # D = (-1, 1, 1, 1). Measured rms of q: 1.97 mrad/s through servos, 1.95 without limits; the prototype: 2.0 and 2.2.
     right = trailing_edge_down(scenario, tmp_path).vary(controller={"D": [-1, 1, 1, 1]}, flight={"duration": 30.0})
-    sixty_seconds = error_metrics(q_error(simulate(right))).rms * math.sqrt(30.0 / 60.0)  # no events for q after 30 s
+    sixty_seconds = error_metrics(error(simulate(right))["q"]).rms * math.sqrt(30.0 / 60.0)  # no events for q after 30 s
     assert sixty_seconds <= 0.0022
 
 
 def test_a_sign_change_in_the_airframe_and_in_d_gives_the_same_flight_to_the_last_bit(tmp_path: Path) -> None:
-    original = SERVO.vary(flight={"duration": 4.0})
+    original = CALM_SERVO.vary(flight={"duration": 4.0})
     changed = trailing_edge_down(original, tmp_path).vary(controller={"D": [-1, 1, 1, 1]})
     nose_up, nose_down = simulate(original), simulate(changed)
     assert nose_down["y"].values.tobytes() == nose_up["y"].values.tobytes()
@@ -88,7 +67,7 @@ def test_an_elevator_with_trailing_edge_down_positive_diverges_with_identity_d_a
     # Diverged: abs(e_q) above 1 rad/s, ten times the command. Measured at 2.38 s, 0.38 s after it; the prototype: 2.38 s.
     # It grows further, by a factor of e each 0.08 s, to more than 1e5 rad/s 1.4 s after the command.
     tape = simulate(trailing_edge_down(UNLIMITED, tmp_path).vary(flight={"duration": 3.4}))
-    t, e = tape.time("truth"), q_error(tape)
+    t, e = tape.time("truth"), error(tape)["q"]
     assert np.abs(e[t < 2.0]).max() < 1e-3
     assert first(t, e, 1.0) == pytest.approx(2.38, abs=0.05)
     assert np.abs(e[-1]) > 1e5
@@ -97,33 +76,13 @@ def test_an_elevator_with_trailing_edge_down_positive_diverges_with_identity_d_a
 def test_saturation_slows_the_divergence_down_to_a_full_turn(tmp_path: Path) -> None:
     # With the stops q is bounded. Diverged: a pitch angle of more than a full turn. Measured at 5.45 s; the prototype:
     # 5.27 s with an unknown bound. The elevator is at its stop and q is 2.2 rad/s.
-    tape = simulate(trailing_edge_down(SERVO, tmp_path).vary(flight={"duration": 6.0}))
+    tape = simulate(trailing_edge_down(CALM_SERVO, tmp_path).vary(flight={"duration": 6.0}))
     t, theta = tape.time("truth"), tape["truth"].group("x")["theta"]
     assert first(t, theta, 2.0 * math.pi) == pytest.approx(5.4, abs=0.3)
     assert np.abs(tape["truth"].group("actuator")["elevator"][t > 3.0]).min() == pytest.approx(math.radians(30.0), rel=1e-5)
 
 
 # Below: the law and the plant without a scenario, at periods and gains that scenarios do not allow.
-
-Reference = Callable[[float], FloatArray]
-
-
-def fly(aircraft: Aircraft, law: LawParams, y_m: list[FloatArray], dt: float, bound: float) -> FloatArray:
-    """The errors e at 0, dt, 2 dt, ... from trim, shape (ticks, m), until one is above the bound, which ends the flight."""
-    period_ns, m = nanoseconds(dt), len(law.K)
-    ideal = Actuators(np.zeros(m), np.full(m, -np.inf), np.full(m, np.inf), np.full(m, np.inf))
-    hardware = PlantParams(aircraft, ideal, period_ns)
-    aircraft_state, u = plant.initial_state(hardware), np.zeros(m)
-    state = rise.engage(dynamics.y(aircraft_state.x, aircraft), y_m[0])
-    errors = [state.e]
-    for k, reference in enumerate(y_m[1:]):
-        aircraft_state = plant.advance(k * period_ns, aircraft_state, u, period_ns, hardware)
-        state, u = rise.step(state, dynamics.y(aircraft_state.x, aircraft), reference, np.array(dt), law)
-        errors.append(state.e)
-        if np.abs(state.e).max() > bound:
-            break
-    return np.array(errors)
-
 
 # Rudder before aileron: [q, V, p, r] driven by [elevator, thrust, rudder, aileron], as in the paper, dt = 0.5 ms, 4 s.
 # q 0.1 rad/s from 0.5 s to 1.5 s, p 0.4 rad/s from 1 s to 2.5 s, r coordinated. Diverged: abs(e_i) above 1, rad/s or m/s.
@@ -133,31 +92,24 @@ FAST = 0.0005
 
 @pytest.fixture(scope="module")
 def swapped() -> Aircraft:
-    _, aircraft = SERVO.aircraft.load()
+    _, aircraft = CALM_SERVO.aircraft.load()
     return aircraft._replace(B=aircraft.B[:, [0, 1, 3, 2]])
 
 
 @pytest.fixture(scope="module")
-def manoeuvre() -> list[FloatArray]:
+def manoeuvre() -> FloatArray:
     pulses = {
         "q": {"start": [0.5], "stop": [1.5], "value": [0.1]},
         "p": {"start": [1.0], "stop": [2.5], "value": [0.4]},
     }
-    section = SERVO.vary(reference_model={"pulses": pulses}).reference_model
-    reference, profile = section.model(), section.profile()
-    x_m, steps = zero_state(reference), model.stepper(FAST, reference)
-    y_m = [model.output(x_m, reference)]
-    for k in range(round(4.0 / FAST)):
-        x_m = model.step(x_m, np.concatenate([command((k + part) * FAST, profile) for part in (0.0, 0.5, 1.0)]), steps)
-        y_m.append(model.output(x_m, reference))
-    return y_m
+    section = CALM_SERVO.vary(reference_model={"pulses": pulses}).reference_model
+    return reference_outputs(section.model(), section.profile(), FAST, round(4.0 / FAST))
 
 
 def swapped_law(aircraft: Aircraft, D: list[float], factor: float) -> LawParams:
     """The gains of scenario osprey_gust in [q, V, p, r], K of p times a factor, inputs scaled by 1 / abs(Omega_ii)."""
-    K, beta = np.array([18.0, 2.0, 18.0 * factor, 9.0]), np.array([29.4, 7.8, 22.5, 10.2])
     scale = 1.0 / np.abs(np.diag(aircraft.C @ aircraft.B))
-    return LawParams(K, np.array([5.0, 0.5, 5.0, 3.0]), beta, np.array(D), scale, np.ones(4), np.ones(4), sign=Sign.IMPLICIT)
+    return law_params([18.0, 2.0, 18.0 * factor, 9.0], [5.0, 0.5, 5.0, 3.0], [29.4, 7.8, 22.5, 10.2], D, input_scale=scale)
 
 
 def test_rudder_before_aileron_needs_another_d_and_is_a_bad_pairing(swapped: Aircraft) -> None:
@@ -168,7 +120,7 @@ def test_rudder_before_aileron_needs_another_d_and_is_a_bad_pairing(swapped: Air
 
 
 def test_rudder_before_aileron_with_the_right_d_is_poor_and_improves_with_k_of_p(
-    swapped: Aircraft, manoeuvre: list[FloatArray]
+    swapped: Aircraft, manoeuvre: FloatArray
 ) -> None:
     # Measured rms for K_3 times 5, 25, 125: p 19, 1.2, 0.10 mrad/s and r 43, 6.2, 1.1. The prototype, in
     # another manoeuvre: p 430, 67, 7.6. Each factor of 5 in K reduces the rms by at least 4.
@@ -180,14 +132,14 @@ def test_rudder_before_aileron_with_the_right_d_is_poor_and_improves_with_k_of_p
     assert (rms[5.0] > 4.0 * rms[25.0]).all()
     assert (rms[25.0] > 4.0 * rms[125.0]).all()
     # The pairing matters more than the gains: with the aileron on p and the original K_3, p has 0.001 mrad/s.
-    _, paired = SERVO.aircraft.load()
+    _, paired = CALM_SERVO.aircraft.load()
     errors = fly(paired, swapped_law(paired, [1.0, 1.0, 1.0, 1.0], 1.0), manoeuvre, FAST, bound=1.0)
     assert (rms[125.0] > 50.0 * np.sqrt(np.mean(errors[:, 2:] ** 2, axis=0))).all()
 
 
 @pytest.mark.parametrize("factor", [1.0, 5.0, 25.0])
 def test_rudder_before_aileron_with_identity_d_diverges_at_the_first_roll(
-    swapped: Aircraft, manoeuvre: list[FloatArray], factor: float
+    swapped: Aircraft, manoeuvre: FloatArray, factor: float
 ) -> None:
     # Measured 0.03 s, 0.02 s, 0.01 s after the command of p at 1 s, for each K_3. The prototype: at 12 s, its first
     # command of p; with the same commands this loop diverges at 12.03 s.
@@ -199,23 +151,18 @@ def test_rudder_before_aileron_with_identity_d_diverges_at_the_first_roll(
 # y = (x1, x2), y_m = 0.1 (sin t, sin 1.3t), dt = 10 ms, 12 s. Diverged: abs(e_i) above 10, a hundred times the reference.
 
 OMEGA = np.array([[1.0, 2.0], [2.0, 1.0]])
-SMALL = Aircraft(
+SMALL = still_air(
     A=np.array([[-1.0, 0.0, 0.5], [0.0, -1.0, -0.5], [0.5, 0.5, -1.0]]),
     B=np.vstack([OMEGA, np.zeros(2)]),
     C=np.eye(2, 3),
     gravity=np.zeros((3, 3)),
-    gust_direction=np.zeros((3, 0)),
-    gusts=Gusts(np.zeros(0), np.zeros(0), np.zeros(0)),
-    speed=np.array(1.0),
 )
-SINES: list[FloatArray] = [0.1 * np.sin(np.array([1.0, 1.3]) * 0.01 * k) for k in range(1200)]
+SINES: FloatArray = 0.1 * np.sin(np.outer(0.01 * np.arange(1200), [1.0, 1.3]))
 
 
 def fly_small(D: list[float], K: list[float]) -> FloatArray:
     # beta_1 is far above U_12 beta_2 = 4 beta_2, as (30) requires
-    beta = np.array([2.0, 0.2])
-    law = LawParams(np.array(K), np.ones(2), beta, np.array(D), np.ones(2), np.full(2, 2.0), np.ones(2), sign=Sign.IMPLICIT)
-    return fly(SMALL, law, SINES, 0.01, bound=10.0)
+    return fly(SMALL, law_params(K, 1.0, [2.0, 0.2], D, omega=2.0), SINES, 0.01, bound=10.0)
 
 
 def test_a_positive_diagonal_does_not_mean_identity_d() -> None:

@@ -1,0 +1,81 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Builders that the tests of the closed loop share: parameters of the law, reference outputs, flights without a scenario."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from aircraft_sim import dynamics, plant
+from aircraft_sim.actuators import Actuators
+from aircraft_sim.disturbance import Gusts
+from aircraft_sim.dynamics import Aircraft
+from aircraft_sim.plant import AircraftState, PlantParams
+from flight_analysis.metrics import true_error
+from flight_bringup.scenarios import find_scenario
+from flight_core.rates import nanoseconds
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
+from reference_model import model
+from reference_model.command import Profile, command
+from rise_di_controller import law as rise
+from rise_di_controller.law import LawParams, Sign
+
+CALM_SERVO = find_scenario("osprey_servo").vary(
+    aircraft={"sensors": {}, "gusts": {}, "rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
+)
+"""Scenario osprey_servo in calm air, without noise, at 100 Hz and in steps of 5 ms."""
+
+
+def law_params(K: Any, Lambda: Any, beta: Any, D: Any = 1.0, sign: Sign = Sign.IMPLICIT, **others: Any) -> LawParams:
+    """Parameters of the law. A number holds for each channel; input_scale, omega and eps are 1 unless given."""
+    values = {"K": np.atleast_1d(K), "Lambda": Lambda, "beta": beta, "D": D}
+    values |= {"input_scale": 1.0, "omega": 1.0, "eps": 1.0} | others
+    arrays = np.broadcast_arrays(*(np.asarray(value, dtype=np.float64) for value in values.values()))
+    return LawParams(**dict(zip(values, (array.copy() for array in arrays), strict=True)), sign=sign)
+
+
+def still_air(A: FloatArray, B: FloatArray, C: FloatArray, gravity: FloatArray) -> Aircraft:
+    """An aircraft without gusts."""
+    empty = np.zeros(0)
+    return Aircraft(A, B, C, gravity, np.zeros((len(A), 0)), Gusts(empty, empty, empty), speed=np.array(1.0))
+
+
+def reference_outputs(params: model.Model, profile: Profile, dt: float, steps: int) -> FloatArray:
+    """y_m at 0, dt, 2 dt, ..., shape (steps + 1, m), from rest."""
+    x_m, matrices = np.zeros(len(params.A_m)), model.stepper(dt, params)
+    y_m = [model.output(x_m, params)]
+    for k in range(steps):
+        x_m = model.step(x_m, command((k + np.array([0.0, 0.5, 1.0])) * dt, profile).ravel(), matrices)
+        y_m.append(model.output(x_m, params))
+    return np.array(y_m)
+
+
+def fly(
+    aircraft: Aircraft, law: LawParams, y_m: Iterable[FloatArray], dt: float, bound: float, x_0: FloatArray | None = None
+) -> FloatArray:
+    """The errors e at 0, dt, 2 dt, ..., shape (ticks, m), until one is above the bound, which ends the flight.
+
+    The law acts on the aircraft through ideal actuators. The flight starts from x_0, or from trim.
+    """
+    period_ns, m, references = nanoseconds(dt), len(law.K), iter(y_m)
+    ideal = Actuators(np.zeros(m), np.full(m, -np.inf), np.full(m, np.inf), np.full(m, np.inf))
+    hardware, u = PlantParams(aircraft, ideal, period_ns), np.zeros(m)
+    simulated = AircraftState(np.zeros(len(aircraft.A)) if x_0 is None else x_0, u)
+    state = rise.engage(dynamics.y(simulated.x, aircraft), next(references))
+    errors = [state.e]
+    for k, reference in enumerate(references):
+        simulated = plant.advance(k * period_ns, simulated, u, period_ns, hardware)
+        state, u = rise.step(state, dynamics.y(simulated.x, aircraft), reference, np.array(dt), law)
+        errors.append(state.e)
+        if np.abs(state.e).max() > bound:
+            break
+    return np.array(errors)
+
+
+def error(tape: Tape) -> Signal:
+    """The true error of a simulated flight."""
+    signal = true_error(tape)
+    assert signal is not None
+    return signal
