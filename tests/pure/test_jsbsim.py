@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.builders import aircraft_parameters, truth_of
+from tests.conftest import REPOSITORY
 
 from aircraft_sim import isolated, jsbsim_trim
 from aircraft_sim.actuators import Actuators
@@ -20,7 +22,6 @@ from aircraft_sim.disturbance import AXES, Gusts
 from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, OUTPUTS, STATES, Command, FlightCondition, WindModel
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import sideslip_zero
-from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
@@ -30,6 +31,7 @@ from flight_core.vectors import FloatArray
 
 STEP_NS = 5_000_000
 CESSNA = FlightCondition("c172p", 46.3, 1219.2, STEP_NS)
+C182 = FlightCondition("c182", 56.6, 1219.2, STEP_NS)
 ZEROS = np.zeros(len(AXES))
 NO_WIND = WindModel(Gusts(ZEROS, ZEROS, ZEROS + 1.0), None)
 SECTION: dict[str, Any] = {"airframe": "jsbsim:c172p", "speed": 46.3, "altitude": 1219.2, "rate": 200.0, "step": 0.005}
@@ -53,8 +55,7 @@ def command(**values: float) -> FloatArray:
 
 
 def one_gust(axis: str, speed: float, length: float) -> WindModel:
-    strength = np.array([speed * (name == axis) for name in AXES])
-    return WindModel(Gusts(ZEROS, strength, ZEROS + length), None)
+    return WindModel(Gusts(ZEROS, np.array([speed * (name == axis) for name in AXES]), ZEROS + length), None)
 
 
 # Trim
@@ -64,7 +65,7 @@ def one_gust(axis: str, speed: float, length: float) -> WindModel:
     "condition",
     # c172p: JSBSim's own trim. c182: JSBSim's trim fails, because the engine does not run in it. DHC6: JSBSim's trim does not
     # last, because the turboprops have not settled.
-    [CESSNA, FlightCondition("c182", 56.6, 1219.2, STEP_NS), FlightCondition("DHC6", 66.9, 1828.8, STEP_NS)],
+    [CESSNA, C182, FlightCondition("DHC6", 66.9, 1828.8, STEP_NS)],
     ids=lambda condition: condition.name,
 )
 def test_trim_is_an_equilibrium_that_lasts(condition: FlightCondition) -> None:
@@ -90,9 +91,8 @@ def test_in_trim_every_deviation_is_zero() -> None:
 
 def test_end_stops_are_those_of_the_whole_command() -> None:
     trim = cessna().trim
-    assert trim.commands + trim.upper == pytest.approx(
-        [1.0, 1.0, 1.0, 1.0]
-    )  # the nose-down pitch trim uses a part of the elevator
+    # The nose-down pitch trim uses a part of the elevator.
+    assert trim.commands + trim.upper == pytest.approx([1.0, 1.0, 1.0, 1.0])
     assert trim.commands[1] + trim.lower[1] == pytest.approx(0.0)
     assert trim.lower[0] == -1.0  # the other way the stick reaches its own stop first
 
@@ -135,8 +135,7 @@ def test_wind_acts_along_the_axes_of_trim(axis: str, state: str, scale: float) -
     peak = truth[f"gust.{axis}"][-1]
     assert peak == pytest.approx(2.0, rel=0.01)
     assert truth[f"x.{state}"][-1] == pytest.approx(scale * peak, rel=0.2)
-    others = [name for name in AXES if name != axis]
-    assert not any(truth[f"gust.{name}"].any() for name in others)
+    assert not any(truth[f"gust.{name}"].any() for name in AXES if name != axis)
 
 
 def test_the_wind_turns_with_the_heading() -> None:
@@ -152,10 +151,10 @@ def test_the_wind_turns_with_the_heading() -> None:
 
 
 def test_turbulence_acts_from_the_first_sample_on() -> None:
-    values = SECTION | {"turbulence": {"altitude": 1219.2, "sigma": 3.05, "seed": 1}}
-    simulator = Simulator(AircraftParameters.validate_mapping(values, "aircraft"))
+    turbulence = {"altitude": 1219.2, "sigma": 3.05, "seed": 1}
+    simulator = Simulator(aircraft_parameters(**SECTION, turbulence=turbulence))
     simulator.sample(0, command())
-    truth = dict(zip(simulator.truth_names, simulator.truth(), strict=True))
+    truth = truth_of(simulator)
     assert abs(truth["gust.longitudinal"]) > 0.1
     # Airspeed is the norm of ground velocity less wind; the ground velocity is 46.3 m/s along the first axis.
     wind = np.array([truth[f"gust.{axis}"] for axis in AXES])
@@ -165,8 +164,7 @@ def test_turbulence_acts_from_the_first_sample_on() -> None:
 def test_actuators_act_before_the_aircraft() -> None:
     # An aileron stuck from the start has no effect. A lag of 0.1 s passes 63 % after 0.1 s.
     stuck = JsbsimModel(CESSNA, Actuators(stuck_at=np.array([np.inf, np.inf, 0.0, np.inf])), NO_WIND)
-    truth = fly(stuck, command(aileron=0.1), 0.5)
-    assert np.max(np.abs(truth["x.p"])) < 1e-4
+    assert np.max(np.abs(fly(stuck, command(aileron=0.1), 0.5)["x.p"])) < 1e-4
     slow = JsbsimModel(CESSNA, Actuators(lag=np.full(4, 0.1)), NO_WIND)
     assert fly(slow, command(aileron=0.1), 0.1)["actuator.aileron"][-1] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)))
 
@@ -184,12 +182,11 @@ def test_a_flight_in_another_process_agrees_to_the_last_bit() -> None:
     # c182 needs the solver's trim. A third process finds it, and both apply its result.
     code = (
         "from tests.pure.test_jsbsim import *\n"
-        "truth = fly(cessna(condition=FlightCondition('c182', 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)\n"
+        "truth = fly(cessna(condition=C182), command(aileron=0.1), 1.0)\n"
         "print(np.array(list(truth.values())).tobytes().hex())\n"
     )
-    root = Path(__file__).resolve().parents[2]
-    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root).stdout
-    truth = fly(cessna(condition=FlightCondition("c182", 56.6, 1219.2, STEP_NS)), command(aileron=0.1), 1.0)
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=REPOSITORY).stdout
+    truth = fly(cessna(condition=C182), command(aileron=0.1), 1.0)
     assert output.strip() == np.array(list(truth.values())).tobytes().hex()
 
 
@@ -197,9 +194,8 @@ def test_nothing_is_printed_and_nothing_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    fly(
-        cessna(condition=FlightCondition("global5000", 169.8, 7620.0, STEP_NS)), command(), 0.1
-    )  # its model asks for a table as output
+    model = cessna(condition=FlightCondition("global5000", 169.8, 7620.0, STEP_NS))  # it asks for a table as output
+    fly(model, command(), 0.1)
     assert not list(tmp_path.iterdir())
     assert capfd.readouterr() == ("", "")
 
@@ -230,35 +226,25 @@ def test_an_exception_or_an_exit_in_the_isolated_process_is_reported() -> None:
 def test_a_crash_of_jsbsim_ends_a_flight_in_one_process_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     real = isolated.call
     monkeypatch.setattr(isolated, "call", lambda *_, timeout: real(ctypes.string_at, 0, timeout=timeout))
-    scenario = find_scenario("jsbsim_c172p").vary(
-        aircraft={"speed": 47.11}
-    )  # no other test has cached the trim of this condition
+    # No other test has cached the trim of this condition.
+    scenario = find_scenario("jsbsim_c172p").vary(aircraft={"speed": 47.11})
     assert simulate(scenario).outcome == "jsbsim:c172p cannot be flown: JSBSim was killed by SIGSEGV"
 
 
 @pytest.mark.parametrize(
     ("condition", "sentence"),
     [
-        (
-            CESSNA._replace(speed=20.0),
-            r"^jsbsim:c172p does not trim at 20 m/s and 1219.2 m: accelerations of .* are left at best",
-        ),
-        (FlightCondition("pa28", 51.0, 1219.2, STEP_NS), r"^jsbsim:pa28 does not trim at .*: engine 1 cannot be started$"),
-        (
-            FlightCondition("SGS", 25.0, 900.0, STEP_NS),
-            r"^jsbsim:SGS has no engine to control V with: no fcs/throttle-cmd-norm\[0\]$",
-        ),
-        (
-            FlightCondition("dr1", 41.0, 900.0, STEP_NS),
-            r"^jsbsim:dr1 .*: its model needs the property /sim/model/pushback/position-norm, which JSBSim alone ",
-        ),
-        (FlightCondition("blank", 41.0, 900.0, STEP_NS), r"^jsbsim:blank cannot be loaded: "),
+        (("c172p", 20.0, 1219.2), "does not trim at 20 m/s and 1219.2 m: accelerations of .* are left at best"),
+        (("pa28", 51.0, 1219.2), "does not trim at .*: engine 1 cannot be started$"),
+        (("SGS", 25.0, 900.0), r"has no engine to control V with: no fcs/throttle-cmd-norm\[0\]$"),
+        (("dr1", 41.0, 900.0), ".*: its model needs the property /sim/model/pushback/position-norm, which JSBSim alone "),
+        (("blank", 41.0, 900.0), "cannot be loaded: "),
     ],
     ids=["stalled", "engine", "glider", "property", "empty"],
 )
-def test_a_condition_without_trim_is_refused_in_one_sentence(condition: FlightCondition, sentence: str) -> None:
-    with pytest.raises(FlightEnded, match=sentence) as ended:
-        cessna(condition=condition)
+def test_a_condition_without_trim_is_refused_in_one_sentence(condition: tuple[str, float, float], sentence: str) -> None:
+    with pytest.raises(FlightEnded, match=f"^jsbsim:{condition[0]} {sentence}") as ended:
+        cessna(condition=FlightCondition(*condition, STEP_NS))
     assert "\n" not in str(ended.value)
 
 
@@ -300,7 +286,7 @@ def test_a_state_that_is_not_finite_counts_as_diverged() -> None:
         ({"airframe": "jsbsim:../c172p"}, r"airframe: found 'jsbsim:../c172p', expected jsbsim:c172p perhaps"),
         ({"speed": None}, r"speed: found none, expected the true airspeed to trim at, m/s"),
         ({"altitude": None}, r"altitude: found none, expected the altitude to trim at, m"),
-        ({"bias": {"q": {"start": 0.0, "value": 1.0, "rise": 1.0}}}, r"bias: found a value, expected none: jsbsim:c172p has no"),
+        ({"bias": {"q": {"start": 0.0, "value": 1.0, "rise": 1.0}}}, "bias: found a value, expected none: jsbsim:c172p has no"),
         ({"uncertainty": {"A": 0.1}}, r"uncertainty: found a value, expected none: jsbsim:c172p has no matrices"),
         ({"gusts": {"up": {"start": 0.0, "speed": 1.0, "length": 1.0}}}, r"gusts.up: found 'up', expected an axis of the wind"),
         ({"actuators": {"lag": [0.1]}}, r"actuators.lag: found 1 values, expected 4, one for each of elevator, throttle, "),
@@ -309,11 +295,11 @@ def test_a_state_that_is_not_finite_counts_as_diverged() -> None:
 )
 def test_parameters_that_do_not_fit_are_refused(changes: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"^aircraft.{sentence}"):
-        AircraftParameters.validate_mapping(SECTION | changes, "aircraft")
+        aircraft_parameters(**SECTION | changes)
 
 
 def test_channels_match_the_tables() -> None:
-    channels = AircraftParameters.validate_mapping(SECTION, "aircraft").channels()
+    channels = aircraft_parameters(**SECTION).channels()
     assert list(channels.outputs) == list(OUTPUTS) == ["q", "V", "p", "r"]
     assert channels.inputs == {"elevator": "1", "throttle": "1", "aileron": "1", "rudder": "1"}
     assert channels.speed == 46.3

@@ -92,6 +92,7 @@ def test_an_invalid_scenario_is_one_sentence(
 
 # Section of the aircraft -> its values and the sentence of the error, a pattern.
 GUST, STEP, SINE = {"start": 0.0, "speed": 1.0, "length": 9.0}, {"start": 0.0, "value": 1.0, "rise": 0.0}, {"amplitude": 1.0}
+AIR = {"wind": 7.7, "sigma": 1.0}
 PRODUCT = {"into": "p", "product": ["q", "p"], "gain": 1.0}
 FOUR = "found 1 values, expected 4, one for each of"
 BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
@@ -129,11 +130,8 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
         ({"altitude": 3.0, "wind": 7.7}, r"\.altitude: found 3\.0, expected greater than or equal to 3\.048"),
         ({"altitude": 100.0}, r"\.wind: found none, expected a value at 100 m: it acts below 609\.6 m"),
         ({"altitude": 400.0, "wind": 7.7}, r"\.sigma: found none, expected a value at 400 m: it acts above 304\.8 m"),
-        (
-            {"altitude": 100.0, "wind": 7.7, "sigma": 1.0},
-            r"\.sigma: found 1 m/s, expected none at 100 m: it acts above 304\.8 m",
-        ),
-        ({"altitude": 700.0, "wind": 7.7, "sigma": 1.0}, r"\.wind: found 7\.7 m/s, expected none at 700 m"),
+        (AIR | {"altitude": 100.0}, r"\.sigma: found 1 m/s, expected none at 100 m: it acts above 304\.8 m"),
+        (AIR | {"altitude": 700.0}, r"\.wind: found 7\.7 m/s, expected none at 700 m"),
         ({"altitude": 100.0, "wind": -1.0}, r"\.wind: found -1\.0, expected greater than or equal to 0"),
         ({"altitude": 100.0, "winds": 1.0}, r"\.winds: unknown key, expected wind perhaps"),
     ],
@@ -172,17 +170,17 @@ def test_a_section_without_data_in_the_airframe_is_refused(section: str, values:
 
 
 @pytest.mark.parametrize(
-    ("values", "sentence"),
+    ("section", "values", "sentence"),
     [
-        ({"gusts": {"up": {"q": 1.0}}}, r"gusts\.up: found 'up', expected an axis of the wind: longitudinal, lateral, vert"),
-        ({"inertial_coupling": [PRODUCT | {"product": ["q"]}]}, r"\[0\]\.product: found 1 states, expected two of them"),
-        ({"inertial_coupling": [PRODUCT | {"product": ["q", "w"]}]}, r"\[0\]\.product\[1\]: found 'w', expected a state"),
-        ({"inertial_coupling": [PRODUCT | {"into": "w"}]}, r"\[0\]\.into: found 'w', expected a state"),
+        ("gusts", {"up": {"q": 1.0}}, r"\.up: found 'up', expected an axis of the wind: longitudinal, lateral, vert"),
+        ("inertial_coupling", [PRODUCT | {"product": ["q"]}], r"\[0\]\.product: found 1 states, expected two of them"),
+        ("inertial_coupling", [PRODUCT | {"product": ["q", "w"]}], r"\[0\]\.product\[1\]: found 'w', expected a state"),
+        ("inertial_coupling", [PRODUCT | {"into": "w"}], r"\[0\]\.into: found 'w', expected a state"),
     ],
 )
-def test_an_invalid_airframe_is_refused_by_name(values: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ParameterError, match=rf"^airframe\..*{sentence}"):
-        Airframe.validate_mapping(load_airframe("osprey").model_dump() | values, "airframe")
+def test_an_invalid_section_of_an_airframe_is_refused_by_name(section: str, values: Any, sentence: str) -> None:
+    with pytest.raises(ParameterError, match=rf"^airframe\.{section}{sentence}"):
+        Airframe.validate_mapping(load_airframe("osprey").model_dump() | {section: values}, "airframe")
 
 
 def test_an_integer_is_accepted_as_a_number(osprey_gust: Scenario) -> None:
