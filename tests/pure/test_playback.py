@@ -3,11 +3,10 @@
 """Playback schedule of a log: the messages, their order and their due times."""
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
+from tests.joint_states import STORE, vector
+from tests.recordings import EPOCH, MS
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -18,10 +17,6 @@ from flight_log.message_definitions import definition
 from flight_log.named_vectors import JOINT_STATE
 from flight_log.playback import begins_with_stamp, read_playback
 from flight_log.tape_writer import write_run
-
-MS = 1_000_000
-EPOCH = 1_790_000_000_000 * MS
-STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 @pytest.fixture(scope="module")
@@ -73,15 +68,11 @@ def test_a_log_without_messages_is_rejected(tmp_path: Path) -> None:
 
 def bag_of(folder: Path, sent: list[tuple[str, int, int, float]]) -> Path:
     """A log of (topic, time of sending, stamp, value) in the order of receipt. `truth` has the channel t."""
-    types: dict[str, Any] = STORE.types
     with BagWriter(folder) as bag:
         channels = {topic: bag.add_topic(topic, JOINT_STATE, "") for topic in dict.fromkeys(one[0] for one in sent)}
         for number, (topic, sent_ns, stamp_ns, value) in enumerate(sent, start=1):
-            name = "t" if topic == "/truth" else "q"
-            stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
-            header = types["std_msgs/msg/Header"](stamp, "peer")
-            message = types[JOINT_STATE](header, [name], np.array([value]), np.zeros(0), np.zeros(0))
-            bag.write(channels[topic], EPOCH + number * MS, sent_ns, number, bytes(STORE.serialize_cdr(message, JOINT_STATE)))
+            message = vector(stamp_ns, ["t" if topic == "/truth" else "q"], [value], "peer")
+            bag.write(channels[topic], EPOCH + number * MS, sent_ns, number, message)
     return folder
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from tests.joint_states import JOINT_STATE, vector
+from tests.recordings import EPOCH, MS
 
 from flight_analysis.report.run_folder import new_run, write_report
 from flight_analysis.report.summary import empty_summary
@@ -17,9 +18,6 @@ from flight_cli.report import report
 from flight_core.parameters import ParameterError
 from flight_log.bag import BagWriter
 from flight_log.latency import latency
-
-MS = 1_000_000
-EPOCH = 1_795_000_000_000_000_000
 
 
 @pytest.fixture(scope="module")
@@ -88,8 +86,7 @@ def test_latency_is_the_time_between_the_sending_of_y_and_of_its_u(tmp_path: Pat
         for topic, instants in sent.items():
             channel = bag.add_topic(topic, JOINT_STATE, "")
             for stamp, at in instants.items():
-                message = vector(EPOCH + stamp * MS, ["q"], [1.0])
-                bag.write(channel, EPOCH + 99 * MS, EPOCH + at * MS, 1, message)
+                bag.write(channel, EPOCH + 99 * MS, EPOCH + at * MS, 1, vector(EPOCH + stamp * MS, ["q"], [1.0]))
     latencies = latency(tmp_path / "run")
     assert latencies is not None
     assert (latencies.stamp_ns - EPOCH).tolist() == [0, 20 * MS]
