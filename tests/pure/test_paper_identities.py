@@ -200,14 +200,13 @@ class Loop:
 
 def run(p: Problem, x_0: FloatArray, x_m0: FloatArray, duration: float) -> Loop:
     """Integrate the closed loop."""
-    n, m = p.B.shape
     e_0 = p.C @ (x_0 - x_m0)
 
     def w_dot(t: float, w: FloatArray) -> FloatArray:
         now = Loop(p, e_0, lambda _: w)
         return np.concatenate([now.x_dot(t), now.x_m_dot(t), now.e(t), p.beta * np.sign(now.e(t))])
 
-    start = np.concatenate([x_0, x_m0, np.zeros(2 * m)])
+    start = np.concatenate([x_0, x_m0, np.zeros(2 * len(e_0))])
     solved = solve_ivp(w_dot, (0.0, duration), start, "DOP853", dense_output=True, rtol=1e-10, atol=1e-10, max_step=0.005)
     assert solved.sol is not None
     return Loop(p, e_0, solved.sol)

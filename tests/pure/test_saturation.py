@@ -14,19 +14,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.closed_loop import CALM_SERVO, error
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import true_error
 from flight_bringup.scenarios import find_scenario
-from flight_core.tape import Signal, Tape
+from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 
 DEG = math.pi / 180.0
 GUSTS = find_scenario("osprey_servo").aircraft.model_dump()["gusts"]
-SERVO = find_scenario("osprey_servo").vary(
-    aircraft={"sensors": {}, "gusts": {}, "rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0, "pulses": {}}
-)
+SERVO = CALM_SERVO.vary(reference_model={"pulses": {}})
 INPUTS = list(SERVO.aircraft.load()[0].inputs)  # the order of the actuators; the law has its own
 UNGUARDED: dict[str, Any] = {"lower": None, "upper": None, "slew": None}
 
@@ -50,12 +48,6 @@ def pulse(start: float, stop: float, value: float) -> dict[str, list[float]]:
     return {"start": [start], "stop": [stop], "value": [value]}
 
 
-def error(tape: Tape) -> Signal:
-    signal = true_error(tape)
-    assert signal is not None
-    return signal
-
-
 def state(tape: Tape, name: str) -> FloatArray:
     return tape["truth"].group("x")[name]
 
@@ -70,11 +62,15 @@ V_END = 12.0
 
 
 @cache
+def pulse_flight(name: str, stop: float, duration: float, channel: str, *edges: float, guarded: bool) -> Tape:
+    """A flight with the stops of one actuator and one pulse on a channel."""
+    pulses = {channel: pulse(*edges)}
+    scenario = with_stops(name, stop, guarded=guarded)
+    return simulate(scenario.vary(flight={"duration": duration}, reference_model={"pulses": pulses}))
+
+
 def thrust_flight(*, guarded: bool) -> Tape:
-    pulses = {"V": pulse(2.0, V_END, 4.0)}
-    return simulate(
-        with_stops("thrust", 0.15, guarded=guarded).vary(flight={"duration": 60.0}, reference_model={"pulses": pulses})
-    )
+    return pulse_flight("thrust", 0.15, 60.0, "V", 2.0, V_END, 4.0, guarded=guarded)
 
 
 def test_thrust_with_anti_windup_recovers_without_undershoot() -> None:
@@ -103,12 +99,8 @@ def test_thrust_without_anti_windup_winds_up_and_undershoots() -> None:
 P_END = 3.0
 
 
-@cache
 def aileron_flight(*, guarded: bool) -> Tape:
-    pulses = {"p": pulse(1.0, P_END, 0.6)}
-    return simulate(
-        with_stops("aileron", 3 * DEG, guarded=guarded).vary(flight={"duration": 12.0}, reference_model={"pulses": pulses})
-    )
+    return pulse_flight("aileron", 3 * DEG, 12.0, "p", 1.0, P_END, 0.6, guarded=guarded)
 
 
 @pytest.mark.parametrize(
@@ -162,8 +154,6 @@ def test_anti_windup_leaves_a_third_of_the_pitch_rate_error_after_a_gust() -> No
 
 
 # A slow rudder: the lateral gust of the scenario at 2 s, a flight of 10 s. It needs 46 deg/s.
-
-
 @cache
 def rudder_flight(rate_deg: float, *, limited: bool = False, sign: str = "auto") -> Tape:
     actuators = SERVO.aircraft.actuators.model_dump()

@@ -19,7 +19,8 @@ import pytest
 from benchmarks import servo_world
 from benchmarks.servo_world import LITERAL, METRICS, PI, TABLES, Row, delayed, linear_loop, measure, score, servo_scenario
 from scipy.signal import lsim
-from tests.pure.test_saturation import error, last_beyond, pulse, state, with_stops
+from tests.closed_loop import error
+from tests.pure.test_saturation import last_beyond, pulse, state, with_stops
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
