@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The pages: line length, links, anchors, and words that the glossary replaced."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+TOP = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docker/README.md")
+PAGES = [*(REPOSITORY / name for name in TOP), *sorted((REPOSITORY / "docs").glob("*.md"))]
+MAX_LINE = 200
+
+TEXTS = {".py", ".md", ".yaml", ".xml", ".jinja", ".js", ".sh", ".c"}
+FOLDERS = ("ros_ws/src", "tests", "benchmarks", "docs", "docker")
+
+REPLACED = {
+    "anew": "again",
+    "crowd": "peers",
+    "engages anew": "re-engages",
+    "hears": "receives, subscribes to",
+    "held up": "overrun",
+    "herald": "early DDS participant",
+    "inbox": "polled subscription",
+    "let go": "failsafe: hold, then ramp to trim",
+    "lets go": "failsafe: hold, then ramp to trim",
+    "newcomer": "new node, late subscriber",
+    "nobody": "no publisher, no node",
+    "outlet": "publisher",
+    "outsider": "attacker",
+    "overheard": "replayed",
+    "somebody": "a user, a process, a node",
+    "someone": "a user, a process, a node",
+    "stranger": "unexpected publisher",
+    "takes leave": "shuts down",
+    "whoever": "a user, a process, a node",
+}
+"""Words without a meaning in the field, with the word to use instead (docs/glossary.md)."""
+
+WORDS = re.compile(f"(?<![a-z])({'|'.join(REPLACED).replace(' ', '[ _]')})(?![a-z])", re.IGNORECASE)
+
+
+def prose(page: Path) -> str:
+    """The text of a page without code blocks, code spans and formulas."""
+    text = re.sub(r"^(```.*?^```|    .*?$)", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    return re.sub(r"`[^`\n]*`|\$\$.*?\$\$|\$[^$]*\$", "", text, flags=re.DOTALL)
+
+
+def links(page: Path) -> list[str]:
+    return re.findall(r"\]\(([^)\s]+)\)", prose(page))
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives to the headings of a page."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(REPOSITORY))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_no_line_of_a_page_is_longer_than_200_characters(page: Path) -> None:
+    lines = page.read_text(encoding="utf-8").splitlines()
+    assert [number for number, line in enumerate(lines, 1) if len(line) > MAX_LINE] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_relative_link_and_anchor_exists(page: Path) -> None:
+    broken = []
+    for link in links(page):
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        if not re.match(r"[a-z]+:", link) and not (target.exists() and (not anchor or anchor in anchors(target))):
+            broken.append(link)
+    assert broken == []
+
+
+@pytest.mark.parametrize("page", ["architecture", "glossary", "theory", "symbols", "interfaces", "experiments", "evidence"])
+def test_the_readme_links_the_page(page: str) -> None:
+    assert f"docs/{page}.md" in links(REPOSITORY / "README.md")
+
+
+def test_sources_tests_and_pages_use_the_words_of_the_field() -> None:
+    files = [path for folder in FOLDERS for path in sorted((REPOSITORY / folder).rglob("*")) if path.suffix in TEXTS]
+    files += [REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "Makefile", "pyproject.toml")]
+    occurrences = [
+        f"{name(path)}:{number}: {match.group()}: {REPLACED[match.group().lower().replace('_', ' ')]}"
+        for path in files
+        if path != Path(__file__).resolve() and "corpus" not in path.parts
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        for match in WORDS.finditer(line)
+    ]
+    assert occurrences == []
