@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, Phase, settings
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -18,6 +18,11 @@ from flight_log.tape_writer import write_run
 # The time of an example depends on the host, not on the code under test.
 settings.register_profile("flight", deadline=None)
 settings.load_profile("flight")
+
+few = settings(
+    max_examples=30, derandomize=True, database=None, phases=(Phase.generate,), suppress_health_check=list(HealthCheck)
+)
+"""Deterministic examples of fuzzing. benchmarks/fuzz.py does long searches."""
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

@@ -15,6 +15,7 @@ import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 from tests.joint_states import JOINT_STATE, STORE, vector
 
+from aircraft_sim.airframe import LIBRARY as AIRFRAMES
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
 from autopilot_bridge.bridge import Bridge
@@ -56,21 +57,19 @@ def rejected(call: Callable[[], object]) -> bool:
 
 def mcap(data: bytes, folder: Path) -> None:
     """A log: read as a flight, as messages and as a replay; then repaired. The repaired log is not damaged."""
-    run = _run(folder, data)
+    run = write_run(folder, data)
     file = run / "run_0.mcap"
     rejected(lambda: read_run(file))
     rejected(lambda: latency(file))
     rejected(lambda: read_playback(file))
     rejected(lambda: _replay(file))
-    if not rejected(lambda: repair(run)):
-        again = repair(run)
-        if any(one.damaged for one in again.files):
-            raise AssertionError("the repaired log is damaged")
+    if not rejected(lambda: repair(run)) and any(one.damaged for one in repair(run).files):
+        raise AssertionError("the repaired log is damaged")
 
 
 def metadata(data: bytes, folder: Path) -> None:
     """metadata.yaml of a bag, and a file of metadata for a bag."""
-    run = _run(folder, _PLAIN)
+    run = write_run(folder, _PLAIN)
     (run / "metadata.yaml").write_bytes(data)
     rejected(lambda: read_bag_metadata(run))
     rejected(lambda: read_metadata_records(run / "metadata.yaml"))
@@ -125,7 +124,7 @@ def message(data: bytes, folder: Path) -> None:
         decode = decoder("/y", JOINT_STATE)
         assert decode is not None
         decode(messages)
-    run = _run(folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)]))
+    run = write_run(folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)]))
     rejected(lambda: read_run(run))
     rejected(lambda: latency(run))
     rejected(lambda: read_playback(run))
@@ -142,7 +141,8 @@ TARGETS: Mapping[str, Target] = {
 }
 
 
-def _run(folder: Path, content: bytes) -> Path:
+def write_run(folder: Path, content: bytes) -> Path:
+    """The folder of a run that holds this log alone."""
     run = folder / "run"
     run.mkdir(exist_ok=True)
     for file in run.iterdir():
@@ -173,15 +173,8 @@ def log(
 ) -> bytes:
     """An MCAP file of (topic, type, payload), 1 ms apart. By default it has no checksums, which would reveal a changed byte."""
     stream = BytesIO()
-    writer = Writer(
-        stream,
-        chunk_size=1024,
-        compression=packed,
-        index_types=IndexType.ALL if indexed else IndexType.NONE,
-        use_chunking=chunked,
-        enable_crcs=checked,
-        enable_data_crcs=checked,
-    )
+    index = IndexType.ALL if indexed else IndexType.NONE
+    writer = Writer(stream, 1024, packed, index, use_chunking=chunked, enable_crcs=checked, enable_data_crcs=checked)
     writer.start(profile="ros2", library="fuzz")
     channels: dict[str, int] = {}
     for name, content in attached.items():
@@ -215,11 +208,11 @@ FLIGHT = {"/y": ("q", "V"), "/y_m": ("q", "V"), "/u": ("elevator", "thrust"), "/
 
 
 def _flight() -> list[tuple[str, str, bytes]]:
-    messages = []
-    for k in range(6):
-        at = 10_000_000 * k
-        for topic, names in FLIGHT.items():
-            messages.append((topic, JOINT_STATE, vector(at, names, (0.01 * k, 0.1 * k), "/n")))
+    messages = [
+        (topic, JOINT_STATE, vector(10_000_000 * k, names, (0.01 * k, 0.1 * k), "/n"))
+        for k in range(6)
+        for topic, names in FLIGHT.items()
+    ]
     return [*messages, (PARAMETER_EVENTS, PARAMETER_EVENT, _event())]
 
 
@@ -253,7 +246,7 @@ SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "mcap": _mcaps,
     "metadata": _metadata,
     "scenario": lambda: _files(share() / "config"),
-    "airframe": lambda: _files(Path(__file__).parents[2] / "ros_ws/src/aircraft_sim/aircraft_sim/airframes"),
+    "airframe": lambda: _files(AIRFRAMES),
     "map": lambda: _files(MAPS),
     "message": lambda: [_SAMPLE, _event(), vector(1, (), ())],
 }

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.conftest import REPOSITORY
-from tests.fuzz.targets import SEEDS, TARGETS, log, rejected
+from tests.conftest import REPOSITORY, few
+from tests.fuzz.targets import SEEDS, TARGETS, log, rejected, write_run
 from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -24,16 +24,6 @@ from flight_bringup.scenarios import find_scenario
 from flight_log.tape_reader import read_run
 
 CORPUS = REPOSITORY / "tests" / "corpus"
-
-# Deterministic examples. benchmarks/fuzz.py does long searches.
-few = settings(
-    max_examples=30,
-    derandomize=True,
-    deadline=None,
-    database=None,
-    phases=(Phase.generate,),
-    suppress_health_check=list(HealthCheck),
-)
 
 
 @pytest.mark.parametrize("target", TARGETS)
@@ -78,18 +68,6 @@ def damaged(draw: st.DrawFn, name: str) -> bytes:
 NUMBERS = [0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1, 2**63, 2**64 - 1]
 
 
-@few
-@given(damaged("mcap"))
-def test_a_damaged_log_is_read_repaired_or_rejected(tmp_path: Path, data: bytes) -> None:
-    TARGETS["mcap"](data, tmp_path)
-
-
-@few
-@given(damaged("message") | st.binary(max_size=200))
-def test_a_damaged_message_in_a_log_is_read_or_skipped(tmp_path: Path, data: bytes) -> None:
-    TARGETS["message"](data, tmp_path)
-
-
 # Text: unexpected values at any place
 
 SCALARS = (
@@ -129,28 +107,19 @@ def edited(draw: st.DrawFn, seeds: list[Any]) -> bytes:
     return yaml.safe_dump(tree, allow_unicode=True).encode("utf-8", "surrogatepass")
 
 
+INPUTS = {
+    "mcap": damaged("mcap"),
+    "message": damaged("message") | st.binary(max_size=200),
+    **{name: edited(SEEDS[name]()) for name in ("scenario", "airframe", "map")},
+    "metadata": edited(SEEDS["metadata"]()) | st.binary(max_size=100),
+}
+
+
+@pytest.mark.parametrize("target", TARGETS)
 @few
-@given(edited(SEEDS["scenario"]()))
-def test_a_scenario_with_other_values_flies_or_is_rejected(tmp_path: Path, data: bytes) -> None:
-    TARGETS["scenario"](data, tmp_path)
-
-
-@few
-@given(edited(SEEDS["airframe"]()))
-def test_an_airframe_with_other_values_is_valid_or_rejected(tmp_path: Path, data: bytes) -> None:
-    TARGETS["airframe"](data, tmp_path)
-
-
-@few
-@given(edited(SEEDS["map"]()))
-def test_a_channel_map_with_other_values_is_valid_or_rejected(tmp_path: Path, data: bytes) -> None:
-    TARGETS["map"](data, tmp_path)
-
-
-@few
-@given(edited(SEEDS["metadata"]()) | st.binary(max_size=100))
-def test_metadata_with_other_values_leaves_the_log_readable(tmp_path: Path, data: bytes) -> None:
-    TARGETS["metadata"](data, tmp_path)
+@given(st.data())
+def test_a_damaged_log_or_a_file_of_other_values_is_read_or_rejected(target: str, tmp_path: Path, data: st.DataObject) -> None:
+    TARGETS[target](data.draw(INPUTS[target]), tmp_path)
 
 
 @pytest.mark.parametrize("target", ["scenario", "airframe", "map", "metadata"])
@@ -225,9 +194,7 @@ def reported(tmp_path: Path, osprey_gust: Scenario) -> Report:
     """Reads messages as a flight of the default scenario."""
 
     def report(read: Callable[[Path], object], messages: list[tuple[str, str, bytes]]) -> None:
-        run = tmp_path / "run"
-        run.mkdir(exist_ok=True)
-        (run / "run_0.mcap").write_bytes(log(messages, attached={"osprey_gust.yaml": osprey_gust.path.read_bytes()}))
+        run = write_run(tmp_path, log(messages, attached={"osprey_gust.yaml": osprey_gust.path.read_bytes()}))
         with np.errstate(all="ignore"):
             rejected(lambda: read(run))
 

@@ -3,7 +3,6 @@
 """Regressions found by fuzzing: tracebacks, hangs and excessive memory."""
 
 import json
-import shutil
 import tracemalloc
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import yaml
 from mcap.records import Message
 from mcap.writer import CompressionType
 from tests.conftest import REPOSITORY
-from tests.fuzz.targets import log
+from tests.fuzz.targets import log, write_run
 from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -29,17 +28,18 @@ from flight_log.tape_reader import read_run
 
 CORPUS = REPOSITORY / "tests" / "corpus"
 Y = [("/y", JOINT_STATE, vector(10_000_000 * k, ("q", "V"), (0.1 * k, k))) for k in range(20)]
-
-
 BOMBS = [*sorted(path.name for path in (CORPUS / "mcap").glob("*bomb*")), "zstd_header_says_a_terabyte"]
 
 
-def write_run(folder: Path, content: bytes) -> Path:
-    """Write the folder of a run with this log."""
-    run = folder / "run"
-    run.mkdir()
-    (run / "run_0.mcap").write_bytes(content)
-    return run
+def constant_flight(scenario: Scenario, value: float = 0.0, name: str = "osprey_gust.yaml") -> bytes:
+    """The log of three samples of y, y_m and u with one value, and of its scenario."""
+    outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
+    messages = [
+        (topic, JOINT_STATE, vector(k * 10_000_000, names, (value,) * 4))
+        for k in range(3)
+        for topic, names in {"/y": outputs, "/y_m": outputs, "/u": inputs}.items()
+    ]
+    return log(messages, attached={name: scenario.path.read_bytes()})
 
 
 @pytest.mark.parametrize("name", BOMBS)
@@ -59,9 +59,7 @@ def test_an_lz4_chunk_with_changed_bytes_is_skipped(tmp_path: Path) -> None:
     changed = bytearray(log(Y, CompressionType.LZ4))
     frame = changed.index(b"\x04\x22\x4d\x18")  # the magic number of LZ4 frames
     changed[frame + 4] ^= 0xFF  # the flags of the first of several chunks
-    path = tmp_path / "changed.mcap"
-    path.write_bytes(changed)
-    scan = Scan(path)
+    scan = Scan(write_run(tmp_path, bytes(changed)) / "run_0.mcap")
     assert any(isinstance(record, Message) for record in scan.records())
     assert scan.damaged == 1
 
@@ -79,19 +77,13 @@ def test_a_channel_with_an_invalid_quality_of_service_is_repaired(tmp_path: Path
 
 @pytest.mark.parametrize("name", ["run_0.mcap", "metadata.yaml", "", "..", "../../x.yaml", "a\x00.yaml", "x" * 300 + ".yaml"])
 def test_a_scenario_in_a_log_is_extracted_without_overwriting_the_log(name: str, tmp_path: Path, osprey_gust: Scenario) -> None:
-    content = osprey_gust.path.read_bytes()
-    outputs, inputs = osprey_gust.controller.outputs, osprey_gust.controller.inputs
-    topics = {"/y": outputs, "/y_m": outputs, "/u": inputs}
-    messages = [
-        (topic, JOINT_STATE, vector(k * 10_000_000, names, (0.0,) * 4)) for k in range(3) for topic, names in topics.items()
-    ]
-    log_before = log(messages, attached={name: content})
+    log_before = constant_flight(osprey_gust, name=name)
     run = write_run(tmp_path, log_before)
     read_flight(run)
     assert (run / "run_0.mcap").read_bytes() == log_before
     kept = "x.yaml" if name == "../../x.yaml" else "scenario.yaml"
     assert {path.name for path in run.iterdir()} == {"run_0.mcap", kept}
-    assert (run / kept).read_bytes() == content
+    assert (run / kept).read_bytes() == osprey_gust.path.read_bytes()
 
 
 @pytest.mark.parametrize("t", [float("nan"), float("inf"), -1e300])
@@ -103,7 +95,6 @@ def test_with_an_invalid_flight_time_the_first_sample_is_at_0(t: float, tmp_path
 
 def test_a_truncated_u_or_one_of_another_type_has_no_latency(tmp_path: Path) -> None:
     assert latency(write_run(tmp_path, log([*Y, ("/u", JOINT_STATE, b"\x00\x01")]))) is None
-    shutil.rmtree(tmp_path / "run")
     assert latency(write_run(tmp_path, log([*Y, ("/u", "std_msgs/msg/String", b"\x00\x01\x00\x00")]))) is None
 
 
@@ -138,11 +129,8 @@ def test_exponential_and_recursive_aliases_are_rejected() -> None:
 
 
 def test_the_notes_of_a_log_contain_no_terminal_control_codes(tmp_path: Path) -> None:
-    run = write_run(
-        tmp_path,
-        log([*Y, ("/\x1b[2Jz", JOINT_STATE, vector(1, ("a",), (1.0,))), ("/\x1b[2Jz", JOINT_STATE, vector(2, ("b",), (1.0,)))]),
-    )
-    notes = read_run(run).tape.notes
+    hostile = [("/\x1b[2Jz", JOINT_STATE, vector(k, (name,), (1.0,))) for k, name in ((1, "a"), (2, "b"))]
+    notes = read_run(write_run(tmp_path, log([*Y, *hostile]))).tape.notes
     assert r"\x1b[2Jz: 1 samples with other names refused" in notes
     assert all(note.isprintable() for note in notes)
 
@@ -163,12 +151,7 @@ def test_text_of_a_log_cannot_end_the_script_of_the_page() -> None:
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, for extreme values
 @pytest.mark.parametrize("value", [1e300, float("nan"), float("-inf")])
 def test_a_value_of_the_summary_that_is_not_finite_is_null(value: float, tmp_path: Path, osprey_gust: Scenario) -> None:
-    topics = {"/y": osprey_gust.controller.outputs, "/y_m": osprey_gust.controller.outputs, "/u": osprey_gust.controller.inputs}
-    messages = [
-        (topic, JOINT_STATE, vector(k * 10_000_000, names, (value,) * 4)) for k in range(3) for topic, names in topics.items()
-    ]
-    run = write_run(tmp_path, log(messages, attached={"osprey_gust.yaml": osprey_gust.path.read_bytes()}))
-    summary = read_flight(run).summary
+    summary = read_flight(write_run(tmp_path, constant_flight(osprey_gust, value))).summary
     json.dumps(summary, allow_nan=False)
     assert summary["errors"]["q"]["whole"]["rms"] in (None, 0.0)
     assert summary["inputs"]["elevator"]["whole"]["rms"] is None

@@ -5,10 +5,10 @@
 from typing import Any
 
 import numpy as np
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, few
 from tests.joint_states import vector
 
 from autopilot_bridge.channel_map import message_type, read_raw
@@ -21,14 +21,7 @@ from flight_ros.rclpy_private import DeserializationError
 NAMES = ("q", "V", "p", "r")
 REASONS = {"finite", "length", "mac", "malformed", "name", "order"}
 
-many = settings(
-    max_examples=300,
-    derandomize=True,
-    deadline=None,
-    database=None,
-    phases=(Phase.generate,),
-    suppress_health_check=list(HealthCheck),
-)
+many = settings(few, max_examples=300)
 
 
 @st.composite
