@@ -248,12 +248,8 @@ Names = tuple[str, ...]
 BadSample = tuple[float, Names, FloatArray]  # the offset of its stamp from the present, s; names; values
 
 
-def values(length: int, random: Generator) -> FloatArray:
-    return random.uniform(-1.0, 1.0, length)
-
-
 def not_finite(value: float, names: Names, random: Generator) -> BadSample:
-    bad = values(len(names), random)
+    bad = random.uniform(-1.0, 1.0, len(names))
     bad[random.integers(len(names))] = value
     return 0.0, names, bad
 
@@ -265,16 +261,16 @@ def infinite(names: Names, random: Generator) -> BadSample:
 def wrong_names(names: Names, random: Generator) -> BadSample:
     bad = list(names)
     bad[random.integers(len(names))] = random.choice(("", "x", f"{names[0]} ", "q_deg", "\N{GREEK SMALL LETTER DELTA}"))
-    return 0.0, tuple(bad), values(len(names), random)
+    return 0.0, tuple(bad), random.uniform(-1.0, 1.0, len(names))
 
 
 def wrong_length(names: Names, random: Generator) -> BadSample:
     length = random.choice((0, 1, len(names) - 1, len(names) + 1, 1000))
-    return 0.0, names, values(length, random)
+    return 0.0, names, random.uniform(-1.0, 1.0, length)
 
 
 def wrong_stamp(sign: float, names: Names, random: Generator) -> BadSample:
-    return sign * 10.0 ** random.uniform(0.0, 8.0), names, values(len(names), random)
+    return sign * 10.0 ** random.uniform(0.0, 8.0), names, random.uniform(-1.0, 1.0, len(names))
 
 
 BAD: dict[str, tuple[Callable[[Names, Generator], BadSample], str, str]] = {  # sample, key of the counter, log line

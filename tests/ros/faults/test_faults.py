@@ -85,10 +85,8 @@ def contents(runs: list[Path]) -> tuple[set[bytes], set[tuple[str, str]]]:
 
 
 class Window(NamedTuple):
-    """Begin and end of a fault and the re-engagement, s; the host scheduling delay, and the time allowed for it."""
+    """Instant of the re-engagement after a fault, host scheduling delay, and the time allowed for it, s."""
 
-    begin: float
-    end: float
     engaged: float
     host_delay: float
     slack: float
@@ -96,15 +94,14 @@ class Window(NamedTuple):
 
 def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
     """Check all that the case states; time of the detection, of the recovery, and host scheduling delay, s."""
-    begin, end = flight.begin, flight.end
     reaction = None
     if case.detection is not None:
         detected = flight.until(lambda: case.detection(flight), case.within + 3.0, "detected")  # type: ignore[misc]
-        reaction = max(detected - begin, 0.0)  # the message of the detection may overtake that of the fault
-    engaged = flight.until(lambda: engaged_for(SETTLING, flight, begin, end), 10.0, "engaged again")
-    host_delay = 0.0 if case.response is Response.LATE else flight.host_delay(begin - 0.1, engaged + SETTLING)
+        reaction = max(detected - flight.begin, 0.0)  # the message of the detection may overtake that of the fault
+    engaged = flight.until(lambda: engaged_for(SETTLING, flight), 10.0, "engaged again")
+    host_delay = 0.0 if case.response is Response.LATE else flight.host_delay(flight.begin - 0.1, engaged + SETTLING)
     slack = SLACK + 2.0 * host_delay  # the delays of two processes add up: of the node and of the probe
-    recovery = max(engaged - end, 0.0)
+    recovery = max(engaged - flight.end, 0.0)
     if reaction is not None:
         allowed = case.within + slack
         assert reaction <= allowed, f"detected after {reaction:.3f} s, allowed {allowed:.3f} s"
@@ -114,7 +111,7 @@ def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
     for key in ("ready_to_traffic", "ready_to_caught_up"):
         duration = flight.measured.get(key, 0.0)
         assert duration <= RESTART + slack, f"{key} {duration:.3f} s, allowed {RESTART + slack:.3f} s"
-    CHECKS[case.response](case, flight, Window(begin, end, engaged, host_delay, slack))
+    CHECKS[case.response](case, flight, Window(engaged, host_delay, slack))
     for role, process in flight.processes.items():
         assert process.popen.poll() is None, f"{role} has ended: {process.output}"
         assert "Traceback" not in process.output
@@ -122,17 +119,17 @@ def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
     return reaction, recovery, host_delay
 
 
-def engaged_for(duration: float, flight: Flight, begin: float, end: float) -> float | None:
+def engaged_for(duration: float, flight: Flight) -> float | None:
     """Since when the law has been engaged, once that has lasted for a duration after the fault."""
-    since = flight.engaged_since(begin)
-    return since if since is not None and time.time() - max(since, end) >= duration else None
+    since = flight.engaged_since(flight.begin)
+    return since if since is not None and time.time() - max(since, flight.end) >= duration else None
 
 
 def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
     """The law and the aircraft used samples of the flight's own nodes only; no topic paused beyond its age limit."""
-    until = window.end + SETTLING
-    ticks, (_, applied) = flight.ticks(window.begin, until), flight.actuator_positions(window.begin, until)
-    before = flight.ticks(window.begin - 0.5, until)
+    until = flight.end + SETTLING
+    ticks, (_, applied) = flight.ticks(flight.begin, until), flight.actuator_positions(flight.begin, until)
+    before = flight.ticks(flight.begin - 0.5, until)
     if window.host_delay < MAX_AGE + HOLD + RAMP:  # else the failsafe was over, and the publisher lock free
         assert np.abs(ticks.y).max() <= USUAL
         assert np.abs(ticks.y_m).max() <= USUAL
@@ -146,16 +143,16 @@ def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
     # The probe subscribes with best effort: in a storm its socket drops samples that the flight's nodes receive again.
     flooded = case.name.removeprefix("storm on ")
     topics = tuple(topic for topic in ("y", "y_m", "u", "truth", "internals") if topic != flooded)
-    pauses = check_pauses(flight, topics, window.begin, until, window)
+    pauses = check_pauses(flight, topics, until, window)
     if quiet:
         assert ticks.modes == [Mode.ENGAGED], pauses
         # without the thrust, which may still settle after an earlier fault
         assert np.abs((ticks.u - before.u[0])[:, : INPUTS.index("thrust")]).max() <= MOVES
 
 
-def check_pauses(flight: Flight, topics: tuple[str, ...], begin: float, end: float, window: Window) -> dict[str, float]:
+def check_pauses(flight: Flight, topics: tuple[str, ...], end: float, window: Window) -> dict[str, float]:
     """No topic paused for longer than its age limit; the pauses, s."""
-    pauses = {topic: flight.pause(topic, begin, end) for topic in topics}
+    pauses = {topic: flight.pause(topic, flight.begin, end) for topic in topics}
     limits = {topic: (U_MAX_AGE if topic == "u" else MAX_AGE) + 2.0 * window.host_delay for topic in topics}
     assert all(pause <= limits[topic] for topic, pause in pauses.items()), (pauses, window)
     flight.measured["longest_pause"] = max(pauses.values())
@@ -164,7 +161,7 @@ def check_pauses(flight: Flight, topics: tuple[str, ...], begin: float, end: flo
 
 def check_controller_failsafe(case: Case, flight: Flight, window: Window) -> None:
     """HOLD: u is constant to the last bit; RAMP: a straight line to trim; TRIM: 0; then a bumpless re-engagement."""
-    ticks = flight.ticks(window.begin, window.engaged + SETTLING)
+    ticks = flight.ticks(flight.begin, window.engaged + SETTLING)
     if window.host_delay > QUIET:
         assert {Mode.TRIM} <= set(ticks.modes) <= set(Mode) - {Mode.WAITING, Mode.INACTIVE}
         return
@@ -184,37 +181,37 @@ def check_controller_failsafe(case: Case, flight: Flight, window: Window) -> Non
     assert (u[engaged] == u[engaged - 1]).all()
     # the controller does not publish a new tick until y or y_m is stale: well within the aircraft's age limit of u
     topics = ("u", "y_m") if "aircraft" in case.name else ("u", "y", "truth")
-    check_pauses(flight, topics, window.begin, window.engaged, window)
+    check_pauses(flight, topics, window.engaged, window)
 
 
 def check_aircraft_failsafe(case: Case, flight: Flight, window: Window) -> None:
     """The aircraft holds its last input for the age limit and HOLD, then ramps it to trim; the next u is applied bumpless."""
-    t, applied = flight.actuator_positions(window.begin, window.engaged + SETTLING)
-    before = flight.actuator_positions(window.begin - 0.5, window.begin + 0.05)[1][-1]
+    t, applied = flight.actuator_positions(flight.begin, window.engaged + SETTLING)
+    before = flight.actuator_positions(flight.begin - 0.5, flight.begin + 0.05)[1][-1]
     assert np.abs(before).max() > 1e-4  # u = 0 would prove nothing
     if window.host_delay > QUIET:
         assert (applied == 0.0).all(axis=1).any()
         return
-    scale, after = applied @ before / (before @ before), t - window.begin
+    scale, after = applied @ before / (before @ before), t - flight.begin
     assert np.abs(scale[(after > 0.05) & (after < U_MAX_AGE + HOLD - 0.02)] - 1.0).max(initial=0.0) <= EXACT
     ramp = (after > U_MAX_AGE + HOLD) & (after < U_MAX_AGE + HOLD + RAMP)
     assert np.abs(scale[ramp] - 1.0 + (after[ramp] - U_MAX_AGE - HOLD) / RAMP).max(initial=0.0) <= window.slack / RAMP
-    trim = (after > U_MAX_AGE + HOLD + RAMP + window.slack) & (t < min(window.end, window.engaged) - 0.01)
+    trim = (after > U_MAX_AGE + HOLD + RAMP + window.slack) & (t < min(flight.end, window.engaged) - 0.01)
     assert trim.any()
     assert (applied[trim] == 0.0).all()
     # Bumpless: the first u of the controller is that of the aircraft, and the aircraft applies u from the first ticks on. The
     # ticks are those of the log, because the probe may discover a new controller later than the aircraft does.
-    ticks = flight.until(lambda: flight.engaged_ticks(window.end, window.engaged + SETTLING), 5.0, "the new ticks in the log")
+    ticks = flight.until(lambda: flight.engaged_ticks(flight.end, window.engaged + SETTLING), 5.0, "the new ticks in the log")
     assert (ticks.u[0] == 0.0).all()
-    first = applied[(t > window.end) & (applied != 0.0).any(axis=1)][0]
+    first = applied[(t > flight.end) & (applied != 0.0).any(axis=1)][0]
     (index,) = np.flatnonzero((ticks.u == first).all(axis=1))[:1]
     assert index <= 2 + window.slack / TICK
-    check_pauses(flight, ("y", "y_m", "truth"), window.begin, window.engaged, window)
+    check_pauses(flight, ("y", "y_m", "truth"), window.engaged, window)
 
 
 def check_late(case: Case, flight: Flight, window: Window) -> None:
     """The law is engaged, or u is held where samples came too late; u does not move more than in a steady flight."""
-    ticks = flight.ticks(window.begin, window.end + SETTLING)
+    ticks = flight.ticks(flight.begin, flight.end + SETTLING)
     assert set(ticks.modes) <= {Mode.ENGAGED, Mode.HOLD, Mode.RAMP}
     assert np.abs(ticks.y).max() <= USUAL
     assert np.abs(ticks.u).max() <= 10.0 * MOVES
