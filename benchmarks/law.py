@@ -37,7 +37,7 @@ def percentiles(action: Callable[[int], object]) -> tuple[float, float, float]:
     return float(np.median(took)), float(np.percentile(took, 99.9)), float(took.max())
 
 
-FLOOR = "NumPy a * x + b, the floor"
+FLOOR = "NumPy a * x + b"
 
 
 def measure() -> dict[str, tuple[float, float, float]]:

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of the stack, each figure compared with its floor: the least program that does the same on this host in the same run.
+"""Speed of the stack, each figure compared with a baseline: the least program that does the same on this host in one run.
 
     python -m benchmarks.speed [--only node] [--seconds 10] [--json FILE]
 
 Ratios carry over to other hosts, the figures do not. Neither is valid on a host that is busy with other work.
-The floors: one NumPy operation, a subscription of rclpy whose callback publishes the message again (an echo), an empty timer
+The baselines (`floor`): one NumPy operation, a subscription of rclpy whose callback publishes the message again (an echo), an empty timer
 of rclpy, a loop that only sleeps, a node of rclpy that only spins, the writer of rosbags.
 """
 
@@ -63,7 +63,7 @@ OWN_MISSES = "missed excluding host delays"  # a column
 
 @dataclass(frozen=True)
 class Goal:
-    """The maximum of a figure, or of its ratio to the floor."""
+    """The maximum of a figure, or of its ratio to the baseline."""
 
     column: str
     at_most: float
@@ -77,7 +77,7 @@ class Row:
     group: str
     what: str
     figures: Mapping[str, float]
-    floor: str = ""  # `what` of the row of its floor; its own for a floor, empty without one
+    floor: str = ""  # `what` of the row of its baseline; its own for a baseline, empty without one
     goals: Sequence[Goal] = field(default=())
 
 
@@ -512,7 +512,7 @@ GROUPS: dict[str, Group] = {
 
 
 def show(console: Console, name: str, rows: Sequence[Row]) -> None:
-    """Print the rows of a group, each figure with its ratio to the floor."""
+    """Print the rows of a group, each figure with its ratio to the baseline."""
     columns = list(dict.fromkeys(column for row in rows for column in row.figures))
     table = new_table(name, ("", *columns), texts=1)
     by_name = {row.what: row.figures for row in rows}
