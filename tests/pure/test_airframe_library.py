@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -24,29 +25,25 @@ from rise_di_controller.decomposition import coupling
 
 NAMES = tuple(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
 
-D_AS_PUBLISHED: Mapping[str, tuple[float, ...]] = {
-    "aerosonde_first_edition_lateral": (1, -1),
-    "aerosonde_lateral": (1, -1),
-    "b747_lateral": (1, -1),
-    "b747_longitudinal": (-1, 1),
-    "f16_lateral": (-1, -1),
-    "f16_longitudinal": (-1, 1),
-    "navion_lateral": (1, -1),
-    "navion_longitudinal": (-1, 1),
-    "osprey": (1, 1, 1, 1),
-}
-"""D by the signs of each source: a positive input may give a negative rate. Outputs p, r or q, V (osprey q, V, p, r)."""
 
-COUPLING_IN_PUBLISHED_UNITS = {
-    "aerosonde_first_edition_lateral": 13.6,  # C_n_da = 0.06: the aileron yaws four times as strongly as the rudder
-    "aerosonde_lateral": 0.03,
-    "b747_lateral": 0.38,
-    "b747_longitudinal": 0.61,
-    "f16_lateral": 2.16,
-    "f16_longitudinal": 0.99,
-    "navion_lateral": 0.55,
-    "navion_longitudinal": 0.0,
-    "osprey": 0.06,
+class Published(NamedTuple):
+    """Properties by the signs and in the units of the source."""
+
+    D: tuple[float, ...]  # a positive input may give a negative rate; outputs p, r or q, V (osprey q, V, p, r)
+    coupling: float
+
+
+PUBLISHED = {
+    # C_n_da = 0.06: the aileron yaws four times as strongly as the rudder.
+    "aerosonde_first_edition_lateral": Published((1, -1), 13.6),
+    "aerosonde_lateral": Published((1, -1), 0.03),
+    "b747_lateral": Published((1, -1), 0.38),
+    "b747_longitudinal": Published((-1, 1), 0.61),
+    "f16_lateral": Published((-1, -1), 2.16),
+    "f16_longitudinal": Published((-1, 1), 0.99),
+    "navion_lateral": Published((1, -1), 0.55),
+    "navion_longitudinal": Published((-1, 1), 0.0),
+    "osprey": Published((1, 1, 1, 1), 0.06),
 }
 
 PUBLISHED_POLES: Mapping[str, tuple[complex, ...]] = {
@@ -65,27 +62,28 @@ PUBLISHED_POLES: Mapping[str, tuple[complex, ...]] = {
 }
 
 
+@pytest.fixture(params=NAMES)
+def airframe(request: pytest.FixtureRequest) -> Airframe:
+    """Each airframe of the library."""
+    return load_airframe(request.param)
+
+
 def test_the_library_is_the_nine_airframes_of_the_table() -> None:
-    assert tuple(D_AS_PUBLISHED) == NAMES
+    assert tuple(PUBLISHED) == NAMES
     assert tuple(facts.name for facts in library()) == NAMES  # each file carries its own name
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_airframe_states_its_source_and_its_signs(name: str) -> None:
-    airframe = load_airframe(name)
+def test_every_airframe_states_its_source_and_its_signs(airframe: Airframe) -> None:
     assert "memory" in airframe.source or "computed" in airframe.source
     directions = {"nose up", "nose down", "nose left", "nose right", "roll left", "roll right"}
     for inputs in airframe.inputs.values():
         assert inputs.positive in directions or inputs.positive.startswith("more thrust")
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_sign_in_words_is_the_sign_of_the_diagonal_of_omega(name: str) -> None:
-    airframe = load_airframe(name)
-    facts = airframe_facts(airframe)
-    signs = [i.positive for i in airframe.inputs.values()]
-    expected = [-1.0 if text in ("nose down", "nose left", "roll left") else 1.0 for text in signs]
-    np.testing.assert_array_equal(np.sign(np.diag(facts.Omega)), expected)
+def test_the_sign_in_words_is_the_sign_of_the_diagonal_of_omega(airframe: Airframe) -> None:
+    down = {"nose down", "nose left", "roll left"}
+    expected = [-1.0 if entry.positive in down else 1.0 for entry in airframe.inputs.values()]
+    np.testing.assert_array_equal(np.sign(np.diag(airframe_facts(airframe).Omega)), expected)
 
 
 @pytest.mark.parametrize("name", PUBLISHED_POLES)
@@ -96,25 +94,22 @@ def test_poles_are_the_published_ones(name: str) -> None:
     assert np.all(np.abs(found - expected) <= np.maximum(0.02 * np.abs(expected), 1e-3))
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_d_of_the_published_signs_matches_the_table(name: str) -> None:
-    np.testing.assert_array_equal(airframe_facts(load_airframe(name)).D, D_AS_PUBLISHED[name])
+def test_d_of_the_published_signs_matches_the_table(airframe: Airframe) -> None:
+    np.testing.assert_array_equal(airframe_facts(airframe).D, PUBLISHED[airframe.name].D)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_flipping_inputs_alone_gives_every_airframe_d_equal_to_one(name: str) -> None:
+def test_flipping_inputs_alone_gives_every_airframe_d_equal_to_one(airframe: Airframe) -> None:
     # Remark 1 is a statement about sign conventions.
-    facts = airframe_facts(load_airframe(name))
+    facts = airframe_facts(airframe)
     assert facts.pairing is not None
     assert facts.pairing.outputs == facts.pairing.inputs == tuple(range(facts.m))
-    assert facts.pairing.signs == D_AS_PUBLISHED[name]
+    assert facts.pairing.signs == PUBLISHED[airframe.name].D
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_coupling_in_published_units_matches_the_table(name: str) -> None:
-    airframe = load_airframe(name)
+def test_coupling_in_published_units_matches_the_table(airframe: Airframe) -> None:
+    tolerance = 0.05 if airframe.name.startswith("aerosonde_first") else 0.006
     found = coupling(airframe.matrix_c() @ np.array(airframe.B))
-    assert found == pytest.approx(COUPLING_IN_PUBLISHED_UNITS[name], abs=0.05 if name.startswith("aerosonde_first") else 0.006)
+    assert found == pytest.approx(PUBLISHED[airframe.name].coupling, abs=tolerance)
 
 
 @pytest.mark.parametrize(("name", "published", "si"), [("f16_longitudinal", 0.989, 0.302), ("b747_longitudinal", 0.607, 0.282)])
@@ -125,11 +120,10 @@ def test_coupling_depends_on_the_unit_of_speed(name: str, published: float, si: 
     assert airframe_facts(airframe).coupling == pytest.approx(si, abs=1e-3)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_airframe_is_in_the_theorem_with_zero_dynamics_that_only_an_outer_loop_bounds(name: str) -> None:
+def test_every_airframe_is_in_the_theorem_with_zero_dynamics_that_only_an_outer_loop_bounds(airframe: Airframe) -> None:
     # theta (longitudinal) and phi (lateral) integrate the rates. Each gives a zero at the origin: never strictly stable.
-    facts = airframe_facts(load_airframe(name))
-    angles = [state for state in load_airframe(name).states if state in ("theta", "phi")]
+    facts = airframe_facts(airframe)
+    angles = [state for state in airframe.states if state in ("theta", "phi")]
     assert facts.controllable
     assert facts.zero_dynamics is ZeroDynamics.MARGINAL
     assert np.count_nonzero(np.abs(facts.zeros) < 1e-9) == len(angles)

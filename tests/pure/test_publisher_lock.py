@@ -27,9 +27,8 @@ def locked(*senders: tuple[str, int]) -> PublisherLock:
 def test_samples_of_a_conflicting_publisher_are_ignored_until_the_first_one_times_out() -> None:
     lock = locked(("/aircraft#1", 0), ("/aircraft#1", 90))
     for other in ("/aircraft#2", "/foreign", ""):
-        with pytest.raises(
-            ChannelError, match=f"conflicting publisher {other} ignored: already receiving from /aircraft#1"
-        ) as ignored:
+        sentence = f"conflicting publisher {other} ignored: already receiving from /aircraft#1"
+        with pytest.raises(ChannelError, match=sentence) as ignored:
             lock.check(other, 190, MAX_AGE, TAKEOVER)
         assert ignored.value.reason == "sender"
     lock.check("/aircraft#1", 10_000, MAX_AGE, TAKEOVER)  # the locked publisher itself, after any time

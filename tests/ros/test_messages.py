@@ -2,33 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Named vectors as bytes: against the independent serialisation of rosbags, and against the middleware."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message
-from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from tests.joint_states import vector
 
-from flight_core.vectors import ChannelError
+from flight_core.rates import NANOSECONDS
+from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.messages import NO_CHANNELS, Decoder, Encoder, instant, stamp_of, to_message
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
-TYPES: dict[str, Any] = STORE.types
 NAMES = st.lists(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12), max_size=6, unique=True)
 STAMPS = st.integers(0, 2**31 * 10**9 - 1)
 
 
-def independent(stamp_ns: int, names: list[str], values: list[float], frame_id: str) -> bytes:
-    """The same message, serialised by rosbags."""
-    stamp = TYPES["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-    header = TYPES["std_msgs/msg/Header"](stamp, frame_id)
-    none = np.zeros(0)
-    message = TYPES["sensor_msgs/msg/JointState"](header, names, np.array(values), none, none)
-    return bytes(STORE.serialize_cdr(message, "sensor_msgs/msg/JointState"))
+def decoded(decoder: Decoder, raw: bytes) -> StampedVector:
+    sample = decoder.decode(raw)
+    assert sample is not None
+    return sample
 
 
 @given(NAMES, st.data(), STAMPS, st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20))
@@ -38,7 +32,7 @@ def test_a_sample_is_encoded_as_an_independent_library_encodes_it(
     values = data.draw(st.lists(st.floats(), min_size=len(names), max_size=len(names)))
     encoder = Encoder(names, frame_id)
     encoder.encode(1, np.zeros(len(names)))  # an earlier sample leaves no trace
-    assert encoder.encode(stamp_ns, np.array(values)) == independent(stamp_ns, names, values, frame_id)
+    assert encoder.encode(stamp_ns, np.array(values)) == vector(stamp_ns, names, values, frame_id)
 
 
 def test_the_middleware_reads_what_was_encoded() -> None:
@@ -54,8 +48,7 @@ def test_wanted_channels_are_decoded_by_name_with_and_without_a_known_layout(
 ) -> None:
     decoder, encoder = Decoder(("p", "V")), Encoder(names, "/aircraft#1")
     for _ in range(2):  # the second sample has a known layout
-        sample = decoder.decode(encoder.encode(stamp_ns, np.array(values)))
-        assert sample is not None
+        sample = decoded(decoder, encoder.encode(stamp_ns, np.array(values)))
         assert (sample.stamp_ns, sample.sender) == (stamp_ns, "/aircraft#1")
         assert sample.value.tolist() == [values[names.index("p")], values[names.index("V")]]
 
@@ -63,9 +56,7 @@ def test_wanted_channels_are_decoded_by_name_with_and_without_a_known_layout(
 def test_a_decoder_follows_a_change_of_channel_names_or_publisher() -> None:
     decoder = Decoder(("q",))
     for names, frame_id in ((("q", "V"), "a"), (("V", "q"), "a"), (("q",), "b"), (("q", "V"), "a")):
-        raw = Encoder(names, frame_id).encode(5, np.array([float(name == "q") for name in names]))
-        sample = decoder.decode(raw)
-        assert sample is not None
+        sample = decoded(decoder, Encoder(names, frame_id).encode(5, np.array([float(name == "q") for name in names])))
         assert (sample.value.tolist(), sample.sender) == ([1.0], frame_id)
 
 
@@ -73,37 +64,32 @@ def test_a_vector_without_channels_is_no_sample() -> None:
     assert Decoder(("q",)).decode(Encoder((), "aircraft").encode(7, NO_CHANNELS)) is None
 
 
+GOOD = Encoder(("q", "V"), "a").encode(1, np.array([1.0, 2.0]))
+
+
 def invalid_samples() -> list[tuple[str, bytes]]:
-    good = Encoder(("q", "V"), "a").encode(1, np.array([1.0, 2.0]))
-    nan = Encoder(("q", "V"), "a").encode(2, np.array([np.nan, 2.0]))
     return [
-        ("finite", nan),
+        ("finite", Encoder(("q", "V"), "a").encode(2, np.array([np.nan, 2.0]))),
         ("name", Encoder(("q", "x"), "a").encode(1, np.zeros(2))),
-        ("malformed", good[:40]),
+        ("malformed", GOOD[:40]),
         ("malformed", b""),
-        ("length", bytes(independent(1, ["q", "V"], [1.0], "a"))),
+        ("length", vector(1, ["q", "V"], [1.0], "a")),
     ]
 
 
 @pytest.mark.parametrize(("reason", "raw"), invalid_samples())
 @pytest.mark.parametrize("known_layout", [False, True])
 def test_an_invalid_message_is_rejected_with_its_reason(reason: str, raw: bytes, known_layout: bool) -> None:
-    decoder, good = Decoder(("q", "V")), Encoder(("q", "V"), "a").encode(1, np.array([1.0, 2.0]))
+    decoder = Decoder(("q", "V"))
     if known_layout:
-        decoder.decode(good)
+        decoder.decode(GOOD)
     with pytest.raises(ChannelError) as rejected:
         decoder.decode(raw)
     assert rejected.value.reason == reason
-    sample = decoder.decode(good)
-    assert sample is not None
-    assert sample.value.tolist() == [1.0, 2.0]
+    assert decoded(decoder, GOOD).value.tolist() == [1.0, 2.0]
 
 
 def test_a_message_with_velocities_is_read_by_its_positions() -> None:
-    header = TYPES["std_msgs/msg/Header"](TYPES["builtin_interfaces/msg/Time"](1, 0), "x")
-    message = TYPES["sensor_msgs/msg/JointState"](header, ["q"], np.array([3.0]), np.array([9.0]), np.zeros(0))
-    decoder, raw = Decoder(("q",)), bytes(STORE.serialize_cdr(message, "sensor_msgs/msg/JointState"))
+    decoder, raw = Decoder(("q",)), vector(NANOSECONDS, ["q"], [3.0], "x", velocity=[9.0])
     for _ in range(2):
-        sample = decoder.decode(raw)
-        assert sample is not None
-        assert sample.value.tolist() == [3.0]
+        assert decoded(decoder, raw).value.tolist() == [3.0]
