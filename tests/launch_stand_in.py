@@ -59,15 +59,13 @@ class RosNode:
 
     def __init__(self) -> None:
         self.subscriptions: dict[str, Callable[[Any], None]] = {}
-        self.timers: list[float] = []
 
     def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
         """Keep the callback by the topic."""
         self.subscriptions[topic] = callback
 
     def create_timer(self, period: float, callback: Callable[[], None]) -> None:
-        """Keep the period."""
-        self.timers.append(period)
+        """Accept a timer, which never fires here."""
 
 
 def get_ros_node(context: LaunchContext) -> RosNode:

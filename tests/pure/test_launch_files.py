@@ -5,13 +5,13 @@
 Checked: the arguments, the start order of the processes by their `node_state`, their parameters, and the effect of their end.
 """
 
-import importlib.util
 import os
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 import typer
@@ -19,20 +19,7 @@ import yaml
 from diagnostic_msgs.msg import KeyValue
 from tests import launch_stand_in as stand_in
 from tests.conftest import REPOSITORY
-from tests.launch_stand_in import (
-    DeclareLaunchArgument,
-    ExecutableInPackage,
-    ExecuteProcess,
-    LaunchConfiguration,
-    LaunchContext,
-    LogInfo,
-    Node,
-    OpaqueFunction,
-    ProcessExited,
-    RegisterEventHandler,
-    Shutdown,
-    TimerAction,
-)
+from tests.launch_stand_in import ExecuteProcess, LaunchContext, Node, OpaqueFunction, ProcessExited, TimerAction
 
 from autopilot_bridge.params import LIBRARY, BridgeParameters, load_map
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
@@ -49,12 +36,12 @@ app = application([*COMMANDS])
 
 FILES = sorted((REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "launch").glob("*.launch.py"))
 INSTALLED = REPOSITORY / "ros_ws" / "install"
-NODES: dict[str, type[Parameters]] = {
-    **{name: schema for name, schema in SCHEMAS.items() if name != "flight"},
-    "bridge": BridgeParameters,
-}
+NODES: dict[str, type[Parameters]] = {name: schema for name, schema in SCHEMAS.items() if name != "flight"}
+NODES["bridge"] = BridgeParameters
 SHARED = "flight_bringup.launch.stages"
 PID = 0  # of a process of this launch
+T = TypeVar("T")
+Case = tuple[list[Any], LaunchContext, tuple[str, ...], tuple[str, ...]]
 
 
 @pytest.fixture(autouse=True)
@@ -83,31 +70,26 @@ def process() -> Iterator[None]:
 def described(name: str) -> Sequence[Any]:
     """The entities of a launch file."""
     path = next(file for file in FILES if file.name == f"{name}.launch.py")
-    spec = importlib.util.spec_from_file_location(f"{name}_launch", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    entities: Sequence[Any] = module.generate_launch_description().entities
+    entities: Sequence[Any] = runpy.run_path(str(path))["generate_launch_description"]().entities
     return entities
 
 
 def started(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
     """The actions of a launch with arguments, and its context. `pushed` is the namespace of a launch file that includes it."""
     entities = described(name)
-    declared = {one.name: one.default_value for one in entities if isinstance(one, DeclareLaunchArgument)}
+    declared = {one.name: one.default_value for one in every(stand_in.DeclareLaunchArgument, entities)}
     assert given.keys() <= declared.keys()
     context = LaunchContext(**{key: value for key, value in declared.items() if value is not None})
     context.launch_configurations.update({key: str(value) for key, value in given.items()})
     if pushed:
         context.launch_configurations["ros_namespace"] = pushed
-    (function,) = [one.function for one in entities if isinstance(one, OpaqueFunction)]
-    return list(function(context) or ()), context
+    (preparation,) = every(OpaqueFunction, entities)
+    return list(preparation.function(context) or ()), context
 
 
 def nodes(actions: Sequence[Any]) -> dict[str, Node]:
     """The nodes among actions, by their executables."""
-    return {one.executable: one for one in actions if isinstance(one, Node)}
+    return {one.executable: one for one in every(Node, actions)}
 
 
 def overrides(node: Node) -> dict[str, Any]:
@@ -137,7 +119,12 @@ def all_ready(actions: Sequence[Any], context: LaunchContext, namespace: str = "
 
 
 def ends(actions: Sequence[Any]) -> bool:
-    return any(isinstance(one, Shutdown) for one in actions)
+    return bool(every(stand_in.Shutdown, actions))
+
+
+def every(kind: type[T], actions: Sequence[Any]) -> list[T]:
+    """The actions of a kind."""
+    return [one for one in actions if isinstance(one, kind)]
 
 
 @pytest.fixture
@@ -168,7 +155,7 @@ def test_every_launch_file_is_installed_and_tested_here() -> None:
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_every_argument_is_described_and_its_default_is_one_of_its_choices(path: Path) -> None:
-    arguments = [one for one in described(path.name.removesuffix(".launch.py")) if isinstance(one, DeclareLaunchArgument)]
+    arguments = every(stand_in.DeclareLaunchArgument, described(path.name.removesuffix(".launch.py")))
     assert len({one.name for one in arguments}) == len(arguments) > 3
     for one in arguments:
         assert one.description, one.name
@@ -178,35 +165,31 @@ def test_every_argument_is_described_and_its_default_is_one_of_its_choices(path:
             assert one.default_value not in {"true", "false"}, f"{one.name} needs choices"
 
 
-@pytest.mark.parametrize(
-    ("name", "given", "first", "then"), CASES, ids=lambda one: "-".join(one) if isinstance(one, dict) else ""
-)
-def test_nodes_start_in_order_with_parameters_that_they_have(
-    name: str, given: dict[str, str], first: tuple[str, ...], then: tuple[str, ...], short: Path, tmp_path: Path
-) -> None:
+@pytest.fixture(params=CASES, ids=lambda case: "-".join((case[0], *case[1])))
+def case(request: pytest.FixtureRequest, short: Path, tmp_path: Path) -> Case:
+    """A launch: its actions, its context, and the nodes expected in its first and its second stage."""
+    name, given, first, then = request.param
     log = {"run": str(short)} if name == "replay" else {}
-    actions, context = started(name, **given, **log, runs=tmp_path / "runs")
+    return (*started(name, **given, **log, runs=tmp_path / "runs"), first, then)
+
+
+def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None:
+    actions, context, first, then = case
     follow = all_ready(actions, context)
     assert tuple(nodes(actions)) == first
     assert tuple(nodes(follow)) == then
     assert context.launch_configurations["launch-prefix"].endswith("setpriv --pdeathsig TERM")
     for executable, node in {**nodes(actions), **nodes(follow)}.items():
         assert (INSTALLED / node.package / "lib" / node.package / executable).is_file()
-        assert node.namespace == LaunchConfiguration("namespace")
+        assert node.namespace == stand_in.LaunchConfiguration("namespace")
         assert node.exec_name == executable
         file, given_to_node = node.parameters
         section = {} if executable == "bridge" else read_sections(Path(file), tuple(SCHEMAS))[executable]
         NODES[executable].validate_mapping(section | given_to_node, executable)
 
 
-@pytest.mark.parametrize(
-    ("name", "given", "first", "then"), CASES, ids=lambda one: "-".join(one) if isinstance(one, dict) else ""
-)
-def test_the_end_of_any_node_ends_the_launch_with_an_error(
-    name: str, given: dict[str, str], first: tuple[str, ...], then: tuple[str, ...], short: Path, tmp_path: Path
-) -> None:
-    log = {"run": str(short)} if name == "replay" else {}
-    actions, context = started(name, **given, **log, runs=tmp_path / "runs")
+def test_the_end_of_any_node_ends_the_launch_with_an_error(case: Case) -> None:
+    actions, context, *_ = case
     for executable, node in {**nodes(actions), **nodes(all_ready(actions, context))}.items():
         assert node.on_exit is not None
         for status in (0, 3, -9):
@@ -240,7 +223,7 @@ def test_the_states_of_a_flight_are_those_in_its_namespace(namespace: str, pushe
 
 def test_no_line_of_the_output_starts_a_stage(tmp_path: Path) -> None:
     actions, context = started("fly", runs=tmp_path)
-    matchers = [one.event_handler.matcher for one in actions if isinstance(one, RegisterEventHandler)]
+    matchers = [one.event_handler.matcher for one in every(stand_in.RegisterEventHandler, actions)]
     assert matchers
     assert not any(matcher(ProcessExited("[INFO] [12.5] [controller]: ready", 0)) for matcher in matchers)
     assert set(context.ros_node.subscriptions) == {"/node_state"}
@@ -248,18 +231,18 @@ def test_no_line_of_the_output_starts_a_stage(tmp_path: Path) -> None:
 
 def test_a_node_that_is_not_ready_in_time_is_named(tmp_path: Path) -> None:
     actions, context = started("fly", runs=tmp_path)
-    (timer,) = [one for one in actions if isinstance(one, TimerAction)]
+    (timer,) = every(TimerAction, actions)
     (warn,) = timer.actions
     assert isinstance(warn, OpaqueFunction)
     assert publish(actions, context, f"/recorder#{PID}") == []
-    assert warn.function(context) == [LogInfo("timed out waiting for controller: not ready after 20 s")]
+    assert warn.function(context) == [stand_in.LogInfo("timed out waiting for controller: not ready after 20 s")]
     assert publish(actions, context, f"/controller#{PID}")
     assert warn.function(context) == []
 
 
 def test_a_flight_ends_after_its_duration_and_in_lockstep_when_the_aircraft_completes_it(tmp_path: Path) -> None:
     follow = all_ready(*started("fly", duration=5, runs=tmp_path))
-    (timer,) = [one for one in follow if isinstance(one, TimerAction)]
+    (timer,) = every(TimerAction, follow)
     assert timer.period == pytest.approx(5.5, abs=0.4)  # and the half second in which nodes discover each other
     assert ends(timer.actions)
     assert {"start_time"} == overrides(nodes(follow)["reference_model"]).keys() - {"lockstep"}
@@ -267,7 +250,7 @@ def test_a_flight_ends_after_its_duration_and_in_lockstep_when_the_aircraft_comp
     actions, context = started("fly", lockstep="true", duration=5, runs=tmp_path)
     follow = all_ready(actions, context)
     assert overrides(nodes(follow)["aircraft"])["duration"] == 5.0
-    assert not [one for one in follow if isinstance(one, TimerAction)]
+    assert not every(TimerAction, follow)
     for key, state in ((f"/aircraft#{PID}", NodeState.READY), (f"/controller#{PID}", NodeState.COMPLETED)):
         assert not publish(follow, context, key, state)
     assert ends(publish(follow, context, f"/aircraft#{PID}", NodeState.COMPLETED))
@@ -283,9 +266,9 @@ def test_a_bridge_is_a_dry_run_by_default_and_its_topics_are_recorded(tmp_path: 
     assert bridge["map"] in recorder["attach"]
     follow = all_ready(*started("bridge", map="ardupilot", dry_run="false", runs=tmp_path))
     assert overrides(nodes(follow)["bridge"])["dry_run"] is False
-    assert not [one for one in follow if isinstance(one, TimerAction)]  # until Ctrl-C
+    assert not every(TimerAction, follow)  # until Ctrl-C
     follow = all_ready(*started("bridge", map="ardupilot", duration=5, runs=tmp_path))
-    (timer,) = [one for one in follow if isinstance(one, TimerAction)]
+    (timer,) = every(TimerAction, follow)
     assert ends(timer.actions)
 
 
@@ -299,14 +282,14 @@ def test_a_bridge_with_a_flipped_sign_is_refused_before_anything_starts(tmp_path
 
 
 def player(actions: Sequence[Any]) -> ExecuteProcess:
-    (process,) = [one for one in actions if isinstance(one, ExecuteProcess)]
+    (process,) = every(ExecuteProcess, actions)
     return process
 
 
 def options(process: ExecuteProcess) -> dict[str, Any]:
     """The options of `rise-di play` on its command line."""
     executable, command, *words = process.cmd
-    assert executable == ExecutableInPackage(package="flight_cli", executable="rise-di")
+    assert executable == stand_in.ExecutableInPackage(package="flight_cli", executable="rise-di")
     assert (INSTALLED / executable.package / "lib" / executable.package / executable.executable).is_file()
     group = typer.main.get_command(app)
     assert isinstance(group, typer.core.TyperGroup)

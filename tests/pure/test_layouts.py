@@ -35,16 +35,8 @@ CURVES = {
 TABS = {"tracking": 4, "error": 4, "input": 4, "integrals": 8, "controller": 4, "wind": 3}  # title: number of plots
 COLOUR = re.compile("#[0-9a-f]{6}")
 
-PANEL = {
-    "showXAxisLabels": True,
-    "showYAxisLabels": True,
-    "showLegend": True,
-    "legendDisplay": "floating",
-    "showPlotValuesInLegend": False,
-    "isSynced": True,
-    "xAxisVal": "timestamp",
-    "sidebarDimension": 240,
-}
+SHOWN = dict.fromkeys(("showXAxisLabels", "showYAxisLabels", "showLegend", "isSynced"), True)
+PANEL = SHOWN | {"showPlotValuesInLegend": False, "legendDisplay": "floating", "xAxisVal": "timestamp", "sidebarDimension": 240}
 """The fixed part of a Plot panel of Foxglove."""
 
 
@@ -62,8 +54,8 @@ def leaves(tree: Any) -> Iterator[str]:
     assert set(tree) == {"direction", "first", "second", "splitPercentage"}
     assert tree["direction"] in {"row", "column"}
     assert 0 < tree["splitPercentage"] < 100
-    yield from leaves(tree["first"])
-    yield from leaves(tree["second"])
+    for part in ("first", "second"):
+        yield from leaves(tree[part])
 
 
 def test_the_command_writes_both_layouts(tmp_path: Path) -> None:

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rosbags.typesys import Stores, get_typestore
+from tests.joint_states import STORE
+from tests.recordings import EPOCH, MS, scenario_file, truncate
 from typer.testing import CliRunner, Result
 
 from aircraft_sim.airframe import load_airframe
@@ -40,14 +40,13 @@ from rise_di_controller.params import ControllerParameters
 
 app = application([*COMMANDS])
 
-MS = 1_000_000
-EPOCH = 1_790_000_000_000_000_000  # ns, a stamp in real time, which float64 does not resolve to 1 ns
 GUST = find_scenario("osprey_gust").vary(
     flight={"duration": 4.0}, aircraft={"gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}}
 )
 SERVO = find_scenario("osprey_servo").vary(flight={"duration": 4.0})
 LEADING = with_feedforward(SERVO.controller, load_airframe("osprey"))
-LOST = {"noise": [0.0017, 0.03, 0.0017, 0.0017], "delay": 0.01, "dropout": 0.6, "seed": 3}
+LOST = {"rate": 100.0, "sensors": {"noise": [0.0017, 0.03, 0.0017, 0.0017], "delay": 0.01, "dropout": 0.6, "seed": 3}}
+SHORT = {"max_age": 0.025, "hold": 0.01, "ramp": 0.03}
 
 SCENARIOS = {
     "osprey_gust": GUST,
@@ -55,13 +54,8 @@ SCENARIOS = {
     "literal sign": GUST.vary(controller={"sign": "literal"}),
     "feedforward": SERVO.vary(controller=LEADING.model_dump()),
     "all limits reached": GUST.vary(controller={"lower": [-0.01] * 4, "upper": [0.002] * 4, "slew": [0.05, 0.05, 0.05, 0.02]}),
-    "samples late and lost": SERVO.vary(
-        aircraft={"rate": 100.0, "sensors": LOST}, controller={"max_age": 0.025, "hold": 0.01, "ramp": 0.03}
-    ),
-    "feedforward, samples late and lost": SERVO.vary(
-        aircraft={"rate": 100.0, "sensors": LOST},
-        controller=LEADING.model_dump() | {"max_age": 0.025, "hold": 0.01, "ramp": 0.03},
-    ),
+    "samples late and lost": SERVO.vary(aircraft=LOST, controller=SHORT),
+    "feedforward, samples late and lost": SERVO.vary(aircraft=LOST, controller=LEADING.model_dump() | SHORT),
 }
 
 
@@ -144,6 +138,7 @@ EVENTS = st.sampled_from(["", "", "", "", "configured", "replaced"])
 ACTIVE = st.sampled_from([True, True, True, False])
 TICKS = st.lists(st.builds(Tick, AGES, AGES, st.integers(0, 9000), ACTIVE, EVENTS, st.just(())), min_size=2)
 QUICK = {"max_age": 0.03, "hold": 0.02, "ramp": 0.03}
+PATIENT = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
 
 
 @settings(deadline=None)
@@ -156,29 +151,25 @@ def test_a_replay_equals_a_flight_with_late_and_lost_samples(ticks: list[Tick], 
     assert equal(result), result.first()
 
 
-@pytest.mark.parametrize(
-    ("events", "modes"),
-    [
-        ([LOST_Y] * 40 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.TRIM, Mode.ENGAGED]),
-        ([LOST_Y_M] * 12 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]),  # y is fresh but unused
-        ([OFF] * 4 + [FLY] * 3, [Mode.ENGAGED, Mode.INACTIVE, Mode.ENGAGED]),
-        (
-            [Tick(y_age=None, active=False)] * 5 + [LOST_Y] * 2 + [FLY] * 3,
-            [Mode.ENGAGED, Mode.INACTIVE, Mode.HOLD, Mode.ENGAGED],
-        ),
-        (
-            [LOST_Y] * 5 + [Tick(y_age=20, y_m_age=20)] * 3,
-            [Mode.ENGAGED, Mode.HOLD, Mode.ENGAGED],
-        ),  # its stamp is older
-        ([Tick(event="configured")] + [FLY] * 3, [Mode.ENGAGED]),
-        ([Tick(late=8000), LOST_Y, LOST_Y, FLY], [Mode.ENGAGED]),  # dt of 38 ms
-    ],
-    ids=["y lost", "y_m lost", "deactivated", "activated without y", "engaged by a late y", "configured again", "late"],
-)
+MODES: dict[str, tuple[list[Tick], list[Mode]]] = {
+    "y lost": ([LOST_Y] * 40 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.TRIM, Mode.ENGAGED]),
+    # y is fresh but unused
+    "y_m lost": ([LOST_Y_M] * 12 + [FLY] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]),
+    "deactivated": ([OFF] * 4 + [FLY] * 3, [Mode.ENGAGED, Mode.INACTIVE, Mode.ENGAGED]),
+    "activated without y": (
+        [Tick(y_age=None, active=False)] * 5 + [LOST_Y] * 2 + [FLY] * 3,
+        [Mode.ENGAGED, Mode.INACTIVE, Mode.HOLD, Mode.ENGAGED],
+    ),
+    # its stamp is older
+    "engaged by a late y": ([LOST_Y] * 5 + [Tick(y_age=20, y_m_age=20)] * 3, [Mode.ENGAGED, Mode.HOLD, Mode.ENGAGED]),
+    "configured again": ([Tick(event="configured")] + [FLY] * 3, [Mode.ENGAGED]),
+    "late": ([Tick(late=8000), LOST_Y, LOST_Y, FLY], [Mode.ENGAGED]),  # dt of 38 ms
+}
+
+
+@pytest.mark.parametrize(("events", "modes"), MODES.values(), ids=MODES)
 def test_a_replay_passes_the_same_modes(events: list[Tick], modes: list[Mode]) -> None:
-    parameters = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
-    tape = driven(parameters, [FLY] * 20 + events)
-    result = replay(tape, parameters)
+    result = replay(driven(PATIENT, [FLY] * 20 + events), PATIENT)
     assert equal(result), result.first()
     recorded = result.recorded[:, result.names.index("mode")].tolist()
     assert [mode for k, mode in enumerate(recorded) if k == 0 or recorded[k - 1] != mode] == modes
@@ -257,12 +248,8 @@ def test_one_bit_of_one_sample_is_found_and_only_there(topic: str, channels: lis
 
 
 def test_differences_are_counted_in_units_in_the_last_place() -> None:
-    for recorded, computed, ulps in (
-        (1.0, math.nextafter(1.0, 2), 1),
-        (-5e-324, 5e-324, 2),
-        (0.0, -0.0, 0),
-        (1.0, math.nan, None),
-    ):
+    cases = ((1.0, math.nextafter(1.0, 2), 1), (-5e-324, 5e-324, 2), (0.0, -0.0, 0), (1.0, math.nan, None))
+    for recorded, computed, ulps in cases:
         yes = np.ones(1, dtype=bool)
         pair = np.array([[recorded]]), np.array([[computed]])
         result = ReplayResult(("u.a",), np.ones(1, dtype=np.int64), np.zeros(1), *pair, yes, ~yes, ())
@@ -277,10 +264,9 @@ def test_differences_are_counted_in_units_in_the_last_place() -> None:
 def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
     """The tape with those samples of `internals` and `u` whose numbers `keep` accepts."""
     kept = np.asarray(keep(tape["internals"]["number"]), dtype=bool)
-    signals = dict(tape.signals)
-    for name in ("internals", "u"):
-        signals[name] = Signal(tape[name].stamp_ns[kept], tape[name].names, tape[name].values[kept])
-    return replace(tape, signals=signals)
+    pair = {name: tape[name] for name in ("internals", "u")}
+    cut = {name: Signal(one.stamp_ns[kept], one.names, one.values[kept]) for name, one in pair.items()}
+    return replace(tape, signals={**tape.signals, **cut})
 
 
 @pytest.mark.parametrize("name", ["osprey_gust", "feedforward"])
@@ -308,12 +294,11 @@ def test_one_bit_of_one_gain_is_found_after_a_gap(name: str) -> None:
 
 
 def test_after_a_gap_in_which_the_failsafe_began_checks_resume_at_the_next_engagement() -> None:
-    parameters = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
-    tape = driven(parameters, [FLY] * 20 + [LOST_Y] * 20 + [FLY] * 20 + [LOST_Y] * 20)
-    whole = replay(tape, parameters)
+    tape = driven(PATIENT, [FLY] * 20 + [LOST_Y] * 20 + [FLY] * 20 + [LOST_Y] * 20)
+    whole = replay(tape, PATIENT)
     first_held = int(whole.number[whole.recorded[:, 0] != Mode.ENGAGED][0])
     # Without this sample the log does not tell when the failsafe began.
-    result = replay(without(tape, lambda number: number != first_held), parameters)
+    result = replay(without(tape, lambda number: number != first_held), PATIENT)
     assert result.first() is None
     unchecked = result.number[~result.checked]
     modes = result.recorded[~result.checked, 0]
@@ -349,13 +334,8 @@ def test_gains_changed_in_flight_differ_from_the_tick_of_the_change() -> None:
 
 
 def test_a_replay_applies_successive_gain_changes_one_by_one() -> None:
-    changes: list[dict[str, Any]] = [
-        {"k_g": 2.0},
-        {"Lambda": [3.0, 4.0, 2.0, 1.0]},
-        {"k_g": 3.3},
-        {"slew": [0.2] * 4},
-        {"k_g": 1.0},
-    ]
+    changes: list[dict[str, Any]] = [{"k_g": 2.0}, {"Lambda": [3.0, 4.0, 2.0, 1.0]}]
+    changes += [{"k_g": 3.3}, {"slew": [0.2] * 4}, {"k_g": 1.0}]
     ticks = [FLY] * 30 + [Tick(changes=(*changes[:3],))] + [FLY] * 10 + [Tick(changes=(change,)) for change in changes[3:]]
     result = replay(driven(GUST.controller, ticks + [FLY] * 5), GUST.controller, changes=changes)
     assert equal(result), result.first()
@@ -386,10 +366,9 @@ def test_an_open_loop_equals_the_controller_on_the_recorded_inputs() -> None:
 
 
 def test_an_open_loop_continues_over_gaps_and_lost_inputs() -> None:
-    parameters = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
-    tape = driven(parameters, [FLY] * 20 + [LOST_Y] * 20 + [FLY] * 20)
+    tape = driven(PATIENT, [FLY] * 20 + [LOST_Y] * 20 + [FLY] * 20)
     tape = without(tape, lambda number: (number > 5) & (number != 15))
-    result = replay(tape, parameters, vary(parameters, {"k_g": 3.0}))
+    result = replay(tape, PATIENT, vary(PATIENT, {"k_g": 3.0}))
     assert result.checked.all()
     assert np.isfinite(result.computed).all()
     u = result.group(result.computed, "u").values
@@ -403,9 +382,8 @@ def test_a_log_of_other_channels_is_refused() -> None:
     tape = simulate(GUST.vary(flight={"duration": 0.1}))
     log = tape["internals"]
     less = replace(tape, signals={"internals": Signal(log.stamp_ns, ("mood", *log.names[1:]), log.values)})
-    with pytest.raises(
-        ParameterError, match="internals: found no mode, also mood, expected the channels of the scenario in the log"
-    ):
+    sentence = "internals: found no mode, also mood, expected the channels of the scenario in the log"
+    with pytest.raises(ParameterError, match=sentence):
         replay(less, GUST.controller)
     with pytest.raises(ParameterError, match="the log: found no sample of internals"):
         replay(Tape({"y": tape["y"]}), GUST.controller)
@@ -438,39 +416,29 @@ def test_each_parameter_set_has_its_own_digest() -> None:
     assert 0 <= digest < 2**48
     assert int(float(digest)) == digest
     assert vary(GUST.controller, {"lockstep": True, "y_rate": 500.0, "autostart": False}).digest() == digest
-    others = [
-        vary(GUST.controller, {"k_g": flipped(1.0)}),
-        vary(GUST.controller, {"upper": [1.0] * 4}),
-        vary(GUST.controller, {"sign": "implicit"}),
-        SERVO.controller,
-        LEADING,
-    ]
+    changes: tuple[dict[str, Any], ...] = ({"k_g": flipped(1.0)}, {"upper": [1.0] * 4}, {"sign": "implicit"})
+    others = [*(vary(GUST.controller, change) for change in changes), SERVO.controller, LEADING]
     assert len({digest, *(other.digest() for other in others)}) == 6
 
 
 # The command
 
 
-def scenario_file(folder: Path, **sections: Mapping[str, Any]) -> Path:
-    """The default scenario with changes and commands on all channels, 2 s."""
-    tree = yaml.safe_load(GUST.path.read_text(encoding="utf-8"))
-    tree["/**/flight"]["ros__parameters"]["duration"] = 2.0
-    tree["/**/reference_model"]["ros__parameters"]["pulses"] = BUSY
-    for name, changes in sections.items():
-        tree[f"/**/{name}"]["ros__parameters"] |= changes
+def busy_scenario(folder: Path, **controller: object) -> Path:
+    """The default scenario with changes to the controller and commands on all channels, 2 s."""
+    flight, reference_model = {"duration": 2.0}, {"pulses": BUSY}
     path = folder / "busy.yaml"
-    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
-    return path
+    return scenario_file(path, GUST.path, flight=flight, reference_model=reference_model, controller=controller)
 
 
 @pytest.fixture(scope="module")
 def tape(tmp_path_factory: pytest.TempPathFactory) -> Tape:
-    return simulate(load_scenario(scenario_file(tmp_path_factory.mktemp("scenario"))))
+    return simulate(load_scenario(busy_scenario(tmp_path_factory.mktemp("scenario"))))
 
 
 @pytest.fixture
 def run(tape: Tape, tmp_path: Path) -> Path:
-    return write_run(tape, tmp_path / "run", LogAttachments(scenario_file(tmp_path))).parent
+    return write_run(tape, tmp_path / "run", LogAttachments(busy_scenario(tmp_path))).parent
 
 
 def command(*arguments: str) -> Result:
@@ -484,7 +452,7 @@ def test_the_command_counts_the_ticks(run: Path) -> None:
 
 def test_the_command_finds_one_bit_of_one_gain_in_the_scenario_of_the_log(tape: Tape, tmp_path: Path) -> None:
     gains = [flipped(5.0), 5.0, 3.0, 0.5]
-    run = write_run(tape, tmp_path / "run", LogAttachments(scenario_file(tmp_path, controller={"Lambda": gains}))).parent
+    run = write_run(tape, tmp_path / "run", LogAttachments(busy_scenario(tmp_path, Lambda=gains))).parent
     result = command(str(run))
     assert result.exit_code == 1
     first, count, note = result.stdout.splitlines()
@@ -495,7 +463,7 @@ def test_the_command_finds_one_bit_of_one_gain_in_the_scenario_of_the_log(tape: 
         "note: 201 ticks, from tick 1 at t = 0 s on, flew with other parameters than the log holds: changed in"
     )
     # the same by --set, on the log with the right ones, and as JSON
-    right = write_run(tape, tmp_path / "right", LogAttachments(scenario_file(tmp_path))).parent
+    right = write_run(tape, tmp_path / "right", LogAttachments(busy_scenario(tmp_path))).parent
     result = command(str(right), "--set", f"controller.Lambda={gains}", "--json")
     assert result.exit_code == 1
     summary = json.loads(result.stdout)
@@ -504,10 +472,7 @@ def test_the_command_finds_one_bit_of_one_gain_in_the_scenario_of_the_log(tape: 
 
 
 def test_a_log_cut_short_is_checked_as_far_as_it_goes(run: Path) -> None:
-    file = run / "run_0.mcap"
-    whole = file.read_bytes()
-    file.write_bytes(whole[: len(whole) * 3 // 4])
-    (run / "metadata.yaml").unlink()
+    truncate(run, 0.75)
     summary = json.loads(command(str(run), "--json").stdout)
     assert summary["equal"]
     assert 20 < summary["ticks"] == summary["checked"] < 201
@@ -515,10 +480,8 @@ def test_a_log_cut_short_is_checked_as_far_as_it_goes(run: Path) -> None:
 
 
 def test_other_gains_are_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -> None:
-    csv_file = tmp_path / "u.csv"
-    result = command(
-        str(run), "--set", "controller.k_g=3.0", "--set", "controller.upper=[0.01, 1, 1, 1]", "--csv", str(csv_file)
-    )
+    csv_file, gains = tmp_path / "u.csv", ("--set", "controller.k_g=3.0", "--set", "controller.upper=[0.01, 1, 1, 1]")
+    result = command(str(run), *gains, "--csv", str(csv_file))
     assert result.exit_code == 1
     assert result.stdout.count(OPEN_LOOP) == 2  # over the table, and in the notes
     assert re.search(r"^ *elevator( +[\d.e-]+){4} *$", result.stdout, re.MULTILINE)
@@ -547,31 +510,23 @@ def test_an_invalid_setting_is_one_sentence(setting: str, sentence: str, run: Pa
 
 
 def test_a_log_without_scenario_or_controller_is_one_sentence(tape: Tape, tmp_path: Path) -> None:
-    scenario = scenario_file(tmp_path)
+    scenario = busy_scenario(tmp_path)
     alone = write_run(Tape({"y": tape["y"]}), tmp_path / "alone", LogAttachments(scenario)).parent
     short = Tape({name: one.until(0) for name, one in tape.signals.items()})
-    for run, sentence in (
-        (alone, "the log: found no sample of internals"),
-        (
-            write_run(without(short, lambda number: number < 1), tmp_path / "none", LogAttachments(scenario)).parent,
-            "the log: found no sample",
-        ),
-    ):
+    none = write_run(without(short, lambda number: number < 1), tmp_path / "none", LogAttachments(scenario)).parent
+    for run, sentence in ((alone, "the log: found no sample of internals"), (none, "the log: found no sample")):
         result = command(str(run))
         assert isinstance(result.exception, ParameterError)
         assert str(result.exception).startswith(sentence)
 
 
 def test_changes_of_parameters_are_read_from_the_log(tmp_path: Path) -> None:
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types: dict[str, Any] = store.types
+    types: dict[str, Any] = STORE.types
     time, value = types["builtin_interfaces/msg/Time"], types["rcl_interfaces/msg/ParameterValue"]
     parameter, event = types["rcl_interfaces/msg/Parameter"], types[PARAMETER_EVENT]
     none: dict[str, Any] = {"bool_value": False, "integer_value": 0, "double_value": 0.0, "string_value": ""}
-    none |= {
-        f"{kind}_array_value": np.zeros(0, dtype) for kind, dtype in (("byte", np.uint8), ("bool", bool), ("integer", np.int64))
-    }
-    none |= {"double_array_value": np.zeros(0), "string_array_value": []}
+    kinds = {"byte": np.uint8, "bool": bool, "integer": np.int64, "double": float}
+    none |= {f"{kind}_array_value": np.zeros(0, dtype) for kind, dtype in kinds.items()} | {"string_array_value": []}
 
     def one(name: str, kind: int, **field: Any) -> Any:
         return parameter(name, value(**(none | {"type": kind} | field)))
@@ -588,6 +543,6 @@ def test_changes_of_parameters_are_read_from_the_log(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "run") as bag:
         channel = bag.add_topic("/parameter_events", PARAMETER_EVENT, "")
         for number, message in enumerate(events):
-            bag.write(channel, number, number, number, bytes(store.serialize_cdr(message, PARAMETER_EVENT)))
+            bag.write(channel, number, number, number, bytes(STORE.serialize_cdr(message, PARAMETER_EVENT)))
     changes = parameter_changes(tmp_path / "run", "controller", ControllerParameters.model_fields)
     assert changes == [{"k_g": 2.5, "sign": "soft", "upper": None}, {"Lambda": [1.0, 2.0]}]
