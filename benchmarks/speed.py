@@ -5,8 +5,8 @@
     python -m benchmarks.speed [--only node] [--seconds 10] [--json FILE]
 
 Ratios carry over to other hosts, the figures do not. Neither is valid on a host that is busy with other work.
-The baselines (`floor`): one NumPy operation, a subscription of rclpy whose callback publishes the message again (an echo), an empty timer
-of rclpy, a loop that only sleeps, a node of rclpy that only spins, the writer of rosbags.
+The baselines (`floor`): one NumPy operation, a subscription of rclpy whose callback publishes the message again (an echo), an
+empty timer of rclpy, a loop that only sleeps, a node of rclpy that only spins, the writer of rosbags.
 """
 
 import argparse
@@ -53,7 +53,7 @@ SCENARIO = "osprey_gust"
 RATES = (100, 500, 1000)  # Hz
 EXECUTORS = ("single", "multi", "events")
 PRIORITY = 50  # SCHED_FIFO, as that of ros2_control
-FLOOR_SECONDS = 15.0  # floors are measured no longer than this
+FLOOR_SECONDS = 15.0  # longest measurement of a baseline
 NODE_RATE = 500.0  # Hz, at which callbacks are timed
 WARM_UP = 1.0  # s, excluded from the measurement of a process
 MATCHED_WITHIN = 20.0  # s
