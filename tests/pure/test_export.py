@@ -14,8 +14,7 @@ from tests.recordings import EPOCH
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.export import wide_table, write_csv, write_parquet, write_png
-from flight_analysis.report.recorded_flight import RecordedFlight
-from flight_analysis.report.summary import summarise
+from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.tape import Signal, Tape
 
 

@@ -18,9 +18,9 @@ from flight_analysis.report import comparison, figures, plotting
 from flight_analysis.report.figures import input_limits
 from flight_analysis.report.html import Page, TableGroup, page_html, write_page
 from flight_analysis.report.plotting import Interval, PlotContext, SampleStore, decimate, mask_spans
-from flight_analysis.report.recorded_flight import RecordedFlight
 from flight_analysis.report.summary import (
     DisplayUnit,
+    RecordedFlight,
     display_units,
     format_value,
     pulse_edges,
@@ -316,7 +316,8 @@ def test_both_integrals_of_an_output_stand_side_by_side() -> None:
 
 def test_the_spectrum_of_a_commanded_sine_has_its_peak_there() -> None:
     u = held(1001, elevator=np.sin(2.0 * np.pi * 5.0 * np.arange(1001) / 100.0), thrust=0.0)
-    figure = figures.spectrum_figure({"u": (flight(u=u), 10 * MS)}, {"u": figures.PLANT}, {"elevator": DisplayUnit("deg", 1 / DEG)})
+    units = {"elevator": DisplayUnit("deg", 1 / DEG)}
+    figure = figures.spectrum_figure({"u": (flight(u=u), 10 * MS)}, {"u": figures.PLANT}, units)
     assert figure is not None
     assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
     assert figure.data[0].x[np.argmax(figure.data[0].y)] == pytest.approx(5.0, abs=0.2)

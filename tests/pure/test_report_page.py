@@ -15,8 +15,7 @@ from tests.browser import CHROMIUM, Browser
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.html import write_page
-from flight_analysis.report.recorded_flight import RecordedFlight
-from flight_analysis.report.summary import summarise
+from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
 

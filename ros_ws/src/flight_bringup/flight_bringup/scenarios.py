@@ -3,6 +3,7 @@
 """The scenarios of the stack, and the file of a scenario's name."""
 
 from pathlib import Path
+from typing import Any
 
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_core.files import is_file
@@ -21,8 +22,9 @@ def scenarios() -> list[str]:
     return sorted(path.stem for path in (share() / "config").glob("*.yaml"))
 
 
-def find_scenario(name: str) -> Scenario:
-    """A scenario by its name in `config/`, or by the path of a file (.yaml). Raises ParameterError."""
+def find_scenario(name: str, duration: Any = None) -> Scenario:
+    """A scenario by its name in `config/`, or by the path of a file (.yaml), of a `duration` in s. Raises ParameterError."""
     path = Path(name) if name.endswith(".yaml") else share() / "config" / f"{name}.yaml"
     require(is_file(path), "scenario", f"{name!r}", f"one of {', '.join(scenarios())}, or the path of a scenario file (.yaml)")
-    return load_scenario(path.absolute())
+    scenario = load_scenario(path.absolute())
+    return scenario if duration is None else scenario.vary(flight={"duration": duration})

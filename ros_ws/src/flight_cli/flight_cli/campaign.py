@@ -10,7 +10,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.report.run_folder import REPORT, SUMMARY, new_run
@@ -20,7 +19,7 @@ from flight_campaign import engines
 from flight_campaign.campaign import Campaign, Definition, Sweep, define
 from flight_campaign.campaign_report import write_page
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
-from flight_cli.output import INTERRUPTED, display_path, new_table, progress_bar
+from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, SHOWN_COLUMN, display_path, new_table, progress_bar
 from flight_core.parameters import ParameterError, require
 
 RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
@@ -63,9 +62,7 @@ def campaign(
     if resume is not None:
         monte_carlo = Campaign.resume(resume)
     else:
-        chosen = find_scenario(str(scenario))
-        if duration is not None:
-            chosen = chosen.vary(flight={"duration": duration})
+        chosen = find_scenario(str(scenario), duration)
         definition = define(chosen, aircraft, uncertainty, seed, chunk, None if sweep is None else _parse_sweep(sweep))
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
@@ -99,16 +96,9 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
     if not missing:
         return None
     seconds, begin, done = definition.scenario().flight.duration, time.monotonic(), 0
-    columns = (
-        TextColumn("aircraft"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[shown]}"),
-    )
     try:
-        with progress_bar(*columns, quiet=quiet) as bar:
-            task = bar.add_task("campaign", total=total, completed=there, shown="compiling")
+        with progress_bar(*COUNT_COLUMNS, SHOWN_COLUMN, quiet=quiet) as bar:
+            task = bar.add_task("aircraft", total=total, completed=there, shown="compiling")
             for flights in monte_carlo.fly(engine):
                 done += flights
                 speed = done * seconds / (time.monotonic() - begin)
@@ -125,12 +115,11 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
 def _write_results(monte_carlo: Campaign) -> dict[str, Any]:
     """Write the summary, the report and the scenarios of the worst aircraft; returns the summary."""
     definition = monte_carlo.definition
-    cases = []
-    for case in range(definition.cases):
-        tally = monte_carlo.tally(case)
-        cases.append(
-            {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(monte_carlo, case, tally)}
-        )
+    tallies = [monte_carlo.tally(case) for case in range(definition.cases)]
+    cases = [
+        {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(monte_carlo, case, tally)}
+        for case, tally in enumerate(tallies)
+    ]
     figures = {
         "scenario": definition.name,
         "aircraft": definition.aircraft,
@@ -140,7 +129,7 @@ def _write_results(monte_carlo: Campaign) -> dict[str, Any]:
         "cases": cases,
     }
     (monte_carlo.folder / SUMMARY).write_text(json.dumps(figures, indent=1), encoding="utf-8")
-    write_page(monte_carlo.folder / REPORT, definition, [monte_carlo.tally(case) for case in range(definition.cases)], cases)
+    write_page(monte_carlo.folder / REPORT, definition, tallies, cases)
     return figures
 
 

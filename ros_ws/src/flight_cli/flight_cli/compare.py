@@ -3,7 +3,6 @@
 """`rise-di compare`: RISE-DI and other control laws on the same aircraft, each tuned by the same gain_tuning."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,13 +13,12 @@ from rich.table import Table
 
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.summary import display_units
+from flight_analysis.report.summary import display_units, finite_or_null
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import law_comparison
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.law_comparison import LawResult
-from flight_cli.output import new_table, progress_bar
-from flight_core.files import writing
+from flight_cli.output import COUNT_COLUMNS, new_table, progress_bar, write_text
 from flight_core.parameters import require
 
 SEEDS = (1, 2, 3)
@@ -66,7 +64,7 @@ def compare(
     benchmark, path = gain_tuning.build_benchmark(chosen), gains or gain_tuning.tuned_file(chosen)
     known = gain_tuning.load(path)
     results = []
-    with progress_bar() as bar:
+    with progress_bar(*COUNT_COLUMNS) as bar:
         wanted = [(name, aim) for name in names for aim in aims if aim not in known.get(name, {})]
         for name, aim in wanted if tune else ():
             task = bar.add_task("", total=gain_tuning.generation_count(LAWS[name], benchmark))
@@ -95,7 +93,8 @@ def compare(
         console.print(f"without tuned gains (--tune finds them): {missing}")
     if to_json is not None:
         rows = [_as_json(one, chosen) for one in results]
-        _write(to_json, json.dumps({"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "laws": rows}, indent=1))
+        figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "laws": rows}
+        write_text("--json", to_json, json.dumps(figures, indent=1) + "\n")
 
 
 def _parse_levels(text: str) -> list[float]:
@@ -139,19 +138,6 @@ def _by_name(one: LawResult, scenario: Scenario) -> tuple[dict[str, float], dict
 def _as_json(one: LawResult, scenario: Scenario) -> dict[str, Any]:
     """Figures of a law for JSON: SI, null for an infinite figure."""
     rms, slew = _by_name(one, scenario)
-
-    def finite(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
-    levels = [
-        {key: finite(value) if isinstance(value, float) else value for key, value in level._asdict().items()}
-        for level in one.levels
-    ]
-    sees = LAWS[one.law].measurements
-    row = {"law": one.law, "sees": sees, "tuned_on": one.objective, "score": finite(one.score), "levels": levels}
-    return row | {"rms": rms, "slew": slew, "delay": one.delay}
-
-
-def _write(path: Path, text: str) -> None:
-    with writing("--json", path, "the path of a file"):
-        path.write_text(text + "\n", encoding="utf-8")
+    sees, levels = LAWS[one.law].measurements, [level._asdict() for level in one.levels]
+    row = {"law": one.law, "sees": sees, "tuned_on": one.objective, "score": one.score, "levels": levels}
+    return {**finite_or_null(row), "rms": rms, "slew": slew, "delay": one.delay}

@@ -9,15 +9,13 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn
 
-from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.sign_check import require_signs
-from flight_analysis.report.run_folder import conclude, conclude_unflown, new_run
+from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
-from flight_bringup.graph import Autopilot, find_autopilot
+from flight_bringup.graph import find_autopilot
 from flight_bringup.scenarios import find_scenario
-from flight_cli.output import ENDED_EARLY, INTERRUPTED, display_path, progress_bar, show_flight
+from flight_cli.output import CLOCK_COLUMNS, ENDED_EARLY, INTERRUPTED, display_path, progress_bar, show_flight
 from flight_core import outcome as ends
 from flight_core.parameters import ParameterError, require
 
@@ -50,17 +48,16 @@ def fly(
 
     Exit status: 0 completed, 2 bad input, 3 ended early, 130 interrupted.
     """
-    chosen = find_scenario(scenario)
-    if duration is not None:
-        chosen = chosen.vary(flight={"duration": duration})
+    chosen = find_scenario(scenario, duration)
     stepping = lockstep or one_process or chosen.flight.lockstep
-    autopilot = None if bridge is None else _autopilot(chosen, bridge, send=send)
+    autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
+    if autopilot is not None:
+        require_signs(autopilot.channel_map, chosen)
     require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
     real_time = "a flight in real time over topics: an autopilot does not wait"
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     run = new_run(chosen, runs)
-    columns = (TextColumn("{task.fields[clock]}"), BarColumn(), TextColumn("{task.fields[shown]}"))
-    with progress_bar(*columns, quiet=as_json) as bar:
+    with progress_bar(*CLOCK_COLUMNS, quiet=as_json) as bar:
         task = bar.add_task("flight", total=chosen.flight.duration, clock="", shown="")
 
         def progress(t: float, shown: str) -> None:
@@ -74,11 +71,11 @@ def fly(
             progress(chosen.flight.duration, outcome)
     status = STATUS.get(outcome, ENDED_EARLY)
     try:
-        result = conclude(run, outcome)
+        result = write_report(run, outcome)
     except ParameterError:
         if status == 0:
             raise
-        conclude_unflown(run, chosen, outcome)
+        write_empty_summary(run, chosen, outcome)
         print(f"error: {outcome}, before the first sample; see {display_path(run)}", file=sys.stderr)
         raise typer.Exit(status) from None
     outcome = result.flight.summary["outcome"]
@@ -89,9 +86,3 @@ def fly(
         show_flight(Console(), result.flight)
         print(f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  {display_path(result.report)}")
     raise typer.Exit(status)
-
-
-def _autopilot(scenario: Scenario, map_name: str, *, send: bool) -> Autopilot:
-    found = find_autopilot(map_name, dry_run=not send)
-    require_signs(found.channel_map, scenario)
-    return found

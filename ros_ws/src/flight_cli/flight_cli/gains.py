@@ -22,9 +22,9 @@ from flight_analysis.design.gain_selection import (
     select_gains,
     study_airframe,
 )
+from flight_analysis.report.summary import finite_or_null
 from flight_bringup.scenarios import find_scenario
-from flight_cli.output import new_table
-from flight_core.files import writing
+from flight_cli.output import new_table, write_text
 from flight_core.parameters import ParameterError, require
 
 CONDITION_FAILS = 1
@@ -36,6 +36,7 @@ MEANINGS = {
     "response": "how much one unit of scaled input changes y_dot, abs(Omega_ii) input_scale; bandwidth = K x response",
 }
 """Terms of the table and their meaning."""
+HEADER = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
 
 
 def gains(
@@ -69,18 +70,16 @@ def gains(
     require(rate is None or 1.0 <= rate <= 1000.0, "--rate", rate, "1 to 1000 Hz")
     require(delay is None or 0.0 <= delay <= MAX_DELAY_MARGIN, "--delay", delay, f"0 to {MAX_DELAY_MARGIN:g} s")
     require(0.0 <= gamma_2 < math.inf, "--gamma-2", gamma_2, "0 or more, 1/s")
-    setting = loop_setting(chosen, gamma_2)._replace(inputs=tuple(inputs.split(",")) if inputs else (), feedforward=feedforward)
-    if rate is not None:
-        setting = setting._replace(rate=rate)
-    if delay is not None:
-        setting = setting._replace(delay=delay)
-    if lag is not None:
-        setting = setting._replace(lag=_parse_lags(lag, frame))
+    options = {"rate": rate, "delay": delay, "lag": None if lag is None else _parse_lags(lag, frame)}
+    loop: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
+    paired = tuple(inputs.split(",")) if inputs else ()
+    setting = loop_setting(chosen, gamma_2)._replace(inputs=paired, feedforward=feedforward, **loop)
     if check:
         for option, given in (("--write", write is not None), ("--feedforward", feedforward)):
             require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
-        changed = rate is not None or delay is not None or lag is not None or inputs is not None
-        require(not changed, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
+        require(
+            not loop and inputs is None, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs"
+        )
         known, named = chosen.controller.outputs, f"airframe {frame.name}"
         require(sorted(known) == sorted(frame.outputs), named, ", ".join(frame.outputs), f"the outputs {', '.join(known)}")
     console = Console(quiet=as_json)
@@ -92,7 +91,7 @@ def gains(
             selection = select_gains(found, setting)
             answers, text = {"theorem": selection.theorem, "engineering": selection.engineering}, as_yaml(selection)
     if write is not None and text is not None:
-        _write(write, text)
+        write_text("--write", write, HEADER + text)
     if as_json:
         print(json.dumps(_as_json(found, answers, seed)))
     else:
@@ -114,12 +113,6 @@ def _parse_lags(text: str, airframe: Airframe) -> dict[str, float]:
     require(len(values) == len(names), "--lag", f"{len(values)} values", f"one for all or one for each of {', '.join(names)}")
     require(all(0.0 <= value < math.inf for value in values), "--lag", text, "seconds, 0 or more")
     return dict(zip(names, values, strict=True))
-
-
-def _write(path: Path, text: str) -> None:
-    header = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
-    with writing("--write", path, "the path of a file"):
-        path.write_text(header + text, encoding="utf-8")
 
 
 def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) -> None:
@@ -198,8 +191,8 @@ def _as_json(found: Study, answers: dict[str, GainAssessment], seed: int) -> dic
     } | {
         name: {
             "controller": answer.controller.model_dump(exclude_none=True),
-            "delay_margin": _finite(answer.delay_margin),
-            "channel_margins": [_finite(margin) for margin in answer.channel_margins],
+            "delay_margin": finite_or_null(answer.delay_margin),
+            "channel_margins": finite_or_null(answer.channel_margins),
             "bounds": {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")}
             | {"rho": answer.bounds.rho},
             "conditions": [
@@ -207,9 +200,9 @@ def _as_json(found: Study, answers: dict[str, GainAssessment], seed: int) -> dic
                     "name": condition.name,
                     "part": part,
                     "channel": None if condition.channel is None else answer.controller.outputs[condition.channel],
-                    "found": _finite(condition.found),
-                    condition.side.replace(" ", "_"): _finite(condition.bound),
-                    "margin": _finite(condition.margin),
+                    "found": finite_or_null(condition.found),
+                    condition.side.replace(" ", "_"): finite_or_null(condition.bound),
+                    "margin": finite_or_null(condition.margin),
                     "holds": condition.holds,
                     "estimate": condition.estimate,
                 }
@@ -219,8 +212,3 @@ def _as_json(found: Study, answers: dict[str, GainAssessment], seed: int) -> dic
         }
         for name, answer in answers.items()
     }
-
-
-def _finite(value: float | None) -> float | None:
-    # JSON has neither NaN nor infinity.
-    return value if value is not None and math.isfinite(value) else None

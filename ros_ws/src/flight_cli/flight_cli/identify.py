@@ -15,8 +15,7 @@ from rich.console import Console
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, RESIDUALS, STATES, require_aircraft
 from flight_analysis.design.identification import IdentifiedAircraft
 from flight_analysis.design.identification import identify as identify_aircraft
-from flight_cli.output import new_table
-from flight_core.files import writing
+from flight_cli.output import new_table, write_text
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
 from flight_core.units import SI_PER_UNIT
@@ -56,8 +55,7 @@ def identify(
     except FlightEnded as error:
         print(f"error: {error}", file=sys.stderr)
         raise typer.Exit(CANNOT_FLY) from None
-    with writing("--output", path, "the path of a file"):
-        path.write_text(found.text, encoding="utf-8")
+    write_text("--output", path, found.text)
     if as_json:
         print(json.dumps(_as_json(found, path)))
     else:

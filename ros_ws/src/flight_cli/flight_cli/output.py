@@ -12,8 +12,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.table import Table
 
 from flight_analysis.metrics import PARTS_LEGEND
-from flight_analysis.report.recorded_flight import RecordedFlight
-from flight_analysis.report.summary import ERROR_COLUMNS, INPUT_COLUMNS, Column, display_units, limited_cell, table_rows
+from flight_analysis.report.summary import (
+    ERROR_COLUMNS,
+    INPUT_COLUMNS,
+    SATURATION_COLUMN,
+    Column,
+    RecordedFlight,
+    display_units,
+    input_rows,
+    table_rows,
+)
+from flight_core.files import writing
 
 ENDED_EARLY, INTERRUPTED = 3, 130
 """Exit statuses; bad input is 2 (`flight_cli.cli`)."""
@@ -30,19 +39,16 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
             table_rows(summary["errors"], ERROR_COLUMNS, units),
         )
     )
-    rows = table_rows(summary["inputs"], INPUT_COLUMNS, units)
-    limited = [limited_cell(of) for of in summary["inputs"].values()]
-    if rows:
-        columns = (*INPUT_COLUMNS, Column("limited", "%", ()))
+    if rows := input_rows(summary, units):
         console.print(
             grouped_table(
-                "Inputs about trim, and mean abs(u_dot) a second",
+                "Inputs about trim, and mean abs(u_dot) per second",
                 "input",
-                columns,
-                [[*row, share] for row, share in zip(rows, limited, strict=True)],
+                (*INPUT_COLUMNS, SATURATION_COLUMN),
+                rows,
             )
         )
-    console.print(f"{PARTS_LEGEND}. bound: the largest error in calm", style="dim", highlight=False)
+    console.print(f"{PARTS_LEGEND}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
     for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"])):
         console.print(line, highlight=False)
 
@@ -56,10 +62,15 @@ def new_table(title: str, headings: Iterable[str], left: Container[str] = (), wr
     return table
 
 
+COUNT_COLUMNS = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+SHOWN_COLUMN = TextColumn("{task.fields[shown]}")
+CLOCK_COLUMNS = (TextColumn("{task.fields[clock]}"), BarColumn(), SHOWN_COLUMN)
+"""Columns of progress bars: a count and the time that is left, a text, a clock with a text."""
+
+
 def progress_bar(*columns: ProgressColumn, quiet: bool = False) -> Progress:
-    """A progress bar on standard error; by default it shows a description, the count and the time that is left."""
-    default = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*(columns or default), console=Console(stderr=True, quiet=quiet))
+    """A progress bar on standard error."""
+    return Progress(*columns, console=Console(stderr=True, quiet=quiet))
 
 
 def grouped_table(title: str, first: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Table:
@@ -68,7 +79,8 @@ def grouped_table(title: str, first: str, columns: Sequence[Column], rows: Itera
     table.add_column(f"\n{first}", no_wrap=True)
     for column, before in zip(columns, (None, *columns), strict=False):
         begins = before is None or column.group != before.group
-        table.add_column(f"{column.group if begins else ''}\n{column.head}", justify="right", no_wrap=True)
+        head = column.head.replace("undisturbed", "undist.")  # fits a terminal of 80 columns
+        table.add_column(f"{column.group if begins else ''}\n{head}", justify="right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     return table
@@ -86,6 +98,12 @@ def _timing(summary: Mapping[str, Any]) -> list[str]:
         median, p99, largest = (f"{value * 1e3:.3f}" for value in latency.values())
         lines.append(f"y sent to u sent: median {median} ms, p99 {p99}, max {largest}")
     return lines
+
+
+def write_text(option: str, path: Path, text: str) -> None:
+    """Write a file that an option names. Raises ParameterError where it cannot be written."""
+    with writing(option, path, "the path of a file"):
+        path.write_text(text, encoding="utf-8")
 
 
 def display_path(path: Path) -> str:

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, TextColumn
 
-from flight_cli.output import progress_bar
+from flight_cli.output import CLOCK_COLUMNS, progress_bar
 from flight_core.parameters import require
 from flight_log.playback import SHARED, read_playback
 
@@ -46,7 +45,7 @@ def play(
     end = playback.t(playback.messages[-1].due_ns)
     with (
         Player(playback.types, SHARED) as sender,
-        progress_bar(TextColumn("{task.fields[clock]}"), BarColumn(), TextColumn("{task.fields[shown]}")) as bar,
+        progress_bar(*CLOCK_COLUMNS) as bar,
     ):
         task = bar.add_task("play", total=end - start, clock="", shown=f"{', '.join(playback.types)}, stamps {stamps}")
 

@@ -3,7 +3,7 @@
 """`rise-di report`: tables, report page, figures and data of recorded runs."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -12,10 +12,9 @@ from rich.console import Console
 
 from flight_analysis.report import comparison
 from flight_analysis.report.export import write_csv, write_parquet, write_png
-from flight_analysis.report.page import write_page
-from flight_analysis.report.recorded_flight import RecordedFlight
-from flight_analysis.report.run_folder import conclude, read_flight
-from flight_analysis.report.summary import ERROR_COLUMNS
+from flight_analysis.report.html import write_page
+from flight_analysis.report.run_folder import read_flight, write_report
+from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
 from flight_cli.output import display_path, new_table, show_flight
 from flight_core.files import writing
 
@@ -34,15 +33,17 @@ def report(
 
     Exit status: 0, or 2 bad input.
     """
+    outputs = [("--png", png, write_png), ("--csv", csv, write_csv), ("--parquet", parquet, write_parquet)]
     if len(runs) == 1 and html is None:
-        result = conclude(runs[0])
+        result = write_report(runs[0])
         flights, page = [result.flight], result.report
     else:
         flights, page = [read_flight(run) for run in runs], html or runs[0].absolute().parent / "comparison.html"
-        _write("--html", page, write_page, flights)
-    for option, path, write in (("--png", png, write_png), ("--csv", csv, write_csv), ("--parquet", parquet, write_parquet)):
+        outputs.insert(0, ("--html", page, write_page))
+    for option, path, write in outputs:
         if path is not None:
-            _write(option, path, write, flights)
+            with writing(option, path, "the path of a file"):
+                write(path, flights)
     if as_json:
         summaries = [flight.summary for flight in flights]
         print(json.dumps(summaries[0] if len(runs) == 1 else summaries))
@@ -55,22 +56,15 @@ def report(
     print(f"report:  {display_path(page)}")
 
 
-def _write(
-    option: str, path: Path, write: Callable[[Path, Sequence[RecordedFlight]], None], flights: Sequence[RecordedFlight]
-) -> None:
-    with writing(option, path, "the path of a file"):
-        write(path, flights)
-
-
 def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None:
     """Print the errors of several flights with their ratios to the first."""
     for k, (label, flight) in enumerate(zip(comparison.labels(flights), flights, strict=True), start=1):
         console.print(f"{k}: {label}, {flight.summary['outcome']}", highlight=False, soft_wrap=True)
     headings = ("channel", "", *(str(k + 1) for k in range(len(flights))))
     table = new_table("Tracking error, and its ratio to the first", headings, left=("channel", ""))
-    for block in comparison.blocks(flights, "errors", ERROR_COLUMNS, judged=True):
-        for k, row in enumerate(block.rows):
+    for channel in comparison.metric_tables(flights, "errors", ERROR_COLUMNS, lower_is_better=True):
+        for k, row in enumerate(channel.rows):
             ratios = ("" if j == 0 or ratio is None else f" x{ratio:.3g}" for j, ratio in enumerate(row.ratios))
             cells = (f"{text}{ratio}" for text, ratio in zip(row.texts, ratios, strict=True))
-            table.add_row(block.name if k == 0 else "", row.what, *cells, end_section=k == len(block.rows) - 1)
+            table.add_row(channel.caption if k == 0 else "", row.name, *cells, end_section=k == len(channel.rows) - 1)
     console.print(table)

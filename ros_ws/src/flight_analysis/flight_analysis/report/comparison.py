@@ -11,15 +11,14 @@ import plotly.graph_objects as go
 from flight_analysis.metrics import best_error
 from flight_analysis.report import figures
 from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, time_series_figure
-from flight_analysis.report.recorded_flight import RecordedFlight
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,
-    INPUT_COLUMNS,
     NO_UNIT,
     NO_VALUE,
     SWITCH_COLUMN,
     Column,
     DisplayUnit,
+    RecordedFlight,
     channel_label,
     display_units,
     format_value,
@@ -118,11 +117,6 @@ def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[Comp
     ]
 
 
-def input_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
-    """Metrics of the inputs by channel."""
-    return metric_tables(flights, "inputs", INPUT_COLUMNS, lower_is_better=False)
-
-
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
     """Timing metrics of the controllers, in one table; none where all of them are 0."""
     rows = [_row(flights, name, path, 1e3) for name, path in TIMING_METRICS.items()]
@@ -176,23 +170,6 @@ def input_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> go.
     """U of every flight."""
     curves = _curves(flights, "u", lambda tape: tape["u"], steps=True)
     return time_series_figure(context, curves) if curves else None
-
-
-def spectrum_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> go.Figure | None:
-    """Spectra of u of every flight that has enough samples."""
-    runs = {
-        label: (flight.tape["u"], flight.period_ns)
-        for label, flight in zip(labels(flights), flights, strict=True)
-        if "u" in flight.tape and len(flight.tape["u"].stamp_ns) >= figures.MIN_SPECTRUM_SAMPLES
-    }
-    return figures.spectra_figure(runs, colours(flights), context.units) if runs else None
-
-
-def timing_figure(flights: Sequence[RecordedFlight]) -> go.Figure | None:
-    """Histograms of the timing of every controller."""
-    by_label = zip(labels(flights), flights, strict=True)
-    runs = {label: figures.timing_samples(flight.tape, flight.period_ns) for label, flight in by_label}
-    return figures.histogram_figure(runs, colours(flights)) if any(runs.values()) else None
 
 
 def _curves(flights: Sequence[RecordedFlight], topic: str, signal: Callable[[Tape], Signal], **style: Any) -> dict[str, Curve]:

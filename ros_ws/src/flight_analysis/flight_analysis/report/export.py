@@ -11,8 +11,7 @@ import numpy as np
 from flight_analysis.metrics import best_error
 from flight_analysis.report import comparison
 from flight_analysis.report.figures import GUST, REFERENCE, flight_end, gust_intervals
-from flight_analysis.report.recorded_flight import RecordedFlight
-from flight_analysis.report.summary import NO_UNIT, channel_label
+from flight_analysis.report.summary import NO_UNIT, RecordedFlight, channel_label
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 

@@ -64,6 +64,9 @@ LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times
 Limits = Mapping[str, tuple[float, float]]
 """Lower and upper limit by input, SI; infinite without a limit."""
 
+Runs = Mapping[str, tuple[Tape, int]]
+"""Tape and period of the ticks in ns, by label of the flight."""
+
 
 def plot_context(tape: Tape, units: Mapping[str, DisplayUnit], gusts: Windows) -> PlotContext:
     """The context of a flight: every figure shades its gusts and the failsafe modes of its controller."""
@@ -174,22 +177,23 @@ def integral_figure(context: PlotContext) -> go.Figure | None:
     return time_series_figure(context, {"": curve}, columns=2, height=120)
 
 
-def spectrum_figure(context: PlotContext, period_ns: int) -> go.Figure | None:
-    """Amplitude spectral density of u, both axes logarithmic; None with fewer than MIN_SPECTRUM_SAMPLES."""
-    if "u" not in context.tape or len(context.tape["u"].stamp_ns) < MIN_SPECTRUM_SAMPLES:
+def spectrum_figure(runs: Runs, colours: Mapping[str, str], units: Mapping[str, DisplayUnit]) -> go.Figure | None:
+    """Amplitude spectral density of u, both axes logarithmic: one subplot per channel with all runs that have it.
+
+    A run with fewer than MIN_SPECTRUM_SAMPLES is left out; None without a run.
+    """
+    runs = {
+        label: (tape, period_ns)
+        for label, (tape, period_ns) in runs.items()
+        if "u" in tape and len(tape["u"].stamp_ns) >= MIN_SPECTRUM_SAMPLES
+    }
+    if not runs:
         return None
-    return spectra_figure({"u": (context.tape["u"], period_ns)}, {"u": PLANT}, context.units)
-
-
-def spectra_figure(
-    runs: Mapping[str, tuple[Signal, int]], colours: Mapping[str, str], units: Mapping[str, DisplayUnit]
-) -> go.Figure:
-    """One subplot per channel with the spectra of all runs that have it. A run is a signal and its period in ns."""
-    channels = list(dict.fromkeys(name for signal, _ in runs.values() for name in signal.names))
+    channels = list(dict.fromkeys(name for tape, _ in runs.values() for name in tape["u"].names))
     columns = min(len(channels), 2)
     figure = subplot_grid(len(channels), columns, 190, vertical_spacing=0.2)
-    for label, (signal, period_ns) in runs.items():
-        frequency, densities = spectra(signal, period_ns)
+    for label, (tape, period_ns) in runs.items():
+        frequency, densities = spectra(tape["u"], period_ns)
         for name, density in densities.items():
             unit, factor = units.get(name, NO_UNIT)
             line = go.Scatter(
@@ -209,13 +213,7 @@ def spectra_figure(
     return set_layout(figure, 190, below=44)
 
 
-def timing_figure(context: PlotContext, period_ns: int) -> go.Figure | None:
-    """Histograms of the controller's timing; None where all of it is 0."""
-    samples = timing_samples(context.tape, period_ns)
-    return histogram_figure({"": samples}, {"": PLANT}) if samples else None
-
-
-def timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
+def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
     """Samples of the controller's timing by quantity, ms; a quantity that is always 0 is left out."""
     samples: dict[str, FloatArray] = {}
     if "internals" in tape:
@@ -228,13 +226,19 @@ def timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
     return {quantity: values for quantity, values in samples.items() if len(values) and np.any(np.abs(values) > 1e-6)}
 
 
-def histogram_figure(runs: Mapping[str, Mapping[str, FloatArray]], colours: Mapping[str, str]) -> go.Figure:
-    """One subplot per quantity, in ms, with the histograms of all runs that have it, on common bins and a logarithmic axis."""
-    quantities = list(dict.fromkeys(quantity for run in runs.values() for quantity in run))
+def timing_figure(runs: Runs, colours: Mapping[str, str]) -> go.Figure | None:
+    """Histograms of the controller's timing in ms, on common bins and a logarithmic axis; None where all of it is 0.
+
+    There is one subplot per quantity with all runs that have it.
+    """
+    timing = {label: _timing_samples(tape, period_ns) for label, (tape, period_ns) in runs.items()}
+    quantities = list(dict.fromkeys(quantity for samples in timing.values() for quantity in samples))
+    if not quantities:
+        return None
     columns = min(len(quantities), 2)
     figure = subplot_grid(len(quantities), columns, 150, vertical_spacing=0.24)
     for index, quantity in enumerate(quantities):
-        samples = {label: run[quantity] for label, run in runs.items() if quantity in run}
+        samples = {label: run[quantity] for label, run in timing.items() if quantity in run}
         edges = np.histogram_bin_edges(np.concatenate(list(samples.values())), bins=HISTOGRAM_BINS)
         for label, values in samples.items():
             counts, width = np.histogram(values, edges)[0].astype(float), edges[1] - edges[0]

@@ -14,8 +14,7 @@ from plotly.offline import get_plotlyjs
 
 from flight_analysis.report import comparison, figures, plotting, tables
 from flight_analysis.report.plotting import SampleStore, pack
-from flight_analysis.report.recorded_flight import RecordedFlight
-from flight_analysis.report.summary import display_units, format_value
+from flight_analysis.report.summary import INPUT_COLUMNS, RecordedFlight, display_units, format_value
 from flight_core.outcome import COMPLETED
 
 HERE = Path(__file__).parent
@@ -80,22 +79,24 @@ def _flight_page(flight: RecordedFlight) -> Page:
 
 def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     context, colours = comparison.plot_context(flights), comparison.colours(flights)
+    runs = {label: (flight.tape, flight.period_ns) for label, flight in zip(colours, flights, strict=True)}
     lines = []
     for (label, colour), flight in zip(colours.items(), flights, strict=True):
         text = f"{flight.scenario.name}: {_description(flight)} ({flight.summary['error']})"
         lines.append(Line(text, flight.summary["outcome"], label, colour))
     palette = list(colours.values())
+    inputs = comparison.metric_tables(flights, "inputs", INPUT_COLUMNS, lower_is_better=False)
     groups = [
         TableGroup(comparison.error_tables(flights), "Tracking error", tables.ERROR_LEGEND, palette),
-        TableGroup(comparison.input_tables(flights), "Inputs", tables.INPUT_LEGEND, palette),
+        TableGroup(inputs, "Inputs", tables.INPUT_LEGEND, palette),
         TableGroup(comparison.tick_tables(flights), "Time", "", palette),
     ]
     sections = [
         Section("Output y over the reference y_m", "", comparison.tracking_figure(context, flights)),
         Section("Tracking error e = y - y_m", "", comparison.error_figure(context, flights)),
         Section("Input u", "", comparison.input_figure(context, flights)),
-        Section("Spectrum of u", "", comparison.spectrum_figure(context, flights), over_time=False),
-        Section("Timing of the ticks", "", comparison.timing_figure(flights), over_time=False),
+        Section("Spectrum of u", "", figures.spectrum_figure(runs, colours, context.units), over_time=False),
+        Section("Timing of the ticks", "", figures.timing_figure(runs, colours), over_time=False),
     ]
     return Page(f"{len(flights)} flights compared", lines, groups, sections, context.samples)
 
@@ -108,6 +109,8 @@ def _description(flight: RecordedFlight) -> str:
 def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Section]:
     floors = {name: metrics["floor"] for name, metrics in flight.summary["errors"].items()}
     limits = figures.input_limits(flight.scenario, flight.tape)
+    run, colour = (flight.tape, flight.period_ns), figures.PLANT
+    spectrum = figures.spectrum_figure({"u": run}, {"u": colour}, context.units)
     return [
         Section("Output y over the reference y_m", "", figures.tracking_figure(context)),
         Section(
@@ -128,15 +131,13 @@ def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Sec
             figures.integral_figure(context),
         ),
         Section("Error of the sensors", "y less the true output", figures.sensor_figure(context)),
-        Section(
-            "Spectrum of u", "amplitude spectral density", figures.spectrum_figure(context, flight.period_ns), over_time=False
-        ),
+        Section("Spectrum of u", "amplitude spectral density", spectrum, over_time=False),
         Section(
             "Ticks of the controller",
             "late: after its deadline; age: of y at the tick; dt: as integrated",
             figures.tick_figure(context),
         ),
-        Section("Timing of the ticks", "", figures.timing_figure(context, flight.period_ns), over_time=False),
+        Section("Timing of the ticks", "", figures.timing_figure({"": run}, {"": colour}), over_time=False),
     ]
 
 

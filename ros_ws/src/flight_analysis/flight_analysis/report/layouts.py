@@ -19,18 +19,11 @@ COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b")
 COLUMNS = 2
 
 
-class Channel(NamedTuple):
-    """A channel of a topic."""
-
-    topic: str
-    channel: str
-
-
 class Plot(NamedTuple):
     """Curves over time in one pair of axes, all SI and radians."""
 
     title: str
-    curves: tuple[Channel, ...]
+    curves: tuple[tuple[str, str], ...]  # topic and channel
 
 
 class Tab(NamedTuple):
@@ -57,10 +50,10 @@ def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
     outputs, inputs, wind = channels["y_m"], channels["u"], [name for name in channels["truth"] if name.startswith("gust.")]
 
     def log(title: str, *names: str) -> Plot:
-        return Plot(title, tuple(Channel("internals", name) for name in names))
+        return Plot(title, tuple(("internals", name) for name in names))
 
     return (
-        Tab("tracking", tuple(Plot(f"{name}: y, y_m", (Channel("y", name), Channel("y_m", name))) for name in outputs)),
+        Tab("tracking", tuple(Plot(f"{name}: y, y_m", (("y", name), ("y_m", name))) for name in outputs)),
         Tab("error", tuple(log(f"e {name}", f"e.{name}") for name in outputs)),
         Tab("input", tuple(log(f"u {name}: u_free, u", f"u_free.{name}", f"u.{name}") for name in inputs)),
         Tab(
@@ -75,7 +68,7 @@ def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
                 log("dt (s)", "dt"),
             ),
         ),
-        Tab("wind", tuple(Plot(f"{name} (m/s)", (Channel("truth", name),)) for name in wind)),
+        Tab("wind", tuple(Plot(f"{name} (m/s)", (("truth", name),)) for name in wind)),
     )
 
 
@@ -94,14 +87,8 @@ def foxglove(channels: Mapping[str, Sequence[str]]) -> str:
         if names:
             tabs.append({"title": tab.title, "layout": _mosaic(names)})
     panels["Tab!rise_di"] = {"activeTabIdx": 0, "tabs": tabs}
-    layout = {
-        "configById": panels,
-        "globalVariables": {},
-        "userNodes": {},
-        "playbackConfig": {"speed": 1},
-        "layout": "Tab!rise_di",
-    }
-    return json.dumps(layout, indent=2) + "\n"
+    defaults = {"globalVariables": {}, "userNodes": {}, "playbackConfig": {"speed": 1}}
+    return json.dumps({"configById": panels, **defaults, "layout": "Tab!rise_di"}, indent=2) + "\n"
 
 
 def _foxglove_plot(plot: Plot, channels: Mapping[str, Sequence[str]]) -> dict[str, Any]:

@@ -15,8 +15,7 @@ import yaml
 
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, load_scenario, scenario_yaml
-from flight_analysis.report.recorded_flight import RecordedFlight
-from flight_analysis.report.summary import empty_summary, summarise
+from flight_analysis.report.summary import RecordedFlight, empty_summary, summarise
 from flight_core.files import writing
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError, printable

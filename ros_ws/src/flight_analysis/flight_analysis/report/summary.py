@@ -79,6 +79,20 @@ def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
     return [*engagements(tape), *(edge for edge in pulse_edges(scenario) if edge.start < until), *live, *gusts]
 
 
+class RecordedFlight(NamedTuple):
+    """A flight under the name of its run: what figures, tables, exports and comparisons are made of."""
+
+    name: str
+    scenario: Scenario
+    tape: Tape
+    summary: dict[str, Any]  # of `summarise`
+
+    @property
+    def period_ns(self) -> int:
+        """Period of the controller's ticks, ns."""
+        return period_ns(self.scenario.controller.rate, "controller.rate")
+
+
 def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
     """All metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains each key."""
     for topic in ("y", "y_m"):
@@ -99,7 +113,7 @@ def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
         "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
         "notes": list(tape.notes),
     }
-    return {key: _nan_as_null(value) for key, value in summary.items()}
+    return {key: finite_or_null(value) for key, value in summary.items()}
 
 
 def empty_summary(scenario: Scenario, outcome: str) -> dict[str, Any]:
@@ -136,12 +150,15 @@ def _inputs(tape: Tape, events: Sequence[Transient]) -> dict[str, Any]:
     }
 
 
-def _nan_as_null(value: Any) -> Any:
-    # JSON has no NaN and no infinity. A part of the flight without samples has NaN metrics, an overflow infinite ones.
+def finite_or_null(value: Any) -> Any:
+    """A value for JSON, which has no NaN and no infinity: None in their place, also inside mappings and lists.
+
+    A part of the flight without samples has NaN metrics, an overflow infinite ones.
+    """
     if isinstance(value, Mapping):
-        return {key: _nan_as_null(entry) for key, entry in value.items()}
+        return {key: finite_or_null(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_nan_as_null(entry) for entry in value]
+        return [finite_or_null(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -154,11 +171,15 @@ class Column(NamedTuple):
     scaled: bool = True  # in the unit of its row
 
 
-ERROR_COLUMNS = (
+RMS_COLUMNS = (
     Column("rms", "whole", ("whole", "rms")),
     Column("rms", "undisturbed", ("calm", "rms")),
     Column("rms", "command", ("command", "rms")),
     Column("rms", "gust", ("gust", "rms")),
+)
+
+ERROR_COLUMNS = (
+    *RMS_COLUMNS,
     Column("max", "command", ("command", "max")),
     Column("max", "gust", ("gust", "max")),
     Column("ultimate", "bound", ("bound",)),
@@ -169,10 +190,7 @@ NOISE_FLOOR_COLUMN = Column("noise", "floor", ("floor",))
 SWITCH_COLUMN = Column("switches", "(1/s)", ("sign_switches",), scaled=False)
 
 INPUT_COLUMNS = (
-    Column("rms", "whole", ("whole", "rms")),
-    Column("rms", "undisturbed", ("calm", "rms")),
-    Column("rms", "command", ("command", "rms")),
-    Column("rms", "gust", ("gust", "rms")),
+    *RMS_COLUMNS,
     Column("", "max", ("whole", "max")),
     Column("rate", "whole", ("whole", "rate")),
     Column("rate", "undisturbed", ("calm", "rate")),

@@ -84,7 +84,14 @@ def events(tape: Tape, gusts: Windows) -> list[Event]:
 
 def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], event_list: Sequence[Event]) -> list[Table]:
     """Tables of the error, the inputs, the events and the ticks; a table without rows is left out."""
-    tables = (_error_table(summary, units), _input_table(summary, units), _event_table(event_list), _tick_table(summary))
+    inputs = (*INPUT_COLUMNS, SATURATION_COLUMN)
+    times = [Column("", head) for head in ("from (s)", "to (s)", "")]
+    tables = (
+        _error_table(summary, units),
+        Table("Inputs", inputs, input_rows(summary, units), INPUT_LEGEND + SATURATION_LEGEND),
+        Table("Events", times, [(one.name, f"{one.start:.2f}", f"{one.stop:.2f}", one.extent) for one in event_list]),
+        _tick_table(summary),
+    )
     return [table for table in tables if table.rows]
 
 
@@ -96,16 +103,6 @@ def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
     ]
     caption = f"Tracking error ({summary['error']})"
     return Table(caption, (*columns, *SETTLING_COLUMNS.values()), rows, ERROR_LEGEND + NOISE_FLOOR_LEGEND)
-
-
-def _input_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
-    return Table("Inputs", (*INPUT_COLUMNS, SATURATION_COLUMN), input_rows(summary, units), INPUT_LEGEND + SATURATION_LEGEND)
-
-
-def _event_table(event_list: Sequence[Event]) -> Table:
-    columns = [Column("", head) for head in ("from (s)", "to (s)", "")]
-    rows = [(event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent) for event in event_list]
-    return Table("Events", columns, rows)
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
