@@ -14,7 +14,6 @@ import time
 from collections import deque
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
@@ -126,7 +125,7 @@ class FlightProcesses:
             raise
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def _start(self, node: NodeSpec) -> None:

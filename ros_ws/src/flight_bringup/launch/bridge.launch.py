@@ -30,8 +30,8 @@ from flight_bringup.graph import (
     start_lead,
 )
 from flight_bringup.launch.stages import (
-    BOOLEAN,
     argument,
+    boolean_argument,
     complete,
     end_with_launch,
     flight_node,
@@ -50,13 +50,10 @@ def generate_launch_description() -> LaunchDescription:
         [
             DeclareLaunchArgument("map", description=f"name of a channel map ({', '.join(maps())}), or path of a file (.yaml)"),
             scenario_argument("osprey_gust"),
-            DeclareLaunchArgument(
-                "dry_run",
-                default_value="true",
-                choices=BOOLEAN,
-                description="true: publish on bridge/would_send, send nothing; false: send once the bridge is engaged",
+            boolean_argument(
+                "dry_run", True, "true: publish on bridge/would_send, send nothing; false: send once the bridge is engaged"
             ),
-            DeclareLaunchArgument("recorder", default_value="true", choices=BOOLEAN, description="record the flight"),
+            boolean_argument("recorder", True, "record the flight"),
             DeclareLaunchArgument("duration", default_value="", description="seconds to fly; empty flies until Ctrl-C"),
             runs_argument(),
             namespace_argument("namespace of all nodes, one an aircraft; topics that a map names in full are not in it"),
@@ -66,9 +63,8 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _fly(context: LaunchContext) -> list[Action]:
-    scenario = find_scenario(argument(context, "scenario"))
-    if duration := argument(context, "duration"):
-        scenario = scenario.vary(flight={"duration": yaml.safe_load(duration)})
+    duration = yaml.safe_load(argument(context, "duration"))
+    scenario = find_scenario(argument(context, "scenario"), duration)
     autopilot = find_autopilot(argument(context, "map"), dry_run=argument(context, "dry_run") == "true")
     require_signs(autopilot.channel_map, scenario)
     recorded = argument(context, "recorder") == "true"

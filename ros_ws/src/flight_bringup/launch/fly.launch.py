@@ -55,9 +55,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _fly(context: LaunchContext) -> list[Action]:
-    scenario = find_scenario(argument(context, "scenario"))
-    if duration := argument(context, "duration"):
-        scenario = scenario.vary(flight={"duration": yaml.safe_load(duration)})
+    scenario = find_scenario(argument(context, "scenario"), yaml.safe_load(argument(context, "duration")))
     lockstep = scenario.flight.lockstep if (value := argument(context, "lockstep")) == "" else value == "true"
     run = new_run(scenario, Path(argument(context, "runs")))
     end_with_launch(context)

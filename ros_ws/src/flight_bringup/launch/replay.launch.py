@@ -30,8 +30,8 @@ from flight_bringup.graph import (
     replayed_topics,
 )
 from flight_bringup.launch.stages import (
-    BOOLEAN,
     argument,
+    boolean_argument,
     complete,
     end_with_launch,
     fail_on_exit,
@@ -52,19 +52,10 @@ OPTIONAL = (RECORDER, CONTROLLER, REFERENCE_MODEL, AIRCRAFT)
 
 def generate_launch_description() -> LaunchDescription:
     """The arguments, the player and the nodes."""
-    optional = [
-        DeclareLaunchArgument(
-            spec.executable,
-            default_value=str(spec is CONTROLLER).lower(),
-            choices=BOOLEAN,
-            description=f"run the {spec.executable}",
-        )
-        for spec in OPTIONAL
-    ]
     return LaunchDescription(
         [
             DeclareLaunchArgument("run", description="folder of a run, or an MCAP file"),
-            *optional,
+            *(boolean_argument(spec.executable, spec is CONTROLLER, f"run the {spec.executable}") for spec in OPTIONAL),
             DeclareLaunchArgument(
                 "map",
                 default_value="",
@@ -78,14 +69,9 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument("rate", default_value="1.0", description="speed, as a multiple of real time"),
             DeclareLaunchArgument("start", default_value="0.0", description="flight time of the log to begin at, s"),
-            DeclareLaunchArgument(
-                "loop", default_value="false", choices=BOOLEAN, description="start again at the end, until Ctrl-C"
-            ),
-            DeclareLaunchArgument(
-                "lockstep",
-                default_value="false",
-                choices=BOOLEAN,
-                description="for a lockstep log: keep its stamps; the controller answers each y with the same bytes",
+            boolean_argument("loop", False, "start again at the end, until Ctrl-C"),
+            boolean_argument(
+                "lockstep", False, "for a lockstep log: keep its stamps; the controller answers each y with the same bytes"
             ),
             scenario_argument("", "; empty: the one in the log"),
             runs_argument(),

@@ -47,6 +47,11 @@ def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgumen
     return DeclareLaunchArgument("scenario", default_value=default, description=description)
 
 
+def boolean_argument(name: str, default: bool, description: str) -> DeclareLaunchArgument:
+    """An argument that is "true" or "false"."""
+    return DeclareLaunchArgument(name, default_value=str(default).lower(), choices=BOOLEAN, description=description)
+
+
 def runs_argument() -> DeclareLaunchArgument:
     """The argument `runs`."""
     return DeclareLaunchArgument("runs", default_value="runs", description="folder in which the folder of the run is created")
