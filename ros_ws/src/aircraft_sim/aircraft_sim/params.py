@@ -69,11 +69,6 @@ class TurbulenceParameters(Parameters):
             require((value is not None) == acts, key, found, f"{expected} at {self.altitude:g} m: it acts {where}")
         return self
 
-    @property
-    def has_intensity(self) -> bool:
-        """Whether the intensity is above 0."""
-        return bool(self.wind or self.sigma)
-
 
 class BiasParameters(Parameters):
     """A bias on x_dot of one state. It rises from 0 to its value along half a cosine; with rise 0 it is a step."""
@@ -267,7 +262,6 @@ class AircraftParameters(KeyedParameters):
     def load(self) -> tuple[Airframe, Aircraft]:
         """The airframe in flight and the arrays of equation (1) with all disturbances, for the axes of the airframe's gusts."""
         airframe = self.sampled_airframe()
-        gusts = [self.gusts.get(axis, STILL_AIR) for axis in airframe.gusts]
         direction = [airframe.gust_direction(axis) for axis in airframe.gusts]
         gain, first, second = airframe.products()
         biases = {name: bias for name, bias in self.bias.items() if bias.value != 0.0}
@@ -278,7 +272,7 @@ class AircraftParameters(KeyedParameters):
             airframe.matrix_c(),
             airframe.matrix_gravity(),
             np.reshape(direction, (len(direction), len(airframe.states))).T,
-            Gusts(*(np.array([getattr(gust, key) for gust in gusts]) for key in Gusts._fields)),
+            self._gust_arrays(list(airframe.gusts)),
             np.array(airframe.speed),
             Coupling(self.inertial_coupling * gain, first, second) if self.inertial_coupling > 0.0 else None,
             Bias(*_by_state(biases, Bias._fields, airframe)) if biases else None,
@@ -304,13 +298,15 @@ class AircraftParameters(KeyedParameters):
 
     def wind_model(self) -> WindModel:
         """The wind of an aircraft of JSBSim, on all axes."""
-        gusts = [self.gusts.get(axis, STILL_AIR) for axis in AXES]
-        arrays = (np.array([getattr(gust, key) for gust in gusts]) for key in Gusts._fields)
-        return WindModel(Gusts(*arrays), self._turbulence(self.flight_condition().speed, AXES))
+        return WindModel(self._gust_arrays(AXES), self._turbulence(self.flight_condition().speed, AXES))
+
+    def _gust_arrays(self, axes: Sequence[str]) -> Gusts:
+        gusts = [self.gusts.get(axis, STILL_AIR) for axis in axes]
+        return Gusts(*(np.array([getattr(gust, key) for gust in gusts]) for key in Gusts._fields))
 
     def _turbulence(self, speed: float, axes: Sequence[str]) -> Turbulence | None:
         section = self.turbulence
-        if section is None or not section.has_intensity:
+        if section is None or not (section.wind or section.sigma):  # off, or of intensity 0
             return None
         spectrum = dryden(section.altitude, section.wind or 0.0, section.sigma or 0.0)  # None where it has no effect
         return filters(spectrum, speed, self.step, [AXES.index(axis) for axis in axes], section.seed)

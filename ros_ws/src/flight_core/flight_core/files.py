@@ -58,18 +58,12 @@ def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
 
 def is_file(path: Path) -> bool:
     """Whether the path is a file; False also for an invalid path, such as one that is too long."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
+    return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises OSError and ValueError
 
 
 def is_folder(path: Path) -> bool:
     """Whether the path is a folder; False also for an invalid path."""
-    try:
-        return path.is_dir()
-    except (OSError, ValueError):
-        return False
+    return os.path.isdir(path)  # noqa: PTH112 - as above
 
 
 def open_nonblocking(path: str | Path) -> BinaryIO:

@@ -3,6 +3,7 @@
 """The messages of a log as stored bytes, of any type; and the parameter changes among them."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,20 +18,6 @@ from flight_log.scan import Scan
 
 PARAMETER_EVENTS = "/parameter_events"
 PARAMETER_EVENT = "rcl_interfaces/msg/ParameterEvent"
-
-# Field of rcl_interfaces/msg/ParameterValue that holds the value, by its type.
-FIELDS = (
-    "",
-    "bool_value",
-    "integer_value",
-    "double_value",
-    "string_value",
-    "byte_array_value",
-    "bool_array_value",
-    "integer_array_value",
-    "double_array_value",
-    "string_array_value",
-)
 
 
 class StoredMessage(NamedTuple):
@@ -92,6 +79,7 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
 
 
 def _value(parameter_value: Any) -> Any:
-    field = FIELDS[parameter_value.type] if parameter_value.type < len(FIELDS) else ""
-    value: Any = getattr(parameter_value, field) if field else None
+    # After the field "type" of rcl_interfaces/msg/ParameterValue there is one field for each type, in their order from 1 on.
+    kind, names = parameter_value.type, [field.name for field in fields(parameter_value)]
+    value: Any = getattr(parameter_value, names[kind]) if 0 < kind < len(names) else None
     return value.tolist() if hasattr(value, "tolist") else value

@@ -18,7 +18,7 @@ from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
-from flight_log.named_vectors import Decoder, Samples, decoder, flight_start_ns
+from flight_log.named_vectors import Decoder, decoder, flight_start_ns
 from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
 from flight_log.scan import Scan
 
@@ -106,17 +106,13 @@ class _TopicSamples:
         decoded = self._decode(self._batch)
         self._batch = []
         self._refused += decoded.unreadable
-        for samples in decoded.samples:
-            self._append(samples)
-
-    def _append(self, samples: Samples) -> None:
-        names, stamp_ns, values = samples
-        self._names = self._names or names
-        if names == self._names and values.shape[1] == len(names):
-            self._stamps.append(stamp_ns)
-            self._values.append(values)
-        else:
-            self._refused += len(stamp_ns)
+        for names, stamp_ns, values in decoded.samples:
+            self._names = self._names or names
+            if names == self._names and values.shape[1] == len(names):
+                self._stamps.append(stamp_ns)
+                self._values.append(values)
+            else:
+                self._refused += len(stamp_ns)
 
     def signal(self) -> Signal | None:
         """All samples in the order of their stamps; None without samples."""

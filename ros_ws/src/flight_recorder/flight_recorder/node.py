@@ -178,12 +178,10 @@ class RecorderNode(FlightNode[RecorderParameters]):
             write(channel, received_ns, sent_ns, sequence, message)
             if counted:
                 if sequence > topic.next_sequence > 0:
-                    self._count_lost(topic.name, sequence - topic.next_sequence)
+                    count = sequence - topic.next_sequence
+                    self.lost[topic.name] += count
+                    self.get_logger().warning(f"{topic.name}: {count} messages lost", throttle_duration_sec=2.0)
                 topic.next_sequence = sequence + 1
-
-    def _count_lost(self, name: str, count: int) -> None:
-        self.lost[name] += count
-        self.get_logger().warning(f"{name}: {count} messages lost", throttle_duration_sec=2.0)
 
     def _write_or_end(self, write: Callable[[], None]) -> None:
         """Write to the bag. On an error or a full disk end the bag; the node goes on, because a flight waits for it."""

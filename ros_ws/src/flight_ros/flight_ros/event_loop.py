@@ -135,9 +135,7 @@ def _start(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
 
 def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     executor = _start(nodes)
-    wait_set = WaitSet(
-        [subscription.entity for node in nodes for subscription in node.polled_subscriptions()], nodes[0].context
-    )
+    wait_set = WaitSet([subscription.entity for node in nodes for subscription in node.polled_subscriptions], nodes[0].context)
     begin_ns = serve_ns = report_ns = time.monotonic_ns()
     began = False
     while not stop.requested:
@@ -171,7 +169,7 @@ def _run_real_time(node: FlightNode[Any], stop: _Stop) -> None:
             f"{node.get_name()}.start_time: found an instant {seconds(age):.0f} s ago, expected a future one, or 0"
         )
     begin_ns = time.monotonic_ns() + start_ns - time.time_ns()
-    node.set_time_origin(start_ns, begin_ns)
+    node.time_offset_ns = start_ns - begin_ns
     ticker = Ticker(node.period_ns(), begin_ns)
     if (lead := start_ns - time.time_ns()) > nanoseconds(60):
         node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")

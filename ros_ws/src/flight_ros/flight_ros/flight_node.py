@@ -67,7 +67,7 @@ class FlightNode(Node, Generic[P]):
         self.rejected: Counter[str] = Counter()
         self._logged_ns: dict[str, int] = {}  # by message: when it was logged last
         self._conflict = ""  # the last sample of a conflicting publisher since the last report
-        self._polled_subscriptions: list[PolledSubscription] = []
+        self.polled_subscriptions: list[PolledSubscription] = []
         self._flight_publishers: list[Publisher] = []
         self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to log it next
         self._diagnostics = self.create_publisher(DIAGNOSTICS.type, DIAGNOSTICS.name, PUBLISH)
@@ -76,7 +76,7 @@ class FlightNode(Node, Generic[P]):
         self._compute: list[int] = []
         self._missed = 0
         self._last_tick_ns: int | None = None
-        self._time_offset_ns = 0  # of the time of the ticks from the monotonic clock
+        self.time_offset_ns = 0  # of the time of the ticks from the monotonic clock
         self._clock_step_ns = 0  # of the system clock since the start
 
     # Defined by a subclass
@@ -125,7 +125,7 @@ class FlightNode(Node, Generic[P]):
         subscription = PolledSubscription(
             self, topic, qos or (LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES), raw=True
         )
-        self._polled_subscriptions.append(subscription)
+        self.polled_subscriptions.append(subscription)
         return subscription
 
     def encoder(self, topic: Topic, names: Sequence[str]) -> Encoder:
@@ -167,7 +167,7 @@ class FlightNode(Node, Generic[P]):
 
     def now_ns(self) -> int:
         """The time of the ticks, ns: the system clock at the start plus the monotonic time since then."""
-        return time.monotonic_ns() + self._time_offset_ns
+        return time.monotonic_ns() + self.time_offset_ns
 
     def warn_no_publisher(self, subscription: PolledSubscription) -> None:
         """Called at each tick without a sample of a topic: logs a warning after 3 s, then every 2 s."""
@@ -207,10 +207,6 @@ class FlightNode(Node, Generic[P]):
         self.tick(tick, now_ns)
         self._compute.append(time.monotonic_ns() - begin_ns)
 
-    def set_time_origin(self, start_ns: int, monotonic_ns: int) -> None:
-        """Set the instant of tick 0, given on the system clock and on the monotonic clock."""
-        self._time_offset_ns = start_ns - monotonic_ns
-
     def check_clock(self) -> None:
         """Log an error after a step of the system clock. This node keeps its time; a node that starts now has another time."""
         step_ns = time.time_ns() - self.now_ns()
@@ -224,7 +220,7 @@ class FlightNode(Node, Generic[P]):
         """Log an error for each peer with another message type or incompatible QoS: its topic would stay silent."""
         for publisher in self._flight_publishers:
             self.check_subscribers(publisher)
-        for subscription in self._polled_subscriptions:
+        for subscription in self.polled_subscriptions:
             self.check_publishers(subscription.name, type_name(subscription.topic.type), subscription.qos)
 
     def check_publishers(self, topic: str, message_type: str, qos: QoSProfile | None = None) -> None:
@@ -252,10 +248,6 @@ class FlightNode(Node, Generic[P]):
     def runs_in_lockstep(self) -> bool:
         """Whether the event loop calls `advance` in lockstep instead of `tick` in real time."""
         return self.parameters.lockstep
-
-    def polled_subscriptions(self) -> list[PolledSubscription]:
-        """The subscriptions of this node that are polled."""
-        return self._polled_subscriptions
 
     def require_peers(self) -> None:
         """Raise FlightEnded after the loss of a peer of a lockstep flight."""

@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from importlib import import_module
-from types import TracebackType
 from typing import Any, Self
 
 import rclpy
@@ -17,7 +16,7 @@ from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_ros import transport
 from flight_ros.event_loop import IDLE_POLL_PERIOD
 from flight_ros.flight_node import ACKNOWLEDGE_TIMEOUT
-from flight_ros.messages import STAMP, STAMP_PLACE, instant
+from flight_ros.messages import STAMP, STAMP_PLACE, instant, stamp_of
 from flight_ros.topics import CLOCK, LOCKSTEP
 
 DISCOVERY_TIME = 1.0  # s, to discover other publishers
@@ -50,13 +49,13 @@ class Player:
             self._clock = self._node.create_publisher(CLOCK.type, CLOCK.name, LOCKSTEP)
             time.sleep(MATCHING_TIME)
         except BaseException:
-            self.__exit__(None, None, None)
+            self.__exit__()
             raise
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._node.destroy_node()
         rclpy.try_shutdown()
 
@@ -98,8 +97,7 @@ class Player:
 
 
 def _restamped(data: bytes, begin_ns: int, first_ns: int, rate: float) -> bytes:
-    seconds, nanosecond = STAMP.unpack_from(data, STAMP_PLACE)
-    since_ns = seconds * NANOSECONDS + nanosecond - first_ns
+    since_ns = stamp_of(data) - first_ns
     stamp_ns = begin_ns + (since_ns if rate == 1.0 else round(since_ns / rate))
     message = bytearray(data)
     STAMP.pack_into(message, STAMP_PLACE, *divmod(stamp_ns, NANOSECONDS))

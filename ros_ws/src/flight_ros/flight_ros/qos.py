@@ -26,21 +26,20 @@ def strongest_compatible(offered: Sequence[QoSProfile]) -> QoSProfile:
 
 def rosbag2_profiles(offered: Sequence[QoSProfile]) -> list[dict[str, object]]:
     """Profiles as rosbag2 stores them."""
-    return [_as_mapping(one) for one in offered]
-
-
-def _as_mapping(qos: QoSProfile) -> dict[str, object]:
-    return {
-        "history": qos.history.short_key,
-        "depth": qos.depth,
-        "reliability": qos.reliability.short_key,
-        "durability": qos.durability.short_key,
-        "deadline": _duration(qos.deadline),
-        "lifespan": _duration(qos.lifespan),
-        "liveliness": "automatic",
-        "liveliness_lease_duration": _duration(qos.liveliness_lease_duration),
-        "avoid_ros_namespace_conventions": False,
-    }
+    return [
+        {
+            "history": qos.history.short_key,
+            "depth": qos.depth,
+            "reliability": qos.reliability.short_key,
+            "durability": qos.durability.short_key,
+            "deadline": _duration(qos.deadline),
+            "lifespan": _duration(qos.lifespan),
+            "liveliness": "automatic",
+            "liveliness_lease_duration": _duration(qos.liveliness_lease_duration),
+            "avoid_ros_namespace_conventions": False,
+        }
+        for qos in offered
+    ]
 
 
 def _duration(duration: Duration) -> dict[str, int]:
