@@ -19,8 +19,8 @@ def at(t: float) -> int:
     return nanoseconds(1000.0 + t)
 
 
-def receive_outputs(bridge: Bridge, t: float, raw: float = 0.0) -> None:
-    for name in OUTPUTS:
+def receive_outputs(bridge: Bridge, t: float, names: tuple[str, ...] = OUTPUTS, raw: float = 0.0) -> None:
+    for name in names:
         bridge.take_output(name, raw, at(t), at(t))
 
 
@@ -32,10 +32,16 @@ def new_bridge(channel_map: ChannelMap = CHANNEL_MAP, *, dry_run: bool = False) 
     return Bridge(channel_map, dry_run=dry_run)
 
 
-def engaged_bridge(channel_map: ChannelMap = CHANNEL_MAP) -> Bridge:
-    bridge = new_bridge(channel_map)
+def ready_bridge(u: float = 0.0, *, channel_map: ChannelMap = CHANNEL_MAP, dry_run: bool = False) -> Bridge:
+    """A bridge that has received y and u at t = 0."""
+    bridge = new_bridge(channel_map, dry_run=dry_run)
     receive_outputs(bridge, 0.0)
-    receive_u(bridge, 0.0)
+    receive_u(bridge, 0.0, u)
+    return bridge
+
+
+def engaged_bridge(channel_map: ChannelMap = CHANNEL_MAP) -> Bridge:
+    bridge = ready_bridge(channel_map=channel_map)
     assert bridge.engage(at(0.0)) == ""
     return bridge
 
@@ -67,28 +73,23 @@ def test_engagement_with_stale_inputs_is_refused_with_the_reason() -> None:
 
 
 def test_a_dry_run_computes_but_never_sends_or_engages() -> None:
-    bridge = new_bridge(dry_run=True)
-    receive_outputs(bridge, 0.0)
-    receive_u(bridge, 0.0, 0.1)
+    bridge = ready_bridge(0.1, dry_run=True)
     assert bridge.engage(at(0.0)).startswith("dry_run")
     assert not bridge.sends("joy", at(0.0))
     assert bridge.raw_u()[0] == pytest.approx(0.1 / 0.523599)
 
 
 def test_engagement_with_u_away_from_trim_is_refused() -> None:
-    bridge = new_bridge()
-    receive_outputs(bridge, 0.0)
-    receive_u(bridge, 0.0, 0.05)  # above a tenth of 0.26 rad
+    bridge = ready_bridge(0.05)  # above a tenth of 0.26 rad
     assert bridge.engage(at(0.0)).startswith("u.elevator is 0.05 from trim")
 
 
 def test_u_stays_inside_its_limits_around_trim() -> None:
     bridge = engaged_bridge()
-    receive_u(bridge, 0.01, 9.0)
-    rows = CHANNEL_MAP.inputs.values()
-    assert bridge.raw() == pytest.approx([to_raw(row.trim + row.upper, row.line) for row in rows])
-    receive_u(bridge, 0.02, -9.0)
-    assert bridge.raw() == pytest.approx([to_raw(row.trim + row.lower, row.line) for row in rows])
+    for u, limit in ((9.0, "upper"), (-9.0, "lower")):
+        receive_u(bridge, 0.01, u)
+        rows = CHANNEL_MAP.inputs.values()
+        assert bridge.raw() == pytest.approx([to_raw(row.trim + getattr(row, limit), row.line) for row in rows])
 
 
 def test_a_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None:
@@ -98,9 +99,8 @@ def test_a_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None
         receive_outputs(bridge, t + 1e-3)
         phases.append((bridge.step(at(t + 1e-3)), t, bridge.raw(), bridge.sends("joy", at(t))))
     starts = {phase: next(t for one, t, *_ in phases if one is phase) for phase in Phase}
-    assert starts == pytest.approx(
-        {Phase.ENGAGED: 0.0, Phase.NEUTRAL: 0.2, Phase.RELEASE: 0.5, Phase.DISENGAGED: 1.0}, abs=0.011
-    )  # a tick
+    expected = {Phase.ENGAGED: 0.0, Phase.NEUTRAL: 0.2, Phase.RELEASE: 0.5, Phase.DISENGAGED: 1.0}
+    assert starts == pytest.approx(expected, abs=0.011)  # a tick
     for phase, _, raw, sent in phases:
         assert sent == (phase is not Phase.DISENGAGED)
         if phase is Phase.NEUTRAL:
@@ -168,13 +168,13 @@ def test_y_is_returned_once_per_rate_sample_and_only_while_all_channels_are_fres
     bridge.take_output("q", 0.5, at(0.0), at(0.01))
     assert bridge.y(at(0.01)) is None
     receive_outputs(bridge, 0.02)
-    bridge.take_output("q", 0.5, at(0.03), at(0.03))
+    receive_outputs(bridge, 0.03, ("q",), 0.5)
     sample = bridge.y(at(0.03))
     assert sample is not None
     assert sample.stamp_ns == at(0.03)
     assert sample.value.tolist() == [-0.5, -25.0, 0.0, 0.0]
     assert bridge.y(at(0.04)) is None
-    bridge.take_output("q", 0.5, at(0.25), at(0.25))  # the others are 0.23 s old, above 0.2 s
+    receive_outputs(bridge, 0.25, ("q",), 0.5)  # the others are 0.23 s old, above 0.2 s
     assert bridge.y(at(0.25)) is None
 
 
@@ -195,6 +195,5 @@ def test_the_offboard_heartbeat_starts_before_engagement_and_ends_with_stale_inp
     receive_u(bridge, 0.0)
     assert bridge.sends("offboard", at(0.0))
     assert not bridge.sends("torque", at(0.0))
-    for name in OUTPUTS[:3]:
-        bridge.take_output(name, 0.0, at(0.25), at(0.25))
+    receive_outputs(bridge, 0.25, OUTPUTS[:3])
     assert not bridge.sends("offboard", at(0.25))

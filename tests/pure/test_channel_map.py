@@ -8,8 +8,7 @@ test_published_messages.py.
 """
 
 import math
-from pathlib import Path
-from types import SimpleNamespace
+from types import SimpleNamespace as Message
 from typing import Any
 
 import numpy as np
@@ -28,23 +27,19 @@ MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
 LINES = st.builds(Line, st.sampled_from((-1, 1)), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
 
 
-def message_like(**fields: Any) -> SimpleNamespace:
-    return SimpleNamespace(**fields)
-
-
-FLU = message_like(x=0.3, y=-0.2, z=-0.1)  # roll right at 0.3 rad/s, nose up at 0.2, nose right at 0.1
+FLU = Message(x=0.3, y=-0.2, z=-0.1)  # roll right at 0.3 rad/s, nose up at 0.2, nose right at 0.1
 FRD = np.array([0.3, 0.2, 0.1], dtype=np.float32)  # the same motion as a fixed array of a message
 MOTION = {"p": 0.3, "q": 0.2, "r": 0.1}  # the expected channels for each map
 RATES = {
-    "ardupilot": message_like(twist=message_like(linear=message_like(x=9.0, y=9.0, z=9.0), angular=FLU)),
-    "mavros": message_like(angular_velocity=FLU),
-    "px4": message_like(angular_velocity=FRD),
-    "rosflight": message_like(p=0.3, q=0.2, r=0.1, va=27.0),
+    "ardupilot": Message(twist=Message(linear=Message(x=9.0, y=9.0, z=9.0), angular=FLU)),
+    "mavros": Message(angular_velocity=FLU),
+    "px4": Message(angular_velocity=FRD),
+    "rosflight": Message(p=0.3, q=0.2, r=0.1, va=27.0),
 }
 AIRSPEED = {  # 27 m/s, 2 m/s above the trim of 25 m/s
-    "ardupilot": message_like(vector=message_like(x=-18.0, y=18.0, z=-9.0)),  # 9 (2, 2, 1), of length 27
-    "mavros": message_like(airspeed=27.0),
-    "px4": message_like(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
+    "ardupilot": Message(vector=Message(x=-18.0, y=18.0, z=-9.0)),  # 9 (2, 2, 1), of length 27
+    "mavros": Message(airspeed=27.0),
+    "px4": Message(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
     "rosflight": RATES["rosflight"],
 }
 SENT = {  # elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to the right, rudder 0.1 rad to the right
@@ -96,9 +91,8 @@ def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name
             set_field(message, input_row.field, raw)
             error = 1e-7 * abs(raw) if element == "float32" else 0.5
             assert get_field(message, input_row.field) == pytest.approx(raw, rel=0.0, abs=error, nan_ok=True)
-    for key, reader in [("outputs." + one, row) for one, row in channel_map.outputs.items()] + [
-        ("overrides." + one, row) for one, row in channel_map.overrides.items()
-    ]:
+    readers = {"outputs." + one: row for one, row in channel_map.outputs.items()}
+    for key, reader in (readers | {"overrides." + one: row for one, row in channel_map.overrides.items()}).items():
         if key in messages:
             assert read_raw(messages[key], reader.field, "value") == 0.0
             needs_header = getattr(reader, "stamp", "arrival") == "header"
@@ -136,12 +130,12 @@ def test_a_channel_rises_with_the_raw_value_by_its_sign_and_scale(line: Line, ra
 
 @given(st.floats(0.0, 300.0))
 def test_the_speed_of_a_dynamic_pressure_is_the_one_that_makes_it(speed: float) -> None:
-    message = message_like(fluid_pressure=0.5 * 1.225 * speed**2)
+    message = Message(fluid_pressure=0.5 * 1.225 * speed**2)
     assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == pytest.approx(speed, abs=1e-6)
 
 
 def test_fields_are_reached_by_their_paths() -> None:
-    message = message_like(twist=message_like(angular=message_like(y=1.5)), axes=[0.0, 2.5], parts=[message_like(z=3.5)])
+    message = Message(twist=Message(angular=Message(y=1.5)), axes=[0.0, 2.5], parts=[Message(z=3.5)])
     assert get_field(message, "twist.angular.y") == 1.5
     assert get_field(message, "axes[1]") == 2.5
     set_field(message, "parts[0].z", 4.5)
@@ -152,7 +146,7 @@ def test_fields_are_reached_by_their_paths() -> None:
 
 
 def test_values_of_integer_fields_are_rounded_and_never_wrapped() -> None:
-    message = message_like(channels=np.zeros(18, dtype=np.uint16))
+    message = Message(channels=np.zeros(18, dtype=np.uint16))
     set_field(message, "channels[1]", 1595.5001)
     assert message.channels[1] == 1596
     for wrong in (math.nan, -1.0, 70000.0):
@@ -164,7 +158,7 @@ def test_values_of_integer_fields_are_rounded_and_never_wrapped() -> None:
 @pytest.mark.parametrize("raw", [math.nan, math.inf])
 def test_a_value_that_is_not_finite_is_refused(raw: float) -> None:
     with pytest.raises(ChannelError, match="not finite") as refused:
-        read_raw(message_like(q=raw), "q", "value")
+        read_raw(Message(q=raw), "q", "value")
     assert refused.value.reason == "finite"
 
 
@@ -175,7 +169,7 @@ def test_a_missing_message_package_is_one_sentence_that_names_the_package_to_ins
 
 def test_a_message_that_another_version_lacks_is_one_sentence() -> None:
     with pytest.raises(ParameterError, match="no Airspeed in the installed ardupilot_msgs"):
-        message_type("ardupilot_msgs/msg/Airspeed", lambda name: message_like())
+        message_type("ardupilot_msgs/msg/Airspeed", lambda name: Message())
 
 
 # Invalid values: (key path, value) and the sentence of the refusal.
@@ -217,10 +211,9 @@ def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], va
     assert "\n" not in str(refused.value)
 
 
-def test_a_missing_map_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(
-        ParameterError, match=r"bridge\.map: found 'nowhere', expected one of ardupilot, mavros, px4, rosflight"
-    ):
+def test_a_missing_map_is_one_sentence() -> None:
+    sentence = r"bridge\.map: found 'nowhere', expected one of ardupilot, mavros, px4, rosflight"
+    with pytest.raises(ParameterError, match=sentence):
         BridgeParameters.validate_mapping({"map": "nowhere"}, "bridge")
     with pytest.raises(ParameterError, match="lockstep"):
         BridgeParameters.validate_mapping({"map": "px4", "lockstep": True}, "bridge")

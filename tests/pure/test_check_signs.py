@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.params import LIBRARY, ChannelMap, load_map
-from autopilot_bridge.signs import MIN_ERROR_RATIO, estimate, through
+from autopilot_bridge.signs import MIN_ERROR_RATIO, Estimate, estimate, through
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.sign_check import check
+from flight_analysis.design.sign_check import SignCheck, check
 from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
@@ -29,28 +29,24 @@ MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
 
 
-def omega_of_the_osprey() -> FloatArray:
-    osprey = load_airframe("osprey")
-    assert osprey.outputs == ("q", "V", "p", "r")  # as in the maps
-    return osprey.matrix_c() @ osprey.matrix_b()
+AIRFRAME = load_airframe("osprey")
+OMEGA: FloatArray = AIRFRAME.matrix_c() @ AIRFRAME.matrix_b()
 
 
-def changed(name: str, kind: str, channel: str, **values: Any) -> ChannelMap:
-    content = load_map(name).model_dump()
+def check_osprey(channel_map: ChannelMap, D: tuple[int, ...] = (1, 1, 1, 1), measured: Estimate | None = None) -> SignCheck:
+    return check(channel_map, OMEGA, OUTPUTS, INPUTS, D, measured)
+
+
+def changed(original: ChannelMap, kind: str, channel: str, **values: Any) -> ChannelMap:
+    content = original.model_dump()
     content[kind][channel] |= values
     return ChannelMap.validate_mapping(content, "map")
 
 
-def listed(value: Any) -> Any:
-    """The value with lists in place of tuples, for YAML."""
-    if isinstance(value, dict):
-        return {key: listed(one) for key, one in value.items()}
-    return [listed(one) for one in value] if isinstance(value, tuple) else value
-
-
 def written(channel_map: ChannelMap, folder: Path) -> str:
     path = folder / f"{channel_map.name}.yaml"
-    path.write_text(yaml.safe_dump(listed(channel_map.model_dump(exclude_none=True)), sort_keys=False), encoding="utf-8")
+    content = json.loads(json.dumps(channel_map.model_dump(exclude_none=True)))  # lists in place of tuples, for YAML
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return str(path)
 
 
@@ -58,26 +54,24 @@ def written(channel_map: ChannelMap, folder: Path) -> str:
 def test_the_shipped_maps_fit_the_controller_of_the_osprey(name: str) -> None:
     result = CliRunner().invoke(app, ["check-signs", name, "--json"])
     assert result.exit_code == 0
-    assert [(one["output"], one["input"], one["D"]) for one in json.loads(result.stdout)["channels"]] == [
-        ("q", "elevator", 1),
-        ("p", "aileron", 1),
-        ("r", "rudder", 1),
-        ("V", "thrust", 1),
-    ]
+    channels = [(one["output"], one["input"], one["D"]) for one in json.loads(result.stdout)["channels"]]
+    assert channels == [("q", "elevator", 1), ("p", "aileron", 1), ("r", "rudder", 1), ("V", "thrust", 1)]
 
 
 def test_through_a_map_of_the_right_signs_omega_is_that_of_the_airframe() -> None:
+    assert AIRFRAME.outputs == ("q", "V", "p", "r")  # as in the maps
     for name in MAPS:
-        assert through(load_map(name), omega_of_the_osprey()) == pytest.approx(omega_of_the_osprey())
+        assert through(load_map(name), OMEGA) == pytest.approx(OMEGA)
 
 
 @pytest.mark.parametrize("channel", INPUTS)
 @pytest.mark.parametrize("name", MAPS)
 def test_an_input_with_the_wrong_sign_changes_its_own_d_only(name: str, channel: str) -> None:
-    row, k = load_map(name).inputs[channel], INPUTS.index(channel)
+    original, k = load_map(name), INPUTS.index(channel)
+    row = original.inputs[channel]
     span = sum(row.range)  # the sign changes about the middle, so that trim stays inside the range
-    flipped = changed(name, "inputs", channel, sign=-row.sign, offset=row.offset + row.sign * row.scale * span)
-    checked = check(flipped, omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1))
+    flipped = changed(original, "inputs", channel, sign=-row.sign, offset=row.offset + row.sign * row.scale * span)
+    checked = check_osprey(flipped)
     assert [one.D for one in checked.channels] == [-1 if i == k else 1 for i in range(4)]
     assert len(checked.contradictions) == 1
     assert f"D of {OUTPUTS[k]} and {channel} is -1, the controller has +1" in checked.contradictions[0]
@@ -86,23 +80,19 @@ def test_an_input_with_the_wrong_sign_changes_its_own_d_only(name: str, channel:
 @pytest.mark.parametrize("channel", OUTPUTS)
 def test_two_wrong_signs_that_cancel_in_d_are_still_a_contradiction(channel: str) -> None:
     k = OUTPUTS.index(channel)
-    flipped = changed("ardupilot", "outputs", channel, sign=-load_map("ardupilot").outputs[channel].sign)
-    row = flipped.inputs[INPUTS[k]]
-    content = flipped.model_dump()
-    content["inputs"][INPUTS[k]] |= {"sign": -row.sign}
-    checked = check(ChannelMap.validate_mapping(content, "map"), omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1))
+    original = load_map("ardupilot")
+    flipped = changed(original, "outputs", channel, sign=-original.outputs[channel].sign)
+    checked = check_osprey(changed(flipped, "inputs", INPUTS[k], sign=-original.inputs[INPUTS[k]].sign))
     assert [one.D for one in checked.channels] == [1, 1, 1, 1]
     assert f"outputs.{channel} of the map ardupilot has the wrong sign" in checked.contradictions[0]
 
 
 def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> None:
-    path = written(changed("ardupilot", "inputs", "elevator", sign=-1), tmp_path)
+    path = written(changed(load_map("ardupilot"), "inputs", "elevator", sign=-1), tmp_path)
     result = CliRunner().invoke(app, ["check-signs", path])
     assert result.exit_code == 1
-    assert (
-        "error: with the map ardupilot D of q and elevator is -1, the controller has +1: a positive elevator makes"
-        in result.stderr
-    )
+    sentence = "error: with the map ardupilot D of q and elevator is -1, the controller has +1: a positive elevator makes"
+    assert sentence in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -123,10 +113,11 @@ def test_options_that_contradict_a_bridge_are_refused(options: tuple[str, ...], 
 
 
 def test_a_map_of_other_channels_or_motions_is_one_sentence() -> None:
+    original = load_map("ardupilot")
     with pytest.raises(ParameterError, match=r"outputs\.q\.positive: found 'roll right', .* a motion to which q responds"):
-        through(changed("ardupilot", "outputs", "q", positive="roll right"), omega_of_the_osprey())
+        through(changed(original, "outputs", "q", positive="roll right"), OMEGA)
     with pytest.raises(ParameterError, match=r"inputs\.elevator\.positive: found 'roll right', .* in the airframe p"):
-        through(changed("ardupilot", "inputs", "elevator", positive="roll right"), omega_of_the_osprey())
+        through(changed(original, "inputs", "elevator", positive="roll right"), OMEGA)
 
 
 # Estimate from a recorded flight
@@ -168,10 +159,9 @@ def test_a_recorded_flight_of_the_osprey_shows_the_signs_of_its_omega() -> None:
     tape = simulate(find_scenario("osprey_gust").vary(flight={"duration": 28.0}))
     measured = estimate(tape["y"], tape["u"], OUTPUTS, INPUTS)
     assert (np.diag(measured.ratio) > MIN_ERROR_RATIO).all()
-    right = check(load_map("ardupilot"), omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, 1, 1), measured)
-    assert not right.contradictions
-    wrong = changed("ardupilot", "inputs", "rudder", positive="nose left")
-    checked = check(wrong, omega_of_the_osprey(), OUTPUTS, INPUTS, (1, 1, -1, 1), measured)
+    right = load_map("ardupilot")
+    assert not check_osprey(right, measured=measured).contradictions
+    checked = check_osprey(changed(right, "inputs", "rudder", positive="nose left"), (1, 1, -1, 1), measured)
     assert len(checked.contradictions) == 1
     assert "the recorded flight has r_dot rise with rudder" in checked.contradictions[0]
 

@@ -16,6 +16,7 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import (
     SDU,
     DecompositionError,
+    Pairing,
     coupling,
     decompose,
     leading_minors,
@@ -58,11 +59,17 @@ def decomposed(Omega: FloatArray) -> SDU:
         raise
 
 
-def osprey() -> FloatArray:
-    """Omega of the osprey in the units of its file: rad/s and m/s per deg and %."""
-    airframe = load_airframe("osprey")
-    B: FloatArray = np.array(airframe.B)
-    return airframe.matrix_c() @ B
+def pairing_of(Omega: FloatArray, largest_U: float = math.inf) -> Pairing:
+    pairing = search(Omega, largest_U)
+    assert pairing is not None
+    return pairing
+
+
+AIRFRAME = load_airframe("osprey")
+OSPREY: FloatArray = AIRFRAME.matrix_c() @ np.array(AIRFRAME.B)
+"""Omega of the osprey in the units of its file: rad/s and m/s per deg and %."""
+SWAPPED = OSPREY[:, [0, 1, 3, 2]]  # the rudder is paired with the roll rate
+EXCHANGE = np.array([[0.0, 1.0], [1.0, 0.0]])
 
 
 @given(matrices())
@@ -141,8 +148,7 @@ def test_search_returns_a_pairing_with_identity_d_and_its_u(Omega: FloatArray) -
 @given(matrices())
 def test_search_changes_only_input_signs_where_omega_has_s_d_u(Omega: FloatArray) -> None:
     D = decomposed(Omega).D
-    pairing = search(Omega)
-    assert pairing is not None
+    pairing = pairing_of(Omega)
     assert pairing.outputs == pairing.inputs == tuple(range(len(Omega)))
     assert pairing.signs == tuple(D)
 
@@ -164,7 +170,7 @@ def test_a_positive_diagonal_does_not_make_d_one() -> None:
 
 def test_a_nonsingular_omega_without_s_d_u_is_refused_with_the_number_of_its_minor() -> None:
     with pytest.raises(DecompositionError, match=r"^Omega: found leading minor 1 zero .*, expected .*") as caught:
-        decompose(np.array([[0.0, 1.0], [1.0, 0.0]]))
+        decompose(EXCHANGE)
     assert caught.value.minor == 1
     assert isinstance(caught.value, ParameterError)
 
@@ -214,58 +220,45 @@ def test_a_matrix_that_is_not_square_or_not_finite_is_refused(Omega: FloatArray,
 
 
 def test_leading_minors_may_be_zero() -> None:
-    np.testing.assert_array_equal(leading_minors(np.array([[0.0, 1.0], [1.0, 0.0]])), [0.0, -1.0])
+    np.testing.assert_array_equal(leading_minors(EXCHANGE), [0.0, -1.0])
 
 
 def test_the_osprey_has_identity_d_and_little_coupling() -> None:
     # Channels q, V, p, r and elevator, thrust, aileron, rudder, with the signs of the airframe file.
-    np.testing.assert_array_equal(signs(osprey()), [1.0, 1.0, 1.0, 1.0])
-    assert coupling(osprey()) == pytest.approx(0.058, abs=5e-4)
+    np.testing.assert_array_equal(signs(OSPREY), [1.0, 1.0, 1.0, 1.0])
+    assert coupling(OSPREY) == pytest.approx(0.058, abs=5e-4)
 
 
 def test_textbook_elevator_sign_flips_the_first_d() -> None:
-    trailing_edge_down = osprey() * np.array([-1.0, 1.0, 1.0, 1.0])
+    trailing_edge_down = OSPREY * np.array([-1.0, 1.0, 1.0, 1.0])
     np.testing.assert_array_equal(signs(trailing_edge_down), [-1.0, 1.0, 1.0, 1.0])
-    pairing = search(trailing_edge_down)
-    assert pairing is not None
-    assert pairing.signs == (-1, 1, 1, 1)
+    assert pairing_of(trailing_edge_down).signs == (-1, 1, 1, 1)
 
 
 def test_rudder_paired_with_roll_rate_flips_a_d_and_makes_u_large() -> None:
-    swapped = osprey()[:, [0, 1, 3, 2]]
-    _, D, U = decompose(swapped)
+    _, D, U = decompose(SWAPPED)
     np.testing.assert_array_equal(D, [1.0, 1.0, -1.0, 1.0])
     # By hand, on the block [[-0.02, 1.5], [0.17, -0.09]]: W_12 = -75, L_21 = -8.5, U_12 = W_12 + L_21.
     assert U[2, 3] == pytest.approx(-83.5, abs=1e-9)
 
 
 def test_search_keeps_a_bad_pairing_unless_u_is_limited() -> None:
-    swapped = osprey()[:, [0, 1, 3, 2]]
-    sign_change = search(swapped)
-    assert sign_change is not None
+    sign_change = pairing_of(SWAPPED)
     assert sign_change.inputs == (0, 1, 2, 3)
     assert sign_change.signs == (1, 1, -1, 1)
-    re_paired = search(swapped, largest_U=1.0)
-    assert re_paired is not None
-    assert re_paired.outputs == (0, 1, 2, 3)
-    assert re_paired.inputs == (0, 1, 3, 2)
-    assert re_paired.signs == (1, 1, 1, 1)
+    re_paired = pairing_of(SWAPPED, largest_U=1.0)
+    assert re_paired[:3] == ((0, 1, 2, 3), (0, 1, 3, 2), (1, 1, 1, 1))
     assert float(np.max(np.abs(re_paired.U - np.eye(4)))) == pytest.approx(0.058, abs=5e-4)
 
 
 def test_search_changes_the_pairing_where_sign_changes_do_not_suffice() -> None:
-    pairing = search(np.array([[0.0, 1.0], [1.0, 0.0]]))
-    assert pairing is not None
-    assert pairing.outputs == (0, 1)
-    assert pairing.inputs == (1, 0)
-    assert pairing.signs == (1, 1)
+    assert pairing_of(EXCHANGE)[:3] == ((0, 1), (1, 0), (1, 1))
 
 
 @pytest.mark.parametrize(("near", "far", "inputs"), [(1.0, 0.1, (1, 2, 0)), (0.1, 1.0, (2, 0, 1))])
 def test_search_prefers_the_smaller_u_among_equal_changes(near: float, far: float, inputs: tuple[int, ...]) -> None:
     # No output responds to its own input, so the pairing of all three changes in one of two ways.
-    pairing = search(np.array([[0.0, near, far], [far, 0.0, near], [near, far, 0.0]]))
-    assert pairing is not None
+    pairing = pairing_of(np.array([[0.0, near, far], [far, 0.0, near], [near, far, 0.0]]))
     assert pairing.inputs == inputs
     assert float(np.max(np.abs(pairing.U - np.eye(3)))) < 0.2  # it is above 1 for the other pairing
 
@@ -282,6 +275,5 @@ def test_coupling_is_infinite_where_an_output_does_not_respond_to_its_own_input(
 
 def test_an_uncertainty_of_50_percent_per_entry_does_not_change_d_of_the_osprey() -> None:
     generator = np.random.default_rng(20101)
-    Omega = osprey()
     for _ in range(1000):  # also none in 5000; with 90 % 2 to 4 in 10 000
-        np.testing.assert_array_equal(signs(Omega * generator.uniform(0.5, 1.5, Omega.shape)), np.ones(4))
+        np.testing.assert_array_equal(signs(OSPREY * generator.uniform(0.5, 1.5, (4, 4))), np.ones(4))

@@ -46,14 +46,8 @@ BY_HAND = Nominal(
 # CB = [[2, 0.4], [0.3, -1]], so D = (1, -1). At y = 0 the eigenvalues of the other two states are -2 1/s and 0.
 A = ((-1.0, 0.2, 1.5, 0.0), (0.3, -2.0, 0.5, 0.0), (1.0, 0.4, -2.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 B = ((2.0, 0.4), (0.3, -1.0), (0.0, 0.0), (0.0, 0.0))
-GRAVITY = ((0.0, 0.0, 0.0, -3.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
-MODEL: dict[str, Any] = {
-    "states": ("a", "b", "c", "d"),
-    "A": sum(A, ()),
-    "B": sum(B, ()),
-    "gravity": sum(GRAVITY, ()),
-    "lead": (0.005, 0.005),
-}
+GRAVITY = ((0.0, 0.0, 0.0, -3.0), (0.0,) * 4, (0.0,) * 4, (0.0,) * 4)
+MODEL: dict[str, Any] = {"states": ("a", "b", "c", "d"), "A": sum(A, ()), "B": sum(B, ()), "gravity": sum(GRAVITY, ())}
 CONTROLLER: dict[str, Any] = SERVO.controller.model_dump() | {
     "outputs": ("a", "b"),
     "inputs": ("u", "v"),
@@ -81,6 +75,12 @@ def reference(t: float) -> FloatArray:
     """A reference that is at rest until 0 and moves afterwards, with a continuous second derivative."""
     t = max(t, 0.0)
     return np.array([np.sin(t) ** 3, (1.0 - np.cos(2.0 * t)) ** 2 / 2.0])
+
+
+def nominal_of(params: ControllerParameters) -> Nominal:
+    nominal = params.nominal()
+    assert nominal is not None
+    return nominal
 
 
 def largest_error(params: ControllerParameters) -> float:
@@ -126,9 +126,7 @@ def test_the_input_is_extrapolated_linearly_from_the_last_two() -> None:
 def test_zero_dynamics_are_the_zeros_of_the_model() -> None:
     # With y = x_1 at 0, x_2_dot = -3 x_2; in the small aircraft c_dot = -2 c and d_dot = 0
     assert feedforward.zero_dynamics(BY_HAND) == pytest.approx([-3.0])
-    nominal = small_aircraft().nominal()
-    assert nominal is not None
-    assert sorted(feedforward.zero_dynamics(nominal).real) == pytest.approx([-2.0, 0.0])
+    assert sorted(feedforward.zero_dynamics(nominal_of(small_aircraft())).real) == pytest.approx([-2.0, 0.0])
 
 
 def test_the_feedforward_does_not_depend_on_y() -> None:
@@ -152,8 +150,9 @@ def test_on_the_nominal_plant_the_feedforward_alone_leaves_the_sampling_error() 
 
 def test_the_feedforward_is_off_by_default() -> None:
     for name in ("osprey_gust", "osprey_servo"):
-        assert find_scenario(name).controller.feedforward is None
-        assert find_scenario(name).controller.guard().nominal is None
+        controller = find_scenario(name).controller
+        assert controller.feedforward is None
+        assert controller.guard().nominal is None
 
 
 def short(**changes: Any) -> Scenario:
@@ -166,10 +165,10 @@ def short(**changes: Any) -> Scenario:
     }
     starts = zip(SERVO.aircraft.gusts.items(), (7.0, 9.5), strict=True)
     gusts = {name: gust.model_dump() | {"start": start} for (name, gust), start in starts}
-    fast = SERVO.vary(flight={"duration": 12.0}, aircraft={"gusts": gusts}, reference_model={"pulses": pulses})
     # y and y_m at the controller's rate, in steps of 5 ms: a fifth of the computation, scores within 1 %
-    slow = fast.vary(aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0})
-    return slow.vary(**changes)
+    slow = {"rate": 100.0, "step": 0.005, "gusts": gusts}
+    reference_model = {"rate": 100.0, "pulses": pulses}
+    return SERVO.vary(flight={"duration": 12.0}, aircraft=slow, reference_model=reference_model).vary(**changes)
 
 
 def recomputed(params: ControllerParameters, tape: Tape) -> tuple[FloatArray, FloatArray]:
@@ -227,8 +226,7 @@ def test_engagement_and_re_engagement_during_a_manoeuvre_are_bumpless() -> None:
     assert engaged[1] == 70
     # With y = y_m the law is at rest, so u changes by the feedforward only, by 0.04 to 0.07 per tick. The whole u_ff would be
     # a jump of 0.8 at the first engagement and of 4.6 at the second.
-    nominal = small_aircraft().nominal()
-    assert nominal is not None
+    nominal = nominal_of(small_aircraft())
     for first in engaged:
         u = np.array([state.u for state in states[first : first + 20]])
         assert (u[:3] == u[0]).all()  # two ticks determine the slope and add nothing
@@ -249,11 +247,9 @@ def test_new_gains_change_neither_the_feedforward_nor_the_input() -> None:
     retuned = state._replace(law=law)
     assert rise.control(law, law, new.law()) == pytest.approx(rise.control(state.law, state.law, old.law()))
     now = StampedVector(1500 * MS, reference(1.5))
-    after = [
-        guard.tick(one, now.stamp_ns, now, [now], params.guard(), params.law())[0]
-        for one, params in ((state, old), (retuned, new))
-    ]
-    assert after[0].u_ff.tobytes() == after[1].u_ff.tobytes()
+    before, _ = guard.tick(state, now.stamp_ns, now, [now], old.guard(), old.law())
+    after, _ = guard.tick(retuned, now.stamp_ns, now, [now], new.guard(), new.law())
+    assert before.u_ff.tobytes() == after.u_ff.tobytes()
 
 
 # Refusals
@@ -289,8 +285,7 @@ def test_an_unusable_nominal_model_is_refused(change: Mapping[str, Any], sentenc
 
 def test_a_model_without_hidden_states_or_gravity_is_accepted() -> None:
     square: dict[str, Any] = {"states": ("b", "a"), "A": (0.0,) * 4, "B": (0.3, -1.0, 2.0, 0.4), "gravity": None}
-    nominal = small_aircraft(**square).nominal()
-    assert nominal is not None
+    nominal = nominal_of(small_aircraft(**square))
     assert len(feedforward.zero_dynamics(nominal)) == 0
     assert nominal.inverse @ [[2.0, 0.4], [0.3, -1.0]] == pytest.approx(np.eye(2))
 
@@ -307,10 +302,7 @@ def test_the_gains_command_writes_the_nominal_model_on_request_and_the_section_r
     assert CliRunner().invoke(app, [*arguments, "--feedforward"]).exit_code == 0
     section = yaml.safe_load(path.read_text(encoding="utf-8"))["/**/controller"]["ros__parameters"]
     written = ControllerParameters.validate_mapping(section, "controller")
-    expected = with_feedforward(written, load_airframe("osprey")).nominal()
-    nominal = written.nominal()
-    assert nominal is not None
-    assert expected is not None
+    nominal, expected = nominal_of(written), nominal_of(with_feedforward(written, load_airframe("osprey")))
     for actual, desired in zip(nominal, expected, strict=True):
         np.testing.assert_allclose(actual, desired, rtol=1e-5, atol=1e-12)  # six digits
     # half a period, 3 ms of transport delay, and the lags: servos of 20 ms, an engine of 0.1 s
@@ -341,17 +333,18 @@ def test_the_gains_command_refuses_feedforward_beside_check() -> None:
 def scores() -> dict[str, FloatArray]:
     """Scores by set of aircraft, shape (aircraft, 2): without and with feedforward, servos and noise, the same gains."""
     scenario = short()
-    sets = {"calm": (scenario.vary(aircraft={"gusts": {}}), 0.0, 1), "nominal": (scenario, 0.0, 1)}
-    sets |= {f"+-{level:g}": (scenario, level, 16) for level in (0.3, 0.5)}
+    sets: dict[str, tuple[Scenario, float, int]] = {
+        "calm": (scenario.vary(aircraft={"gusts": {}}), 0.0, 1),
+        "nominal": (scenario, 0.0, 1),
+        "+-0.3": (scenario, 0.3, 16),
+        "+-0.5": (scenario, 0.5, 16),
+    }
 
     def of(one: Scenario, level: float, aircraft: int) -> FloatArray:
         text = define(one, aircraft, level, 1, aircraft).model_dump_json()
         return fly_chunk_figures(text, (0, 0)).figures["score"]
 
-    return {
-        name: np.column_stack([of(one, level, aircraft) for one in both(base)])
-        for name, (base, level, aircraft) in sets.items()
-    }
+    return {name: np.column_stack([of(one, level, n) for one in both(base)]) for name, (base, level, n) in sets.items()}
 
 
 def test_the_feedforward_reduces_the_error_of_the_nominal_osprey_with_servos(scores: dict[str, FloatArray]) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.closed_loop import law_params
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -107,11 +108,9 @@ def test_the_constant_of_lemma_2_is_the_hand_worked_one() -> None:
     # gamma_1 = max(-2, 1 - 9 1.5 - 1, 2 - 9 2) = -2, zeta_b = beta 2 + gamma_1 zeta = 4 - 1 = 3
     one = np.ones((1, 1))
     plant = KnownPlant(-one, one, one, lambda t, x: 0.0 * x)
-    column = np.array([[2.0], [1.0], [0.0]])
-    zero = np.zeros(3)
+    column, zero = np.array([[2.0], [1.0], [0.0]]), np.zeros(3)
     flight = Evidence(np.arange(3.0), column, -np.ones((3, 1)), column, np.full((3, 1), 0.5), zero, zero, zero, zero)
-    params = example(0.01, 1.0).params._replace(Lambda=np.array([3.0]), beta=np.array([2.0]))
-    assert lemma_2(plant, flight, params) == pytest.approx(3.0)
+    assert lemma_2(plant, flight, law_params(1.0, 3.0, 2.0)) == pytest.approx(3.0)
 
 
 def test_P_stays_positive_with_the_constant_of_lemma_2() -> None:
