@@ -8,11 +8,14 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import psutil
 import pytest
+
+from flight_analysis.closed_loop.scenario import Scenario
 
 _numbers = itertools.count(os.getpid())
 
@@ -58,6 +61,18 @@ class Process:
         """Its child processes."""
         return psutil.Process(self.popen.pid).children(recursive=True)
 
+    def child(self, module: str) -> psutil.Process:
+        """Its child process of this module."""
+        return next(child for child in self.children() if module in child.cmdline())
+
+    def wait_for_log(self, folder: Path, size: int, timeout: float = 60.0) -> None:
+        """Wait until the logs below a folder have this size in bytes. The process must not end before."""
+        deadline = time.monotonic() + timeout
+        while sum(path.stat().st_size for path in folder.rglob("*.mcap")) < size:
+            assert time.monotonic() < deadline, self.output
+            assert self.popen.poll() is None, self.output
+            time.sleep(0.005)  # nothing signals the growth of a file
+
     def interrupt(self) -> None:
         """Send SIGINT, as Ctrl-C does."""
         self.popen.send_signal(signal.SIGINT)
@@ -101,3 +116,11 @@ def start(tmp_path: Path) -> Iterator[Start]:
                 child.kill()
             process.popen.kill()
         process.end()
+
+
+@pytest.fixture
+def start_node(start: Start, osprey_gust: Scenario) -> Start:
+    """Start the node of a package with the parameters of the default scenario, and with more ROS arguments."""
+    return lambda package, *arguments, within=(): start(
+        f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path), *arguments, within=within
+    )

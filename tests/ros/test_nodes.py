@@ -4,13 +4,11 @@
 
 import signal
 import subprocess
-from pathlib import Path
 
 import pytest
+from tests.conftest import REPOSITORY
 from tests.ros.conftest import Start
 from tests.ros.peer import peer
-
-from flight_analysis.closed_loop.scenario import Scenario
 
 NODES = {
     "aircraft_sim": "aircraft",
@@ -39,8 +37,8 @@ def test_a_node_without_parameters_names_the_missing_one_and_ends_with_status_2(
         (["--params-file", "nowhere.yaml"], "error: failed to initialize rcl: Couldn't parse params file"),
     ],
 )
-def test_an_invalid_parameter_is_one_sentence(arguments: list[str], sentence: str, start: Start, osprey_gust: Scenario) -> None:
-    node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path), *arguments)
+def test_an_invalid_parameter_is_one_sentence(arguments: list[str], sentence: str, start_node: Start) -> None:
+    node = start_node("rise_di_controller", *arguments)
     assert node.end() == 2
     assert any(line.startswith(sentence) for line in node.lines), node.output
     assert "Traceback" not in node.output
@@ -49,9 +47,9 @@ def test_an_invalid_parameter_is_one_sentence(arguments: list[str], sentence: st
 @pytest.mark.parametrize(("package", "waits_for"), [("rise_di_controller", "/y"), ("aircraft_sim", "/u")])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_node_without_a_publisher_warns_keeps_waiting_and_shuts_down_cleanly(
-    package: str, waits_for: str, number: signal.Signals, start: Start, osprey_gust: Scenario
+    package: str, waits_for: str, number: signal.Signals, start_node: Start
 ) -> None:
-    node = start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path))
+    node = start_node(package)
     node.wait_for(f"waiting for {waits_for}: no publisher")
     assert node.popen.poll() is None
     node.popen.send_signal(number)
@@ -60,34 +58,29 @@ def test_a_node_without_a_publisher_warns_keeps_waiting_and_shuts_down_cleanly(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_that_is_stopped_during_its_start_shuts_down_cleanly(
-    number: signal.Signals, start: Start, osprey_gust: Scenario
-) -> None:
+def test_a_node_that_is_stopped_during_its_start_shuts_down_cleanly(number: signal.Signals, start_node: Start) -> None:
     with peer(topics=()) as peer_node:
-        node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
+        node = start_node("rise_di_controller")
         early_participant = f"_start_{node.popen.pid}"
-        peer_node.until(
-            lambda: early_participant in peer_node.node.get_node_names() or "ready" in node.output
-        )  # the start may be faster than the discovery
+        # The start may be faster than the discovery.
+        peer_node.until(lambda: early_participant in peer_node.node.get_node_names() or "ready" in node.output)
         node.popen.send_signal(number)
         assert node.end(5.0) == 0
         assert "Traceback" not in node.output
 
 
-def test_the_early_participant_is_destroyed_once_the_node_exists(start: Start, osprey_gust: Scenario) -> None:
+def test_the_early_participant_is_destroyed_once_the_node_exists(start_node: Start) -> None:
     with peer(topics=()) as peer_node:
-        node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
+        node = start_node("rise_di_controller")
         node.wait_for("ready")
         peer_node.until(lambda: set(peer_node.node.get_node_names()) == {"peer", "controller"})
 
 
-def test_no_module_is_imported_once_a_node_is_ready(
-    start: Start, osprey_gust: Scenario, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_module_is_imported_once_a_node_is_ready(start_node: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     # A library function that imports modules at its first call would do so inside a tick.
     monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
     with peer(topics=("/diagnostics",)) as peer_node:
-        nodes = [start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path)) for package in NODES]
+        nodes = [start_node(package) for package in NODES]
 
         def reports(name: str) -> int:
             return sum(one.status[0].name == f"/{name}" for one in peer_node.received["/diagnostics"])
@@ -98,9 +91,9 @@ def test_no_module_is_imported_once_a_node_is_ready(
         assert [line for line in node.output.partition("]: ready")[2].splitlines() if "import time:" in line] == []
 
 
-def test_a_burst_of_signals_ends_a_node_as_one_signal_does(start: Start, osprey_gust: Scenario) -> None:
+def test_a_burst_of_signals_ends_a_node_as_one_signal_does(start_node: Start) -> None:
     # A lock in the signal handler would deadlock here: the second signal interrupts the first handler.
-    node = start("aircraft_sim.main", "--ros-args", "--params-file", str(osprey_gust.path))
+    node = start_node("aircraft_sim")
     node.wait_for("waiting for /u")
     for _ in range(50):
         node.popen.send_signal(signal.SIGTERM)
@@ -116,22 +109,21 @@ def test_a_missing_transport_profile_is_an_error_before_the_start(start: Start, 
 
 
 @pytest.mark.parametrize("package", ["aircraft_sim", "reference_model"])
-def test_a_start_time_in_the_past_is_an_error(package: str, start: Start, osprey_gust: Scenario) -> None:
-    node = start(f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path), "-p", "start_time:=1000000.0")
+def test_a_start_time_in_the_past_is_an_error(package: str, start_node: Start) -> None:
+    node = start_node(package, "-p", "start_time:=1000000.0")
     assert node.end() == 2
     assert any("start_time: found an instant" in line for line in node.lines)
 
 
-def test_a_recorder_that_cannot_write_names_the_folder(start: Start, osprey_gust: Scenario) -> None:
-    arguments = ("--params-file", str(osprey_gust.path), "-p", "directory:=/proc/nowhere")
-    node = start("flight_recorder.main", "--ros-args", *arguments)
+def test_a_recorder_that_cannot_write_names_the_folder(start_node: Start) -> None:
+    node = start_node("flight_recorder", "-p", "directory:=/proc/nowhere")
     assert node.end() == 2
     assert "recorder.directory: /proc/nowhere cannot be written" in node.output
 
 
 @pytest.mark.parametrize(("package", "executable"), NODES.items())
 def test_an_installed_executable_runs(package: str, executable: str) -> None:
-    script = Path(__file__).resolve().parents[2] / "ros_ws" / "install" / package / "lib" / package / executable
+    script = REPOSITORY / "ros_ws" / "install" / package / "lib" / package / executable
     process = subprocess.run([script], capture_output=True, text=True, timeout=60, check=False)
     assert process.returncode == 2
     assert f"error: {executable}." in process.stderr

@@ -9,20 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
-from rclpy.context import Context
 from rclpy.node import Node
 from tests.ros.conftest import Start
 from tests.ros.peer import peer
 
-from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.simulate import simulate
 from flight_core.rates import NANOSECONDS
-from flight_log.bag import LogAttachments
 from flight_log.playback import read_playback
 from flight_log.tape_reader import read_run
-from flight_log.tape_writer import write_run
-from flight_ros import transport
 from flight_ros.messages import stamp_of, to_message
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import CLOCK, INTERNALS, LOCKSTEP, Y_M, Topic, U, Y
@@ -30,51 +23,30 @@ from flight_ros.topics import CLOCK, INTERNALS, LOCKSTEP, Y_M, Topic, U, Y
 MS = 1_000_000
 
 
-@pytest.fixture(scope="module")
-def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two seconds in one process: y and y_m at 500 Hz."""
-    tape = simulate(osprey_gust.vary(flight={"duration": 2.0}))
-    return write_run(tape, tmp_path_factory.mktemp("play") / "run", LogAttachments(osprey_gust.path)).parent
-
-
 class Receiver:
     """Subscribes to topics; holds the bytes of their messages and the instants at which they were sent."""
 
-    def __init__(self, *topics: Topic) -> None:
-        transport.prepare()
-        self._context = Context()
-        rclpy.init(context=self._context)
-        self._node = Node("receiver", context=self._context)
-        self._polled_subscriptions = [PolledSubscription(self._node, topic, LOCKSTEP, raw=True) for topic in topics]
+    def __init__(self, node: Node, *topics: Topic) -> None:
+        self._polled_subscriptions = [PolledSubscription(node, topic, LOCKSTEP, raw=True) for topic in topics]
         self.received: dict[str, list[bytes]] = {topic.name: [] for topic in topics}
         self.sent: dict[str, list[int]] = {topic.name: [] for topic in topics}
 
     def until(self, topic: Topic, count: int, timeout: float = 40.0) -> None:
         """Wait for a number of messages of a topic."""
         deadline = time.monotonic() + timeout
-        while len(self.received[topic.name]) < count:
-            assert time.monotonic() < deadline, (
-                f"{len(self.received[topic.name])} of {count} on {topic.name} within {timeout} s"
-            )
+        while (number := len(self.received[topic.name])) < count:
+            assert time.monotonic() < deadline, f"{number} of {count} on {topic.name} within {timeout} s"
             for subscription in self._polled_subscriptions:
                 for received in subscription.take():
                     self.received[subscription.topic.name].append(bytes(received.message))
                     self.sent[subscription.topic.name].append(received.sent_ns)
             time.sleep(0.002)
 
-    def close(self) -> None:
-        """Destroy the node."""
-        self._node.destroy_node()
-        self._context.try_shutdown()
-
 
 @contextmanager
 def receiver(*topics: Topic) -> Iterator[Receiver]:
-    made = Receiver(*topics)
-    try:
-        yield made
-    finally:
-        made.close()
+    with peer(()) as peer_node:
+        yield Receiver(peer_node.node, *topics)
 
 
 def of(run: Path, topic: str) -> list[bytes]:
@@ -105,10 +77,8 @@ def test_stamps_are_moved_to_now_and_all_other_bytes_are_unchanged(run: Path, st
     stamps = np.array([stamp_of(message) for message in receiving.received["y"]])
     assert set(np.diff(stamps)) == {MS}  # 2 ms at twice the rate
     assert np.median(np.abs(stamps - np.array(receiving.sent["y"]))) < 50 * MS  # as fresh as they were
-    recorded = of(run, "y")[-251:]
-    assert [message[:4] + message[12:] for message in receiving.received["y"]] == [
-        message[:4] + message[12:] for message in recorded
-    ]
+    received, recorded = ([one[:4] + one[12:] for one in y] for y in (receiving.received["y"], of(run, "y")[-251:]))
+    assert received == recorded
 
 
 def test_a_domain_with_a_publisher_of_the_topic_is_an_error(run: Path, start: Start, domain: int) -> None:
@@ -117,9 +87,8 @@ def test_a_domain_with_a_publisher_of_the_topic_is_an_error(run: Path, start: St
         process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
         assert process.end() == 2
     (message,) = process.lines
-    assert message.startswith(
-        f"error: ROS_DOMAIN_ID {domain}: found 1 publishers of /y already, expected no publisher: set ROS_DOMAIN"
-    )
+    sentence = "found 1 publishers of /y already, expected no publisher: set ROS_DOMAIN"
+    assert message.startswith(f"error: ROS_DOMAIN_ID {domain}: {sentence}")
 
 
 def test_a_loop_repeats_until_it_is_interrupted(run: Path, start: Start) -> None:
@@ -135,20 +104,13 @@ def test_a_loop_repeats_until_it_is_interrupted(run: Path, start: Start) -> None
     assert stamps == sorted(stamps)  # also from one pass to the next
 
 
-@pytest.fixture(scope="module")
-def lockstep_run(tmp_path_factory: pytest.TempPathFactory, osprey_gust: Scenario) -> Path:
-    """Folder of the lockstep flight of the next test."""
-    return tmp_path_factory.mktemp("lockstep")
-
-
-def test_a_controller_reproduces_a_lockstep_flight_to_the_byte(lockstep_run: Path, osprey_gust: Scenario, start: Start) -> None:
-    flight = start("flight_cli.cli", "fly", "osprey_gust", "--one-process", "--duration", "2", "--runs", str(lockstep_run))
+def test_a_controller_reproduces_a_lockstep_flight_to_the_byte(start: Start, start_node: Start, tmp_path: Path) -> None:
+    flight = start("flight_cli.cli", "fly", "osprey_gust", "--one-process", "--duration", "2", "--runs", str(tmp_path))
     assert flight.end(timeout=120) == 0, flight.output
-    recorded = lockstep_run / "latest"
+    recorded = tmp_path / "latest"
     u, internals = of(recorded, "u"), of(recorded, "internals")
-    controller = ("--params-file", str(osprey_gust.path), "-p", "lockstep:=true", "-p", "y_rate:=500.0")
     with receiver(U, INTERNALS) as receiving:
-        node = start("rise_di_controller.main", "--ros-args", *controller)
+        node = start_node("rise_di_controller", "-p", "lockstep:=true", "-p", "y_rate:=500.0")
         node.wait_for("ready")
         process = start("flight_cli.cli", "play", str(recorded), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "3")
         receiving.until(U, len(u))
@@ -158,9 +120,9 @@ def test_a_controller_reproduces_a_lockstep_flight_to_the_byte(lockstep_run: Pat
     assert receiving.received["internals"] == internals
 
 
-def test_a_controller_in_real_time_follows_a_recorded_flight(run: Path, osprey_gust: Scenario, start: Start) -> None:
+def test_a_controller_in_real_time_follows_a_recorded_flight(run: Path, start: Start, start_node: Start) -> None:
     with peer() as peer_node:
-        node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
+        node = start_node("rise_di_controller")
         node.wait_for("ready")
         process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
         node.wait_for("WAITING -> ENGAGED")

@@ -57,11 +57,9 @@ def allowed() -> dict[str, Access]:
 
 def graph(peer_node: Peer, node: str) -> Access:
     """The topics and services of a node in the ROS graph."""
-    lists = []
-    for kind in ("publisher", "subscriber", "service", "client"):
-        find = getattr(peer_node.node, f"get_{kind}_names_and_types_by_node")
-        lists.append(frozenset(name for name, _ in find(node, "/")))
-    return Access(*lists)
+    kinds = ("publisher", "subscriber", "service", "client")
+    find = [getattr(peer_node.node, f"get_{kind}_names_and_types_by_node") for kind in kinds]
+    return Access(*(frozenset(name for name, _ in names(node, "/")) for names in find))
 
 
 def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
@@ -86,14 +84,10 @@ def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
 ROLES = ("aircraft", "reference_model", "controller", "recorder")
 
 
-def test_the_policy_allows_exactly_the_topics_and_services_of_a_flight(
-    start: Start, osprey_gust: Scenario, tmp_path: Path
-) -> None:
-    policy, file = allowed(), str(osprey_gust.path)
-    modules = {"rise_di_controller": "controller", "reference_model": "reference_model", "aircraft_sim": "aircraft"}
+def test_the_policy_allows_exactly_the_topics_and_services_of_a_flight(start_node: Start, tmp_path: Path) -> None:
+    policy, packages = allowed(), ("rise_di_controller", "reference_model", "aircraft_sim", "flight_recorder")
     with peer(topics=()) as peer_node:
-        processes = [start(f"{module}.main", "--ros-args", "--params-file", file) for module in modules]
-        processes.append(start("flight_recorder.main", "--ros-args", "--params-file", file))
+        processes = [start_node(package) for package in packages]
         for process in processes:
             process.wait_for("ready", timeout=60.0)
         real_time = discovered(peer_node, ROLES)
@@ -102,7 +96,7 @@ def test_the_policy_allows_exactly_the_topics_and_services_of_a_flight(
             process.end()
         overrides = [f"{role}:lockstep:=true" for role in ROLES] + ["aircraft:control_rate:=100.0", "controller:y_rate:=500.0"]
         overrides.append(f"recorder:directory:={tmp_path / 'run'}")
-        start("flight_bringup.main", "--ros-args", "--params-file", file, *(word for one in overrides for word in ("-p", one)))
+        start_node("flight_bringup", *(word for one in overrides for word in ("-p", one)))
         lockstep = discovered(peer_node, ROLES)
     for role in ROLES:
         assert real_time[role].merged(lockstep[role]) == policy[role], role

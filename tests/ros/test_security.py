@@ -8,13 +8,14 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.conftest import REPOSITORY
+from tests.recordings import scenario_file
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer, peer
 
@@ -114,8 +115,8 @@ def keys(tmp_path: Path) -> tuple[Path, Path]:
     return made
 
 
-def aircraft(start: Start, scenario: Scenario, *arguments: str, within: tuple[str, ...] = ()) -> Process:
-    process = start("aircraft_sim.main", "--ros-args", "--params-file", str(scenario.path), *arguments, within=within)
+def aircraft(start_node: Start, *arguments: str, within: tuple[str, ...] = ()) -> Process:
+    process = start_node("aircraft_sim", *arguments, within=within)
     process.wait_for("ready", BUSY)
     return process
 
@@ -133,25 +134,25 @@ def received(attacker: Process) -> int:
     return int(json.loads(attacker.lines[-1])["received"])
 
 
-def test_by_default_any_process_of_this_host_receives_y_and_commands_u(start: Start, osprey_gust: Scenario) -> None:
-    node = aircraft(start, osprey_gust)
+def test_by_default_any_process_of_this_host_receives_y_and_commands_u(start: Start, start_node: Start) -> None:
+    node = aircraft(start_node)
     assert received(start("tests.ros.attacker", "30", within=ON_LOOPBACK)) > 0
     node.wait_for("receiving u from /controller#1")
 
 
 @pytest.mark.parametrize("number", [0, 1], ids=["no key", "another key"])
 def test_with_a_key_a_process_of_this_host_without_it_cannot_command_u(
-    number: int, start: Start, osprey_gust: Scenario, keys: tuple[Path, Path]
+    number: int, start: Start, start_node: Start, keys: tuple[Path, Path]
 ) -> None:
-    node = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
+    node = aircraft(start_node, "-p", f"key_file:={keys[0]}")
     attacker = start("tests.ros.attacker", "30", *([str(keys[1])] if number else []), within=ON_LOOPBACK)
     assert received(attacker) > 0  # y is not encrypted
     node.wait_for("wrong message authentication code" if number else "no message authentication code")
     assert "receiving u from" not in node.output
 
 
-def test_a_process_with_the_key_commands_u(start: Start, osprey_gust: Scenario, keys: tuple[Path, Path]) -> None:
-    node = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
+def test_a_process_with_the_key_commands_u(start: Start, start_node: Start, keys: tuple[Path, Path]) -> None:
+    node = aircraft(start_node, "-p", f"key_file:={keys[0]}")
     assert received(start("tests.ros.attacker", "30", str(keys[0]), within=ON_LOOPBACK)) > 0
     node.wait_for("receiving u from /controller#1")
     assert "sample refused" not in node.output
@@ -174,10 +175,10 @@ def is_rejected(peer_node: Peer, reason: str) -> Callable[[], bool]:
 
 
 def test_a_replayed_u_is_rejected_also_after_a_restart(
-    start: Start, osprey_gust: Scenario, keys: tuple[Path, Path], peer_node: Peer
+    start: Start, start_node: Start, keys: tuple[Path, Path], peer_node: Peer
 ) -> None:
     before = time.time_ns()
-    first = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
+    first = aircraft(start_node, "-p", f"key_file:={keys[0]}")
     publisher = peer_node.node.create_publisher(U.type, U.name, 10)
     encoder = Encoder(INPUTS, "/controller#1", make_authenticator())
     recorded: list[bytes] = []
@@ -193,7 +194,7 @@ def test_a_replayed_u_is_rejected_also_after_a_restart(
     assert first.end(BUSY) == 0
     # A restarted aircraft has no memory of the last stamp, but rejects samples from before its start.
     peer_node.received["/diagnostics"].clear()
-    second = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}")
+    second = aircraft(start_node, "-p", f"key_file:={keys[0]}")
     peer_node.until(is_rejected(peer_node, "order"), BUSY, each=lambda: publisher.publish(replayed))
     peer_node.until(is_rejected(peer_node, "mac"), BUSY, each=lambda: publisher.publish(u_message(before)))
     assert "receiving u from" not in second.output
@@ -202,11 +203,8 @@ def test_a_replayed_u_is_rejected_also_after_a_restart(
 def test_a_flight_with_a_key_is_signed_and_replays_exactly(
     start: Start, osprey_gust: Scenario, keys: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    text = osprey_gust.path.read_text(encoding="utf-8")
-    for name in ("aircraft", "reference_model", "controller"):
-        text = text.replace(f"/**/{name}:\n  ros__parameters:\n", f"/**/{name}:\n  ros__parameters:\n    key_file: {keys[0]}\n")
-    scenario = tmp_path / "keyed.yaml"
-    scenario.write_text(text, encoding="utf-8")
+    keyed = {node: {"key_file": str(keys[0])} for node in ("aircraft", "reference_model", "controller")}
+    scenario = scenario_file(tmp_path / "keyed.yaml", osprey_gust.path, **keyed)
     flight = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--duration", "2", "--runs", str(tmp_path / "runs"))
     assert flight.end(BUSY) == 0, flight.output
     node = start("flight_cli.cli", "replay", str(tmp_path / "runs" / "latest"))
@@ -224,13 +222,13 @@ def test_a_flight_with_a_key_is_signed_and_replays_exactly(
     ],
 )
 def test_an_invalid_key_file_stops_the_node(
-    content: bytes | None, mode: int, sentence: str, start: Start, osprey_gust: Scenario, tmp_path: Path
+    content: bytes | None, mode: int, sentence: str, start_node: Start, tmp_path: Path
 ) -> None:
     path = tmp_path / "bad"
     if content is not None:
         path.write_bytes(content)
         path.chmod(mode)
-    node = start("aircraft_sim.main", "--ros-args", "--params-file", str(osprey_gust.path), "-p", f"key_file:={path}")
+    node = start_node("aircraft_sim", "-p", f"key_file:={path}")
     assert node.end(BUSY) == 2
     assert f"error: aircraft.key_file: found {path} {sentence}" in node.output or sentence in node.output
 
@@ -239,11 +237,27 @@ def test_an_invalid_key_file_stops_the_node(
 
 
 class Hosts(NamedTuple):
-    """The commands that start a process on each of two hosts, and the address of the first one."""
+    """The commands that start a process on each of two hosts."""
 
     first: tuple[str, ...]
     second: tuple[str, ...]
-    address: str
+
+
+def wait_until(condition: Callable[[Any], bool], argument: Any) -> None:
+    deadline = time.monotonic() + 5.0
+    while not condition(argument):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def is_separate(holder: subprocess.Popen[bytes]) -> bool:
+    """Whether the process has left this network namespace, or has ended."""
+    own, other = Path("/proc/self/ns/net"), Path(f"/proc/{holder.pid}/ns/net")
+    return holder.poll() is not None or other.readlink() != own.readlink()
+
+
+def is_up(show_link: list[str]) -> bool:
+    return b"state UP" in subprocess.run(show_link, capture_output=True, check=False).stdout
 
 
 @pytest.fixture
@@ -255,37 +269,23 @@ def hosts() -> Iterator[Hosts]:
     holders = [subprocess.Popen([unshare, "--net", "sleep", "300"], stderr=subprocess.PIPE) for _ in range(2)]
     try:
         places = [(nsenter, f"--net=/proc/{holder.pid}/ns/net") for holder in holders]
-        own = Path("/proc/self/ns/net").readlink()
         for holder in holders:
-            deadline = time.monotonic() + 5.0
-            while holder.poll() is None and Path(f"/proc/{holder.pid}/ns/net").readlink() == own:
-                assert time.monotonic() < deadline
-                time.sleep(0.01)
+            wait_until(is_separate, holder)
             if holder.poll() is not None:
                 assert holder.stderr is not None
                 pytest.skip(f"no network namespace for this user: {holder.stderr.read().decode().strip()}")
         name = f"rd{holders[0].pid % 100_000}"
-        pair = [ip, "link", "add", name, "netns", str(holders[0].pid), "type", "veth"]
-        pair += ["peer", "name", name, "netns", str(holders[1].pid)]
-        made = subprocess.run(pair, capture_output=True, text=True, check=False)
+        first, second = (holder.pid for holder in holders)
+        pair = f"link add {name} netns {first} type veth peer name {name} netns {second}"
+        made = subprocess.run([ip, *pair.split()], capture_output=True, text=True, check=False)
         if made.returncode:
             pytest.skip(f"no virtual Ethernet devices for this user: {made.stderr.strip()}")
         for number, place in enumerate(places, start=1):
-            for command in (
-                ["addr", "add", f"10.77.0.{number}/24", "dev", name],
-                ["link", "set", name, "up"],
-                ["link", "set", "lo", "up"],
-            ):
-                subprocess.run([*place, ip, *command], check=True)
+            for command in (f"addr add 10.77.0.{number}/24 dev {name}", f"link set {name} up", "link set lo up"):
+                subprocess.run([*place, ip, *command.split()], check=True)
         for place in places:  # it takes up to a second, and Fast DDS ignores a device that is not up
-            deadline = time.monotonic() + 5.0
-            while (
-                "state UP"
-                not in subprocess.run([*place, ip, "link", "show", name], capture_output=True, text=True, check=False).stdout
-            ):
-                assert time.monotonic() < deadline
-                time.sleep(0.01)
-        yield Hosts(places[0], places[1], "10.77.0.1")
+            wait_until(is_up, [*place, ip, "link", "show", name])
+        yield Hosts(*places)
     finally:
         for holder in holders:
             holder.kill()
@@ -308,34 +308,31 @@ def on_network(tmp_path: Path) -> tuple[str, ...]:
     """The environment of a process with network transport."""
     profile = tmp_path / "open.xml"
     profile.write_text(OPEN_PROFILE, encoding="utf-8")
-    return environment(
-        FASTRTPS_DEFAULT_PROFILES_FILE=str(profile),
-        ROS_AUTOMATIC_DISCOVERY_RANGE="SUBNET",
-        ROS_STATIC_PEERS="10.77.0.1;10.77.0.2",
-    )
+    discovery = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": "10.77.0.1;10.77.0.2"}
+    return environment(FASTRTPS_DEFAULT_PROFILES_FILE=str(profile), **discovery)
 
 
 def test_by_default_another_host_neither_receives_y_nor_commands_u(
-    start: Start, osprey_gust: Scenario, hosts: Hosts, on_network: tuple[str, ...]
+    start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
-    node = aircraft(start, osprey_gust, within=hosts.first)
+    node = aircraft(start_node, within=hosts.first)
     assert received(start("tests.ros.attacker", f"{PATIENCE}", within=(*hosts.second, *on_network))) == 0
     assert "receiving u from" not in node.output
     assert "sample refused" not in node.output  # no sample has arrived
 
 
 def test_with_a_network_profile_another_host_receives_y_and_commands_u(
-    start: Start, osprey_gust: Scenario, hosts: Hosts, on_network: tuple[str, ...]
+    start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
-    node = aircraft(start, osprey_gust, within=(*hosts.first, *on_network))
+    node = aircraft(start_node, within=(*hosts.first, *on_network))
     assert received(start("tests.ros.attacker", "30", within=(*hosts.second, *on_network))) > 0
     node.wait_for("receiving u from /controller#1")
 
 
 def test_with_a_network_profile_and_a_key_another_host_receives_y_but_cannot_command_u(
-    start: Start, osprey_gust: Scenario, hosts: Hosts, on_network: tuple[str, ...], keys: tuple[Path, Path]
+    start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...], keys: tuple[Path, Path]
 ) -> None:
-    node = aircraft(start, osprey_gust, "-p", f"key_file:={keys[0]}", within=(*hosts.first, *on_network))
+    node = aircraft(start_node, "-p", f"key_file:={keys[0]}", within=(*hosts.first, *on_network))
     assert received(start("tests.ros.attacker", "30", within=(*hosts.second, *on_network))) > 0
     node.wait_for("no message authentication code")
     assert "receiving u from" not in node.output
