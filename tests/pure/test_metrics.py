@@ -8,26 +8,8 @@ import numpy as np
 import pytest
 from tests.recordings import EPOCH, MS, signal
 
-from flight_analysis.metrics import (
-    Transient,
-    engagements,
-    error_metrics,
-    errors_by_part,
-    in_spans,
-    inputs_by_part,
-    latency_metrics,
-    live_commands,
-    noise_floor,
-    part_masks,
-    saturation_shares,
-    settling_bands,
-    settling_time,
-    settling_times,
-    sign_switches,
-    spectra,
-    tick_metrics,
-    tracking_error,
-)
+from flight_analysis import metrics
+from flight_analysis.metrics import Transient
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from rise_di_controller.guard import Mode
@@ -41,17 +23,17 @@ def tape(**signals: Signal) -> Tape:
 
 def test_rms_and_max() -> None:
     # sqrt((9 + 16 + 0 + 0) / 4) = 2.5
-    assert error_metrics(np.array([3.0, -4.0, 0.0, 0.0])) == (2.5, 4.0)
+    assert metrics.error_metrics(np.array([3.0, -4.0, 0.0, 0.0])) == (2.5, 4.0)
 
 
 def test_a_part_without_samples_has_nan_metrics() -> None:
-    assert all(math.isnan(metric) for metric in error_metrics(np.zeros(0)))
+    assert all(math.isnan(metric) for metric in metrics.error_metrics(np.zeros(0)))
 
 
 def test_error_is_formed_at_the_stamps_of_y_by_name() -> None:
     y = signal([0, 1, 2], q=[1.0, 2.0, 3.0], V=[0.0, 0.0, 0.0])
     y_m = signal([0, 2], V=[1.0, 1.0], q=[0.0, 4.0])  # q is 2 half way
-    error = tracking_error(tape(y=y, y_m=y_m))
+    error = metrics.tracking_error(tape(y=y, y_m=y_m))
     assert error.names == ("q", "V")
     assert error["q"].tolist() == [1.0, 0.0, -1.0]
     assert error["V"].tolist() == [-1.0, -1.0, -1.0]
@@ -59,11 +41,11 @@ def test_error_is_formed_at_the_stamps_of_y_by_name() -> None:
 
 def test_y_outside_the_reference_is_left_out() -> None:
     y, y_m = signal([0, 1, 2, 3], q=[9.0, 1.0, 1.0, 9.0]), signal([1, 2], q=[0.0, 0.0])
-    assert tracking_error(tape(y=y, y_m=y_m))["q"].tolist() == [1.0, 1.0]
+    assert metrics.tracking_error(tape(y=y, y_m=y_m))["q"].tolist() == [1.0, 1.0]
 
 
 def test_a_span_extends_beyond_its_end() -> None:
-    assert in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [False, True, True, True, False]
+    assert metrics.in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [False, True, True, True, False]
 
 
 def test_each_instant_belongs_to_one_part_of_the_flight() -> None:
@@ -73,7 +55,7 @@ def test_each_instant_belongs_to_one_part_of_the_flight() -> None:
         Transient("gust", "vertical", 3.5, 4.0),
     ]
     t = np.array([0.0, 0.5, 1.5, 3.0, 3.4, 3.6, 4.5, 5.5])
-    masks = {part: t[mask].tolist() for part, mask in part_masks(t, transients, settle=1.0).items()}
+    masks = {part: t[mask].tolist() for part, mask in metrics.part_masks(t, transients, settle=1.0).items()}
     assert masks == {
         "whole": t.tolist(),
         "calm": [1.5, 5.5],  # 0 and 0.5 belong to the engagement
@@ -85,7 +67,7 @@ def test_each_instant_belongs_to_one_part_of_the_flight() -> None:
 def test_errors_are_split_by_part_and_the_ultimate_bound_is_the_largest_undisturbed_error() -> None:
     y = signal([0, 1000, 2000], q=[3.0, 4.0, 0.0])
     flight = tape(y=y, y_m=signal([0, 2000], q=[0.0, 0.0]))
-    table = errors_by_part(flight, [Transient("gust", "g", 0.9, 1.1)], settle=0.0)
+    table = metrics.errors_by_part(flight, [Transient("gust", "g", 0.9, 1.1)], settle=0.0)
     assert table["q"]["gust"] == (4.0, 4.0)
     assert tuple(table["q"]["calm"]) == pytest.approx((math.sqrt(4.5), 3.0))
     assert table["q"]["whole"].max == 4.0
@@ -97,13 +79,13 @@ def test_errors_are_split_by_part_and_the_ultimate_bound_is_the_largest_undistur
 def test_engagements_are_changes_of_the_mode_to_engaged() -> None:
     mode = [Mode.ENGAGED, Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]
     internals = signal([0, 10, 20, 30, 40], mode=mode)
-    assert [one.start for one in engagements(tape(internals=internals))] == [0.0, 0.04]
+    assert [one.start for one in metrics.engagements(tape(internals=internals))] == [0.0, 0.04]
 
 
 def test_close_live_commands_are_one_transient() -> None:
     stamps = [0.0, 500.0, 1000.0, 1500.0, 3000.0, 3500.0]
     u_m = signal(stamps, q=[0.0, 0.1, 0.2, 0.2, 0.0, 0.0], V=1.0)
-    assert live_commands(tape(u_m=u_m)) == [
+    assert metrics.live_commands(tape(u_m=u_m)) == [
         Transient("command", "V", 0.0, 0.0),  # a first value other than 0 is a change
         Transient("command", "q", 0.5, 1.0),
         Transient("command", "q", 3.0, 3.0),
@@ -120,14 +102,14 @@ def test_settling_time_ends_where_the_error_begins_to_stay_in_the_band() -> None
         ([5.0, 0.0, 0.0, 0.0, 5.0, 0.0], 1.0),  # in the band for the dwell of 3 s
         ([5.0, 0.0, 0.0, 5.0, 5.0, 0.0], 5.0),  # in the band for 2 s, then to the end
     ):
-        assert settling_time(t, np.array(e), band=1.0, leaves=2.0, dwell=3.0) == settling
-    assert settling_time(np.zeros(0), np.zeros(0), band=1.0, leaves=2.0) is None
+        assert metrics.settling_time(t, np.array(e), band=1.0, leaves=2.0, dwell=3.0) == settling
+    assert metrics.settling_time(np.zeros(0), np.zeros(0), band=1.0, leaves=2.0) is None
 
 
 def test_the_settling_band_is_a_fraction_of_the_reference_or_of_the_error_without_one() -> None:
     y = signal([0, 10], q=[0.5, -3.0], p=[0.25, 0.0])
     y_m = signal([0, 10], q=[0.0, -2.0], p=[0.0, 0.0])
-    assert settling_bands(tape(y=y, y_m=y_m)) == {"q": 0.02, "p": 0.0025}
+    assert metrics.settling_bands(tape(y=y, y_m=y_m)) == {"q": 0.02, "p": 0.0025}
 
 
 def test_the_settling_band_of_a_measured_error_is_at_least_four_noise_floors() -> None:
@@ -135,9 +117,9 @@ def test_the_settling_band_of_a_measured_error_is_at_least_four_noise_floors() -
     stamps = [10.0 * k for k in range(100)]
     noisy, y_m = signal(stamps, q=[1.0, -1.0] * 50), signal(stamps, q=10.0)
     floor = 4.0 / (0.6745 * math.sqrt(6.0))
-    assert settling_bands(tape(y=noisy, y_m=y_m)) == {"q": pytest.approx(4.0 * floor)}
+    assert metrics.settling_bands(tape(y=noisy, y_m=y_m)) == {"q": pytest.approx(4.0 * floor)}
     truth = signal(stamps, **{"x.q": 10.0})
-    assert settling_bands(tape(y=noisy, y_m=y_m, truth=truth)) == {"q": pytest.approx(0.1)}
+    assert metrics.settling_bands(tape(y=noisy, y_m=y_m, truth=truth)) == {"q": pytest.approx(0.1)}
 
 
 def test_settling_is_measured_up_to_the_next_transient_of_the_channel() -> None:
@@ -153,7 +135,7 @@ def test_settling_is_measured_up_to_the_next_transient_of_the_channel() -> None:
         Transient("command", "p", 3.0, 3.1),
         Transient("gust", "vertical", 5.0, 5.1),
     ]
-    first, other, gust = settling_times(flight, transients)
+    first, other, gust = metrics.settling_times(flight, transients)
     assert first.until == {"q": 5.0}
     assert first.time == {"q": pytest.approx(0.2)}
     assert (other.transient.name, other.until, other.time) == ("p", {"p": 5.0}, {"p": 0.0})
@@ -167,33 +149,33 @@ def test_settling_is_measured_up_to_the_next_transient_of_the_channel() -> None:
 def test_control_effort_is_the_rms_about_trim_and_the_mean_rate() -> None:
     # 0 -> 2 -> -2 -> -2 in 0.1 s each: a total variation of 6 in 0.3 s. sqrt((0 + 4 + 4 + 4) / 4) = sqrt(3).
     flight = tape(u=signal([0, 100, 200, 300], elevator=[0.0, 2.0, -2.0, -2.0]))
-    whole = inputs_by_part(flight, [])["elevator"]["whole"]
+    whole = metrics.inputs_by_part(flight, [])["elevator"]["whole"]
     assert tuple(whole) == pytest.approx((math.sqrt(3.0), 2.0, 20.0))
     # The step into the gust and the one within it end there: 4 and 0 in 0.2 s.
-    parts = inputs_by_part(flight, [Transient("gust", "g", 0.15, 0.35)], settle=0.0)["elevator"]
+    parts = metrics.inputs_by_part(flight, [Transient("gust", "g", 0.15, 0.35)], settle=0.0)["elevator"]
     assert tuple(parts["gust"]) == pytest.approx((2.0, 2.0, 20.0))
     assert parts["calm"].rate == pytest.approx(20.0)  # 2 in 0.1 s
     assert math.isnan(parts["command"].rms)
     assert math.isnan(parts["command"].rate)
-    assert inputs_by_part(tape(), []) == {}
+    assert metrics.inputs_by_part(tape(), []) == {}
 
 
 def test_saturated_ticks_are_counted_by_kind() -> None:
     kinds = [Saturation.NO, Saturation.MAGNITUDE, Saturation.RATE, Saturation.RATE]
     internals = signal([0, 10, 20, 30], **{"limited.thrust": kinds})
-    assert saturation_shares(tape(internals=internals)) == {"thrust": {"magnitude": 0.25, "rate": 0.5}}
-    assert saturation_shares(tape()) == {}
+    assert metrics.saturation_shares(tape(internals=internals)) == {"thrust": {"magnitude": 0.25, "rate": 0.5}}
+    assert metrics.saturation_shares(tape()) == {}
 
 
 def test_sign_switches_are_counted_on_the_increments_of_pi() -> None:
     # Increments +, 0, +, -, -, +: two changes in 0.06 s; an increment of 0 is no direction.
     internals = signal([10.0 * k for k in range(7)], **{"Pi.q": [0.0, 1.0, 1.0, 2.0, 1.0, 0.0, 1.0]})
-    assert sign_switches(tape(internals=internals)) == {"q": pytest.approx(2 / 0.06)}
+    assert metrics.sign_switches(tape(internals=internals)) == {"q": pytest.approx(2 / 0.06)}
 
 
 def test_sign_switches_without_internals_are_those_of_the_error() -> None:
     y, y_m = signal([0, 10, 20], q=[1.0, -1.0, 2.0]), signal([0, 20], q=[0.0, 0.0])
-    assert sign_switches(tape(y=y, y_m=y_m)) == {"q": pytest.approx(2 / 0.02)}
+    assert metrics.sign_switches(tape(y=y, y_m=y_m)) == {"q": pytest.approx(2 / 0.02)}
 
 
 # Noise floor and spectrum
@@ -201,7 +183,7 @@ def test_sign_switches_without_internals_are_those_of_the_error() -> None:
 
 def test_the_noise_floor_is_the_recorded_noise() -> None:
     flight = tape(y=signal([0, 10], q=[1.0, 2.0]), truth=signal([0, 10], **{"noise.q": [3.0, -4.0]}))
-    assert noise_floor(flight) == {"q": pytest.approx(math.sqrt(12.5))}
+    assert metrics.noise_floor(flight) == {"q": pytest.approx(math.sqrt(12.5))}
 
 
 def test_the_noise_floor_is_estimated_from_y_without_truth() -> None:
@@ -209,26 +191,27 @@ def test_the_noise_floor_is_estimated_from_y_without_truth() -> None:
     k = np.arange(20_000)
     y = np.sin(k / 2000.0) + 0.02 * np.random.default_rng(1).standard_normal(len(k))
     flight = tape(y=Signal(EPOCH + k * 2 * MS, ("q",), y[:, None]))
-    assert noise_floor(flight)["q"] == pytest.approx(0.02, rel=0.05)
+    assert metrics.noise_floor(flight)["q"] == pytest.approx(0.02, rel=0.05)
 
 
 def test_the_noise_floor_is_at_least_the_rounding_of_y() -> None:
     constant = tape(y=signal([0, 10, 20, 30], q=[0.1] * 4, V=[0.0] * 4))
-    assert noise_floor(constant) == {"q": 2.0**-56, "V": 0.0}  # 0.1 lies between 2^-4 and 2^-3, and 52 bits follow the first
+    # 0.1 lies between 2^-4 and 2^-3, and 52 bits follow the first.
+    assert metrics.noise_floor(constant) == {"q": 2.0**-56, "V": 0.0}
 
 
 def test_the_spectrum_of_a_sine_peaks_at_its_frequency_and_has_its_variance() -> None:
     # 5 Hz of amplitude 2: variance 2, the integral of the squared density over all frequencies.
     k = np.arange(6000)
     u = Signal(EPOCH + k * 10 * MS, ("elevator",), 2.0 * np.sin(2 * np.pi * 5.0 * k / 100.0)[:, None])
-    frequency, density = spectra(u, 10 * MS)
+    frequency, density = metrics.spectra(u, 10 * MS)
     assert frequency[np.argmax(density["elevator"])] == pytest.approx(5.0, abs=0.1)
     assert np.sum(density["elevator"] ** 2) * (frequency[1] - frequency[0]) == pytest.approx(2.0, rel=0.01)
 
 
 def test_a_spectrum_bridges_missing_samples() -> None:
     k = np.delete(np.arange(1000), [100, 101, 500])
-    frequency, density = spectra(Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS)
+    frequency, density = metrics.spectra(Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS)
     assert frequency[-1] == 50.0
     assert np.all(density["u"] < 1e-12)  # constant, for gaps repeat the sample before
 
@@ -239,31 +222,31 @@ def test_a_spectrum_bridges_missing_samples() -> None:
 def test_periods_without_a_tick_are_counted() -> None:
     # Ticks at 0, 10, 20, 40 ms: none at 30, mean 13.3 ms; the stamps are those of y, 1 ms older.
     internals = signal([-1, 9, 19, 39], late=[0.0, 1e-4, 0.0, 3e-4], age=1e-3)
-    metrics = tick_metrics(tape(internals=internals), 10 * MS)
-    assert metrics is not None
-    assert (metrics.ticks, metrics.without_new_y, metrics.period_max, metrics.late_max) == (4, 1, 0.02, 3e-4)
-    assert metrics.period_mean == pytest.approx(0.04 / 3, abs=1e-9)
-    assert metrics.jitter == 0.0  # the last took two whole periods
+    result = metrics.tick_metrics(tape(internals=internals), 10 * MS)
+    assert result is not None
+    assert (result.ticks, result.without_new_y, result.period_max, result.late_max) == (4, 1, 0.02, 3e-4)
+    assert result.period_mean == pytest.approx(0.04 / 3, abs=1e-9)
+    assert result.jitter == 0.0  # the last took two whole periods
 
 
 def test_jitter_is_the_deviation_from_a_whole_number_of_periods() -> None:
     # 10 + 0.3, 10 - 0.4 and 20 ms: sqrt((0.09 + 0.16 + 0) / 3) ms
     internals = signal([0, 10.3, 19.9, 39.9], late=0.0, age=0.0)
-    metrics = tick_metrics(tape(internals=internals), 10 * MS)
-    assert metrics is not None
-    assert metrics.jitter == pytest.approx(math.sqrt(0.25 / 3) * 1e-3)
+    result = metrics.tick_metrics(tape(internals=internals), 10 * MS)
+    assert result is not None
+    assert result.jitter == pytest.approx(math.sqrt(0.25 / 3) * 1e-3)
 
 
 def test_latency_has_metrics_if_it_is_recorded() -> None:
     latency = signal([0, 10, 20], y_to_u=[1e-3, 3e-3, 2e-3])
-    metrics = latency_metrics(tape(latency=latency))
-    assert metrics is not None
-    assert (metrics.median, metrics.max) == (2e-3, 3e-3)
-    assert latency_metrics(tape()) is None
+    result = metrics.latency_metrics(tape(latency=latency))
+    assert result is not None
+    assert (result.median, result.max) == (2e-3, 3e-3)
+    assert metrics.latency_metrics(tape()) is None
 
 
 def test_a_flight_of_one_tick_has_no_tick_metrics() -> None:
-    assert tick_metrics(tape(internals=signal([0], late=[0.0], age=[0.0])), 10 * MS) is None
+    assert metrics.tick_metrics(tape(internals=signal([0], late=[0.0], age=[0.0])), 10 * MS) is None
 
 
 def test_groups_of_channels_lose_their_prefix() -> None:
@@ -277,6 +260,6 @@ def test_groups_of_channels_lose_their_prefix() -> None:
 def test_a_lost_sample_counts_like_a_missed_tick() -> None:
     # Ticks at 0, 10, 30 ms: at 20 ms there was no new y, and no tick was late.
     internals = signal([0, 10, 30], late=0.0, age=0.0)
-    metrics = tick_metrics(tape(internals=internals), 10 * MS)
-    assert metrics is not None
-    assert (metrics.ticks, metrics.without_new_y, metrics.late_max) == (3, 1, 0.0)
+    result = metrics.tick_metrics(tape(internals=internals), 10 * MS)
+    assert result is not None
+    assert (result.ticks, result.without_new_y, result.late_max) == (3, 1, 0.0)

@@ -7,6 +7,8 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +24,16 @@ from flight_log.tape_reader import read_run
 DURATION = 2.0  # s, of the log
 
 
-def state(folder: Path) -> dict[str, tuple[bytes, int]]:
-    """Content and modification time of every file."""
-    return {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
+@contextmanager
+def unchanged(folder: Path) -> Iterator[None]:
+    """Check that every file keeps its content and its modification time."""
+
+    def state() -> dict[str, tuple[bytes, int]]:
+        return {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
+
+    before = state()
+    yield
+    assert state() == before
 
 
 def last(run: Path) -> float:
@@ -65,19 +74,13 @@ def test_a_repaired_truncated_log_is_read_in_full_by_rosbags(fraction: float, re
     assert not list(run.glob("*.new"))
 
 
-def test_an_intact_log_is_unchanged(run: Path) -> None:
-    before = state(run)
-    done = repair(run)
-    assert not done.wrote_metadata
-    assert state(run) == before
-
-
-def test_a_repaired_log_is_intact(run: Path) -> None:
-    truncate(run, 0.5)
-    repair(run)
-    before = state(run)
-    assert not repair(run).wrote_metadata
-    assert state(run) == before
+@pytest.mark.parametrize("repaired", [False, True])
+def test_an_intact_or_repaired_log_is_unchanged(repaired: bool, run: Path) -> None:
+    if repaired:
+        truncate(run, 0.5)
+        repair(run)
+    with unchanged(run):
+        assert not repair(run).wrote_metadata
 
 
 @pytest.mark.parametrize("content", [None, "", "rosbag2_bagfile_information: 3\n", "{"])
@@ -108,40 +111,35 @@ def test_damage_inside_loses_only_its_chunk(recorded: Path, run: Path) -> None:
 
 def test_a_log_that_is_being_recorded_is_unchanged(run: Path) -> None:
     truncate(run, 0.5)
-    before = state(run)
-    with (run / "run_0.mcap").open("ab") as stream:
+    with unchanged(run), (run / "run_0.mcap").open("ab") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
         with pytest.raises(ParameterError, match="found a recorder that is writing it, expected one that has ended"):
             repair(run)
-    assert state(run) == before
 
 
 def test_a_failed_repair_changes_nothing(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     truncate(run, 0.5)
-    before = state(run)
 
     def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(ParameterError, match=r"cannot be repaired \(No space left on device\)"):
+    with unchanged(run), pytest.raises(ParameterError, match=r"cannot be repaired \(No space left on device\)"):
         repair(run)
-    assert state(run) == before
 
 
 @pytest.mark.parametrize("size", [0, 30, 500])
 def test_a_log_without_a_message_is_rejected_and_unchanged(size: int, run: Path) -> None:
     file = run / "run_0.mcap"
     file.write_bytes(file.read_bytes()[:size])
-    before = state(run)
-    with pytest.raises(ParameterError, match="found no message that could be read"):
+    with unchanged(run), pytest.raises(ParameterError, match="found no message that could be read"):
         repair(run)
-    assert state(run) == before
 
 
 def test_changed_bytes_never_cause_a_traceback_or_false_messages(recorded: Path, run: Path) -> None:
     file, generator = run / "run_0.mcap", np.random.default_rng(2)
-    content, every, repaired = file.read_bytes(), set(messages(recorded)), 0
+    content, repaired = file.read_bytes(), 0
+    data = {(topic, bytes_) for topic, _, bytes_ in messages(recorded)}
     for _ in range(40):
         damaged = bytearray(content)
         for position in generator.integers(0, len(content), 3):
@@ -153,7 +151,6 @@ def test_changed_bytes_never_cause_a_traceback_or_false_messages(recorded: Path,
             continue
         if done.files[0].damaged is not None:
             repaired += 1
-            data = {(topic, bytes_) for topic, _, bytes_ in every}
             assert {(topic, bytes_) for topic, _, bytes_ in messages(run)} <= data
     assert repaired > 10
 

@@ -14,20 +14,11 @@ import pytest
 from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report import comparison, figures, plotting
+from flight_analysis.report import comparison, figures, plotting, summary
 from flight_analysis.report.figures import input_limits
 from flight_analysis.report.html import Page, TableGroup, page_html, write_page
 from flight_analysis.report.plotting import Interval, PlotContext, SampleStore, decimate, mask_spans
-from flight_analysis.report.summary import (
-    DisplayUnit,
-    RecordedFlight,
-    display_units,
-    format_value,
-    pulse_edges,
-    slowest_settling,
-    summarise,
-    transients,
-)
+from flight_analysis.report.summary import DisplayUnit, RecordedFlight, summarise
 from flight_analysis.report.tables import events
 from flight_bringup.scenarios import find_scenario
 from flight_core.outcome import COMPLETED
@@ -220,7 +211,7 @@ def input_flight(**limited: list[Saturation]) -> Tape:
 
 
 def test_limits_near_the_input_are_in_view_and_far_ones_are_not(servo: Scenario) -> None:
-    units = display_units(servo)
+    units = summary.display_units(servo)
     near = servo.vary(controller={"lower": [-3 * DEG, -1.0, -1.0, -1.0], "upper": [3 * DEG, 1.0, 1.0, 1.0]})
     for scenario, limit, inside in ((near, 3.0, True), (servo, 30.0, False)):
         tape = input_flight()
@@ -416,21 +407,21 @@ def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> N
 
 def test_commands_are_the_edges_of_pulses(osprey_gust: Scenario) -> None:
     pulses = {"q": {"start": [2.0, 6.0], "stop": [4.0, 8.0], "value": [0.1, -0.1]}}
-    edges = pulse_edges(osprey_gust.vary(reference_model={"pulses": pulses, "rise": 0.1}))
+    edges = summary.pulse_edges(osprey_gust.vary(reference_model={"pulses": pulses, "rise": 0.1}))
     assert [(edge.kind, edge.name, edge.start) for edge in edges] == [("command", "q", at) for at in (2.0, 4.0, 6.0, 8.0)]
     assert [edge.stop for edge in edges] == pytest.approx([2.1, 4.1, 6.1, 8.1])
 
 
 def test_live_commands_replace_those_of_the_scenario(osprey_gust: Scenario) -> None:
     live = signal([5000, 5500], q=[0.0, 0.1])
-    commands = [one for one in transients(osprey_gust, flight(u_m=live)) if one.kind == "command"]
+    commands = [one for one in summary.transients(osprey_gust, flight(u_m=live)) if one.kind == "command"]
     assert [one.start for one in commands] == [2.0, 4.0, 5.5]  # the scenario has q at 2, 4, 6 and 8 s, and more
 
 
 def test_slowest_settling_marks_a_transient_after_which_the_error_did_not_settle() -> None:
     def settling(*times: float | None) -> str:
         entries = [{"kind": "gust", "start": 1.0, "until": {"q": 3.5}, "settling": {"q": time}} for time in times]
-        return slowest_settling({"transients": entries}, "q", "gust")
+        return summary.slowest_settling({"transients": entries}, "q", "gust")
 
     assert settling() == "-"
     assert settling(0.5, 2.0) == "2.00"
@@ -438,7 +429,8 @@ def test_slowest_settling_marks_a_transient_after_which_the_error_did_not_settle
 
 
 def test_values_have_three_digits() -> None:
-    assert [format_value(value) for value in (None, 0.0, 1.0, 123.4, 4.5678e-7)] == ["-", "0.00", "1.00", "123", "4.57e-07"]
+    texts = {None: "-", 0.0: "0.00", 1.0: "1.00", 123.4: "123", 4.5678e-7: "4.57e-07"}
+    assert [summary.format_value(value) for value in texts] == list(texts.values())
 
 
 # Curves
