@@ -101,11 +101,11 @@ class Bridge:
         """Whether no u was received, or none for longer than its age limit."""
         return self._u_sender is None or now_ns - self._u_ns > self._max_age_ns
 
-    def _u_timeout(self, now_ns: int) -> tuple[str, ...]:
+    def _u_timeout(self, now_ns: int) -> str:
         """The reason why u has timed out, as a sentence; empty where u is fresh."""
         if self._u_sender is None:
-            return ("u not received yet",)
-        return (f"u is {seconds(now_ns - self._u_ns):.2f} s old",) if self.u_timed_out(now_ns) else ()
+            return "u not received yet"
+        return f"u is {seconds(now_ns - self._u_ns):.2f} s old" if self.u_timed_out(now_ns) else ""
 
     def ready(self, now_ns: int) -> bool:
         """Whether y and u are fresh."""
@@ -117,8 +117,8 @@ class Bridge:
             return "dry_run is true: nothing is sent"
         if self._active_override:
             return f"pilot override active: {self._active_override}"
-        if stale := (*self.stale(now_ns).values(), *self._u_timeout(now_ns)):
-            return "; ".join(stale)
+        if stale := "; ".join(filter(None, (*self.stale(now_ns).values(), self._u_timeout(now_ns)))):
+            return stale
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
         for name, u, limit in zip(self.inputs, self._u, limits, strict=True):
             if abs(u) > limit:
@@ -147,7 +147,7 @@ class Bridge:
             if stale := self.stale(now_ns):
                 self.disengage("; ".join(stale.values()), now_ns)
             elif timeout := self._u_timeout(now_ns):
-                self.reason = timeout[0]
+                self.reason = timeout
                 self._enter(Phase.NEUTRAL, now_ns)
         times = self.channel_map.silence
         if self.phase is Phase.NEUTRAL and now_ns - self._phase_ns >= nanoseconds(times.neutral):

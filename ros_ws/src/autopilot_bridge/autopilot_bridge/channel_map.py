@@ -18,6 +18,7 @@ import numpy as np
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
+# The path of a field: names separated by dots, each with an optional index in brackets.
 PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
 STEP = re.compile(r"(\w+)(?:\[(\d+)\])?")
 
@@ -43,11 +44,6 @@ def to_raw(channel: float, line: Line) -> float:
     return line.sign * (channel - line.offset) / line.scale
 
 
-def is_path(text: str) -> bool:
-    """Whether the text is the path of a field: names separated by dots, each with an optional index in brackets."""
-    return PATH.fullmatch(text) is not None
-
-
 def get_field(message: Any, path: str) -> Any:
     """Value at a path such as "twist.angular.y" or "axes[1]". Raises ChannelError, reason "field", where there is none."""
     value = message
@@ -71,12 +67,8 @@ def set_field(message: Any, path: str, value: Any) -> None:
         if not math.isfinite(value):
             raise ChannelError("range", f"{path} takes integers, not {value:g}")
         value = round(value)
-    *parents, (name, place) = STEP.findall(path)
-    parent = message
-    for parent_name, parent_place in parents:
-        parent = getattr(parent, parent_name)
-        if parent_place:
-            parent = parent[int(parent_place)]
+    parents, _, last = path.rpartition(".")
+    parent, ((name, place),) = get_field(message, parents), STEP.findall(last)
     try:
         if place:
             getattr(parent, name)[int(place)] = value

@@ -4,13 +4,14 @@
 
 from collections.abc import Mapping
 from importlib.resources import files
+from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from autopilot_bridge.channel_map import Line, is_path, to_raw
+from autopilot_bridge.channel_map import PATH, Line, to_raw
 from flight_core.files import is_file, read_yaml
 from flight_core.parameters import KeyedParameters, NonNegative, Parameters, Positive, as_tuple, require
 
@@ -30,18 +31,7 @@ Motion = Literal[
 ]
 
 MOTIONS: Mapping[str, tuple[str, int]] = MappingProxyType(
-    {
-        "nose up": ("q", 1),
-        "nose down": ("q", -1),
-        "roll right": ("p", 1),
-        "roll left": ("p", -1),
-        "nose right": ("r", 1),
-        "nose left": ("r", -1),
-        "faster": ("V", 1),
-        "slower": ("V", -1),
-        "more thrust": ("V", 1),
-        "less thrust": ("V", -1),
-    }
+    dict(zip(get_args(Motion), product(("q", "p", "r", "V", "V"), (1, -1)), strict=True))
 )
 """The output that responds to a motion, and its sign: FRD, q nose up +, p roll right +, r nose right +, V faster +."""
 
@@ -167,19 +157,16 @@ class ChannelMap(Parameters):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        outputs = ", ".join(self.outputs)
+        outputs, messages = ", ".join(self.outputs), ", ".join(self.messages)
         require(self.instant in self.outputs, "instant", f"{self.instant!r}", f"one of the outputs {outputs}")
         self._check_fields()
         self._check_topics()
         owners: dict[tuple[str, str], str] = {}
         for name, row in self.inputs.items():
             key = f"inputs.{name}"
-            messages = ", ".join(self.messages)
             require(row.message in self.messages, f"{key}.message", f"{row.message!r}", f"one of the messages {messages}")
-            when = self.messages[row.message].when
-            require(
-                when == "engaged", f"{key}.message", f"one sent when {when}", "one sent when engaged: it moves the aircraft"
-            )
+            when, moving = self.messages[row.message].when, "one sent when engaged: it moves the aircraft"
+            require(when == "engaged", f"{key}.message", f"one sent when {when}", moving)
             other = owners.setdefault((row.message, row.field), name)
             require(other == name, f"{key}.field", f"{row.field}, that of {other}", "a field of its own")
             low, high = row.range
@@ -195,10 +182,12 @@ class ChannelMap(Parameters):
         return self
 
     def _check_fields(self) -> None:
-        paths = {f"{kind}.{name}.field": row.field for kind, rows in self._rows() for name, row in rows.items()}
+        rows: dict[str, Mapping[str, Any]] = {"outputs": self.outputs, "inputs": self.inputs, "overrides": self.overrides}
+        paths = {f"{kind}.{name}.field": row.field for kind, named in rows.items() for name, row in named.items()}
         paths |= {f"messages.{name}.values.{path}": path for name, row in self.messages.items() for path in row.values}
         for key, path in paths.items():
-            require(is_path(path), key, f"{path!r}", "the path of a field, such as twist.angular.y or axes[1]")
+            is_path = PATH.fullmatch(path) is not None
+            require(is_path, key, f"{path!r}", "the path of a field, such as twist.angular.y or axes[1]")
 
     def _check_topics(self) -> None:
         types: dict[str, str] = {}
@@ -209,17 +198,10 @@ class ChannelMap(Parameters):
         for topic in self.topics:
             require(topic in types, f"topics.{topic}", "a topic", "one that a row uses")
 
-    def _rows(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        return ("outputs", self.outputs), ("inputs", self.inputs), ("overrides", self.overrides)
-
     def used_topics(self) -> list[tuple[str, str, str]]:
         """(key of the row, topic, type) of each row that names a topic."""
-        rows: list[tuple[str, Mapping[str, Any]]] = [
-            ("outputs", self.outputs),
-            ("messages", self.messages),
-            ("overrides", self.overrides),
-        ]
-        return [(f"{kind}.{name}", row.topic, row.type) for kind, named in rows for name, row in named.items()]
+        rows: dict[str, Mapping[str, Any]] = {"outputs": self.outputs, "messages": self.messages, "overrides": self.overrides}
+        return [(f"{kind}.{name}", row.topic, row.type) for kind, named in rows.items() for name, row in named.items()]
 
 
 ROUNDING = 1e-6

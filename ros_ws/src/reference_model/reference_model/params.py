@@ -20,7 +20,6 @@ from flight_core.parameters import (
 )
 from flight_core.rates import period_ns
 from flight_core.units import GRAVITY
-from flight_core.vectors import FloatArray
 from reference_model.command import Profile
 from reference_model.model import Model, second_order
 
@@ -100,16 +99,13 @@ class ReferenceModelParameters(KeyedParameters):
         return self
 
     def _check_model(self) -> None:
-        require(
-            (self.second_order is None) != (self.linear is None),
-            "second_order",
-            "no model" if self.linear is None else "it beside linear",
-            "exactly one model: second_order or linear",
-        )
+        one = (self.second_order is None) != (self.linear is None)
+        found = "no model" if self.linear is None else "it beside linear"
+        require(one, "second_order", found, "exactly one model: second_order or linear")
         key = "second_order.damping"
         if self.second_order is not None:
-            require_length("second_order.natural_frequency", self.second_order.natural_frequency, self.outputs)
-            require_length("second_order.damping", self.second_order.damping, self.outputs)
+            for name in ("natural_frequency", "damping"):
+                require_length(f"second_order.{name}", getattr(self.second_order, name), self.outputs)
         elif self.linear is not None:
             key, n, m = "linear.A_m", len(self.linear.states), len(self.outputs)
             for name, rows, columns in (("A_m", n, n), ("B_m", n, m)):
@@ -158,8 +154,3 @@ class ReferenceModelParameters(KeyedParameters):
             bank_rate,
             turn_rate,
         )
-
-
-def zero_state(model: Model) -> FloatArray:
-    """State x_m(0) = 0: the reference starts in trim."""
-    return np.zeros(len(model.A_m))

@@ -8,7 +8,7 @@ from flight_core.rates import period_ns, seconds
 from flight_core.vectors import FloatArray
 from reference_model import model
 from reference_model.command import command
-from reference_model.params import ReferenceModelParameters, zero_state
+from reference_model.params import ReferenceModelParameters
 
 BLOCK = 100  # steps for which the profile is evaluated at once
 
@@ -20,7 +20,7 @@ class Reference:
         self._model, self._profile = parameters.model(), parameters.profile()
         self.period_ns = period_ns(parameters.rate, "rate")
         self._stepper = model.stepper(seconds(self.period_ns), self._model)
-        self._x_m = zero_state(self._model)
+        self._x_m = np.zeros(len(self._model.A_m))  # the reference starts in trim
         self._number = 0
         self._u_m = self._block(0)
         self.live: FloatArray | None = None  # (m,) commands that replace the profile's

@@ -8,6 +8,7 @@ together with them. U measures the quality of the pairing: beta and K of channel
 
 import math
 from itertools import groupby, permutations, product
+from operator import ne
 from typing import NamedTuple
 
 import numpy as np
@@ -48,15 +49,6 @@ class Pairing(NamedTuple):
     U: FloatArray  # (m, m) of the reordered matrix in inputs of unit response
 
 
-class _Elimination(NamedTuple):
-    """Omega = L diag(p) W with L unit lower, W unit upper triangular."""
-
-    L: FloatArray
-    p: FloatArray
-    W: FloatArray
-    L_inverse: FloatArray
-
-
 def decompose(Omega: FloatArray) -> SDU:
     """S, D and U of Omega, shape (m, m), by elimination without pivoting; unique.
 
@@ -68,14 +60,13 @@ def decompose(Omega: FloatArray) -> SDU:
     Decomposition and Some of Its Applications", Systems & Control Letters 21, 1993.
     """
     L, p, W, L_inverse = _eliminate(Omega)
-    D = np.sign(p)
-    S = (L * np.abs(p)) @ L.T
+    D, S = np.sign(p), (L * np.abs(p)) @ L.T
     return SDU((S + S.T) / 2.0, D, (D[:, None] * L_inverse.T * D) @ W + 0.0)  # no -0.0
 
 
 def signs(Omega: FloatArray) -> FloatArray:
     """D of Omega, shape (m,): D_k = sign(Delta_k / Delta_(k-1)). Raises DecompositionError as `decompose` does."""
-    return np.sign(_eliminate(Omega).p)
+    return np.sign(_eliminate(Omega)[1])
 
 
 def leading_minors(Omega: FloatArray) -> FloatArray:
@@ -126,9 +117,7 @@ def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
 
     def change(order: tuple[tuple[int, ...], tuple[int, ...]]) -> tuple[int, int]:
         outputs, inputs = order
-        re_paired = sum(i != j for i, j in zip(outputs, inputs, strict=True))
-        reordered = sum(i != k for i, k in zip(outputs, places, strict=True))
-        return re_paired, reordered
+        return sum(map(ne, outputs, inputs)), sum(map(ne, outputs, places))
 
     orders = sorted(product(permutations(places), permutations(places)), key=change)
     for _, group in groupby(orders, key=change):
@@ -168,8 +157,7 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to Equilibrate Both Rows and Columns Norms in
     Matrices", RAL-TR-2001-034.
     """
-    rows = np.ones(len(matrix))
-    columns = np.ones(len(matrix))
+    rows, columns = np.ones(len(matrix)), np.ones(len(matrix))
     for _ in range(_EQUILIBRATIONS):
         scaled = np.abs(matrix) / rows[:, None] / columns
         row, column = scaled.max(axis=1), scaled.max(axis=0)
@@ -178,8 +166,11 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return rows, columns
 
 
-def _eliminate(Omega: FloatArray) -> _Elimination:
-    """Omega = L diag(p) W without pivoting; p_k = (L^-1)_k Omega (W^-1)_k, from which the certainty of its sign follows."""
+def _eliminate(Omega: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """L, p, W and L^-1 of Omega = L diag(p) W without pivoting, L unit lower and W unit upper triangular.
+
+    p_k = (L^-1)_k Omega (W^-1)_k, from which the certainty of its sign follows.
+    """
     rest = _square(Omega)
     m = len(rest)
     rows, columns = _sizes(rest)
@@ -199,4 +190,4 @@ def _eliminate(Omega: FloatArray) -> _Elimination:
         rest[k + 1 :, k + 1 :] -= np.outer(L[k + 1 :, k], rest[k, k + 1 :])
         L_inverse[k + 1 :] -= np.outer(L[k + 1 :, k], L_inverse[k])
         W_inverse[:, k + 1 :] -= np.outer(W_inverse[:, k], W[k, k + 1 :])
-    return _Elimination(L, p, W, L_inverse)
+    return L, p, W, L_inverse

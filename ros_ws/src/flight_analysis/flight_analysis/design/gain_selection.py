@@ -31,7 +31,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.vectors import Array, FloatArray
 from reference_model import model
 from reference_model.command import command
-from reference_model.params import ReferenceModelParameters, zero_state
+from reference_model.params import ReferenceModelParameters
 from rise_di_controller.decomposition import DecompositionError, coupling, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
 from rise_di_controller.law import LawParams, Sign
@@ -242,7 +242,7 @@ def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> _References:
     def commanded(t: Array) -> Array:
         return command(t, profile)
 
-    x, step = zero_state(matrices), model.stepper(STEP / 2.0, matrices)
+    x, step = np.zeros(len(matrices.A_m)), model.stepper(STEP / 2.0, matrices)
     rows = []
     for k in range(2 * round(manoeuvre.duration / STEP) + 1):
         t = k * STEP / 2.0
