@@ -31,10 +31,8 @@ SIZES = st.integers(1, 5)
 ENTRIES = st.floats(-10.0, 10.0).filter(lambda value: abs(value) > 0.01)
 
 
-@st.composite
-def matrices(draw: st.DrawFn) -> FloatArray:
-    m = draw(SIZES)
-    return draw(arrays(np.float64, (m, m), elements=ENTRIES))
+def matrices() -> st.SearchStrategy[FloatArray]:
+    return SIZES.flatmap(lambda m: arrays(np.float64, (m, m), elements=ENTRIES))
 
 
 @st.composite

@@ -15,7 +15,6 @@ import pytest
 from tests.closed_loop import CALM_SERVO
 
 from aircraft_sim import dynamics, plant
-from aircraft_sim.plant import AircraftState
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector
@@ -25,7 +24,6 @@ from rise_di_controller.law import LawParams, control, retune
 from rise_di_controller.params import ControllerParameters
 
 PERIOD_NS = 10_000_000
-TICKS = 4000
 SINES = {  # u always moves; p is small, because the bank that builds up without control loads the rudder
     "q": {"amplitude": 0.1, "frequency": 1.0},
     "V": {"amplitude": 1.0, "frequency": 0.3},
@@ -65,27 +63,39 @@ class Tick(NamedTuple):
 def references() -> FloatArray:
     """y_m of the scenario at each tick, in the law's order."""
     y_m = simulate(SERVO)["y_m"]
-    return np.column_stack([y_m[name] for name in SERVO.controller.outputs])
+    return np.column_stack([y_m[name] for name in SERVO.controller.outputs])[:4000]
 
 
-def fly(conditions: Callable[[int], Conditions]) -> list[Tick]:
-    """Simulate the scenario. New parameters are taken between two ticks by `retune`, as in the node."""
+def fly(
+    conditions: Callable[[int], Conditions],
+    y_m: FloatArray | None = None,
+    x_0: FloatArray | None = None,
+    *,
+    latched: bool = True,
+) -> list[Tick]:
+    """Simulate the scenario, or the reference y_m from the state x_0. Without latching e_0 is 0.
+
+    New parameters are taken between two ticks by `retune`, as in the node.
+    """
     hardware = SERVO.aircraft.plant()
     aircraft, state, old = plant.initial_state(hardware), guard.initial_state(4), conditions(0).parameters.law()
+    aircraft = aircraft if x_0 is None else aircraft._replace(x=x_0)
     y: StampedVector | None = None
-    y_m: list[StampedVector] = []
+    samples: list[StampedVector] = []
     records = []
-    for k in range(TICKS):
+    for k, reference in enumerate(references() if y_m is None else y_m):
         now_ns, now = k * PERIOD_NS, conditions(k)
         if k > 0:
             aircraft = plant.advance(now_ns - PERIOD_NS, aircraft, state.u[INPUTS], PERIOD_NS, hardware)
-        measured, reference = dynamics.y(aircraft.x, hardware.aircraft)[OUTPUTS], references()[k]
+        measured = dynamics.y(aircraft.x, hardware.aircraft)[OUTPUTS]
         y = StampedVector(now_ns, measured) if now.y else y
-        y_m = [*y_m[-15:], StampedVector(now_ns, reference)] if now.y_m else y_m
+        samples = [*samples[-15:], StampedVector(now_ns, reference)] if now.y_m else samples
         before, law = state, now.parameters.law()
         if state.law is not None and now.parameters != conditions(max(k - 1, 0)).parameters:
             state = state._replace(law=retune(state.law, old, law))
-        state, inputs = guard.tick(state, now_ns, y, y_m, now.parameters.guard(), law, now.active)
+        state, inputs = guard.tick(state, now_ns, y, samples, now.parameters.guard(), law, now.active)
+        if k == 0 and not latched and state.law is not None:
+            state = state._replace(law=state.law._replace(e_0=np.zeros(4)))
         records.append(Tick(before, state, old, law, inputs.dt if inputs is not None else 0.0, measured - reference))
         old = law
     return records
@@ -208,22 +218,11 @@ OFF_TRIM = {"q": 0.1, "V": 2.0, "p": 0.2, "r": 0.1}
 @cache
 def upset(*, latched: bool) -> tuple[FloatArray, FloatArray]:
     """Errors e (600, 4) and inputs u (600, 4) of 6 s in the law's order. Without latching e_0 is 0."""
-    hardware, parameters = SERVO.aircraft.plant(), SERVO.controller
     x = np.zeros(len(AIRFRAME.states))
     for name, value in OFF_TRIM.items():
         x[AIRFRAME.index(name)] = value
-    aircraft, state, zero = AircraftState(x, np.zeros(4)), guard.initial_state(4), np.zeros(4)
-    e, u = [], []
-    for k in range(600):
-        now_ns, y = k * PERIOD_NS, dynamics.y(aircraft.x, hardware.aircraft)[OUTPUTS]
-        y_m = [StampedVector(now_ns, zero)]
-        state, _ = guard.tick(state, now_ns, StampedVector(now_ns, y), y_m, parameters.guard(), parameters.law())
-        if k == 0 and not latched and state.law is not None:
-            state = state._replace(law=state.law._replace(e_0=zero))
-        e.append(y)
-        u.append(state.u)
-        aircraft = plant.advance(now_ns, aircraft, state.u[INPUTS], PERIOD_NS, hardware)
-    return np.array(e), np.array(u)
+    records = fly(lambda k: Conditions(), np.zeros((600, 4)), x, latched=latched)
+    return np.array([tick.error for tick in records]), np.array([tick.after.u for tick in records])
 
 
 def test_engagement_with_an_error_commands_zero_at_the_first_tick() -> None:
