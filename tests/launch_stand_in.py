@@ -26,11 +26,7 @@ class LaunchContext:
         self.is_shutdown = False
         self.events: list[Event] = []
         self.ros_node = RosNode()
-
-    @property
-    def asyncio_loop(self) -> "LaunchContext":
-        """The loop."""
-        return self
+        self.asyncio_loop = self
 
     def call_soon_threadsafe(self, callback: Callable[..., None], *arguments: Any) -> None:
         """Call at once."""

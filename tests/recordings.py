@@ -11,6 +11,7 @@ import yaml
 from mcap.reader import make_reader
 from mcap.summary import Summary
 from numpy.typing import ArrayLike
+from rosbags.highlevel import AnyReader
 
 from flight_core.tape import Signal
 
@@ -50,3 +51,13 @@ def summary_of(file: Path) -> Summary:
         summary = make_reader(stream).get_summary()
     assert summary is not None
     return summary
+
+
+def messages(run: Path) -> list[tuple[str, int, bytes]]:
+    """Topic, log time and bytes of all messages, as rosbags reads them. Each can be deserialised."""
+    with AnyReader([run]) as reader:
+        assert sum(one.msgcount for one in reader.connections) == reader.message_count
+        read = [(one.topic, stamp_ns, data) for one, stamp_ns, data in reader.messages()]
+        for one, _, data in reader.messages():
+            reader.deserialize(data, one.msgtype)
+    return read

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from rosbags.highlevel import AnyReader
-from tests.recordings import summary_of, truncate
+from tests.recordings import messages, summary_of, truncate
 
 from flight_core.parameters import ParameterError
 from flight_log.repair import repair
@@ -40,16 +39,6 @@ def last(run: Path) -> float:
     """Flight time of the last sample on any topic."""
     tape = read_run(run).tape
     return float(max(tape.time(name)[-1] for name in tape.signals))
-
-
-def messages(run: Path) -> list[tuple[str, int, bytes]]:
-    """All messages as rosbags reads them."""
-    with AnyReader([run]) as reader:
-        assert sum(one.msgcount for one in reader.connections) == reader.message_count
-        read = [(one.topic, stamp_ns, data) for one, stamp_ns, data in reader.messages()]
-        for one, _, data in reader.messages():
-            reader.deserialize(data, one.msgtype)
-    return read
 
 
 @pytest.mark.parametrize("fraction", [0.35, 0.6, 0.9, 0.999])

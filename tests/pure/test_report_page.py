@@ -99,8 +99,7 @@ def test_a_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, 
         assert inside == pytest.approx(np.arange(51) * 0.002 + 2.0, abs=1e-9)  # 500 Hz
     t = servo.tape.time("y")
     x, values = curve(browser, 0, "y", row=2)
-    expected = np.interp(x, t, y["V"])
-    assert values == pytest.approx(expected, rel=1e-6)  # float32
+    assert values == pytest.approx(np.interp(x, t, y["V"]), rel=1e-6)  # float32
     ranges = browser.run(f"{PLOTS}.slice(0, 3).map(plot => plot._fullLayout.xaxis4.range)")
     assert ranges == [[2.0, 2.1]] * 3
     zoom(browser, 0.0, 7.0, plot=2)
@@ -167,12 +166,10 @@ def test_no_table_is_wider_than_the_page(browser: Browser, page: Path) -> None:
 
 def test_ten_minutes_at_500_hz_are_drawn_in_time(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
     # White noise in y, u and the truth hardly compresses. The best of three loads, for other processes share the host.
-    count, random = 300_001, np.random.default_rng(1)
-    stamps = np.arange(count, dtype=np.int64) * 2_000_000
-    signals = {
-        topic: Signal(stamps, servo.tape[topic].names, random.standard_normal((count, len(servo.tape[topic].names))))
-        for topic in ("y", "y_m", "u", "truth")
-    }
+    count, random, signals = 300_001, np.random.default_rng(1), {}
+    for topic in ("y", "y_m", "u", "truth"):
+        names = servo.tape[topic].names
+        signals[topic] = Signal(np.arange(count) * 2_000_000, names, random.standard_normal((count, len(names))))
     path = tmp_path / "long.html"
     write_page(path, [recorded("long", servo.scenario, Tape(signals))])
     times = []

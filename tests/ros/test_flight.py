@@ -33,10 +33,7 @@ def short_scenario(osprey_gust: Scenario, tmp_path: Path) -> Path:
         ("start: 40.0", "start: 7.0"),
         ("start: 46.0", "start: 9.5"),
         ("{start: [10.0], stop: [30.0]", "{start: [1.0], stop: [30.0]"),
-        (
-            "{start: [12.0, 17.0, 20.0, 24.0], stop: [13.5, 18.5, 21.0, 25.0]",
-            "{start: [1.0, 4.0, 20.0, 24.0], stop: [2.0, 5.0, 21.0, 25.0]",
-        ),
+        ("{start: [12.0, 17.0, 20.0, 24.0], stop: [13.5, 18.5,", "{start: [1.0, 4.0, 20.0, 24.0], stop: [2.0, 5.0,"),
     ):
         assert old in text
         text = text.replace(old, new)
@@ -49,19 +46,18 @@ def fly(start: Start, scenario: Path, *arguments: str) -> Process:
     return start("flight_cli.cli", "fly", str(scenario), *arguments)
 
 
-def children(process: Process) -> list[psutil.Process]:
-    return psutil.Process(process.popen.pid).children(recursive=True)
+Engaged = tuple[Process, list[psutil.Process]]
 
 
-def wait_for_nodes(process: Process, run: Path) -> list[psutil.Process]:
-    """Wait until the controller engages; return the four processes of the flight."""
+@pytest.fixture
+def engaged(start: Start, short_scenario: Path, tmp_path: Path) -> Engaged:
+    """A flight whose controller has engaged, and its four processes."""
+    flight = fly(start, short_scenario)
     deadline = time.monotonic() + 30.0
-    while time.monotonic() < deadline:
-        logs = list(run.glob("*/log/controller.log"))
-        if logs and "ENGAGED" in logs[0].read_text(encoding="utf-8"):
-            return children(process)
+    while not any("ENGAGED" in log.read_text(encoding="utf-8") for log in tmp_path.glob("runs/*/log/controller.log")):
+        assert time.monotonic() < deadline, f"the controller did not engage within 30 s: {flight.output}"
         time.sleep(0.02)
-    raise AssertionError(f"the controller did not engage within 30 s: {process.output}")
+    return flight, flight.children()
 
 
 def rms(error: FloatArray) -> FloatArray:
@@ -109,9 +105,8 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
     assert set(tape["u"].stamp_ns.tolist()) <= set(tape["y"].stamp_ns.tolist())
 
 
-def test_interrupt_ends_all_processes_and_keeps_the_log(start: Start, short_scenario: Path, tmp_path: Path) -> None:
-    flight = fly(start, short_scenario)
-    nodes = wait_for_nodes(flight, tmp_path / "runs")
+def test_interrupt_ends_all_processes_and_keeps_the_log(engaged: Engaged, tmp_path: Path) -> None:
+    flight, nodes = engaged
     assert len(nodes) == 4
     time_of_interrupt = time.monotonic()
     flight.interrupt()
@@ -131,9 +126,8 @@ def test_interrupt_ends_all_processes_and_keeps_the_log(start: Start, short_scen
         assert "Traceback" not in log.read_text(encoding="utf-8")
 
 
-def test_a_second_interrupt_does_not_interrupt_the_shutdown(start: Start, short_scenario: Path, tmp_path: Path) -> None:
-    flight = fly(start, short_scenario)
-    nodes = wait_for_nodes(flight, tmp_path / "runs")
+def test_a_second_interrupt_does_not_interrupt_the_shutdown(engaged: Engaged, tmp_path: Path) -> None:
+    flight, nodes = engaged
     flight.interrupt()
     flight.interrupt()
     psutil.wait_procs(nodes[:1], timeout=3.0)
@@ -145,28 +139,27 @@ def test_a_second_interrupt_does_not_interrupt_the_shutdown(start: Start, short_
 
 
 @pytest.mark.parametrize("seconds", [0.3, 1.0])  # an earlier interrupt stops the interpreter itself
-def test_an_early_interrupt_causes_no_traceback(seconds: float, start: Start, short_scenario: Path, tmp_path: Path) -> None:
+def test_an_early_interrupt_causes_no_traceback(seconds: float, start: Start, short_scenario: Path) -> None:
     flight = fly(start, short_scenario)
     with pytest.raises(subprocess.TimeoutExpired):  # the instant of the interrupt is the test case
         flight.popen.wait(seconds + 0.05)
-    nodes = children(flight)
+    nodes = flight.children()
     flight.interrupt()
     assert flight.end() in {130, -signal.SIGINT}, flight.output
     assert "Traceback" not in flight.output
     assert not psutil.wait_procs(nodes, timeout=3.0)[1]
 
 
-def test_two_flights_on_one_domain_do_not_mix(start: Start, short_scenario: Path, tmp_path: Path) -> None:
-    first = fly(start, short_scenario)
-    wait_for_nodes(first, tmp_path / "runs")
+def test_two_flights_on_one_domain_do_not_mix(start: Start, short_scenario: Path, engaged: Engaged) -> None:
     second = fly(start, short_scenario)
     assert second.end() == 2
     assert "a domain of its own for each flight: set ROS_DOMAIN_ID" in second.output
+    first, _ = engaged
     first.interrupt()
     assert first.end() == 130
 
 
-def test_a_flight_with_a_wrong_sign_ends_when_it_diverges(start: Start, short_scenario: Path, tmp_path: Path) -> None:
+def test_a_flight_with_a_wrong_sign_ends_when_it_diverges(start: Start, short_scenario: Path) -> None:
     wrong = short_scenario.with_name("wrong.yaml")
     text = short_scenario.read_text(encoding="utf-8")
     wrong.write_text(text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"), encoding="utf-8")
@@ -178,18 +171,16 @@ def test_a_flight_with_a_wrong_sign_ends_when_it_diverges(start: Start, short_sc
     assert "outcome: diverged at t = " in in_process.output
 
 
-def test_a_killed_node_ends_the_flight_and_is_named(start: Start, short_scenario: Path, tmp_path: Path) -> None:
-    flight = fly(start, short_scenario)
-    nodes = wait_for_nodes(flight, tmp_path / "runs")
-    next(node for node in nodes if "rise_di_controller.main" in node.cmdline()).kill()
+def test_a_killed_node_ends_the_flight_and_is_named(engaged: Engaged) -> None:
+    flight, nodes = engaged
+    flight.child("rise_di_controller.main").kill()
     assert flight.end() == 3
     assert "controller was killed by SIGKILL" in flight.output
     assert not psutil.wait_procs(nodes, timeout=3.0)[1]
 
 
-def test_nodes_end_when_the_command_itself_is_killed(start: Start, short_scenario: Path, tmp_path: Path) -> None:
-    flight = fly(start, short_scenario)
-    nodes = wait_for_nodes(flight, tmp_path / "runs")
+def test_nodes_end_when_the_command_itself_is_killed(engaged: Engaged, tmp_path: Path) -> None:
+    flight, nodes = engaged
     flight.popen.kill()
     assert not psutil.wait_procs(nodes, timeout=3.0)[1]
     # and the recorder closed its file

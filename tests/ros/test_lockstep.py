@@ -4,19 +4,18 @@
 
 import json
 import re
-import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import MappingProxyType
+from typing import Any
 
 import pytest
-import yaml
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
+from tests import recordings
 from tests.ros.conftest import Process, Start
 
 from flight_analysis.closed_loop.scenario import load_scenario
@@ -36,16 +35,9 @@ ROUGH = {
 }
 
 
-def scenario_file(
-    folder: Path, duration: float, name: str = "osprey_servo", aircraft: Mapping[str, object] = MappingProxyType({})
-) -> Path:
-    """A shortened scenario with changes to its aircraft."""
-    tree = yaml.safe_load(find_scenario(name).path.read_text(encoding="utf-8"))
-    tree["/**/flight"]["ros__parameters"]["duration"] = duration
-    tree["/**/aircraft"]["ros__parameters"] |= aircraft
-    path = folder / "rough.yaml"
-    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
-    return path
+def scenario_file(folder: Path, duration: float, name: str = "osprey_servo", **sections: Mapping[str, Any]) -> Path:
+    """A shortened scenario with changes to its sections."""
+    return recordings.scenario_file(folder / "rough.yaml", find_scenario(name).path, flight={"duration": duration}, **sections)
 
 
 def fly(start: Start, scenario: Path, runs: str, *options: str) -> Path:
@@ -109,35 +101,23 @@ def test_twenty_successive_flights_complete(tmp_path: Path) -> None:
 def nodes(start: Start, scenario: Path) -> dict[str, Process]:
     """The four nodes, started one by one as a user does, in an endless lockstep flight."""
     overrides = {
-        "recorder": ("flight_recorder", ["directory:=run"]),
-        "controller": ("rise_di_controller", ["y_rate:=500.0"]),
+        "recorder": ("flight_recorder", ["-p", "directory:=run"]),
+        "controller": ("rise_di_controller", ["-p", "y_rate:=500.0"]),
         "reference_model": ("reference_model", []),
-        "aircraft": ("aircraft_sim", ["control_rate:=100.0", "recorded:=true"]),
+        "aircraft": ("aircraft_sim", ["-p", "control_rate:=100.0", "-p", "recorded:=true"]),
     }
-    return {
-        role: start(
-            f"{package}.main",
-            *("--ros-args", "--params-file", str(scenario), "-p", "lockstep:=true"),
-            *(word for item in items for word in ("-p", item)),
-        )
-        for role, (package, items) in overrides.items()
-    }
+    shared = ("--ros-args", "--params-file", str(scenario), "-p", "lockstep:=true")
+    return {role: start(f"{package}.main", *shared, *words) for role, (package, words) in overrides.items()}
 
 
-def wait_until_recorded(folder: Path, process: Process) -> None:
-    """Wait until the log has 1 MB. By then the liveliness monitor of every node is active."""
-    deadline = time.monotonic() + 60.0
-    while sum(path.stat().st_size for path in folder.rglob("*.mcap")) < 1_000_000:
-        assert time.monotonic() < deadline, process.output
-        assert process.popen.poll() is None, process.output
-        time.sleep(0.01)  # nothing signals the growth of a file
+LOG_SIZE = 1_000_000  # bytes; by then the liveliness monitor of every node is active
 
 
 @pytest.mark.parametrize("victim", ["aircraft", "reference_model", "controller", "recorder"])
 def test_other_nodes_end_within_two_seconds_of_a_kill_and_name_the_lost_peer(victim: str, start: Start, tmp_path: Path) -> None:
     processes = nodes(start, scenario_file(tmp_path, 1e6))
-    wait_until_recorded(tmp_path / "run", processes["aircraft"])
-    processes[victim].popen.send_signal(signal.SIGKILL)
+    processes["aircraft"].wait_for_log(tmp_path / "run", LOG_SIZE)
+    processes[victim].popen.kill()
     killed = time.monotonic()
     for role, process in processes.items():
         if role != victim:
@@ -150,20 +130,16 @@ def test_other_nodes_end_within_two_seconds_of_a_kill_and_name_the_lost_peer(vic
 
 def test_a_killed_node_ends_the_flight_with_its_name_in_the_summary(start: Start, tmp_path: Path) -> None:
     command = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5)), "--lockstep", "--runs", "runs")
-    wait_until_recorded(tmp_path / "runs", command)
-    node = next(child for child in command.children() if "reference_model.main" in child.cmdline())
-    node.send_signal(signal.SIGKILL)
+    command.wait_for_log(tmp_path / "runs", LOG_SIZE)
+    command.child("reference_model.main").kill()
     assert command.end() == 3
-    outcome = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))["outcome"]
-    assert outcome == "reference_model was killed by SIGKILL"
+    summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["outcome"] == "reference_model was killed by SIGKILL"
 
 
 def test_a_diverged_aircraft_ends_the_flight_with_the_reason_and_a_log(start: Start, tmp_path: Path) -> None:
-    scenario = scenario_file(tmp_path, 60.0, "osprey_gust")  # it has no saturation that would limit the wrong input
-    text = scenario.read_text(encoding="utf-8")
-    wrong, count = re.subn(r"D: *\n( *- 1\n){4}", lambda match: match.group().replace("- 1", "- -1", 1), text)
-    assert count == 1
-    scenario.write_text(wrong, encoding="utf-8")
+    wrong = {"D": [-1, 1, 1, 1]}
+    scenario = scenario_file(tmp_path, 60.0, "osprey_gust", controller=wrong)  # no saturation limits the wrong input
     command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", "runs")
     assert command.end(timeout=60) == 3, command.output
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))

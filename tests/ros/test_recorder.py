@@ -8,7 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import FluidPressure, JointState, Temperature
 from std_msgs.msg import String
 from tests.conftest import REPOSITORY
+from tests.recordings import messages
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer, peer
 from tests.small_disk import small_disk
@@ -44,9 +46,18 @@ def peer_node() -> Iterator[Peer]:
         yield made
 
 
-def recorder(start: Start, scenario: Scenario, folder: Path | str, *parameters: str) -> Process:
-    arguments = [word for one in (f"directory:={folder}", *parameters) for word in ("-p", one)]
-    return start("flight_recorder.main", "--ros-args", "--params-file", str(scenario.path), *arguments)
+Recorder = Callable[..., Process]
+
+
+@pytest.fixture
+def recorder(start: Start, osprey_gust: Scenario) -> Recorder:
+    """Start a recorder with a folder and further parameters."""
+
+    def begin(folder: Path | str, *parameters: str) -> Process:
+        arguments = [word for one in (f"directory:={folder}", *parameters) for word in ("-p", one)]
+        return start("flight_recorder.main", "--ros-args", "--params-file", str(osprey_gust.path), *arguments)
+
+    return begin
 
 
 def stop(process: Process) -> None:
@@ -56,9 +67,8 @@ def stop(process: Process) -> None:
 
 def diagnostics(peer_node: Peer) -> tuple[int, str, dict[str, str]]:
     """Level, sentence and figures of the recorder's newest diagnostics."""
-    for message in reversed(peer_node.received["/diagnostics"]):
-        if message.status[0].name == "/recorder":
-            status = message.status[0]
+    for status in (message.status[0] for message in reversed(peer_node.received["/diagnostics"])):
+        if status.name == "/recorder":
             return status.level[0], status.message, {one.key: one.value for one in status.values}
     return -1, "", {}
 
@@ -67,14 +77,9 @@ def recorded(peer_node: Peer, topic: str) -> int:
     return int(diagnostics(peer_node)[2].get(f"messages {topic}", 0))
 
 
-def messages(run: Path) -> dict[str, list[tuple[int, bytes]]]:
-    """Log time and bytes of all messages, by topic, as rosbags reads them."""
-    by_topic: dict[str, list[tuple[int, bytes]]] = {}
-    with AnyReader([run]) as reader:
-        for one, stamp_ns, data in reader.messages():
-            by_topic.setdefault(one.topic, []).append((stamp_ns, data))
-            reader.deserialize(data, one.msgtype)
-    return by_topic
+def count_messages(run: Path) -> Counter[str]:
+    """The number of messages in a log, by topic."""
+    return Counter(topic for topic, _, _ in messages(run))
 
 
 def errors(process: Process) -> list[str]:
@@ -84,9 +89,9 @@ def errors(process: Process) -> list[str]:
 # Recorded topics
 
 
-def test_rosout_and_parameter_events_are_recorded(start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path) -> None:
+def test_rosout_and_parameter_events_are_recorded(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     peer_node.node.get_logger().info("logged before the recorder started")
-    process = recorder(start, osprey_gust, "run")
+    process = recorder("run")
     peer_node.until(lambda: recorded(peer_node, "/rosout") > 1)
     peer_node.node.declare_parameter("gain", 3.0)
     peer_node.until(lambda: recorded(peer_node, "/parameter_events") > 0)
@@ -100,12 +105,10 @@ def test_rosout_and_parameter_events_are_recorded(start: Start, osprey_gust: Sce
     assert [one.name for event in events for one in event.new_parameters if event.node == "/peer"] == ["gain"]  # type: ignore[attr-defined]
 
 
-def test_further_topics_are_recorded_with_any_offered_qos(
-    start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
-) -> None:
+def test_further_topics_are_recorded_with_any_offered_qos(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     latched = peer_node.node.create_publisher(String, "/latched", LATCHED)
     latched.publish(String(data="before"))
-    process = recorder(start, osprey_gust, "run", "topics:=[/latched, relative/pressure, /late, /y]")
+    process = recorder("run", "topics:=[/latched, relative/pressure, /late, /y]")
     process.wait_for("ready")
     weak = peer_node.node.create_publisher(FluidPressure, "/relative/pressure", BEST_EFFORT)
     peer_node.until(lambda: recorded(peer_node, "/relative/pressure") > 2, each=lambda: weak.publish(FluidPressure()))
@@ -113,65 +116,61 @@ def test_further_topics_are_recorded_with_any_offered_qos(
     peer_node.until(lambda: recorded(peer_node, "/late") > 2, each=lambda: late.publish(Temperature(temperature=1.0)))
     peer_node.until(lambda: recorded(peer_node, "/latched") > 0)
     stop(process)
-    by_topic = messages(tmp_path / "run")
-    assert len(by_topic["/latched"]) == 1  # published before the recorder started
-    assert len(by_topic["/relative/pressure"]) > 2
-    assert len(by_topic["/late"]) > 2
+    counts = count_messages(tmp_path / "run")
+    assert counts["/latched"] == 1  # published before the recorder started
+    assert counts["/relative/pressure"] > 2
+    assert counts["/late"] > 2
     assert errors(process) == []
 
 
-def test_a_later_publisher_with_a_weaker_qos_is_recorded(
-    start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
-) -> None:
+def test_a_later_publisher_with_a_weaker_qos_is_recorded(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     strong = peer_node.node.create_publisher(String, "/mixed", LATCHED)
     strong.publish(String(data="strong"))
-    process = recorder(start, osprey_gust, "run", "topics:=[/mixed]")
+    process = recorder("run", "topics:=[/mixed]")
     peer_node.until(lambda: recorded(peer_node, "/mixed") == 1)
     weak = peer_node.node.create_publisher(String, "/mixed", BEST_EFFORT)
     process.wait_for("/mixed: now recorded with best_effort")
     peer_node.until(lambda: recorded(peer_node, "/mixed") > 3, each=lambda: weak.publish(String(data="weak")))
     stop(process)
-    texts = [data for _, data in messages(tmp_path / "run")["/mixed"]]
+    texts = [data for topic, _, data in messages(tmp_path / "run") if topic == "/mixed"]
     assert sum(b"strong" in text for text in texts) == 1
     assert sum(b"weak" in text for text in texts) > 2
 
 
-def test_a_topic_without_a_publisher_is_named(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
-    process = recorder(start, osprey_gust, "run", "topics:=[/never]")
+def test_a_topic_without_a_publisher_is_named(recorder: Recorder, peer_node: Peer) -> None:
+    process = recorder("run", "topics:=[/never]")
     process.wait_for("no publisher of /never; recording starts with the first one")
     peer_node.until(lambda: diagnostics(peer_node)[2].get("missing /never") == "no publisher")
     stop(process)
     assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: it had no publisher" in line)
 
 
-def test_a_topic_whose_type_is_not_installed_is_named(
-    start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path
-) -> None:
+def test_a_topic_whose_type_is_not_installed_is_named(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     # The recorder runs in this folder. Its packages precede the installed ones, and its lifecycle_msgs has no messages.
     (tmp_path / "lifecycle_msgs").mkdir()
     (tmp_path / "lifecycle_msgs" / "__init__.py").touch()
     peer_node.node.create_publisher(State, "/strange", LATCHED)
-    process = recorder(start, osprey_gust, "run", "topics:=[/strange]")
+    process = recorder("run", "topics:=[/strange]")
     process.wait_for("/strange is not recorded: its type lifecycle_msgs/msg/State is not installed")
     stop(process)
 
 
-def test_a_publisher_of_another_type_is_named(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
+def test_a_publisher_of_another_type_is_named(recorder: Recorder, peer_node: Peer) -> None:
     peer_node.node.create_publisher(String, "/u_m", LATCHED)
-    process = recorder(start, osprey_gust, "run")
+    process = recorder("run")
     process.wait_for("/u_m: /peer publishes std_msgs/msg/String, expected sensor_msgs/msg/JointState")
     stop(process)
 
 
-def test_an_invalid_topic_name_is_rejected(start: Start, osprey_gust: Scenario, tmp_path: Path) -> None:
-    process = recorder(start, osprey_gust, "run", "topics:=[a topic]")
+def test_an_invalid_topic_name_is_rejected(recorder: Recorder, tmp_path: Path) -> None:
+    process = recorder("run", "topics:=[a topic]")
     assert process.end() == 2
     assert errors(process) == ["error: recorder.topics: found 'a topic', expected the name of a topic"]
     assert not (tmp_path / "run").exists()
 
 
-def test_lost_messages_are_counted_and_reported(start: Start, osprey_gust: Scenario, peer_node: Peer, tmp_path: Path) -> None:
-    process = recorder(start, osprey_gust, "run")
+def test_lost_messages_are_counted_and_reported(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
+    process = recorder("run")
     process.wait_for("ready")
     names, sent = [f"x.{k}" for k in range(100)], 0
     publisher = peer_node.node.create_publisher(JointState, "truth", PUBLISH)
@@ -222,20 +221,15 @@ def publisher(domain: int) -> Iterator[subprocess.Popen[str]]:
     process.communicate(timeout=20.0)
 
 
+@pytest.mark.usefixtures("publisher")
 @pytest.mark.parametrize(
     ("least", "reason"),
     [("0.0", "no space left for "), ("1.2", r"min_free: found \d\.\d MB free in .*, expected at least 1.2 MB")],
 )
 def test_a_full_disk_ends_the_recording_with_one_error_and_not_the_flight(
-    least: str,
-    reason: str,
-    start: Start,
-    osprey_gust: Scenario,
-    peer_node: Peer,
-    disk: Path,
-    publisher: subprocess.Popen[str],
+    least: str, reason: str, recorder: Recorder, peer_node: Peer, disk: Path
 ) -> None:
-    process = recorder(start, osprey_gust, disk / "run", f"min_free:={least}", "lockstep:=true")
+    process = recorder(disk / "run", f"min_free:={least}", "lockstep:=true")
     process.wait_for("recording ended")
     peer_node.until(lambda: diagnostics(peer_node)[0] == 2)
     _, sentence, figures = diagnostics(peer_node)
@@ -245,36 +239,21 @@ def test_a_full_disk_ends_the_recording_with_one_error_and_not_the_flight(
     peer_node.node.create_subscription(Time, "recorded", received.append, QoSProfile(depth=10))
     peer_node.until(lambda: len(received) > 5)
     stop(process)
-    assert len([line for line in errors(process) if "recording ended" in line]) == 1
-    assert len(errors(process)) == 1
-    by_topic = messages(disk / "run")
-    assert {topic: str(len(those)) for topic, those in by_topic.items()} == {
-        key.removeprefix("messages "): value for key, value in figures.items() if key.startswith("messages ") and value != "0"
-    }
+    (error,) = errors(process)
+    assert "recording ended" in error
+    counts = {f"messages {topic}": str(count) for topic, count in count_messages(disk / "run").items()}
+    assert counts == {key: value for key, value in figures.items() if key.startswith("messages ") and value != "0"}
     assert read_run(disk / "run").tape.notes == ()
 
 
-def test_too_little_space_at_the_start_is_rejected(start: Start, osprey_gust: Scenario, disk: Path) -> None:
-    process = recorder(start, osprey_gust, disk / "run")
+def test_too_little_space_at_the_start_is_rejected(recorder: Recorder, disk: Path) -> None:
+    process = recorder(disk / "run")
     assert process.end() == 2
-    assert re.fullmatch(
-        r"error: recorder.min_free: found 3.0 MB free in .*/disk/run, expected at least 100 MB", process.lines[-1]
-    )
+    sentence = r"error: recorder.min_free: found 3.0 MB free in .*/disk/run, expected at least 100 MB"
+    assert re.fullmatch(sentence, process.lines[-1])
 
 
 # A recorder that is killed
-
-
-def size(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*.mcap"))
-
-
-def wait_for_size(folder: Path, least: int, process: Process) -> None:
-    deadline = time.monotonic() + 30.0
-    while size(folder) < least:
-        assert time.monotonic() < deadline, process.output
-        assert process.popen.poll() is None, process.output
-        time.sleep(0.005)  # nothing signals the growth of a file
 
 
 def stamps_and_sequences(folder: Path) -> dict[str, tuple[list[int], list[int]]]:
@@ -304,21 +283,22 @@ def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
     return max(newest - stamps[-1] for stamps, _ in by_topic.values()) / NANOSECONDS
 
 
+@pytest.mark.usefixtures("publisher")
 def test_twenty_killed_recorders_lose_at_most_three_tenths_of_a_second(
-    start: Start, osprey_gust: Scenario, tmp_path: Path, publisher: subprocess.Popen[str], peer_node: Peer
+    recorder: Recorder, tmp_path: Path, peer_node: Peer
 ) -> None:
     generator = np.random.default_rng(1)
     witness = PolledSubscription(peer_node.node, Y, NEWEST_SAMPLES, raw=True)
     missing = []
-    following = recorder(start, osprey_gust, "run0")
+    following = recorder("run0")
     for k in range(20):
         process, folder = following, tmp_path / f"run{k}"
-        wait_for_size(folder, 50_000, process)
+        process.wait_for_log(folder, 50_000, timeout=30.0)
         while missing_seconds(folder, witness) > 0.2:  # at first it receives the history of 2 s that the publishers keep
             assert process.popen.poll() is None, process.output
         begin = {topic: sequences[-1] for topic, (_, sequences) in stamps_and_sequences(folder).items()}
         if k < 19:
-            following = recorder(start, osprey_gust, f"run{k + 1}")  # starts in the meantime
+            following = recorder(f"run{k + 1}")  # starts in the meantime
         with pytest.raises(subprocess.TimeoutExpired):  # the random instant of the kill is the test case
             process.popen.wait(float(generator.uniform(0.0, 0.3)))
         process.popen.kill()
@@ -340,8 +320,8 @@ def test_a_flight_with_a_killed_recorder_has_a_report_and_a_repairable_log(
     start: Start, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     flight = start("flight_cli.cli", "fly", str(osprey_gust.path), "--duration", "30")
-    wait_for_size(tmp_path / "runs", 150_000, flight)
-    node = next(child for child in flight.children() if "flight_recorder.main" in child.cmdline())
+    flight.wait_for_log(tmp_path / "runs", 150_000, timeout=30.0)
+    node = flight.child("flight_recorder.main")
     killed_ns = time.time_ns()
     node.kill()
     assert flight.end(60.0) == 3, flight.output
@@ -351,11 +331,8 @@ def test_a_flight_with_a_killed_recorder_has_a_report_and_a_repairable_log(
     assert (killed_ns - before.tape["y"].stamp_ns[-1]) / NANOSECONDS < 0.3
     assert before.scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
     assert {stored.name for stored in before.attachments} == {"parameters.yaml", "airframe.yaml"}
-    assert {name for name in before.metadata if before.metadata[name]} >= {
-        "rise_di_flight",
-        "rise_di_host",
-        "rise_di_versions",
-    }
+    filled = {name for name in before.metadata if before.metadata[name]}
+    assert filled >= {"rise_di_flight", "rise_di_host", "rise_di_versions"}
     report = start("flight_cli.cli", "report", str(run))
     assert report.end(60.0) == 0, report.output
     assert "is truncated: read up to its last complete chunk, t = " in " ".join(report.output.split())
@@ -363,8 +340,7 @@ def test_a_flight_with_a_killed_recorder_has_a_report_and_a_repairable_log(
     repair = start("flight_cli.cli", "repair", str(run))
     assert repair.end(60.0) == 0, repair.output
     assert "of the 30 s of the scenario" in repair.output
-    counts = {topic: len(those) for topic, those in messages(run).items()}
-    assert counts["/y"] == len(before.tape["y"].stamp_ns)
+    assert count_messages(run)["/y"] == len(before.tape["y"].stamp_ns)
     after = read_run(run)
     assert after.tape.notes == ()
     assert after.tape["y"].values.tobytes() == before.tape["y"].values.tobytes()

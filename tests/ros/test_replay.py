@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from lifecycle_msgs.msg import Transition
+from tests import recordings
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer, peer
 from tests.ros.test_controller import set_parameters, transition
@@ -43,15 +43,18 @@ def fly(start: Start, scenario: Path, *options: str) -> Process:
     return start("flight_cli.cli", "fly", str(scenario), *options)
 
 
+def receive_more(peer_node: Peer, count: int) -> None:
+    """Wait for further samples of `internals`."""
+    enough = len(peer_node.received["internals"]) + count
+    peer_node.until(lambda: len(peer_node.received["internals"]) >= enough, timeout=60.0)
+
+
 def with_limits(path: Path) -> Path:
     """The scenario with feedforward, and with magnitude and rate limits at which u saturates."""
     controller = with_feedforward(load_scenario(path).controller, load_airframe("osprey"))
     limits = {"lower": [-0.05] * 4, "upper": [0.01] * 4, "slew": [0.3] * 4}
-    tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     as_json = json.loads(json.dumps(nest(dict(flatten(controller.model_dump())))))
-    tree["/**/controller"]["ros__parameters"] = as_json | limits
-    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
-    return path
+    return recordings.scenario_file(path, path, controller=as_json | limits)
 
 
 @pytest.mark.parametrize("options", [("--lockstep",), ("--one-process",)])
@@ -77,24 +80,20 @@ def test_a_flight_in_real_time_is_replayed_with_parameter_changes_outages_and_a_
     def modes() -> list[int]:
         return peer_node.modes()[-1:]
 
-    def more(count: int) -> None:
-        until = len(peer_node.received["internals"]) + count
-        peer_node.until(lambda: len(peer_node.received["internals"]) >= until, timeout=60.0)
-
     peer_node.until(lambda: modes() == [Mode.ENGAGED], timeout=60.0)
     assert set_parameters(peer_node, k_g=1.5, Lambda=[4.0, 4.0, 2.0, 0.4])[0]
-    more(50)
+    receive_more(peer_node, 50)
     assert set_parameters(peer_node, upper=[0.01] * 4)[0]
     with both_cores_busy():  # ticks are late, and some are missed
-        more(50)
+        receive_more(peer_node, 50)
     assert transition(peer_node, Transition.TRANSITION_DEACTIVATE)
     peer_node.until(lambda: modes() == [Mode.INACTIVE])
-    more(20)
+    receive_more(peer_node, 20)
     assert transition(peer_node, Transition.TRANSITION_CLEANUP)
     assert transition(peer_node, Transition.TRANSITION_CONFIGURE)  # the law re-engages from its last u
     assert transition(peer_node, Transition.TRANSITION_ACTIVATE)
     peer_node.until(lambda: modes() == [Mode.ENGAGED])
-    more(50)
+    receive_more(peer_node, 50)
     flight.interrupt()
     assert flight.end(timeout=60) == 130, flight.output
     run = tmp_path / "runs" / "latest"
@@ -108,17 +107,10 @@ def test_a_flight_in_real_time_is_replayed_with_parameter_changes_outages_and_a_
 
 def test_the_log_of_a_killed_recorder_is_replayed(start: Start, tmp_path: Path) -> None:
     flight = fly(start, scenario_file(tmp_path, 30.0, "osprey_gust"), "--lockstep")
-    log: list[Path] = []
-
-    def written() -> bool:
-        log[:] = tmp_path.rglob("*.mcap")
-        return bool(log) and log[0].stat().st_size > 200_000
-
-    with peer(()) as peer_node:
-        peer_node.until(written, timeout=60.0)
-    next(one for one in flight.children() if "flight_recorder.main" in one.cmdline()).kill()
+    flight.wait_for_log(tmp_path, 200_000)
+    flight.child("flight_recorder.main").kill()
     assert flight.end(timeout=60) == 3, flight.output
-    output = replayed(start, log[0].parent)
+    output = replayed(start, tmp_path / "runs" / "latest")
     assert output["ticks"] == output["checked"] > 100
     assert any("is truncated" in note for note in output["notes"])
 
@@ -136,8 +128,7 @@ def test_a_late_recorder_leaves_its_first_tick_unchecked_and_notes_the_missing_s
         *("-p", f"scenario_file:={scenario}", "-p", "directory:=run"),
     )
     recorder.wait_for("recording to")
-    count = len(peer_node.received["internals"])
-    peer_node.until(lambda: len(peer_node.received["internals"]) > count + 200)
+    receive_more(peer_node, 201)
     recorder.interrupt()
     assert recorder.end() == 0, recorder.output
     output = replayed(start, tmp_path / "run")
