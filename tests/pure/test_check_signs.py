@@ -43,13 +43,6 @@ def changed(original: ChannelMap, kind: str, channel: str, **values: Any) -> Cha
     return ChannelMap.validate_mapping(content, "map")
 
 
-def written(channel_map: ChannelMap, folder: Path) -> str:
-    path = folder / f"{channel_map.name}.yaml"
-    content = json.loads(json.dumps(channel_map.model_dump(exclude_none=True)))  # lists in place of tuples, for YAML
-    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    return str(path)
-
-
 @pytest.mark.parametrize("name", MAPS)
 def test_the_shipped_maps_fit_the_controller_of_the_osprey(name: str) -> None:
     result = CliRunner().invoke(app, ["check-signs", name, "--json"])
@@ -88,8 +81,10 @@ def test_two_wrong_signs_that_cancel_in_d_are_still_a_contradiction(channel: str
 
 
 def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> None:
-    path = written(changed(load_map("ardupilot"), "inputs", "elevator", sign=-1), tmp_path)
-    result = CliRunner().invoke(app, ["check-signs", path])
+    path, flipped = tmp_path / "ardupilot.yaml", changed(load_map("ardupilot"), "inputs", "elevator", sign=-1)
+    content = json.loads(json.dumps(flipped.model_dump(exclude_none=True)))  # lists in place of tuples, for YAML
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    result = CliRunner().invoke(app, ["check-signs", str(path)])
     assert result.exit_code == 1
     sentence = "error: with the map ardupilot D of q and elevator is -1, the controller has +1: a positive elevator makes"
     assert sentence in result.stderr

@@ -30,21 +30,18 @@ def sample(ms: float, value: float = 0.0) -> StampedVector:
 def test_reference_is_taken_at_the_stamp_of_y() -> None:
     samples = [sample(0, 0.0), sample(10, 1.0), sample(20, 3.0)]
 
-    def at(ms: float) -> float | None:
-        value = align(samples, round(ms * MS), 10 * MS)
-        return None if value is None else float(value[0])
+    def at(ms: float) -> FloatArray | None:
+        return align(samples, round(ms * MS), 10 * MS)
 
-    assert at(10) == 1.0  # a sample of that stamp
-    assert at(15) == pytest.approx(2.0)  # between two
-    assert at(25) == pytest.approx(4.0)  # extrapolated from the last two
+    assert at(10) == pytest.approx([1.0] * 4, rel=0.0, abs=0.0)  # a sample of that stamp
+    assert at(15) == pytest.approx([2.0] * 4)  # between two
+    assert at(25) == pytest.approx([4.0] * 4)  # extrapolated from the last two
     assert at(31) is None  # more than one period after the newest
     assert at(-1) is None  # before the oldest
 
 
 def test_a_single_sample_is_held_for_one_period() -> None:
-    held = align([sample(0, 7.0)], 10 * MS, 10 * MS)
-    assert held is not None
-    assert held.tolist() == [7.0] * 4
+    assert align([sample(0, 7.0)], 10 * MS, 10 * MS) == pytest.approx([7.0] * 4, rel=0.0, abs=0.0)
     assert align([sample(0, 7.0)], 11 * MS, 10 * MS) is None
 
 
@@ -52,17 +49,15 @@ def test_noise_of_closely_spaced_reference_samples_is_not_amplified() -> None:
     # Two samples 1 us apart differ by 1: the line through them is wrong by 8000 after 8 ms. The slope is taken from samples
     # that are at least a twentieth of the extrapolation limit apart, here the first and the last; otherwise the value is held.
     close = [StampedVector(2 * MS, np.array([1.0])), StampedVector(2 * MS + 1000, np.array([2.0]))]
-    value = align([sample(0, 0.0), *close], 10 * MS, 10 * MS)
-    assert value is not None
-    assert value[0] == pytest.approx(2.0 * 10.0 / 2.001, rel=1e-12)
+    first = StampedVector(0, np.array([0.0]))
+    assert align([first, *close], 10 * MS, 10 * MS) == pytest.approx([2.0 * 10.0 / 2.001], rel=1e-12)
     assert align(close, 10 * MS, 10 * MS) == pytest.approx([2.0], rel=0.0)
 
 
 @given(ms=st.floats(0, 20))
 def test_a_straight_line_is_reproduced_at_any_instant(ms: float) -> None:
     value = align([sample(t, t) for t in (0, 5, 10)], round(ms * MS), 10 * MS)
-    assert value is not None
-    assert value[0] == pytest.approx(round(ms * MS) / MS, abs=1e-9)
+    assert value == pytest.approx([round(ms * MS) / MS] * 4, abs=1e-9)
 
 
 def tick(

@@ -94,11 +94,8 @@ def test_a_long_pulse_ends_at_its_value() -> None:
 
 
 def test_the_general_form_and_the_second_order_form_are_the_same_model() -> None:
-    same = {
-        "states": ["q", "q_rate", "p", "p_rate", "r", "r_rate"],
-        "A_m": parameters().model().A_m.ravel().tolist(),
-        "B_m": parameters().model().B_m.ravel().tolist(),
-    }
-    general = parameters(second_order=None, linear=same).model()
-    for general_matrix, matrix in zip(general, parameters().model(), strict=True):
+    same = parameters().model()
+    A_m, B_m = same.A_m.ravel().tolist(), same.B_m.ravel().tolist()
+    linear = {"states": ["q", "q_rate", "p", "p_rate", "r", "r_rate"], "A_m": A_m, "B_m": B_m}
+    for general_matrix, matrix in zip(parameters(second_order=None, linear=linear).model(), same, strict=True):
         assert (general_matrix == matrix).all()

@@ -32,15 +32,12 @@ UNGUARDED: dict[str, Any] = {"lower": None, "upper": None, "slew": None}
 def with_stops(name: str, stop: float, *, guarded: bool) -> Scenario:
     """The scenario with the stops of one actuator at -stop and stop; `guarded` is whether the controller has these limits."""
     actuators = SERVO.aircraft.actuators.model_dump()
-    lower = [-stop if name == key else old for key, old in zip(INPUTS, actuators["lower"], strict=True)]
-    upper = [-value for value in lower]  # all stops are symmetric
-    limits = {
-        "lower": [lower[INPUTS.index(key)] for key in SERVO.controller.inputs],
-        "upper": [upper[INPUTS.index(key)] for key in SERVO.controller.inputs],
-    }
+    lower = dict(zip(INPUTS, actuators["lower"], strict=True)) | {name: -stop}  # all stops are symmetric
+    limits = np.array([lower[key] for key in SERVO.controller.inputs])
+    stops = {"lower": [*lower.values()], "upper": [-value for value in lower.values()]}
     return SERVO.vary(
-        aircraft={"actuators": actuators | {"lower": lower, "upper": upper}},
-        controller=limits if guarded else UNGUARDED,
+        aircraft={"actuators": actuators | stops},
+        controller={"lower": limits.tolist(), "upper": (-limits).tolist()} if guarded else UNGUARDED,
     )
 
 
