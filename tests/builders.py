@@ -5,10 +5,11 @@
 from typing import Any
 
 import numpy as np
+from tests.closed_loop import error
 
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
-from flight_analysis.metrics import error_metrics, true_error
+from flight_analysis.metrics import error_metrics
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 
@@ -27,6 +28,5 @@ def truth_of(simulator: Simulator) -> dict[str, float]:
 
 def rms(tape: Tape) -> FloatArray:
     """Root mean square of the true error over the whole flight, q, V, p, r in mrad/s and m/s."""
-    error = true_error(tape)
-    assert error is not None
-    return np.array([error_metrics(error[name]).rms * (1.0 if name == "V" else 1e3) for name in ("q", "V", "p", "r")])
+    e = error(tape)
+    return np.array([error_metrics(e[name]).rms * (1.0 if name == "V" else 1e3) for name in ("q", "V", "p", "r")])

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.builders import MS, aircraft_parameters, rms
+from tests.closed_loop import error
 
 from aircraft_sim import plant
 from aircraft_sim.actuators import Actuators, step
@@ -16,7 +17,6 @@ from aircraft_sim.dynamics import x_dot
 from aircraft_sim.plant import AircraftState, PlantParams, advance
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import true_error
 from flight_bringup.scenarios import find_scenario
 from flight_core.integrators import rk4
 from flight_core.rates import NANOSECONDS
@@ -205,12 +205,9 @@ def test_the_servo_scenario_uses_the_softened_sign(servo: Scenario) -> None:
     assert servo.controller.sampled_sign()[0] is Sign.SOFT
 
 
-def test_error_through_servos_in_gusts(servo: Scenario) -> None:
+def test_error_through_servos_with_and_without_gusts(servo: Scenario) -> None:
     # Measured 7.59, 0.0871, 9.74, 6.38. The prototype that these gains come from: 7.6, 0.088, 9.9, 6.4.
     assert (rms(simulate(servo)) <= [7.6, 0.088, 9.9, 6.4]).all()
-
-
-def test_error_through_servos_without_gusts(servo: Scenario) -> None:
     # Measured 1.97, 0.0552, 9.74, 2.19. The prototype: 2.0, 0.058, 9.9, 2.2.
     assert (rms(simulate(servo.vary(aircraft={"gusts": {}}))) <= [2.0, 0.058, 9.9, 2.2]).all()
 
@@ -224,13 +221,12 @@ def test_error_through_servos_with_sensor_noise() -> None:
 def test_the_softened_sign_leaves_no_limit_cycle_behind_servos(servo: Scenario) -> None:
     tape = simulate(servo)
     rest = tape.time("u") > 55.0  # gusts and commands end before 50 s
-    error = true_error(tape)
-    assert error is not None
     # The literal sign would keep moving every input by beta: 15 deg/s, 60 %/s. Here the slow spiral mode is left.
     slew = np.abs(np.diff(tape["u"].values[rest], axis=0)).mean(axis=0) / 0.01
     beta = np.array(servo.controller.beta) * np.array(servo.controller.input_scale)
     assert (slew < 0.01 * beta).all()
-    assert np.abs(error.values[(error.stamp_ns - tape.start_ns) > 55 * 10**9]).max() < 5e-4
+    e = error(tape)
+    assert np.abs(e.values[(e.stamp_ns - tape.start_ns) > 55 * 10**9]).max() < 5e-4
 
 
 def test_without_the_sign_term_the_same_gains_have_twice_the_error(servo: Scenario) -> None:

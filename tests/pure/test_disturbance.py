@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from tests.builders import MS, aircraft_parameters
+from tests.closed_loop import error
 
 from aircraft_sim import dynamics
 from aircraft_sim.airframe import load_airframe
@@ -20,7 +21,6 @@ from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.plant import AircraftState, advance
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import true_error
 from flight_core.vectors import FloatArray
 
 V0 = 25.0
@@ -159,9 +159,8 @@ def largest(disturbed: dict[str, Any], rate: float, scenario: Scenario) -> Float
         controller={"rate": rate, "delay": 0.0},
         flight={"duration": 6.0},
     )
-    error = true_error(simulate(no_commands))
-    assert error is not None
-    return 1e3 * np.array([np.abs(error[name]).max() for name in ("q", "r")])
+    e = error(simulate(no_commands))
+    return 1e3 * np.array([np.abs(e[name]).max() for name in ("q", "r")])
 
 
 @pytest.mark.parametrize("name", INSIDE)

@@ -26,6 +26,7 @@ from flight_ros.messages import Decoder, Encoder
 from flight_ros.topics import U
 from flight_ros.transport import LOOPBACK_PROFILE
 
+Keys = tuple[Path, Path]
 INPUTS = ("elevator", "thrust", "aileron", "rudder")
 KEY, OTHER_KEY = bytes(range(32)), bytes(range(1, 33))
 PATIENCE = 5.0
@@ -106,7 +107,7 @@ def test_without_a_key_a_message_has_no_code() -> None:
 
 
 @pytest.fixture
-def keys(tmp_path: Path) -> tuple[Path, Path]:
+def keys(tmp_path: Path) -> Keys:
     """Two key files: the one of the flight, and another one."""
     made = tmp_path / "key", tmp_path / "other"
     for path, key in zip(made, (KEY, OTHER_KEY), strict=True):
@@ -134,28 +135,27 @@ def received(attacker: Process) -> int:
     return int(json.loads(attacker.lines[-1])["received"])
 
 
-def test_by_default_any_process_of_this_host_receives_y_and_commands_u(start: Start, start_node: Start) -> None:
-    node = aircraft(start_node)
-    assert received(start("tests.ros.attacker", "30", within=ON_LOOPBACK)) > 0
-    node.wait_for("receiving u from /controller#1")
+ACCEPTED, REJECTED = "receiving u from", "sample refused"
 
 
-@pytest.mark.parametrize("number", [0, 1], ids=["no key", "another key"])
-def test_with_a_key_a_process_of_this_host_without_it_cannot_command_u(
-    number: int, start: Start, start_node: Start, keys: tuple[Path, Path]
+@pytest.mark.parametrize(
+    ("node_key", "attacker_key", "logged", "not_logged"),
+    [
+        (None, None, ACCEPTED, REJECTED),
+        (0, None, "no message authentication code", ACCEPTED),
+        (0, 1, "wrong message authentication code", ACCEPTED),
+        (0, 0, ACCEPTED, REJECTED),
+    ],
+    ids=["by default", "no key", "another key", "the key"],
+)
+def test_a_process_of_this_host_receives_y_and_commands_u_unless_it_lacks_the_key(
+    node_key: int | None, attacker_key: int | None, logged: str, not_logged: str, start: Start, start_node: Start, keys: Keys
 ) -> None:
-    node = aircraft(start_node, "-p", f"key_file:={keys[0]}")
-    attacker = start("tests.ros.attacker", "30", *([str(keys[1])] if number else []), within=ON_LOOPBACK)
-    assert received(attacker) > 0  # y is not encrypted
-    node.wait_for("wrong message authentication code" if number else "no message authentication code")
-    assert "receiving u from" not in node.output
-
-
-def test_a_process_with_the_key_commands_u(start: Start, start_node: Start, keys: tuple[Path, Path]) -> None:
-    node = aircraft(start_node, "-p", f"key_file:={keys[0]}")
-    assert received(start("tests.ros.attacker", "30", str(keys[0]), within=ON_LOOPBACK)) > 0
-    node.wait_for("receiving u from /controller#1")
-    assert "sample refused" not in node.output
+    node = aircraft(start_node, *(() if node_key is None else ("-p", f"key_file:={keys[node_key]}")))
+    key = () if attacker_key is None else (str(keys[attacker_key]),)
+    assert received(start("tests.ros.attacker", "30", *key, within=ON_LOOPBACK)) > 0  # y is not encrypted
+    node.wait_for(logged)
+    assert not_logged not in node.output
 
 
 @pytest.fixture
@@ -174,9 +174,7 @@ def is_rejected(peer_node: Peer, reason: str) -> Callable[[], bool]:
     return counted
 
 
-def test_a_replayed_u_is_rejected_also_after_a_restart(
-    start: Start, start_node: Start, keys: tuple[Path, Path], peer_node: Peer
-) -> None:
+def test_a_replayed_u_is_rejected_also_after_a_restart(start_node: Start, keys: Keys, peer_node: Peer) -> None:
     before = time.time_ns()
     first = aircraft(start_node, "-p", f"key_file:={keys[0]}")
     publisher = peer_node.node.create_publisher(U.type, U.name, 10)
@@ -201,7 +199,7 @@ def test_a_replayed_u_is_rejected_also_after_a_restart(
 
 
 def test_a_flight_with_a_key_is_signed_and_replays_exactly(
-    start: Start, osprey_gust: Scenario, keys: tuple[Path, Path], tmp_path: Path
+    start: Start, osprey_gust: Scenario, keys: Keys, tmp_path: Path
 ) -> None:
     keyed = {node: {"key_file": str(keys[0])} for node in ("aircraft", "reference_model", "controller")}
     scenario = scenario_file(tmp_path / "keyed.yaml", osprey_gust.path, **keyed)
@@ -321,18 +319,12 @@ def test_by_default_another_host_neither_receives_y_nor_commands_u(
     assert "sample refused" not in node.output  # no sample has arrived
 
 
-def test_with_a_network_profile_another_host_receives_y_and_commands_u(
-    start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...]
+@pytest.mark.parametrize("keyed", [False, True], ids=["no key", "key"])
+def test_with_a_network_profile_another_host_receives_y_and_commands_u_unless_there_is_a_key(
+    keyed: bool, start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...], keys: Keys
 ) -> None:
-    node = aircraft(start_node, within=(*hosts.first, *on_network))
+    key = ("-p", f"key_file:={keys[0]}") if keyed else ()
+    node = aircraft(start_node, *key, within=(*hosts.first, *on_network))
     assert received(start("tests.ros.attacker", "30", within=(*hosts.second, *on_network))) > 0
-    node.wait_for("receiving u from /controller#1")
-
-
-def test_with_a_network_profile_and_a_key_another_host_receives_y_but_cannot_command_u(
-    start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...], keys: tuple[Path, Path]
-) -> None:
-    node = aircraft(start_node, "-p", f"key_file:={keys[0]}", within=(*hosts.first, *on_network))
-    assert received(start("tests.ros.attacker", "30", within=(*hosts.second, *on_network))) > 0
-    node.wait_for("no message authentication code")
-    assert "receiving u from" not in node.output
+    node.wait_for("no message authentication code" if keyed else "receiving u from /controller#1")
+    assert (ACCEPTED in node.output) is not keyed
