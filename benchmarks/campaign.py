@@ -14,19 +14,14 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import psutil
 import typer
-from benchmarks.sampling import new_table
+from benchmarks.sampling import new_table, true_error_of
 from rich.console import Console
 
-from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import sampled_matrices
-from control_laws import rise_di
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import true_error
 from flight_bringup.scenarios import find_scenario
-from flight_campaign import engines, fleet
-from flight_campaign.benchmark_course import build_course
-from flight_campaign.campaign import Campaign, define
+from flight_campaign import engines
+from flight_campaign.campaign import Campaign, define, fly_chunk_figures
 from flight_core.vectors import FloatArray
 
 FINE = 1e-4  # s: a twentieth of the scenario's step, the reference for the integration error
@@ -62,9 +57,7 @@ def alone(scenario: Scenario) -> tuple[float, FloatArray]:
     begin = time.perf_counter()
     tape = simulate(scenario)
     took = time.perf_counter() - begin
-    error = true_error(tape)
-    if error is None:
-        raise RuntimeError("the simulation has no truth topic")
+    error = true_error_of(tape)
     ticks = error.stamp_ns % round(1e9 / scenario.controller.rate) == 0
     rms = np.array([np.sqrt(np.mean(error[name][ticks] ** 2)) for name in scenario.controller.outputs])
     return scenario.flight.duration / took, rms
@@ -75,21 +68,15 @@ def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray
 
     The first result is the speed of the simulation in one process at the scenario's own step, aircraft-seconds per second.
     """
-    course = build_course(scenario)
-    A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), UNCERTAINTY, UNCERTAINTY, SEED, 0, count)
-    result = fleet.fly(
-        fleet.assemble(A, B, scenario.aircraft.plant(), course),
-        fleet.vehicle(scenario),
-        course,
-        rise_di.control_law(scenario.controller.law().sign),
-        rise_di.params(scenario.controller),
-    )
-    worst, single_speed = np.zeros(len(scenario.controller.outputs)), 0.0
+    definition = define(scenario, count, UNCERTAINTY, SEED, count)
+    figures = fly_chunk_figures(definition.model_dump_json(), (0, 0)).figures
+    outputs = scenario.controller.outputs
+    worst, single_speed = np.zeros(len(outputs)), 0.0
     for number in range(count):
-        sampled = scenario.vary(aircraft={"uncertainty": {"A": UNCERTAINTY, "B": UNCERTAINTY, "seed": SEED, "number": number}})
+        sampled = definition.aircraft_scenario(number)
         single_speed = max(single_speed, alone(sampled)[0])
         _, rms = alone(sampled.vary(aircraft={"step": FINE}))
-        worst = np.maximum(worst, np.abs(np.asarray(result.rms)[:, number] / rms - 1.0))
+        worst = np.maximum(worst, np.abs([figures[f"rms.{name}"][number] for name in outputs] / rms - 1.0))
     return single_speed, worst
 
 

@@ -7,7 +7,7 @@ python benchmarks/sampling.py --all    # 2 and 1 ms too
 """
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from math import ceil
 from typing import Annotated, Any, NamedTuple
@@ -25,12 +25,13 @@ from flight_analysis.metrics import error_metrics, true_error
 from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
+from flight_core.tape import Signal, Tape
 from flight_core.units import SI_PER_UNIT
 from flight_core.vectors import FloatArray
 
 WORLDS = {"paper": "no actuators", "servo": "actuators with lag, rate limits and end stops"}
 PERIODS, SMALL_PERIODS = (0.02, 0.01, 0.005), (0.002, 0.001)  # s
-WIDTH = 128  # characters, smallest width of the tables
+WIDTH = 150  # characters, smallest width of the tables
 MAX_STABLE_STEP = 0.0025  # s, of the integration
 NO_SIGN = 1e-9  # times beta: the law is then a PI controller
 
@@ -70,9 +71,7 @@ class Figures(NamedTuple):
 def fly(case: Case) -> Figures:
     """Simulate a scenario in one process. Raises ParameterError for an invalid one."""
     tape = simulate(case.scenario)
-    error = true_error(tape)
-    if error is None:
-        raise ParameterError("truth: found no outputs in it, expected those of the simulated aircraft")
+    error = true_error_of(tape)
     start, stop = case.window
     t, t_u = error.stamp_ns / 1e9, tape.time("u")
     rms = np.array([error_metrics(error[name][(t >= start) & (t <= stop)]).rms for name in error.names])
@@ -82,6 +81,14 @@ def fly(case: Case) -> Figures:
         for name in case.scenario.aircraft.load()[0].inputs
     ]
     return Figures(rms, np.array(slew))
+
+
+def true_error_of(tape: Tape) -> Signal:
+    """The true error. Raises ParameterError for a tape without it."""
+    error = true_error(tape)
+    if error is None:
+        raise ParameterError("truth: found no outputs, expected those of the simulated aircraft")
+    return error
 
 
 def scaled_beta(scenario: Scenario, rates: Mapping[str, float]) -> list[float]:
@@ -143,6 +150,13 @@ def new_table(title: str, columns: Sequence[str], texts: int) -> Table:
     return table
 
 
+def wide_console() -> Console:
+    """Standard output, wide enough for the tables."""
+    console = Console()
+    console.width = max(console.width, WIDTH)
+    return console
+
+
 def main(
     include_small: Annotated[
         bool, typer.Option("--all", help="Periods of 2 and 1 ms too, which takes ten times as long.")
@@ -150,8 +164,6 @@ def main(
     processes: Annotated[int, typer.Option(min=1, help="Flights at a time.")] = os.cpu_count() or 1,
 ) -> None:
     """Print rms errors and mean slew of the inputs for each sampling of the sign, by scheme and period."""
-    console = Console()
-    console.width = max(console.width, WIDTH)
     servo, gust = find_scenario("osprey_servo"), find_scenario("osprey_gust")
     periods = PERIODS + (SMALL_PERIODS if include_small else ())
     rows = [(world, scheme, period) for world in WORLDS for scheme in schemes(world, 0.01) for period in periods]
@@ -165,17 +177,17 @@ def main(
         flights = pool.map(fly, sampling + gusty)
         results = list(track(flights, "flights", len(sampling + gusty), console=Console(stderr=True)))
     pairs = list(zip(results[::2], results[1::2], strict=True))
-    show(console.print, rows, pairs[: len(rows)], gust_rows, pairs[len(rows) :])
+    show(rows, pairs[: len(rows)], gust_rows, pairs[len(rows) :])
 
 
 def show(
-    output: Callable[[Table], None],
     rows: Sequence[tuple[str, str, float]],
     pairs: Sequence[tuple[Figures, Figures]],
     gust_rows: Sequence[tuple[Mapping[str, float], float]],
     gust_pairs: Sequence[tuple[Figures, Figures]],
 ) -> None:
     """Print one table a world, and the table of the gusts."""
+    console = wide_console()
     for world, meaning in WORLDS.items():
         table = new_table(
             f"{world} world ({meaning}): rms of the true error q / V / p / r in mrad/s and mm/s;"
@@ -186,7 +198,7 @@ def show(
         for (of, scheme, period), (rest, sine) in zip(rows, pairs, strict=True):
             if of == world:
                 table.add_row(scheme, f"{period * 1e3:g}", cells(rest.rms, 1e3), cells(sine.rms, 1e3), cells(rest.activity))
-        output(table)
+        console.print(table)
     table = new_table(
         "osprey_gust, implicit sign: rms of the true error q / V / p / r in mrad/s and mm/s;"
         "\nbeta of elevator / thrust / aileron / rudder in deg/s and %/s",
@@ -196,7 +208,7 @@ def show(
     for (rates, period), figures in zip(gust_rows, gust_pairs, strict=True):
         beta = cells(np.array(list(rates.values())))
         table.add_row(beta, f"{period * 1e3:g}", *(cells(one.rms, 1e3) for one in figures))
-    output(table)
+    console.print(table)
 
 
 if __name__ == "__main__":

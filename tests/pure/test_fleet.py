@@ -47,7 +47,7 @@ def fly_fleet(scenario: Scenario, part: float = 0.3, seed: int = 5) -> fleet.Fle
     course = build_course(scenario)
     A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), part, part, seed, NUMBERS[0], len(NUMBERS))
     aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course)
-    control_law, params = rise_di.control_law(scenario.controller.law().sign), rise_di.params(scenario.controller)
+    control_law, params = rise_di.CONTROL_LAWS[scenario.controller.law().sign], rise_di.params(scenario.controller)
     return fleet.fly(aircraft, fleet.vehicle(scenario), course, control_law, params)
 
 
@@ -127,7 +127,7 @@ def test_each_aircraft_of_a_fleet_flies_as_in_the_single_process_simulation(scen
 def test_every_aircraft_can_have_its_own_gains_wind_and_delay() -> None:
     course, vehicle, plant = build_course(SERVO), fleet.vehicle(SERVO), SERVO.aircraft.plant()
     A, B = sampled_matrices(load_airframe("osprey"), 0.3, 0.3, 5, 0, 1)
-    control_law, params = rise_di.control_law(SERVO.controller.law().sign), rise_di.params(SERVO.controller)
+    control_law, params = rise_di.CONTROL_LAWS[SERVO.controller.law().sign], rise_di.params(SERVO.controller)
     wind, late = np.array([1.0, 0.0, 1.0, 1.0]), np.array([0, 0, 2, 0])
     beta = params.beta * np.array([1.0, 1.0, 1.0, 0.5])
     aircraft = fleet.assemble(np.repeat(A, 4, 0), np.repeat(B, 4, 0), plant, course, wind, late)
@@ -175,7 +175,7 @@ def test_an_aircraft_that_diverges_is_marked_and_does_not_affect_the_others() ->
     params = rise_di.params(SERVO.controller)
     free = params.limits._replace(lower=-np.inf + 0.0 * params.D, upper=np.inf + 0.0 * params.D)
     aircraft = fleet.assemble(A, B, plant, course)
-    both = fleet.fly(aircraft, vehicle, course, rise_di.control_law(SERVO.controller.law().sign), params._replace(limits=free))
+    both = fleet.fly(aircraft, vehicle, course, rise_di.CONTROL_LAWS[SERVO.controller.law().sign], params._replace(limits=free))
     assert np.asarray(both.diverged).tolist() == [False, True]
     assert np.isfinite(np.asarray(both.rms)[:, 0]).all()
 

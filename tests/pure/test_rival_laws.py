@@ -159,7 +159,7 @@ def recursion(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray, steps:
 def test_lqi_is_the_limit_of_a_long_finite_horizon(osprey: NominalModel) -> None:
     size, weights = osprey.C @ osprey.size, gains(integral=np.full((4, 1), 2.0), effort=np.full((4, 1), 0.1), fade=4.0)
     F, G, E = lqi.design(osprey, 4.0)
-    found = lqi.lqi_gain(osprey, weights)[..., 0]
+    found = lqi.lqi_params(weights, osprey).gain[..., 0]
     Q = E.T @ np.diag(np.concatenate([1.0 / size**2, (2.0 / size) ** 2])) @ E
     R = np.diag((0.1 / osprey.input_scale / size) ** 2)
     # what decays with LEAK alone, 0.01 1/s, is not in the gain; the loop's own modes have 50 s to end
@@ -173,7 +173,7 @@ def test_lqi_is_the_limit_of_a_long_finite_horizon(osprey: NominalModel) -> None
 def test_lqi_leaves_no_error_under_a_constant_disturbance() -> None:
     model = integrator()
     params = lqi.lqi_params(gains(integral=2.0, effort=0.1, fade=4.0), model)
-    assert abs(fly(lqi.control_law(vanes=False), params, 3000, 0.0, 1.0, model).y[-1]) < 1e-6
+    assert abs(fly(lqi.control_law(model, vanes=False), params, 3000, 0.0, 1.0, model).y[-1]) < 1e-6
 
 
 # MacKunis
@@ -312,7 +312,7 @@ def test_super_twisting_rejects_a_ramp_disturbance() -> None:
 def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
     K, Lambda = np.array([[9.0], [8.0], [4.0], [2.0]]), np.array([[3.0], [2.0], [1.0], [0.5]])
     params = rise_di.of_gains({"K": K, "Lambda": Lambda}, osprey)
-    control_law, e = rise_di.control_law(Sign.SOFT), np.array([[0.1], [0.2], [0.0], [-0.3]])
+    control_law, e = rise_di.CONTROL_LAWS[Sign.SOFT], np.array([[0.1], [0.2], [0.0], [-0.3]])
     zero = np.zeros((4, 1))
     measured = Measurements(zero, zero, zero, zero, zero, zero, zero, zero, zero)
     state = control_law.start(measured, params)
@@ -327,7 +327,7 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
 
 def test_the_observer_converges_to_states_wind_and_disturbance_of_its_model(osprey: NominalModel) -> None:
     estimator = rise_observer.observer(osprey)
-    _, corrections = rise_observer.observer_gains(estimator, osprey, initial_gains(LAWS["lqg"], osprey))
+    _, corrections = rise_observer.observer_gains(osprey, initial_gains(LAWS["lqg"], osprey))
     correction = corrections[..., 0]
     generator = np.random.default_rng(1)
     z, z_hat = 0.01 * generator.standard_normal(len(estimator.F)), np.zeros(len(estimator.F))

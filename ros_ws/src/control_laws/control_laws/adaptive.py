@@ -4,8 +4,8 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, filter_gain, saturate
-from flight_core.vectors import Array, FloatArray, array_namespace
+from control_laws.nominal_model import NominalModel, filter_gain, params_of_gains, saturate
+from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
 
@@ -45,7 +45,6 @@ def l1(model: NominalModel, *, feedforward: bool) -> ControlLaw:
     Omega, inverse = model.Omega, model.inverse
 
     def start(measured: Measurements, params: L1Params) -> L1State:
-        del params
         zero = array_namespace(measured.y).zeros_like(measured.y)
         return L1State(measured.y, zero, zero)
 
@@ -66,9 +65,7 @@ def l1(model: NominalModel, *, feedforward: bool) -> ControlLaw:
     return ControlLaw(start, step)
 
 
-def l1_params(gains: dict[str, FloatArray], model: NominalModel) -> L1Params:
-    """Parameters from gains K and bandwidth, shapes (m, N)."""
-    return L1Params(gains["K"], gains["bandwidth"], model.limits)
+l1_params = params_of_gains(L1Params)
 
 
 class MracParams(NamedTuple):
@@ -97,7 +94,6 @@ def mrac(model: NominalModel, *, vanes: bool) -> ControlLaw:
     inverse, size = model.inverse, model.size[:, None]
 
     def start(measured: Measurements, params: MracParams) -> Array:
-        del params
         xp = array_namespace(measured.y)
         return xp.zeros_like(measured.y[:, None, :] * xp.concat([measured.x, measured.x[:1]])[None, :, :])
 
@@ -116,6 +112,4 @@ def mrac(model: NominalModel, *, vanes: bool) -> ControlLaw:
     return ControlLaw(start, step)
 
 
-def mrac_params(gains: dict[str, FloatArray], model: NominalModel) -> MracParams:
-    """Parameters from gains K, adaptation and bias (m, N), leak (1, N)."""
-    return MracParams(gains["K"], gains["adaptation"], gains["bias"], gains["leak"], model.limits)
+mrac_params = params_of_gains(MracParams)

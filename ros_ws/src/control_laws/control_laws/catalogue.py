@@ -62,101 +62,45 @@ def initial_gains(law: Law, model: NominalModel) -> Gains:
     return {name: gains[name] for name in law.tuned}
 
 
-def _rise(sign: Sign) -> Callable[[NominalModel], ControlLaw]:
-    return lambda model: rise_di.control_law(sign)
+_rise, _rise_gains = rise_di.of_gains, ("K", "Lambda", "beta", "softening")
+_observer, _observer_gains = rise_observer.observer_params, ("effort", "gust", "drift", "loose")
+_filtered, _ideal = (partial(mackunis.control_law, ideal=ideal) for ideal in (False, True))
+_l1_ff, _model = partial(adaptive.l1, feedforward=True), "A, B, f"
+_soft, _implicit = (partial(rise_di.control_law, sign=sign) for sign in (Sign.SOFT, Sign.IMPLICIT))
+_bounded, _lqg = (partial(rise_observer.control_law, authority=one) for one in (rise_observer.AUTHORITY_FRACTION, 1.0))
 
-
-_soft, _soft_gains = _rise(Sign.SOFT), ("K", "Lambda", "beta", "softening")
-_full, _air = "full state", "full state, vanes"
+FULL_STATE: dict[str, tuple[str, Callable[..., ControlLaw], Callable[[Gains, NominalModel], Any], tuple[str, ...]]] = {
+    "di": ("dynamic inversion", inversion.control_law, inversion.inversion_params, ("K",)),
+    "di_pi": ("dynamic inversion + PI", inversion.control_law, inversion.inversion_params, ("K", "Lambda")),
+    "mrac": ("MRAC", adaptive.mrac, adaptive.mrac_params, ("K", "adaptation", "bias", "leak")),
+    "lqi": ("LQI", lqi.control_law, lqi.lqi_params, ("integral", "effort", "fade")),
+}
+"""Title, law, parameters and tuned gains of the laws of the full state; each also flies with vanes, relative to the air."""
 
 LAWS: dict[str, Law] = {
-    "rise": Law("RISE-DI, softened sign", "y", "", _soft, rise_di.of_gains, _soft_gains),
-    "rise_implicit": Law(
-        "RISE-DI, implicit sign", "y", "", _rise(Sign.IMPLICIT), rise_di.of_gains, ("K", "Lambda", "beta", "omega")
-    ),
-    "rise_ff": Law("RISE-DI + feedforward", "y", "A, B, f", _soft, rise_di.of_gains, _soft_gains, feedforward=True),
+    "rise": Law("RISE-DI, softened sign", "y", "", _soft, _rise, _rise_gains),
+    "rise_implicit": Law("RISE-DI, implicit sign", "y", "", _implicit, _rise, ("K", "Lambda", "beta", "omega")),
+    "rise_ff": Law("RISE-DI + feedforward", "y", _model, _soft, _rise, _rise_gains, feedforward=True),
     "rise_observer": Law(
-        "RISE-DI + feedforward + observer",
-        "y",
-        "A, B, f, wind",
-        partial(rise_observer.control_law, authority=rise_observer.AUTHORITY_FRACTION),
-        rise_observer.observer_params,
-        (*_soft_gains, "effort", "gust", "drift", "loose"),
-        feedforward=True,
+        "RISE-DI + feedforward + observer", "y", f"{_model}, wind", _bounded, _observer, _rise_gains + _observer_gains, True
     ),
-    "lqg": Law(
-        "LQG + feedforward",
-        "y",
-        "A, B, f, wind",
-        partial(rise_observer.control_law, authority=1.0),
-        rise_observer.observer_params,
-        ("effort", "gust", "drift", "loose"),
-        feedforward=True,
-    ),
-    "pi": Law("PI", "y", "", _soft, rise_di.of_gains, ("K", "Lambda")),
-    "pi_ff": Law("PI + feedforward", "y", "A, B, f", _soft, rise_di.of_gains, ("K", "Lambda"), feedforward=True),
+    "lqg": Law("LQG + feedforward", "y", f"{_model}, wind", _lqg, _observer, _observer_gains, feedforward=True),
+    "pi": Law("PI", "y", "", _soft, _rise, ("K", "Lambda")),
+    "pi_ff": Law("PI + feedforward", "y", _model, _soft, _rise, ("K", "Lambda"), feedforward=True),
     "l1": Law("L1", "y", "Omega", partial(adaptive.l1, feedforward=False), adaptive.l1_params, ("K", "bandwidth")),
-    "l1_ff": Law(
-        "L1 + feedforward",
-        "y",
-        "A, B, f",
-        partial(adaptive.l1, feedforward=True),
-        adaptive.l1_params,
-        ("K", "bandwidth"),
-        feedforward=True,
-    ),
+    "l1_ff": Law("L1 + feedforward", "y", _model, _l1_ff, adaptive.l1_params, ("K", "bandwidth"), feedforward=True),
     "twisting": Law(
         "super-twisting", "y", "Omega", super_twisting.control_law, super_twisting.twisting_params, ("root", "beta")
     ),
     "mackunis": Law(
-        "MacKunis RISE, filtered difference",
-        "y",
-        "Omega",
-        partial(mackunis.control_law, ideal=False),
-        mackunis.mackunis_params,
-        ("K", "Lambda", "beta", "softening", "filter"),
+        "MacKunis RISE, filtered difference", "y", "Omega", _filtered, mackunis.mackunis_params, (*_rise_gains, "filter")
     ),
-    "mackunis_ideal": Law(
-        "MacKunis RISE, perfect y_dot",
-        "y, y_dot",
-        "Omega",
-        partial(mackunis.control_law, ideal=True),
-        mackunis.mackunis_params,
-        ("K", "Lambda", "beta", "softening"),
-    ),
+    "mackunis_ideal": Law("MacKunis RISE, perfect y_dot", "y, y_dot", "Omega", _ideal, mackunis.mackunis_params, _rise_gains),
     "indi": Law("INDI", "y, actuators", "Omega", indi.control_law, indi.indi_params, ("K", "bandwidth", "share")),
-    "di": Law(
-        "dynamic inversion", _full, "A, B, f", partial(inversion.control_law, vanes=False), inversion.inversion_params, ("K",)
-    ),
-    "di_vanes": Law(
-        "dynamic inversion", _air, "A, B, f", partial(inversion.control_law, vanes=True), inversion.inversion_params, ("K",)
-    ),
-    "di_pi": Law(
-        "dynamic inversion + PI",
-        _full,
-        "A, B, f",
-        partial(inversion.control_law, vanes=False),
-        inversion.inversion_params,
-        ("K", "Lambda"),
-    ),
-    "di_pi_vanes": Law(
-        "dynamic inversion + PI",
-        _air,
-        "A, B, f",
-        partial(inversion.control_law, vanes=True),
-        inversion.inversion_params,
-        ("K", "Lambda"),
-    ),
-    "mrac": Law(
-        "MRAC", _full, "A, B, f", partial(adaptive.mrac, vanes=False), adaptive.mrac_params, ("K", "adaptation", "bias", "leak")
-    ),
-    "mrac_vanes": Law(
-        "MRAC", _air, "A, B, f", partial(adaptive.mrac, vanes=True), adaptive.mrac_params, ("K", "adaptation", "bias", "leak")
-    ),
-    "lqi": Law(
-        "LQI", _full, "A, B, f", lambda model: lqi.control_law(vanes=False), lqi.lqi_params, ("integral", "effort", "fade")
-    ),
-    "lqi_vanes": Law(
-        "LQI", _air, "A, B, f", lambda model: lqi.control_law(vanes=True), lqi.lqi_params, ("integral", "effort", "fade")
-    ),
+} | {
+    f"{name}_vanes" if vanes else name: Law(
+        title, "full state, vanes" if vanes else "full state", _model, partial(control_law, vanes=vanes), params, tuned
+    )
+    for name, (title, control_law, params, tuned) in FULL_STATE.items()
+    for vanes in (False, True)
 }

@@ -4,8 +4,8 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, filter_gain, saturate
-from flight_core.vectors import Array, FloatArray, array_namespace
+from control_laws.nominal_model import NominalModel, filter_gain, params_of_gains, saturate
+from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
 
@@ -40,7 +40,6 @@ def control_law(model: NominalModel) -> ControlLaw:
     inverse = model.inverse
 
     def start(measured: Measurements, params: IndiParams) -> IndiState:
-        del params
         return IndiState(measured.y, array_namespace(measured.y).zeros_like(measured.y), measured.position)
 
     def step(state: IndiState, measured: Measurements, dt: Array, params: IndiParams) -> tuple[IndiState, Array]:
@@ -54,6 +53,4 @@ def control_law(model: NominalModel) -> ControlLaw:
     return ControlLaw(start, step)
 
 
-def indi_params(gains: dict[str, FloatArray], model: NominalModel) -> IndiParams:
-    """Parameters from gains K, bandwidth and share, shapes (m, N)."""
-    return IndiParams(gains["K"], gains["bandwidth"], gains["share"], model.limits)
+indi_params = params_of_gains(IndiParams)

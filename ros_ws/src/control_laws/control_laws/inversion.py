@@ -4,7 +4,7 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, conditional_integration, saturate
+from control_laws.nominal_model import ErrorIntegral, NominalModel, conditional_integration, saturate, start_integral
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
@@ -16,13 +16,6 @@ class InversionParams(NamedTuple):
     K: Array  # 1/s
     Lambda: Array  # 1/s, 0 for inversion without an integral
     limits: Limits
-
-
-class InversionState(NamedTuple):
-    """State of the law from tick to tick, (m, N)."""
-
-    e: Array
-    integral_e: Array
 
 
 def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
@@ -37,12 +30,7 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
     drift, gravity = model.C @ model.A, model.C @ model.gravity
     Omega, inverse = model.Omega, model.inverse
 
-    def start(measured: Measurements, params: InversionParams) -> InversionState:
-        del params
-        e = measured.y - measured.y_m
-        return InversionState(e, array_namespace(e).zeros_like(e))
-
-    def step(state: InversionState, measured: Measurements, dt: Array, params: InversionParams) -> tuple[InversionState, Array]:
+    def step(state: ErrorIntegral, measured: Measurements, dt: Array, params: InversionParams) -> tuple[ErrorIntegral, Array]:
         x = measured.x_air if vanes else measured.x
         e = measured.y - measured.y_m
         increment = dt * (e + state.e) / 2.0
@@ -51,9 +39,9 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
         nu = measured.y_m_dot - model_part - params.K * (e + params.Lambda * integral_e)
         u, beyond = saturate(inverse @ nu, measured, dt, params.limits)
         effect = -params.K * params.Lambda * increment
-        return InversionState(e, conditional_integration(state.integral_e, integral_e, effect, Omega @ beyond)), u
+        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, effect, Omega @ beyond)), u
 
-    return ControlLaw(start, step)
+    return ControlLaw(start_integral, step)
 
 
 def inversion_params(gains: dict[str, FloatArray], model: NominalModel) -> InversionParams:

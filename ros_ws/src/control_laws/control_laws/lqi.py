@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from control_laws.nominal_model import NominalModel, conditional_integration, saturate
+from control_laws.nominal_model import ErrorIntegral, NominalModel, conditional_integration, saturate, start_integral
 from control_laws.riccati import gain_of, zero_order_hold
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
@@ -23,26 +23,14 @@ class LqiParams(NamedTuple):
     limits: Limits
 
 
-class LqiState(NamedTuple):
-    """State of the law from tick to tick, (m, N)."""
-
-    e: Array
-    integral_e: Array
-
-
-def control_law(*, vanes: bool) -> ControlLaw:
+def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
     """State feedback and integral: u = -gain [x, y_m, y_m_dot, integral of e], with `vanes` x relative to the air.
 
     The integral is a trapezoid with conditional integration (anti-windup): that of channel i stops while u_i is saturated and
     the increment has the sign of the excess.
     """
 
-    def start(measured: Measurements, params: LqiParams) -> LqiState:
-        del params
-        e = measured.y - measured.y_m
-        return LqiState(e, array_namespace(e).zeros_like(e))
-
-    def step(state: LqiState, measured: Measurements, dt: Array, params: LqiParams) -> tuple[LqiState, Array]:
+    def step(state: ErrorIntegral, measured: Measurements, dt: Array, params: LqiParams) -> tuple[ErrorIntegral, Array]:
         xp = array_namespace(measured.y)
         e = measured.y - measured.y_m
         increment = dt * (e + state.e) / 2.0
@@ -52,21 +40,15 @@ def control_law(*, vanes: bool) -> ControlLaw:
         u, beyond = saturate(-xp.sum(params.gain * z[None, :, :], axis=1), measured, dt, params.limits)
         m = e.shape[0]
         own = xp.stack([params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)])
-        return LqiState(e, conditional_integration(state.integral_e, integral_e, -own * increment, beyond)), u
+        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, -own * increment, beyond)), u
 
-    return ControlLaw(start, step)
-
-
-class Design(NamedTuple):
-    """The design model in discrete time: z+ = F z + G u; the cost is on e and its integral, E z."""
-
-    F: FloatArray  # (n + 3 m, n + 3 m)
-    G: FloatArray  # (n + 3 m, m)
-    E: FloatArray  # (2 m, n + 3 m)
+    return ControlLaw(start_integral, step)
 
 
-def design(model: NominalModel, fade: float) -> Design:
-    """The nominal aircraft with the reference and the integral of e, sampled with u held over a period.
+def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The nominal aircraft with the reference and the integral of e, sampled with u held over a period: F, G and E.
+
+    z+ = F z + G u; the cost is on e and its integral, E z. Shapes (n + 3 m, n + 3 m), (n + 3 m, m) and (2 m, n + 3 m).
 
         x_dot   = (A + gravity) x + B u      rows of angles: -LEAK angle, a measured disturbance
         y_m_dot = w - LEAK y_m,  w_dot = -fade w,  integral of e: C x - y_m
@@ -85,10 +67,10 @@ def design(model: NominalModel, fade: float) -> Design:
     F, G = zero_order_hold(motion, drive, model.period)
     E = np.zeros((2 * m, n + 3 * m))
     E[:m, x], E[np.arange(m), y_m], E[np.arange(m, 2 * m), integral] = model.C, -1.0, 1.0
-    return Design(F, G, E)
+    return F, G, E
 
 
-def lqi_gain(model: NominalModel, gains: dict[str, FloatArray]) -> FloatArray:
+def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
     """The gain that minimises the sum of e'Q e + q'Q_i q + u'R u over z+ = F z + G u, for N sets of weights: (m, n + 3 m, N).
 
         Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,  q the integral of e
@@ -104,9 +86,4 @@ def lqi_gain(model: NominalModel, gains: dict[str, FloatArray]) -> FloatArray:
         weights = np.concatenate([np.ones(len(size)), gains["integral"][:, k] ** 2]) / np.tile(size[:, 0] ** 2, 2)
         R = np.diag((gains["effort"][:, k] / model.input_scale / size[:, 0]) ** 2)
         solved.append(gain_of(F, G, E.T @ np.diag(weights) @ E, R))
-    return np.stack(solved, axis=-1)
-
-
-def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
-    """Parameters from weights integral and effort (m, N) and fade (1, N)."""
-    return LqiParams(lqi_gain(model, gains), model.limits)
+    return LqiParams(np.stack(solved, axis=-1), model.limits)

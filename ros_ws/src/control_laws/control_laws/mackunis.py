@@ -46,7 +46,6 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
     Omega, inverse = model.Omega, model.inverse
 
     def start(measured: Measurements, params: MacKunisParams) -> MacKunisState:
-        del params
         e = measured.y - measured.y_m
         zero = array_namespace(e).zeros_like(e)
         return MacKunisState(e, e, zero, zero, zero)

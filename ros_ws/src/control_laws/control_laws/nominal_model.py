@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nominal model of a model-based law, and what all laws share: saturation of u and anti-windup of their integrals.
+"""The nominal model of a model-based law, and what all laws share: parameters, saturation of u, anti-windup of integrals.
 
 Arrays hold N aircraft in their last axis. Channels are in the law's order, states in the airframe's.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,6 +51,24 @@ class NominalModel(NamedTuple):
     def limits(self) -> Limits:
         """The limits as arguments of a law, shape (m, 1)."""
         return Limits(self.lower[:, None], self.upper[:, None], self.rate[:, None])
+
+
+def params_of_gains(kind: Callable[..., Any]) -> Callable[[dict[str, FloatArray], NominalModel], Any]:
+    """Parameters of a law whose fields are its gains, shapes (m, N) or (1, N), and the limits of the model."""
+    return lambda gains, model: kind(**gains, limits=model.limits)
+
+
+class ErrorIntegral(NamedTuple):
+    """State of a law with an integral of the error from tick to tick, (m, N)."""
+
+    e: Array
+    integral_e: Array
+
+
+def start_integral(measured: Measurements, _: Any) -> ErrorIntegral:
+    """The state at engagement."""
+    e = measured.y - measured.y_m
+    return ErrorIntegral(e, array_namespace(e).zeros_like(e))
 
 
 def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:

@@ -28,11 +28,6 @@ class RiseParams(NamedTuple):
     limits: Limits
 
 
-def control_law(sign: Sign) -> ControlLaw:
-    """The law with its sign sampled in one way: u = u_ff + what `step_with_anti_windup` commands inside the limits."""
-    return LAWS_BY_SIGN[sign]
-
-
 def params(controller: ControllerParameters) -> RiseParams:
     """Parameters of a controller, shape (m, 1)."""
 
@@ -56,11 +51,10 @@ def of_gains(gains: dict[str, FloatArray], model: NominalModel) -> RiseParams:
     return RiseParams(K, gains["Lambda"], beta, model.D[:, None], model.input_scale[:, None], omega, eps, model.limits)
 
 
-def _start(measured: Measurements, params: RiseParams) -> LawState:
-    return law.engage(measured.y, measured.y_m)
-
-
 def _control_law(sign: Sign) -> ControlLaw:
+    def start(measured: Measurements, params: RiseParams) -> LawState:
+        return law.engage(measured.y, measured.y_m)
+
     def step(state: LawState, measured: Measurements, dt: Array, params: RiseParams) -> tuple[LawState, Array]:
         of_law = LawParams(*params[:-1], sign)
         after, _, u = step_with_anti_windup(
@@ -68,7 +62,13 @@ def _control_law(sign: Sign) -> ControlLaw:
         )
         return after, u
 
-    return ControlLaw(_start, step)
+    return ControlLaw(start, step)
 
 
-LAWS_BY_SIGN = {sign: _control_law(sign) for sign in Sign}
+CONTROL_LAWS = {sign: _control_law(sign) for sign in Sign}
+"""The law by the sampling of its sign: u = u_ff + what `step_with_anti_windup` commands inside the limits."""
+
+
+def control_law(_: NominalModel, *, sign: Sign) -> ControlLaw:
+    """The law of CONTROL_LAWS, which does not depend on the model."""
+    return CONTROL_LAWS[sign]

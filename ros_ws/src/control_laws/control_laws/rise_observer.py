@@ -83,9 +83,7 @@ def observer(model: NominalModel) -> ObserverModel:
     return ObserverModel(F, G_u, H)
 
 
-def observer_gains(
-    estimator: ObserverModel, model: NominalModel, gains: dict[str, FloatArray]
-) -> tuple[FloatArray, FloatArray]:
+def observer_gains(model: NominalModel, gains: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Gain (m, s, N) and correction (s, m, N), linear-quadratic, for N sets of weights.
 
     Control: sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2 with `effort` (m, N), s. Estimate: the wind driven
@@ -93,7 +91,7 @@ def observer_gains(
     `loose` (1, N), sizes per root s, for the model error; the noise of e as measured. Source: H. Kwakernaak,
     R. Sivan, "Linear Optimal Control Systems", ch. 5 and 6.
     """
-    size, count = (model.C @ model.size)[:, None], gains["effort"].shape[1]
+    estimator, size, count = observer(model), (model.C @ model.size)[:, None], gains["effort"].shape[1]
     Q = np.tile(estimator.H.T @ np.diag(1.0 / size[:, 0] ** 2) @ estimator.H, (count, 1, 1))
     R = diagonals((gains["effort"] / model.input_scale[:, None] / size) ** 2)
     gain = gain_of(estimator.F, estimator.G, Q, R)
@@ -141,6 +139,4 @@ def control_law(model: NominalModel, *, authority: float) -> ControlLaw:
 def observer_params(gains: dict[str, FloatArray], model: NominalModel) -> ObserverParams:
     """Parameters from the gains of RISE-DI, if there are any, and from effort and drift (m, N), gust (G, N), loose (1, N)."""
     none = 0.0 * gains["effort"]
-    return ObserverParams(
-        rise_di.of_gains({"K": none, "Lambda": none} | gains, model), *observer_gains(observer(model), model, gains)
-    )
+    return ObserverParams(rise_di.of_gains({"K": none, "Lambda": none} | gains, model), *observer_gains(model, gains))

@@ -4,8 +4,8 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, conditional_integration, saturate
-from flight_core.vectors import Array, FloatArray, array_namespace
+from control_laws.nominal_model import NominalModel, conditional_integration, params_of_gains, saturate
+from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
 
@@ -31,7 +31,6 @@ def control_law(model: NominalModel) -> ControlLaw:
     Omega, inverse = model.Omega, model.inverse
 
     def start(measured: Measurements, params: TwistingParams) -> Array:
-        del params
         return array_namespace(measured.y).zeros_like(measured.y)
 
     def step(state: Array, measured: Measurements, dt: Array, params: TwistingParams) -> tuple[Array, Array]:
@@ -46,6 +45,4 @@ def control_law(model: NominalModel) -> ControlLaw:
     return ControlLaw(start, step)
 
 
-def twisting_params(gains: dict[str, FloatArray], model: NominalModel) -> TwistingParams:
-    """Parameters from gains root and beta, shapes (m, N)."""
-    return TwistingParams(gains["root"], gains["beta"], model.limits)
+twisting_params = params_of_gains(TwistingParams)

@@ -143,7 +143,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft are dropped.
     A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), part, part, definition.seed, first, definition.chunk)
     aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course)
-    result = fleet.fly(aircraft, vehicle, course, rise_di.control_law(scenario.controller.law().sign), params)
+    result = fleet.fly(aircraft, vehicle, course, rise_di.CONTROL_LAWS[scenario.controller.law().sign], params)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs))}
