@@ -9,8 +9,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from benchmarks.sampling import cells, new_table
-from rich.console import Console
+from benchmarks.sampling import cells, new_table, wide_console
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.gain_selection import with_feedforward
@@ -20,7 +19,6 @@ from flight_campaign.campaign import define, fly_chunk
 from flight_campaign.statistics import Tally
 
 LEVELS = (0.3, 0.5)
-WIDTH = 128  # characters, smallest width of the table
 
 
 def both(scenario: Scenario) -> tuple[Scenario, Scenario]:
@@ -57,9 +55,7 @@ def main(
             slew = np.array([tally.figures[f"slew.{key}"].mean * units[key].factor for key in channels.inputs])
             score = tally.figures["score"]
             table.add_row(name, label, f"{score.mean:.2f}", f"{score.largest:.2f}", cells(rms, 1e3), cells(slew))
-    console = Console()
-    console.width = max(console.width, WIDTH)
-    console.print(table)
+    wide_console().print(table)
 
 
 if __name__ == "__main__":

@@ -8,18 +8,16 @@
 import gc
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
+from benchmarks.sampling import new_table
 from rich.console import Console
-from rich.table import Table
 
-from flight_analysis.closed_loop.scenario import load_scenario
+from flight_bringup.scenarios import find_scenario
 from flight_core.vectors import StampedVector
 from rise_di_controller import guard
 from rise_di_controller.law import engage, step
 
-SCENARIO = Path(__file__).resolve().parents[1] / "ros_ws/src/flight_bringup/config/osprey_gust.yaml"
 REPEATS = 20_000
 
 
@@ -42,7 +40,7 @@ FLOOR = "NumPy a * x + b"
 
 def measure() -> dict[str, tuple[float, float, float]]:
     """Median, 99.9th percentile and maximum in us of a law step, a step with anti-windup, a tick, and the multiply-add."""
-    controller = load_scenario(SCENARIO).controller
+    controller = find_scenario("osprey_gust").controller
     law, limits = controller.law(), controller.guard()
     rng = np.random.default_rng(1)
     y, y_m = rng.normal(size=(REPEATS, 4)) * 0.01, np.zeros(4)
@@ -71,9 +69,8 @@ def main() -> None:
     """Measure and print."""
     measured = measure()
     floor = measured[FLOOR][0]
-    table = Table(title=f"One tick of four channels, {REPEATS} times, us", title_justify="left")
-    for column in ("", "median", "99.9 %", "max", "median / floor"):
-        table.add_column(column, justify="left" if column == "" else "right")
+    title = f"One tick of four channels, {REPEATS} times, us"
+    table = new_table(title, ("", "median", "99.9 %", "max", "median / floor"), texts=1)
     for name, (median, high, most) in measured.items():
         table.add_row(name, f"{median:.1f}", f"{high:.1f}", f"{most:.0f}", f"{median / floor:.1f}")
     Console().print(table)

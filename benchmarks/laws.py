@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from benchmarks.sampling import SINES, new_table
+from benchmarks.sampling import SINES, new_table, wide_console
 from rich.console import Console
 from rich.progress import track
 
@@ -28,7 +28,6 @@ GUSTS = {
 }  # s, m/s, m: longer, upwards, from the left
 TURBULENCE = {"altitude": 100.0, "wind": 15.4, "seed": 3}  # m; m/s at 20 ft, moderate by MIL-F-8785C
 NOISE_SEED = 7
-WIDTH = 110  # characters, smallest width of the table
 WRONG = (0.3, 0.5, 0.5, 1.0)
 """Largest relative error of each entry of the observer's wind columns, sampled for each; 1 stands for no wind model."""
 
@@ -75,9 +74,7 @@ def main(
     for name, one in rows:
         cells = (f"{level.mean:.2f} ({level.worst:.2f})" for level in one.levels)
         table.add_row(name, one.law, one.objective, f"{one.score:.2f}", *cells)
-    console = Console()
-    console.width = max(console.width, WIDTH)
-    console.print(table)
+    wide_console().print(table)
 
 
 if __name__ == "__main__":

@@ -26,18 +26,28 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
-from benchmarks.sampling import MOVING, NO_SIGN, REST, cells, new_table, sampling_scenario, scaled_beta
+from benchmarks.sampling import (
+    MOVING,
+    NO_SIGN,
+    REST,
+    cells,
+    new_table,
+    sampling_scenario,
+    scaled_beta,
+    true_error_of,
+    wide_console,
+)
 from rich.console import Console
 from rich.progress import track
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.gain_conditions import LinearPlant, Loop, delay_margin
-from flight_analysis.metrics import ErrorMetrics, error_metrics, true_error
+from flight_analysis.metrics import ErrorMetrics, error_metrics
 from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_campaign.statistics import score_units
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import require
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller import guard
@@ -47,7 +57,6 @@ NOISE = [0.0017, 0.03, 0.0017, 0.0017]  # q, V, p, r in rad/s and m/s, rms per s
 SETTLED = {"q": ("vertical", 0.005), "V": ("vertical", 0.1), "r": ("lateral", 0.005)}  # rad/s, m/s: settled below it
 FINE_STEP = 0.0005  # s: actuators lead by half an integration step, which changes the size of a limit cycle
 TRIPLED = 3.0  # times the score without delay
-WIDTH = 150  # characters, least width of the tables
 DELAY_STEP, LONGEST_DELAY = 0.002, 0.13  # s
 SEEDS = range(1, 9)  # means over seeds, for it matters whether losses fall into a gust
 
@@ -125,34 +134,16 @@ def settling(flight: WindowedFlight) -> FloatArray:
     return np.array(times)
 
 
-def first_rms(flight: WindowedFlight) -> FloatArray:
-    """Rms of the first channel, q, (1,)."""
-    return rms(flight)[:1]
-
-
-def first_slew(flight: WindowedFlight) -> FloatArray:
-    """Slew of the first input, the elevator, (1,)."""
-    return slew(flight)[:1]
-
-
 METRICS: dict[str, Callable[[WindowedFlight], FloatArray]] = {
     "rms": rms,
     "largest error": largest,
     "largest u": largest_u,
     "largest rate": largest_rate,
-    "slew": slew,
     "settled after": settling,
-    "rms of q": first_rms,
-    "slew of elevator": first_slew,
+    "slew": slew,
+    "rms of q": lambda flight: rms(flight)[:1],
+    "slew of elevator": lambda flight: slew(flight)[:1],
 }
-
-
-def true_error_of(tape: Tape) -> Signal:
-    """The true error. Raises ParameterError for a tape without it."""
-    error = true_error(tape)
-    if error is None:
-        raise ParameterError("truth: found no outputs, expected those of the simulated aircraft")
-    return error
 
 
 def _errors(flight: WindowedFlight, read: Callable[[ErrorMetrics], float]) -> FloatArray:
@@ -265,72 +256,30 @@ HIGH: Changes = {"k_g": 1.5, "k_d": [19.5, 23.5, 8.5], "Lambda": [10.0, 10.0, 6.
 
 def gain_rows() -> list[Row]:
     """Laws, gains and rates, without noise."""
-    soft, calm = servo_scenario(), servo_scenario(gusts=False)
-    return [
-        Row(
-            "soft, 20 ms, calm",
-            servo_scenario(0.02, gusts=False),
-            {
-                "rms": (2.4, 0.062, 11.9, 2.7),
-                "largest error": (9.0, 0.20, 59, 16),
-                "largest u": (1.7, 35, 4.4, 4.2),
-                "largest rate": (3, 25, 15, 15),
-            },
-        ),
-        Row(
-            "soft, 10 ms, calm",
-            calm,
-            {
-                "rms": (2.0, 0.058, 9.9, 2.2),
-                "largest error": (7.5, 0.18, 51, 14),
-                "largest u": (1.7, 35, 4.4, 4.4),
-                "largest rate": (2.7, 26, 13, 13),
-            },
-        ),
-        Row(
-            "soft, 10 ms, gusts",
+    # By name: the scenario, then as far as they are known rms, largest error, largest u, largest rate, settled after.
+    calm = partial(servo_scenario, gusts=False)
+    soft, fast = servo_scenario(), servo_scenario(0.005)
+    fine = calm(**LITERAL).vary(aircraft={"step": FINE_STEP})
+    rows: dict[str, tuple[Scenario, *tuple[Values, ...]]] = {
+        "soft, 20 ms, calm": (calm(0.02), (2.4, 0.062, 11.9, 2.7), (9.0, 0.20, 59, 16), (1.7, 35, 4.4, 4.2), (3, 25, 15, 15)),
+        "soft, 10 ms, calm": (calm(), (2.0, 0.058, 9.9, 2.2), (7.5, 0.18, 51, 14), (1.7, 35, 4.4, 4.4), (2.7, 26, 13, 13)),
+        "soft, 10 ms, gusts": (
             soft,
-            {
-                "rms": (7.6, 0.088, 9.9, 6.4),
-                "largest error": (81, 0.60, 51, 64),
-                "largest u": (4.5, 35, 4.4, 14),
-                "largest rate": (28, 104, 13, 56),
-                "settled after": (1.70, 3.65, 1.53),
-            },
+            (7.6, 0.088, 9.9, 6.4),
+            (81, 0.60, 51, 64),
+            (4.5, 35, 4.4, 14),
+            (28, 104, 13, 56),
+            (1.70, 3.65, 1.53),
         ),
-        Row(
-            "soft, 5 ms, gusts",
-            servo_scenario(0.005),
-            {
-                "rms": (6.7, 0.087, 8.5, 5.5),
-                "largest error": (71, 0.61, 46, 54),
-                "largest u": (4.6, 35, 4.4, 14),
-                "largest rate": (25, 104, 12, 50),
-            },
-        ),
-        Row(
-            "soft, twice the beta, gusts",
-            servo_scenario(beta=_beta(30.0, 130.0, 15.0, 60.0)),
-            {"rms": (7.6, 0.088, 9.9, 6.4)},
-        ),
-        Row("soft, low gains, gusts", servo_scenario(**LOW), {"rms": (15.8, 0.110, 16.4, 15.0)}),
-        Row("soft, high gains, gusts", servo_scenario(**HIGH), {"rms": (5.0, 0.074, 5.3, 4.3)}),
-        Row(
-            "PI, calm",
-            servo_scenario(gusts=False, **PI),
-            {"rms": (4.8, 0.172, 22.2, 4.7), "largest error": (17, 0.56, 95, 23)},
-        ),
-        Row(
-            "PI, gusts",
-            servo_scenario(**PI),
-            {"rms": (13.7, 0.178, 22.2, 14.0), "largest error": (144, 0.56, 95, 138)},
-        ),
-        Row(
-            "literal, calm",
-            servo_scenario(gusts=False, **LITERAL).vary(aircraft={"step": FINE_STEP}),
-            {"rms": (13.0, 0.179, 16.8, 18.4), "largest error": (26, 0.38, 57, 40)},
-        ),
-    ]
+        "soft, 5 ms, gusts": (fast, (6.7, 0.087, 8.5, 5.5), (71, 0.61, 46, 54), (4.6, 35, 4.4, 14), (25, 104, 12, 50)),
+        "soft, twice the beta, gusts": (servo_scenario(beta=_beta(30.0, 130.0, 15.0, 60.0)), (7.6, 0.088, 9.9, 6.4)),
+        "soft, low gains, gusts": (servo_scenario(**LOW), (15.8, 0.110, 16.4, 15.0)),
+        "soft, high gains, gusts": (servo_scenario(**HIGH), (5.0, 0.074, 5.3, 4.3)),
+        "PI, calm": (calm(**PI), (4.8, 0.172, 22.2, 4.7), (17, 0.56, 95, 23)),
+        "PI, gusts": (servo_scenario(**PI), (13.7, 0.178, 22.2, 14.0), (144, 0.56, 95, 138)),
+        "literal, calm": (fine, (13.0, 0.179, 16.8, 18.4), (26, 0.38, 57, 40)),
+    }
+    return [Row(name, scenario, dict(zip(METRICS, values, strict=False))) for name, (scenario, *values) in rows.items()]
 
 
 def sampling_rows() -> list[Row]:
@@ -369,15 +318,13 @@ def noise_rows() -> list[Row]:
     rows = []
     for gyro, (soft, literal, pi, soft_slew, literal_slew) in published.items():
         sensors = {"sensors": {"noise": [gyro, 0.0, gyro, gyro]}}
-        calm = partial(servo_scenario, gusts=False)
-        fine = sensors | {"step": FINE_STEP}
-        soft_values = {"rms of q": (soft,), "slew of elevator": (soft_slew,)}
-        literal_values = {"rms of q": (literal,), "slew of elevator": (literal_slew,)}
-        rows += [
-            Row(f"soft, {gyro:g} rad/s", calm().vary(aircraft=sensors), soft_values),
-            Row(f"literal, {gyro:g} rad/s", calm(**LITERAL).vary(aircraft=fine), literal_values),
-            Row(f"PI, {gyro:g} rad/s", calm(**PI).vary(aircraft=sensors), {"rms of q": (pi,)}),
-        ]
+        for name, changes, step, values in (
+            ("soft", {}, {}, {"rms of q": (soft,), "slew of elevator": (soft_slew,)}),
+            ("literal", LITERAL, {"step": FINE_STEP}, {"rms of q": (literal,), "slew of elevator": (literal_slew,)}),
+            ("PI", PI, {}, {"rms of q": (pi,)}),
+        ):
+            scenario = servo_scenario(gusts=False, **changes).vary(aircraft=sensors | step)
+            rows.append(Row(f"{name}, {gyro:g} rad/s", scenario, values))
     return rows
 
 
@@ -409,8 +356,10 @@ def delay_rows() -> list[DelayRow]:
     A range of the prototype, "21 to 28 ms", is read as linear instability to tripled score. Without actuators the score of the
     implicit sign grows by 2.87 at 12 ms and by 3.17 at the prototype's 14 ms, one step of 2 ms later.
     """
-    bare: Changes = {"actuators": {}}
-    no_lag: Changes = {"lag": [0.0] * 4}
+
+    def bare(**controller: Any) -> Scenario:
+        return servo_scenario(lag=[0.0] * 4, **controller).vary(aircraft={"actuators": {}})
+
     return [
         DelayRow("soft", servo_scenario(), 50, 45),
         DelayRow("soft, five total lags wide", servo_scenario(softening=5.0), None, 64),
@@ -420,9 +369,9 @@ def delay_rows() -> list[DelayRow]:
         DelayRow("PI", servo_scenario(**PI), 98, 96),
         DelayRow("literal", servo_scenario(**LITERAL), 44, None),
         DelayRow("implicit, lag ignored", servo_scenario(**IMPLICIT), 24, None),
-        DelayRow("no actuators: soft", servo_scenario(sign="soft", **no_lag).vary(aircraft=bare), 42, 35),
-        DelayRow("no actuators: literal", servo_scenario(**LITERAL, **no_lag).vary(aircraft=bare), 24, None),
-        DelayRow("no actuators: implicit", servo_scenario(**IMPLICIT, **no_lag).vary(aircraft=bare), 14, None),
+        DelayRow("no actuators: soft", bare(sign="soft"), 42, 35),
+        DelayRow("no actuators: literal", bare(**LITERAL), 24, None),
+        DelayRow("no actuators: implicit", bare(**IMPLICIT), 14, None),
     ]
 
 
@@ -432,16 +381,16 @@ TABLES: dict[str, tuple[str, Callable[[], list[Row]]]] = {
     "noise": ("Noise of the gyros in calm air", noise_rows),
     "losses": ("Lost samples", loss_rows),
 }
+NAMES = (*TABLES, "delays")
 
 
 def main(
-    table: Annotated[str | None, typer.Option(help=f"One of {', '.join([*TABLES, 'delays'])}; all by default.")] = None,
+    table: Annotated[str | None, typer.Option(help=f"One of {', '.join(NAMES)}; all by default.")] = None,
     processes: Annotated[int, typer.Option(min=1, help="Flights at a time.")] = os.cpu_count() or 1,
 ) -> None:
     """Print metrics of the osprey with servos beside those of the prototype, and their ratio."""
-    console, bar = Console(), Console(stderr=True)
-    console.width = max(console.width, WIDTH)
-    require(table in (None, "delays", *TABLES), "--table", repr(table), f"one of {', '.join([*TABLES, 'delays'])}")
+    console, bar = wide_console(), Console(stderr=True)
+    require(table in (None, *NAMES), "--table", repr(table), f"one of {', '.join(NAMES)}")
     console.print("q / V / p / r in mrad/s and m/s; elevator / thrust / aileron / rudder in deg and %")
     with ProcessPoolExecutor(processes) as pool:
         for name, (title, make) in TABLES.items():
