@@ -5,7 +5,7 @@
 import os
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import rclpy
 from lifecycle_msgs.msg import State, Transition
@@ -24,7 +24,7 @@ from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import INTERNALS, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, RECORDED, STATES, Y_M, NodeState, U, Y
 from rise_di_controller.guard import Mode
 
-__all__ = ["ControllerStatus", "EngagementClient", "FlightMonitor", "Player"]
+__all__ = ["EngagementClient", "FlightMonitor", "Player"]
 
 MODES = {float(mode): mode.name for mode in Mode}
 
@@ -32,13 +32,6 @@ SERVICE_TIMEOUT = 10.0  # s
 
 AT_REST = 20
 """So many equal samples of u in a row: it has reached trim."""
-
-
-class ControllerStatus(NamedTuple):
-    """One sample of the controller's internals."""
-
-    mode: str
-    e: FloatArray
 
 
 class _Client:
@@ -76,8 +69,8 @@ class FlightMonitor(_Client):
             self._states[received.message.key] = received.message.value
         return self._states.get(f"/{node}#{pid}") in {NodeState.READY, NodeState.COMPLETED}
 
-    def newest(self) -> ControllerStatus | None:
-        """The newest sample since the last call, None without one."""
+    def newest(self) -> tuple[str, FloatArray] | None:
+        """Mode and e of the controller's newest sample since the last call, None without one."""
         status = None
         for received in self._internals.take() if self._internals is not None else ():
             try:
@@ -85,7 +78,7 @@ class FlightMonitor(_Client):
             except ChannelError:
                 continue
             if sample is not None:
-                status = ControllerStatus(MODES.get(sample.value[0], "?"), sample.value[1:])
+                status = MODES.get(sample.value[0], "?"), sample.value[1:]
         return status
 
     def recorded(self) -> float | None:

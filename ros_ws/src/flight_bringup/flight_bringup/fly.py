@@ -2,10 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a scenario: over topics in real time or in lockstep, or in one process."""
 
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -15,7 +13,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
 from flight_analysis.report.summary import display_units
 from flight_bringup.graph import Autopilot
-from flight_bringup.processes import FlightProcesses
+from flight_bringup.processes import FlightProcesses, handle_signals
 from flight_core.outcome import COMPLETED, INTERRUPTED
 from flight_log.tape_writer import write_run
 
@@ -30,18 +28,8 @@ STALL_TIMEOUT = 40.0
 Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
 
 
-@contextmanager
-def _signals_as_interrupt() -> Iterator[None]:
-    # SIGINT too: a shell starts background commands with SIGINT ignored, and Python then leaves it so.
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
 
 
 def fly_over_topics(
@@ -63,7 +51,7 @@ def fly_over_topics(
 
     try:
         with (
-            _signals_as_interrupt(),
+            handle_signals(_interrupt),
             FlightMonitor(scenario.controller.outputs, lockstep=lockstep) as monitor,
             FlightProcesses(
                 scenario, run, monitor, lockstep=lockstep, one_process=one_process, autopilot=autopilot
@@ -82,8 +70,9 @@ def _follow_real_time(scenario: Scenario, processes: FlightProcesses, monitor: "
         if (reason := processes.ended_early()) is not None:
             return reason
         if (status := monitor.newest()) is not None:
-            errors = (f"{name} {e * units[name].factor:+.2f}" for name, e in zip(outputs, status.e, strict=True))
-            text = f"{status.mode}  e: {', '.join(errors)}"
+            mode, values = status
+            errors = (f"{name} {e * units[name].factor:+.2f}" for name, e in zip(outputs, values, strict=True))
+            text = f"{mode}  e: {', '.join(errors)}"
         progress(max(t, 0.0), text)
         time.sleep(POLL_PERIOD)
     return COMPLETED
@@ -113,7 +102,7 @@ def _follow_lockstep(scenario: Scenario, processes: FlightProcesses, monitor: "F
 
 def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
     """Fly in one process without ROS, as fast as the machine allows, and write the bag into `run`. Returns the outcome."""
-    with _signals_as_interrupt():
+    with handle_signals(_interrupt):
         tape = simulate(scenario, lambda t: progress(t, "in one process"))
     write_run(tape, run, attachments_for(scenario, run))
     return tape.outcome

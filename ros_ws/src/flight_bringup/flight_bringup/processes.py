@@ -12,9 +12,10 @@ import sys
 import threading
 import time
 from collections import deque
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_bringup.graph import (
@@ -42,6 +43,17 @@ def end_with_parent() -> list[str]:
     """Prefix of a command: SIGTERM when this process dies. Needs setpriv of util-linux, empty without it."""
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
+
+
+@contextmanager
+def handle_signals(handler: Any) -> Iterator[None]:
+    """Handle SIGINT and SIGTERM in the block. Python leaves SIGINT ignored, as a shell starts background commands."""
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, previous in before.items():
+            signal.signal(number, previous)
 
 
 class NodeProcess:
@@ -165,21 +177,17 @@ class FlightProcesses:
 
     def stop(self) -> None:
         """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT."""
-        # A second Ctrl-C must not interrupt this: it lasts STOP_TIMEOUT at most.
-        before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
-        deadline = time.monotonic() + STOP_TIMEOUT
-        others = [process for process in self.processes if process.node is not RECORDER]
-        recorder = [process for process in self.processes if process.node is RECORDER]
-        for group in (others, recorder):
-            for process in group:
-                if process.popen.poll() is None:
-                    process.popen.terminate()  # not SIGINT, which gives a traceback while Python still imports
-            for process in group:
-                try:
-                    process.popen.wait(max(deadline - time.monotonic(), 0.2))
-                except subprocess.TimeoutExpired:
-                    process.popen.kill()
-                process.finish()
-        self.processes = []
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        with handle_signals(signal.SIG_IGN):  # a second Ctrl-C must not interrupt this: it lasts STOP_TIMEOUT at most
+            deadline = time.monotonic() + STOP_TIMEOUT
+            for recorder in (False, True):
+                group = [process for process in self.processes if (process.node is RECORDER) is recorder]
+                for process in group:
+                    if process.popen.poll() is None:
+                        process.popen.terminate()  # not SIGINT, which gives a traceback while Python still imports
+                for process in group:
+                    try:
+                        process.popen.wait(max(deadline - time.monotonic(), 0.2))
+                    except subprocess.TimeoutExpired:
+                        process.popen.kill()
+                    process.finish()
+            self.processes = []

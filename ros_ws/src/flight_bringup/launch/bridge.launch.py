@@ -8,7 +8,6 @@ and once it is engaged (docs/autopilots.md). Refuses a map whose signs contradic
 """
 
 import math
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,7 +26,6 @@ from flight_bringup.graph import (
     NodeSpec,
     find_autopilot,
     parameter_overrides,
-    start_lead,
 )
 from flight_bringup.launch.stages import (
     argument,
@@ -75,9 +73,7 @@ def _fly(context: LaunchContext) -> list[Action]:
         overrides = parameter_overrides(spec, scenario, run, start_time, lockstep=False, autopilot=autopilot)
         return flight_node(spec, scenario, overrides)
 
-    def second_stage(startup: float) -> Sequence[Action]:
-        lead = start_lead(startup)
-        start_time = round(time.time() + lead, 3)
+    def second_stage(lead: float, start_time: float) -> Sequence[Action]:
         end = [TimerAction(period=lead + scenario.flight.duration, actions=complete(run))] if duration else []
         return [*end, *(node(spec, start_time) for spec in SECOND_STAGE_WITH_BRIDGE)]
 

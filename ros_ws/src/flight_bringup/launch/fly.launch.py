@@ -7,7 +7,6 @@ after the scenario's duration, in lockstep when the aircraft completes it. It en
 """
 
 import math
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, TimerAction
 from launch_ros.actions import Node
 
 from flight_analysis.report.run_folder import new_run
-from flight_bringup.graph import AIRCRAFT, FIRST_STAGE, SECOND_STAGE, NodeSpec, parameter_overrides, start_lead
+from flight_bringup.graph import AIRCRAFT, FIRST_STAGE, SECOND_STAGE, NodeSpec, parameter_overrides
 from flight_bringup.launch.stages import (
     BOOLEAN,
     argument,
@@ -63,9 +62,7 @@ def _fly(context: LaunchContext) -> list[Action]:
     def node(spec: NodeSpec, start_time: float = math.inf) -> Node:
         return flight_node(spec, scenario, parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep))
 
-    def second_stage(startup: float) -> Sequence[Action]:
-        lead = start_lead(startup)
-        start_time = round(time.time() + lead, 3)
+    def second_stage(lead: float, start_time: float) -> Sequence[Action]:
         if lockstep:
             end: Action = on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))
         else:

@@ -115,4 +115,4 @@ def _play(context: LaunchContext) -> list[Action]:
         return flight_node(spec, scenario, overrides)
 
     second_stage = [LogInfo(msg=f"playing {topics}"), player]
-    return start_in_stages(context, {spec: node(spec) for spec in nodes}, lambda startup: second_stage)
+    return start_in_stages(context, {spec: node(spec) for spec in nodes}, lambda lead, start_time: second_stage)

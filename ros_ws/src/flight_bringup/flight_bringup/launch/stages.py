@@ -20,7 +20,7 @@ from launch_ros.ros_adapters import get_ros_node
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
-from flight_bringup.graph import NodeSpec
+from flight_bringup.graph import NodeSpec, start_lead
 from flight_bringup.processes import READY_TIMEOUT, end_with_parent
 from flight_bringup.scenarios import scenarios
 from flight_ros import transport
@@ -106,16 +106,20 @@ def on_state(
 
 
 def start_in_stages(
-    context: LaunchContext, first: Mapping[NodeSpec, Node], second: Callable[[float], Sequence[Action]]
+    context: LaunchContext, first: Mapping[NodeSpec, Node], second: Callable[[float, float], Sequence[Action]]
 ) -> list[Action]:
-    """Start the first stage. Once all its nodes are ready, run the actions of `second`, given the time until then in s."""
+    """Start the first stage. Once all its nodes are ready, run the actions of `second`.
+
+    Its arguments are the time until t = 0 and the system time of t = 0, s.
+    """
     _subscribe_states(context)
     begin = time.monotonic()
     waiting = dict.fromkeys(first)  # in order
 
     def ready(spec: NodeSpec) -> Sequence[Action]:
         del waiting[spec]
-        return () if waiting else second(time.monotonic() - begin)
+        lead = start_lead(time.monotonic() - begin)
+        return () if waiting else second(lead, round(time.time() + lead, 3))
 
     def warn(context: LaunchContext) -> list[Action]:
         names = ", ".join(spec.executable for spec in waiting)
