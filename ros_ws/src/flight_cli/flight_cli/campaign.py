@@ -19,8 +19,8 @@ from flight_campaign import engines
 from flight_campaign.campaign import Campaign, Definition, Sweep, define
 from flight_campaign.campaign_report import write_page
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
-from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, SHOWN_COLUMN, display_path, new_table, progress_bar
-from flight_core.parameters import ParameterError, require
+from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, SHOWN_COLUMN, display_path, new_table, parse_numbers, progress_bar
+from flight_core.parameters import require
 
 RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
 
@@ -81,11 +81,9 @@ def campaign(
 
 def _parse_sweep(text: str) -> Sweep:
     name, _, values = text.partition("=")
-    try:
-        factors = tuple(float(value) for value in values.split(","))
-    except ValueError:
-        raise ParameterError(f"--sweep: found {text!r}, expected a parameter and factors, as in beta=0.5,1,2") from None
-    return Sweep(parameter=name.removeprefix("controller."), factors=factors)
+    factors = parse_numbers(values)
+    require(bool(factors), "--sweep", repr(text), "a parameter and factors, as in beta=0.5,1,2")
+    return Sweep(parameter=name.removeprefix("controller."), factors=tuple(factors))
 
 
 def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) -> float | None:

@@ -5,7 +5,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -36,7 +36,9 @@ def check_signs(
     frame = load_airframe(airframe or chosen.aircraft.airframe)
     checked = check_scenario(channel_map, chosen, frame, bag)
     if as_json:
-        print(json.dumps(_as_json(channel_map, checked)))
+        channels, sentences = [one._asdict() for one in checked.channels], list(checked.contradictions)
+        result = {"map": channel_map.name, "channels": channels, "intervals": checked.intervals, "contradictions": sentences}
+        print(json.dumps(result))
     else:
         _show(Console(), channel_map, checked, frame.name)
     for sentence in checked.contradictions:
@@ -80,12 +82,3 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
 def _format_field(row: OutputRow | InputRow) -> str:
     """The field with the sign of the channel in front."""
     return f"{'-' if row.sign < 0 else '+'} {row.field}"
-
-
-def _as_json(channel_map: ChannelMap, checked: SignCheck) -> dict[str, Any]:
-    return {
-        "map": channel_map.name,
-        "channels": [one._asdict() for one in checked.channels],
-        "intervals": checked.intervals,
-        "contradictions": list(checked.contradictions),
-    }

@@ -18,7 +18,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_campaign import law_comparison
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.law_comparison import LawResult
-from flight_cli.output import COUNT_COLUMNS, new_table, progress_bar, write_text
+from flight_cli.output import COUNT_COLUMNS, new_table, parse_numbers, progress_bar, write_text
 from flight_core.parameters import require
 
 SEEDS = (1, 2, 3)
@@ -60,7 +60,10 @@ def compare(
     aims = tuning.split(",")
     for aim in aims:
         require(aim in gain_tuning.OBJECTIVES, "--tuning", repr(aim), ", ".join(gain_tuning.OBJECTIVES))
-    levels, chosen = _parse_levels(uncertainty), find_scenario(scenario)
+    levels = parse_numbers(uncertainty)
+    fits = bool(levels) and all(0.0 <= level < 1.0 for level in levels)
+    require(fits, "--uncertainty", repr(uncertainty), "parts of each entry, each at least 0 and below 1: 0.3,0.5")
+    chosen = find_scenario(scenario)
     benchmark, path = gain_tuning.build_benchmark(chosen), gains or gain_tuning.tuned_file(chosen)
     known = gain_tuning.load(path)
     results = []
@@ -95,16 +98,6 @@ def compare(
         rows = [_as_json(one, chosen) for one in results]
         figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "laws": rows}
         write_text("--json", to_json, json.dumps(figures, indent=1) + "\n")
-
-
-def _parse_levels(text: str) -> list[float]:
-    try:
-        levels = [float(part) for part in text.split(",")]
-    except ValueError:
-        levels = []
-    fits = bool(levels) and all(0.0 <= level < 1.0 for level in levels)
-    require(fits, "--uncertainty", repr(text), "parts of each entry, each at least 0 and below 1: 0.3,0.5")
-    return levels
 
 
 def _table(tuned_on: str, found: Sequence[LawResult], scenario: Scenario) -> Table:

@@ -24,8 +24,8 @@ from flight_analysis.design.gain_selection import (
 )
 from flight_analysis.report.summary import finite_or_null
 from flight_bringup.scenarios import find_scenario
-from flight_cli.output import new_table, write_text
-from flight_core.parameters import ParameterError, require
+from flight_cli.output import new_table, parse_numbers, write_text
+from flight_core.parameters import require
 
 CONDITION_FAILS = 1
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
@@ -105,10 +105,8 @@ def gains(
 def _parse_lags(text: str, airframe: Airframe) -> dict[str, float]:
     """Lags by input from "0.02,0.1", or from one value for all. Raises ParameterError."""
     names = list(airframe.inputs)
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        raise ParameterError(f"--lag: found {text!r}, expected seconds separated by commas") from None
+    values = parse_numbers(text)
+    require(bool(values), "--lag", repr(text), "seconds separated by commas")
     values = values * len(names) if len(values) == 1 else values
     require(len(values) == len(names), "--lag", f"{len(values)} values", f"one for all or one for each of {', '.join(names)}")
     require(all(0.0 <= value < math.inf for value in values), "--lag", text, "seconds, 0 or more")

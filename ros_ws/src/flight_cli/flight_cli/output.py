@@ -31,23 +31,12 @@ ENDED_EARLY, INTERRUPTED = 3, 130
 def show_flight(console: Console, flight: RecordedFlight) -> None:
     """Print the tables of a flight."""
     summary, units = flight.summary, display_units(flight.scenario)
-    console.print(
-        grouped_table(
-            f"Tracking error ({summary['error']}), {summary['duration']:.1f} s flown",
-            "channel",
-            ERROR_COLUMNS,
-            table_rows(summary["errors"], ERROR_COLUMNS, units),
-        )
-    )
+    title = f"Tracking error ({summary['error']}), {summary['duration']:.1f} s flown"
+    rows = table_rows(summary["errors"], ERROR_COLUMNS, units)
+    console.print(grouped_table(title, "channel", ERROR_COLUMNS, rows))
     if rows := input_rows(summary, units):
-        console.print(
-            grouped_table(
-                "Inputs about trim, and mean abs(u_dot) per second",
-                "input",
-                (*INPUT_COLUMNS, SATURATION_COLUMN),
-                rows,
-            )
-        )
+        title, columns = "Inputs about trim, and mean abs(u_dot) per second", (*INPUT_COLUMNS, SATURATION_COLUMN)
+        console.print(grouped_table(title, "input", columns, rows))
     console.print(f"{PARTS_LEGEND}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
     for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"])):
         console.print(line, highlight=False)
@@ -98,6 +87,14 @@ def _timing(summary: Mapping[str, Any]) -> list[str]:
         median, p99, largest = (f"{value * 1e3:.3f}" for value in latency.values())
         lines.append(f"y sent to u sent: median {median} ms, p99 {p99}, max {largest}")
     return lines
+
+
+def parse_numbers(text: str) -> list[float]:
+    """Numbers separated by commas; an empty list where one of them is none."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
 
 
 def write_text(option: str, path: Path, text: str) -> None:

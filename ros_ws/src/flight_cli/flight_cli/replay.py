@@ -12,9 +12,10 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from flight_analysis.closed_loop.replay import OPEN_LOOP, Difference, ReplayResult, recorded_parameters, vary
+from flight_analysis.closed_loop.replay import OPEN_LOOP, ReplayResult, recorded_parameters, vary
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
+from flight_analysis.report.summary import finite_or_null
 from flight_cli.output import new_table
 from flight_core.files import parse_yaml, writing
 from flight_core.parameters import ParameterError, require
@@ -87,9 +88,11 @@ def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...],
     else:
         different = result.different()
         rows = np.flatnonzero(different.any(axis=1))
+        nan = first.ulps is None
+        by = "which is not a number" if nan else f"{first.computed - first.recorded:+.3g}, {first.ulps} ULP"
         console.print(
             f"tick {first.number} differs first, at t = {first.t:.6g} s: {first.channel} recorded {first.recorded!r},"
-            f" computed {first.computed!r}, {_format_difference(first)}"
+            f" computed {first.computed!r}, {by}"
         )
         by_group = ", ".join(f"{name} in {count}" for name, count in _count_by_group(result).items())
         console.print(f"{of}, {len(rows)} differ, the last at t = {result.t[rows[-1]]:.6g} s; {by_group}")
@@ -103,19 +106,11 @@ def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...],
         console.print(f"note: {note}")
 
 
-def _format_difference(first: Difference) -> str:
-    if first.ulps is None:
-        return "which is not a number"
-    return f"{first.computed - first.recorded:+.3g}, {first.ulps} ULP"
-
-
 def _count_by_group(result: ReplayResult) -> dict[str, int]:
     """Number of ticks in which each group of channels differs."""
-    different = result.different()
-    groups: dict[str, list[int]] = {}
-    for column, name in enumerate(result.names):
-        groups.setdefault(name.split(".")[0], []).append(column)
-    counts = Counter({name: int(different[:, columns].any(axis=1).sum()) for name, columns in groups.items()})
+    different, groups = result.different(), [name.split(".")[0] for name in result.names]
+    ticks = {group: different[:, np.array(groups) == group].any(axis=1) for group in groups}
+    counts = Counter({group: int(differs.sum()) for group, differs in ticks.items()})
     return {name: count for name, count in counts.most_common() if count}
 
 
@@ -143,15 +138,10 @@ def _as_json(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ..
         "other_parameters": int(result.other_parameters.sum()),
         "differing": int(result.different().any(axis=1).sum()),
         "differing_by_group": _count_by_group(result),
-        "first": None if first is None else _first_as_json(first),
+        "first": None if first is None else {**finite_or_null(first._asdict()), "ulps": first.ulps},
         "u_difference": _u_figures(result, inputs),
         "notes": list(notes),
     }
-
-
-def _first_as_json(first: Difference) -> dict[str, Any]:
-    computed = None if np.isnan(first.computed) else first.computed  # JSON has no NaN
-    return first._asdict() | {"computed": computed, "ulps": first.ulps}
 
 
 def _write_csv(path: Path, result: ReplayResult, inputs: tuple[str, ...]) -> None:
@@ -160,7 +150,6 @@ def _write_csv(path: Path, result: ReplayResult, inputs: tuple[str, ...]) -> Non
     with writing("--csv", path, "the path of a file"), path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow(["number", "t", *(f"u.{name}.{what}" for name in inputs for what in ("recorded", "computed"))])
-        for row in range(len(result.number)):
-            pairs = ((result.recorded[row, column], result.computed[row, column]) for column in columns)
-            values = [float(value) for pair in pairs for value in pair]
-            writer.writerow([int(result.number[row]), float(result.t[row]), *values])
+        pairs = np.dstack([result.recorded[:, columns], result.computed[:, columns]]).reshape(len(result.number), -1)
+        rows = zip(result.number.tolist(), result.t.tolist(), pairs.tolist(), strict=True)
+        writer.writerows([number, t, *values] for number, t, values in rows)
