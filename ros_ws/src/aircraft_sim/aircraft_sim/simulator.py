@@ -78,15 +78,6 @@ class StateSpaceModel:
         return plant.diverged(self._state)
 
 
-def flight_dynamics_model(parameters: AircraftParameters) -> FlightDynamicsModel:
-    """The aircraft of the parameters, in trim at t = 0."""
-    if parameters.is_jsbsim:
-        from aircraft_sim.jsbsim_model import JsbsimModel  # noqa: PLC0415 - other aircraft fly without JSBSim
-
-        return JsbsimModel(parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model())
-    return StateSpaceModel(parameters)
-
-
 class Simulator:
     """A flight dynamics model and its sensors, sample by sample."""
 
@@ -94,7 +85,13 @@ class Simulator:
         channels = parameters.channels()
         self.outputs, self.inputs = tuple(channels.outputs), tuple(channels.inputs)
         self.period_ns = period_ns(parameters.rate, "rate")
-        self._model = flight_dynamics_model(parameters)
+        self._model: FlightDynamicsModel  # in trim at t = 0
+        if parameters.is_jsbsim:
+            from aircraft_sim.jsbsim_model import JsbsimModel  # noqa: PLC0415 - other aircraft fly without JSBSim
+
+            self._model = JsbsimModel(parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model())
+        else:
+            self._model = StateSpaceModel(parameters)
         self._sensors = parameters.sensor_arrays()
         self.truth_names = ("t", *self._model.truth_names, *(f"noise.{name}" for name in self.outputs))
         self._drift = sensors.initial_drift(self._sensors)

@@ -16,13 +16,8 @@ def names(airframe: Airframe) -> tuple[str, ...]:
     "x.state", "f.state" (f of equation (1), with all disturbances), "gust.axis" (the wind along each axis of the airframe's
     gusts, 1-cosine gust plus turbulence, m/s), "actuator.input" (the position that has acted up to now).
     """
-    groups = {
-        "x": tuple(airframe.states),
-        "f": tuple(airframe.states),
-        "gust": tuple(airframe.gusts),
-        "actuator": tuple(airframe.inputs),
-    }
-    return tuple(f"{group}.{name}" for group, members in groups.items() for name in members)
+    groups = (("x", airframe.states), ("f", airframe.states), ("gust", airframe.gusts), ("actuator", airframe.inputs))
+    return tuple(f"{group}.{name}" for group, members in groups for name in members)
 
 
 def values(state: AircraftState, wind: FloatArray, rate: FloatArray, plant: PlantParams) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
-from flight_log.named_vectors import JOINT_STATE, STAMP
+from flight_log.named_vectors import JOINT_STATE, STAMP, stamp_of
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.stored_messages import stored_messages
 
@@ -25,8 +25,7 @@ def latency(run: Path) -> Signal | None:
     for message in stored_messages(run) if bag_files(run) else ():
         sample = message.type_name == JOINT_STATE and len(message.data) >= STAMP.stop
         if sample and message.topic.rpartition("/")[2] in ("y", "u"):
-            seconds, nanoseconds = np.frombuffer(message.data[STAMP], dtype="<u4").tolist()
-            sent.setdefault(message.topic, {})[seconds * NANOSECONDS + nanoseconds] = message.sent_ns
+            sent.setdefault(message.topic, {})[stamp_of(message.data)] = message.sent_ns
     topics = {topic.rpartition("/")[2]: topic for topic in sent}
     if len(sent) != 2 or len(topics) != 2:
         return None

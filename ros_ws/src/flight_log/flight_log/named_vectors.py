@@ -60,6 +60,11 @@ def decoder(topic: str, type_name: str) -> Decoder | None:
     return _JointStateDecoder() if type_name == JOINT_STATE else None
 
 
+def stamp_of(data: bytes) -> int:
+    """The stamp of a message that begins with it, ns."""
+    return int.from_bytes(data[STAMP][:4], "little", signed=True) * NANOSECONDS + int.from_bytes(data[STAMP][4:], "little")
+
+
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
     """Stamp of flight time 0, from a sample of `truth` and its t in s: stamp - t. None when t is not a flight time."""
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
-from flight_log.named_vectors import JOINT_STATE, STAMP, decoder, flight_start_ns
+from flight_log.named_vectors import JOINT_STATE, decoder, flight_start_ns, stamp_of
 from flight_log.stored_messages import StoredMessage, stored_messages
 
 CLOCK = "/clock"
@@ -67,7 +67,7 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0) -> 
         if not lockstep:
             now_ns = _sent_ns(one)
         elif stamped:
-            now_ns = max(now_ns, _stamp_ns(one.data))
+            now_ns = max(now_ns, stamp_of(one.data))
         if one.topic in wanted:
             messages.append(ScheduledMessage(now_ns, one.topic, one.data, stamped))
     start_ns = _start_ns(stored, messages[0].due_ns)
@@ -90,16 +90,12 @@ def _matching(name: str, known: Mapping[str, StoredMessage], where: str) -> list
     return topics
 
 
-def _stamp_ns(data: bytes) -> int:
-    return int.from_bytes(data[STAMP][:4], "little", signed=True) * NANOSECONDS + int.from_bytes(data[STAMP][4:], "little")
-
-
 def _sent_ns(stored: StoredMessage) -> int:
     return stored.sent_ns or stored.received_ns
 
 
 def _is_flight_time(stored: StoredMessage) -> bool:
-    return abs(_stamp_ns(stored.data) - _sent_ns(stored)) > MAX_CLOCK_OFFSET_NS
+    return abs(stamp_of(stored.data) - _sent_ns(stored)) > MAX_CLOCK_OFFSET_NS
 
 
 def _start_ns(stored: Sequence[StoredMessage], otherwise: int) -> int:

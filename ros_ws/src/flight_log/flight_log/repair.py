@@ -11,7 +11,7 @@ from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from flight_core.files import is_file
@@ -88,19 +88,16 @@ class _FileScan:
         self.last_ns = 0
         scan = Scan(path)
         for record in scan.records():
-            self._add(record)
+            if isinstance(record, Message):
+                self.messages[record.channel_id] += 1
+                self.first_ns = record.log_time if self.first_ns is None else min(self.first_ns, record.log_time)
+                self.last_ns = max(self.last_ns, record.log_time)
+            elif isinstance(record, Channel):
+                self.channels[record.id] = record
+            elif isinstance(record, Schema):
+                self.schemas[record.id] = record
         self.known_end_ns = scan.known_end_ns
         self.faults = scan.faults
-
-    def _add(self, record: McapRecord) -> None:
-        if isinstance(record, Message):
-            self.messages[record.channel_id] += 1
-            self.first_ns = record.log_time if self.first_ns is None else min(self.first_ns, record.log_time)
-            self.last_ns = max(self.last_ns, record.log_time)
-        elif isinstance(record, Channel):
-            self.channels[record.id] = record
-        elif isinstance(record, Schema):
-            self.schemas[record.id] = record
 
     def contents(self) -> FileContents:
         counts = []

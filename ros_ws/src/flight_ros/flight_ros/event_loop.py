@@ -25,7 +25,7 @@ from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, dest
 from flight_ros.ticker import Ticker, disable_timer_slack
 from flight_ros.topics import NodeState
 
-ENDED_EARLY = 3  # exit status
+BAD_PARAMETERS, ENDED_EARLY = 2, 3  # exit statuses
 
 MAX_START_AGE_NS = 10 * NANOSECONDS  # a late node catches up with its missed ticks, but not with hours
 
@@ -58,14 +58,17 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop.request)
     try:
-        nodes = _create_nodes(make_nodes, early_participant)
-    except ParameterError as error:
-        sys.exit(_print_error(str(error)))
-    except FlightEnded as error:
-        _print_error(str(error))
-        sys.exit(ENDED_EARLY)
-    except ARGUMENT_ERRORS as error:
-        sys.exit(_print_error(" ".join(str(error).split())))
+        transport.prepare()
+        if not rclpy.ok():
+            rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        nodes = [make_node() for make_node in make_nodes]
+        if early_participant is not None:
+            destroy_participant(early_participant)
+    except (ParameterError, FlightEnded, *ARGUMENT_ERRORS) as error:
+        own = isinstance(error, ParameterError | FlightEnded)  # one sentence; those of rclpy have several lines
+        print(f"error: {error if own else ' '.join(str(error).split())}", file=sys.stderr)
+        rclpy.try_shutdown()
+        sys.exit(ENDED_EARLY if isinstance(error, FlightEnded) else BAD_PARAMETERS)
     node = nodes[0]
     try:
         if sockets := transport.open_to_network():
@@ -76,7 +79,7 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
             _run_real_time(node, stop)
     except ParameterError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(BAD_PARAMETERS)
     except FlightEnded as error:
         node.get_logger().fatal(str(error))
         sys.exit(ENDED_EARLY)
@@ -88,24 +91,6 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
             one.finish()
             one.destroy_node()
         rclpy.try_shutdown()
-
-
-def _create_nodes(
-    make_nodes: Sequence[Callable[[], FlightNode[Any]]], early_participant: Participant | None
-) -> list[FlightNode[Any]]:
-    transport.prepare()
-    if not rclpy.ok():
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    nodes = [make_node() for make_node in make_nodes]
-    if early_participant is not None:
-        destroy_participant(early_participant)
-    return nodes
-
-
-def _print_error(sentence: str) -> int:
-    print(f"error: {sentence}", file=sys.stderr)
-    rclpy.try_shutdown()
-    return 2
 
 
 def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: int = 0) -> None:
