@@ -158,17 +158,17 @@ class Loop:
 
     def r_dot(self, t: float) -> FloatArray:
         """Equation (12)."""
-        return self.r_dot_without_u(t) + np.asarray(self.p.C @ self.p.B @ self.u_dot(t))
-
-    def r_dot_without_u(self, t: float) -> FloatArray:
         p = self.p
-        plant = p.C @ p.A @ self.x_dot(t) + p.C @ self.f_dot(t)
+        plant = p.C @ p.A @ self.x_dot(t) + p.C @ self.f_dot(t) + p.C @ p.B @ self.u_dot(t)
         model = p.C @ p.A_m @ self.x_m_dot(t) + p.C @ p.B_m @ p.u_m_dot(t)
         return np.asarray(plant - model + p.Lambda * self.e_dot(t))
 
     def N(self, t: float) -> FloatArray:
         """Equation (15)."""
-        return np.asarray(self.M @ self.r_dot_without_u(t) + self.e(t))
+        p = self.p
+        plant = p.C @ p.A @ self.x_dot(t) + p.C @ self.f_dot(t)
+        model = p.C @ p.A_m @ self.x_m_dot(t) + p.C @ p.B_m @ p.u_m_dot(t)
+        return np.asarray(self.M @ (plant - model + p.Lambda * self.e_dot(t)) + self.e(t))
 
     def split(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Equations (17), (18) with x_urho = 0, so c1 = 0 in (7): N_d, N~, and the term that the paper puts into N~.
@@ -200,11 +200,15 @@ class Loop:
 
 def run(p: Problem, x_0: FloatArray, x_m0: FloatArray, duration: float) -> Loop:
     """Integrate the closed loop."""
+    n, m = p.B.shape
     e_0 = p.C @ (x_0 - x_m0)
 
     def w_dot(t: float, w: FloatArray) -> FloatArray:
-        now = Loop(p, e_0, lambda _: w)
-        return np.concatenate([now.x_dot(t), now.x_m_dot(t), now.e(t), p.beta * np.sign(now.e(t))])
+        x, x_m, integral_e, Pi = np.split(w, [n, 2 * n, 2 * n + m])
+        e = p.C @ (x - x_m)
+        u = -p.D * (p.K * (e - e_0 + p.Lambda * integral_e)) - p.D * Pi
+        x_dot = p.A @ x + p.f(t, x) + p.B @ u
+        return np.concatenate([x_dot, p.A_m @ x_m + p.B_m @ p.u_m(t), e, p.beta * np.sign(e)])
 
     start = np.concatenate([x_0, x_m0, np.zeros(2 * len(e_0))])
     solved = solve_ivp(w_dot, (0.0, duration), start, "DOP853", dense_output=True, rtol=1e-10, atol=1e-10, max_step=0.005)
