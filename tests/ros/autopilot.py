@@ -68,9 +68,8 @@ class Autopilot:
             self._publish(*sample.value.tolist())
             truth = self._simulator.truth()[places]
             print("y", time.time_ns(), *truth.tolist(), flush=True)
-            number = max(
-                number + 1, int((time.monotonic() - begin) / period)
-            )  # samples are skipped after a stop of the process
+            # Samples are skipped after a stop of the process.
+            number = max(number + 1, int((time.monotonic() - begin) / period))
 
     def _publish(self, q: float, V: float, p: float, r: float) -> None:
         twist, airspeed = TwistStamped(), Vector3Stamped()

@@ -11,13 +11,14 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from geometry_msgs.msg import TwistStamped, Vector3Stamped
+from geometry_msgs.msg import Twist, TwistStamped, Vector3, Vector3Stamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -87,15 +88,18 @@ class BridgeSetup:
         """Start a node of the stack by its module, with the scenario's parameters."""
         return self._start(name, "--ros-args", "--params-file", str(SCENARIO))
 
-    def engage(self, *, on: bool = True) -> str:
+    def command(self, *u: float) -> None:
+        """Publish u, stamped now."""
+        self.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array(u), "test"))
+
+    def engage(self, each: Callable[[], None] | None = None) -> str:
         """Call the service; the reason of a refusal, empty where there is none."""
-        return str(self.peer.call(SetBool, "bridge/engage", SetBool.Request(data=on)).message)
+        return str(self.peer.call(SetBool, "bridge/engage", SetBool.Request(data=True), each).message)
 
     def law(self, transition: int) -> None:
         """Activate or deactivate the controller."""
-        assert self.peer.call(
-            ChangeState, "controller/change_state", ChangeState.Request(transition=Transition(id=transition))
-        ).success
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert self.peer.call(ChangeState, "controller/change_state", request).success
 
     def engage_from_trim(self) -> None:
         """Engage as in docs/autopilots.md: deactivate, wait for trim, engage, activate."""
@@ -104,21 +108,24 @@ class BridgeSetup:
         self.peer.until(lambda: self.peer.received["u"] and not any(self.peer.received["u"][-1].position))
         self.peer.until(lambda: self.engage() == "")
         self.law(Transition.TRANSITION_ACTIVATE)
-        self.joys.clear()
-        self.peer.until(lambda: len(self.joys) > 5)
+        self.wait_for_joys()
 
     def engage_by_command(self) -> None:
         """Engage by `rise-di engage`."""
         command = self._start("flight_cli.cli", "engage")
         self.peer.until(lambda: command.popen.poll() is not None, timeout=60.0)
         assert command.end() == 0, command.output
+        self.wait_for_joys()
+
+    def wait_for_joys(self) -> None:
+        """Wait for six further messages to the autopilot."""
         self.joys.clear()
         self.peer.until(lambda: len(self.joys) > 5)
 
-    def spin(self, duration: float) -> None:
+    def spin(self, duration: float, each: Callable[[], None] | None = None) -> None:
         """Receive messages for a duration in s."""
         end = time.monotonic() + duration
-        self.peer.until(lambda: time.monotonic() > end, timeout=duration + 5.0)
+        self.peer.until(lambda: time.monotonic() > end, timeout=duration + 5.0, each=each)
 
     def after(self, t: float) -> tuple[list[float], list[float]]:
         """Times at which finite values and NaN were sent, s after an instant of the system clock."""
@@ -250,15 +257,11 @@ def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_t
     def command() -> None:
         nonlocal last
         last = time.time()
-        setup.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([commanded, 0.0, 0.0, 0.0]), "test"))
+        setup.command(commanded, 0.0, 0.0, 0.0)
 
     received = setup.peer.received
     setup.peer.until(lambda: received["y"] and received["bridge/would_send"], timeout=60.0, each=command)
-    client = setup.peer.node.create_client(SetBool, "bridge/engage")
-    setup.peer.until(client.service_is_ready, each=command)
-    future = client.call_async(SetBool.Request(data=True))
-    setup.peer.until(future.done, each=command)
-    assert future.result().message == ""
+    assert setup.engage(each=command) == ""
     setup.peer.until(lambda: len(setup.joys) > 10, each=command)
     stale = last
 
@@ -276,8 +279,7 @@ def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_t
     assert MAX_AGE + NEUTRAL + RELEASE - LATE < max(released) < MAX_AGE + NEUTRAL + RELEASE + 2 * LATE
 
     setup.joys.clear()
-    begin = time.monotonic()
-    setup.peer.until(lambda: time.monotonic() > begin + 0.5, each=command)
+    setup.spin(0.5, each=command)
     assert not setup.joys  # u is fresh again; the bridge does not re-engage by itself
     assert sum("-> ENGAGED" in line for line in bridge.lines) == 1
 
@@ -304,10 +306,7 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
 
     setup.bridge()
     player = start("flight_cli.cli", "play", str(bag), "--topics", ",".join(topics))
-
-    def command() -> None:
-        setup.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.1, 0.0, 0.0, 0.0]), "test"))
-
+    command = partial(setup.command, 0.1, 0.0, 0.0, 0.0)
     setup.peer.until(lambda: player.popen.poll() is not None, timeout=60.0, each=command)
     assert player.end() == 0, player.output
     received = setup.peer.received["y"]
@@ -351,10 +350,7 @@ def test_a_map_with_a_wrong_sign_is_refused(setup: BridgeSetup, start: Start) ->
 def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeSetup) -> None:
     setup.autopilot()
     setup.bridge()
-
-    def command() -> None:
-        setup.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.1, 0.1, 9.0, -0.1]), "test"))
-
+    command = partial(setup.command, 0.1, 0.1, 9.0, -0.1)
     received = setup.peer.received["bridge/would_send"]
     setup.peer.until(lambda: len(received) > 20 and setup.peer.received["y"], each=command)
     assert list(received[-1].name) == ["joy.axes[1]", "joy.axes[2]", "joy.axes[0]", "joy.axes[3]"]
@@ -371,9 +367,8 @@ def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Sta
     with peer(topics=()) as other:
         other.node.create_publisher(TwistStamped, "/ap/airspeed", 10)  # as an AP_DDS would whose type has changed
         other.node.create_subscription(Imu, "/ap/joy", lambda _: None, 10)
-        bridge.wait_for(
-            "/ap/airspeed: /peer publishes geometry_msgs/msg/TwistStamped, expected geometry_msgs/msg/Vector3Stamped"
-        )
+        published, expected = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Vector3Stamped"
+        bridge.wait_for(f"/ap/airspeed: /peer publishes {published}, expected {expected}")
         bridge.wait_for("/ap/joy: /peer subscribes to sensor_msgs/msg/Imu, expected sensor_msgs/msg/Joy")
 
 
@@ -391,34 +386,21 @@ def serialised(message: Any) -> Any:
     return deserialize_message(serialize_message(message), type(message))
 
 
-def twist() -> TwistStamped:
-    message = TwistStamped()
-    message.twist.angular.x, message.twist.angular.y, message.twist.angular.z = 0.3, -0.2, -0.1
-    return message
+RATES = Vector3(x=0.3, y=-0.2, z=-0.1)
+AIRSPEED = Vector3Stamped(vector=Vector3(x=-18.0, y=18.0, z=-9.0))  # of length 27
 
 
-def imu() -> Imu:
-    message = Imu()
-    message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z = 0.3, -0.2, -0.1
-    return message
-
-
-def airspeed() -> Vector3Stamped:
-    message = Vector3Stamped()
-    message.vector.x, message.vector.y, message.vector.z = -18.0, 18.0, -9.0  # of length 27
-    return message
-
-
-ROWS: tuple[tuple[str, Callable[[], Any], dict[str, float]], ...] = (
-    ("ardupilot", twist, {"q": 0.2, "p": 0.3, "r": 0.1}),
-    ("ardupilot", airspeed, {"V": 2.0}),
-    ("mavros", imu, {"q": 0.2, "p": 0.3, "r": 0.1}),
+@pytest.mark.parametrize(
+    ("name", "message", "expected"),
+    [
+        ("ardupilot", TwistStamped(twist=Twist(angular=RATES)), {"q": 0.2, "p": 0.3, "r": 0.1}),
+        ("ardupilot", AIRSPEED, {"V": 2.0}),
+        ("mavros", Imu(angular_velocity=RATES), {"q": 0.2, "p": 0.3, "r": 0.1}),
+    ],
+    ids=("twist", "airspeed", "imu"),
 )
-
-
-@pytest.mark.parametrize(("name", "make", "expected"), ROWS, ids=lambda one: getattr(one, "__name__", ""))
-def test_outputs_are_read_from_real_messages(name: str, make: Callable[[], Any], expected: dict[str, float]) -> None:
-    message = serialised(make())
+def test_outputs_are_read_from_real_messages(name: str, message: Any, expected: dict[str, float]) -> None:
+    message = serialised(message)
     for channel, value in expected.items():
         row = load_map(name).outputs[channel]
         assert message_type(row.type) is type(message)

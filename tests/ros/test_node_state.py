@@ -33,10 +33,8 @@ def received_states(peer_node: Peer, topic: str = NODE_STATE.name) -> dict[str, 
 
 def test_a_late_subscriber_gets_the_state_of_each_process(start: Start, osprey_gust: Scenario) -> None:
     arguments = ("--ros-args", "--params-file", str(osprey_gust.path), "-r", "__ns:=/one")
-    nodes = {
-        name: start(f"{module}.main", *arguments)
-        for name, module in (("controller", "rise_di_controller"), ("aircraft", "aircraft_sim"))
-    }
+    modules = {"controller": "rise_di_controller", "aircraft": "aircraft_sim"}
+    nodes = {name: start(f"{module}.main", *arguments) for name, module in modules.items()}
     for node in nodes.values():
         node.wait_for("ready")
     with peer(topics=()) as peer_node:
@@ -92,9 +90,8 @@ def start_stage(scenario: Scenario, run: Path) -> None:
 
 
 def test_a_log_line_does_not_start_a_flight(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
-    only_stage.write_text(
-        "import time\nprint('[INFO] [1.0] [controller]: ready', flush=True)\ntime.sleep(60)\n", encoding="utf-8"
-    )
+    code = "import time\nprint('[INFO] [1.0] [controller]: ready', flush=True)\ntime.sleep(60)\n"
+    only_stage.write_text(code, encoding="utf-8")
     with pytest.raises(ParameterError, match="timed out waiting for controller: not ready after 3 s; see the logs in "):
         start_stage(osprey_gust, tmp_path / "run")
     assert "[controller]: ready" in (tmp_path / "run" / "log" / "controller.log").read_text(encoding="utf-8")
