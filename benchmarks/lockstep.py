@@ -9,46 +9,39 @@ The scenario osprey_gust with aircraft and reference model at the 100 Hz of the 
     without ROS      the same parts in one loop
     bare echo        a vector of four channels to another process and back, by the same publisher and subscription
 
-    .venv/bin/python benchmarks/lockstep.py [--duration 60] [--repeat 3]
+    .venv/bin/python -m benchmarks.lockstep [--duration 60] [--repeat 3]
 """
 
 import argparse
-import os
-import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import rclpy
-import yaml
+from benchmarks.nodes import open_node
+from benchmarks.processes import Child
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
-from rclpy.context import Context
-from rclpy.node import Node
 
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.scenarios import find_scenario
-from flight_ros import transport
 from flight_ros.messages import Encoder
 from flight_ros.rclpy_private import WaitSet
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import LOCKSTEP, PUBLISH, U, Y
 
 ECHOES = 5000
+RATE = 100.0  # Hz, of the controller of osprey_gust
+FLOOR = "bare echo, to another process and back"
 
 
-def scenario_at_controller_rate(folder: Path, duration: float) -> Scenario:
-    """The scenario osprey_gust with one sample of aircraft and reference model a tick."""
-    tree = yaml.safe_load(find_scenario("osprey_gust").path.read_text(encoding="utf-8"))
-    tree["/**/flight"]["ros__parameters"]["duration"] = duration
-    tree["/**/aircraft"]["ros__parameters"] |= {"rate": 100.0, "step": 0.01}
-    tree["/**/reference_model"]["ros__parameters"]["rate"] = 100.0
-    path = folder / "at_100_hz.yaml"
-    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+def write_scenario(scenario: Scenario, path: Path) -> Scenario:
+    """The scenario, read from a file that it is written to, for other processes."""
+    path.write_text(scenario_yaml(scenario), encoding="utf-8")
     return load_scenario(path)
 
 
@@ -75,28 +68,13 @@ def loop_steps_per_second(scenario: Scenario) -> float:
     return (len(tape["u"].stamp_ns) - 1) / (time.perf_counter() - begin)
 
 
-def echo() -> None:
-    """The other process: it publishes each message of y on u until the parent closes the pipe."""
-    os.set_blocking(sys.stdin.fileno(), False)
-    context, node = _node("echo")
-    subscription, publisher = PolledSubscription(node, Y, LOCKSTEP, raw=True), node.create_publisher(U.type, U.name, PUBLISH)
-    waiter = WaitSet([subscription.entity], context)
-    while sys.stdin.buffer.read(1) is None:  # b"" at its end
-        waiter.wait(20_000_000)
-        for received in subscription.take():
-            publisher.publish(received.message)
-    node.destroy_node()
-    context.try_shutdown()
-
-
 def echo_steps_per_second() -> float:
     """Round trips per second of four channels to another process and back."""
-    context, node = _node("requester")
-    subscription, publisher = PolledSubscription(node, U, LOCKSTEP, raw=True), node.create_publisher(Y.type, Y.name, PUBLISH)
-    waiter, encoder, values = WaitSet([subscription.entity], context), Encoder(("q", "V", "p", "r"), "requester"), np.zeros(4)
-    other = subprocess.Popen([sys.executable, __file__, "--echo"], stdin=subprocess.PIPE)  # noqa: S603 - this file
-    try:
-        begin = 0.0
+    encoder, values = Encoder(("q", "V", "p", "r"), "requester"), np.zeros(4)
+    with open_node("requester") as node, Child("polled_echo"):
+        subscription = PolledSubscription(node, U, LOCKSTEP, raw=True)
+        publisher = node.create_publisher(Y.type, Y.name, PUBLISH)
+        waiter = WaitSet([subscription.entity], node.context)
         for k in range(ECHOES):
             if k == 1:  # the first round trip includes discovery
                 begin = time.perf_counter()
@@ -104,17 +82,21 @@ def echo_steps_per_second() -> float:
             while not list(subscription.take(1)):
                 waiter.wait(20_000_000)
         return (ECHOES - 1) / (time.perf_counter() - begin)
-    finally:
-        other.communicate()
-        node.destroy_node()
-        context.try_shutdown()
 
 
-def _node(name: str) -> tuple[Context, Node]:
-    transport.prepare()
-    context = Context()
-    rclpy.init(context=context)
-    return context, Node(name, context=context)
+def measure(folder: Path, duration: float, repeat: int) -> dict[str, float]:
+    """Steps per second of the echo (FLOOR) and of each kind of flight: the median of `repeat` runs, interleaved."""
+    aircraft, model = {"rate": RATE, "step": 1.0 / RATE}, {"rate": RATE}
+    scenario = find_scenario("osprey_gust").vary(flight={"duration": duration}, aircraft=aircraft, reference_model=model)
+    scenario = write_scenario(scenario, folder / "at_100_hz.yaml")
+    measurements: dict[str, Callable[[Path], float]] = {
+        FLOOR: lambda run: echo_steps_per_second(),
+        "lockstep, four processes": lambda run: flight_steps_per_second(scenario, run, one_process=False),
+        "lockstep, one process": lambda run: flight_steps_per_second(scenario, run, one_process=True),
+        "one loop without ROS": lambda run: loop_steps_per_second(scenario),
+    }
+    rates = [[of(folder / f"{name} {k}") for name, of in measurements.items()] for k in range(repeat)]
+    return dict(zip(measurements, np.median(rates, axis=0).tolist(), strict=True))
 
 
 def main() -> None:
@@ -122,27 +104,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--duration", type=float, default=60.0, help="flight time, s")
     parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--echo", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.echo:
-        echo()
-        return
-    rates_of: dict[str, list[float]] = {"bare echo": [], "four processes": [], "one process": [], "without ROS": []}
     with tempfile.TemporaryDirectory() as folder:
-        scenario = scenario_at_controller_rate(Path(folder), options.duration)
-        for k in range(options.repeat):
-            rates_of["bare echo"].append(echo_steps_per_second())
-            for name in ("four processes", "one process"):
-                run = Path(folder) / f"{name} {k}"
-                rates_of[name].append(flight_steps_per_second(scenario, run, one_process=name == "one process"))
-            rates_of["without ROS"].append(loop_steps_per_second(scenario))
-    floor = float(np.median(rates_of["bare echo"]))
+        rates = measure(Path(folder), options.duration, options.repeat)
     print(f"median of {options.repeat}, {options.duration:g} s of flight each")
-    print(f"{'':16}{'steps/s':>9}{'to the echo':>13}{'times real time':>17}")
-    for name, rates in rates_of.items():
-        rate = float(np.median(rates))
-        real_time = "" if name == "bare echo" else f"{rate / scenario.controller.rate:.1f}"
-        print(f"{name:16}{rate:9.0f}{rate / floor:13.2f}{real_time:>17}")
+    print(f"{'':38}{'steps/s':>9}{'to the echo':>13}{'times real time':>17}")
+    for name, rate in rates.items():
+        real_time = "" if name == FLOOR else f"{rate / RATE:.1f}"
+        print(f"{name:38}{rate:9.0f}{rate / rates[FLOOR]:13.2f}{real_time:>17}")
 
 
 if __name__ == "__main__":

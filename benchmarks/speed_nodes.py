@@ -1,58 +1,45 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes that benchmarks/speed.py measures. Each prints one line of JSON at its end or on SIGTERM.
+"""The processes of the benchmarks. Each prints one line of JSON at its end or on SIGTERM.
 
 python -m benchmarks.speed_nodes ROLE [--executor single] [--hz 500] [--seconds 10]
 
-Executors are never spinner without a timeout: without one the events executor of these wheels hangs.
+Executors never spin without a timeout: without one the events executor of these wheels hangs.
 """
 
 import argparse
 import json
 import os
 import signal
-import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
-import rclpy
+from benchmarks.nodes import open_node, termination, ticks
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from flight_core.parameters import NodeParameters
 from flight_core.rates import NANOSECONDS
-from flight_ros import transport
 from flight_ros.event_loop import run
 from flight_ros.flight_node import FlightNode
-from flight_ros.ticker import Tick, Ticker
-from flight_ros.topics import NEWEST_SAMPLES, PUBLISH, U, Y
+from flight_ros.rclpy_private import WaitSet
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.ticker import Tick
+from flight_ros.topics import LOCKSTEP, NEWEST_SAMPLES, PUBLISH, U, Y
 from rise_di_controller.node import ControllerNode
 
-EXECUTORS: dict[str, Callable[[], Any]] = {
+EXECUTORS: dict[str, Callable[..., Any]] = {
     "single": SingleThreadedExecutor,
-    "multi": lambda: MultiThreadedExecutor(num_threads=2),
+    "multi": partial(MultiThreadedExecutor, num_threads=2),
     "events": EventsExecutor,
 }
-ROLES = ("echo", "timed_echo", "idle", "timer", "bare_loop", "ticker", "delay_monitor", "controller")
 PAUSE = 0.1  # s, the timeout of an executor
 MONITOR_PERIOD = 0.0005  # s
-
-
-def lateness(late_ns: list[int], missed: int) -> dict[str, float]:
-    """Percentiles of the lateness of ticks, us, without the warm-up."""
-    late = np.array(late_ns[len(late_ns) // 20 :]) / 1e3
-    return {
-        "p50": float(np.percentile(late, 50)),
-        "p99": float(np.percentile(late, 99)),
-        "max": float(late.max()),
-        "missed": missed,
-        "ticks": len(late_ns),
-    }
 
 
 def times(took_ns: list[int]) -> dict[str, float]:
@@ -61,72 +48,79 @@ def times(took_ns: list[int]) -> dict[str, float]:
     return {"p50": float(np.percentile(took, 50)), "p99": float(np.percentile(took, 99)), "calls": len(took_ns)}
 
 
-def termination() -> threading.Event:
-    """An event that SIGTERM and SIGINT set."""
-    ended = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: ended.set())
-    return ended
+def lateness(late_ns: list[int], missed: int) -> dict[str, float]:
+    """Percentiles of the lateness of ticks, us, without the warm-up."""
+    late = times(late_ns)
+    most = max(late_ns[len(late_ns) // 20 :]) / 1e3
+    return {"p50": late["p50"], "p99": late["p99"], "max": most, "missed": missed, "ticks": late["calls"]}
 
 
-def bare_node(name: str) -> Node:
-    """A plain node of rclpy on the stack's transport."""
-    transport.prepare()
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    return Node(name)
+def executor_of(node: Node, kind: str) -> Any:
+    """An executor that spins the node."""
+    executor = EXECUTORS[kind](context=node.context)
+    executor.add_node(node)
+    return executor
 
 
-def echo(executor: str, hz: float, *, timed: bool) -> dict[str, float]:
+def echo(kind: str, hz: float, *, timed: bool) -> dict[str, float]:
     """A subscription to y whose callback publishes each message on u.
 
     Timed: the executor spins once at a fixed rate, when a message has arrived, and the time to the end of the callback is
     measured. Otherwise the executor spins as usual.
     """
-    ended, node = termination(), bare_node("echo")
-    publisher = node.create_publisher(U.type, U.name, PUBLISH)
-    sent_ns = [0]
+    ended = termination()
+    took: list[int] = []
+    sent_ns = 0
 
     def answer(message: Any) -> None:
+        nonlocal sent_ns
         publisher.publish(message)
-        sent_ns[0] = time.perf_counter_ns()
+        sent_ns = time.perf_counter_ns()
 
-    node.create_subscription(Y.type, Y.name, answer, NEWEST_SAMPLES)
-    spinner = EXECUTORS[executor]()
-    spinner.add_node(node)
-    took: list[int] = []
-    ticker, begin_ns = Ticker(round(NANOSECONDS / hz), time.monotonic_ns()), time.perf_counter_ns()
-    while not ended.is_set():
-        if not timed:
-            spinner.spin_once(timeout_sec=PAUSE)
-            continue
-        if (pause := ticker.remaining()) > 0:
-            time.sleep(pause)
-        ticker.due()
-        if sent_ns[0] > begin_ns:  # a message had arrived; checked late, since an executor may have threads
-            took.append(sent_ns[0] - begin_ns)
+    with open_node("echo") as node:
+        publisher = node.create_publisher(U.type, U.name, PUBLISH)
+        node.create_subscription(Y.type, Y.name, answer, NEWEST_SAMPLES)
+        executor = executor_of(node, kind)
+        while not timed and not ended.is_set():
+            executor.spin_once(timeout_sec=PAUSE)
         begin_ns = time.perf_counter_ns()
-        spinner.spin_once(timeout_sec=0.0)
-    node.destroy_node()
-    rclpy.try_shutdown()
+        for _ in ticks(hz):
+            if ended.is_set():
+                break
+            if sent_ns > begin_ns:  # a message had arrived; checked late, since an executor may have threads
+                took.append(sent_ns - begin_ns)
+            begin_ns = time.perf_counter_ns()
+            executor.spin_once(timeout_sec=0.0)
     return times(took) if took else {}
+
+
+def polled_echo() -> dict[str, float]:
+    """Publishes each message of y on u, by the stack's publisher and subscription."""
+    ended = termination()
+    with open_node("echo") as node:
+        subscription = PolledSubscription(node, Y, LOCKSTEP, raw=True)
+        publisher = node.create_publisher(U.type, U.name, PUBLISH)
+        waiter = WaitSet([subscription.entity], node.context)
+        while not ended.is_set():
+            waiter.wait(20_000_000)
+            for received in subscription.take():
+                publisher.publish(received.message)
+    return {}
 
 
 def idle() -> dict[str, float]:
     """A node that only spins."""
-    ended, node = termination(), bare_node("idle")
-    spinner = SingleThreadedExecutor()
-    spinner.add_node(node)
-    print("ready", flush=True)
-    while not ended.is_set():
-        spinner.spin_once(timeout_sec=PAUSE)
-    node.destroy_node()
-    rclpy.try_shutdown()
+    ended = termination()
+    with open_node("idle") as node:
+        executor = executor_of(node, "single")
+        while not ended.is_set():
+            executor.spin_once(timeout_sec=PAUSE)
     return {}
 
 
-def timer(executor: str, hz: float, seconds: float) -> dict[str, float]:
+def timer(kind: str, hz: float, seconds: float) -> dict[str, float]:
     """Lateness of the callback of an empty timer of rclpy on the steady clock."""
-    ended, node = termination(), bare_node("timer")
+    ended = termination()
     period_ns = round(NANOSECONDS / hz)
     late: list[int] = []
     at: list[int] = []
@@ -136,28 +130,24 @@ def timer(executor: str, hz: float, seconds: float) -> dict[str, float]:
         at.append(time.monotonic_ns())
         late.append(period_ns - left_ns)
 
-    made = node.create_timer(1.0 / hz, tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
-    spinner = EXECUTORS[executor]()
-    spinner.add_node(node)
-    end = time.monotonic() + seconds
-    while time.monotonic() < end and not ended.is_set():
-        spinner.spin_once(timeout_sec=PAUSE)
-    node.destroy_node()
-    rclpy.try_shutdown()
+    with open_node("timer") as node:
+        made = node.create_timer(1.0 / hz, tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        executor = executor_of(node, kind)
+        end = time.monotonic() + seconds
+        while time.monotonic() < end and not ended.is_set():
+            executor.spin_once(timeout_sec=PAUSE)
     due = round((at[-1] - at[0]) / period_ns) + 1
     return lateness(late, max(due - len(at), 0))
 
 
 def bare_loop(hz: float, seconds: float) -> dict[str, float]:
     """A loop that only sleeps until the next deadline."""
-    ticker, late, missed = Ticker(round(NANOSECONDS / hz), time.monotonic_ns()), [], 0
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if (pause := ticker.remaining()) > 0:
-            time.sleep(pause)
-        if (tick := ticker.due()) is not None:
-            late.append(tick.late_ns)
-            missed += tick.missed
+    late, missed, end = [], 0, time.monotonic() + seconds
+    for tick in ticks(hz):
+        late.append(tick.late_ns)
+        missed += tick.missed
+        if time.monotonic() >= end:
+            break
     return lateness(late, missed)
 
 
@@ -234,6 +224,19 @@ def controller() -> dict[str, float]:
     return times(until_u) | {f"whole {name}": value for name, value in times(whole).items()}
 
 
+ROLES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
+    "echo": lambda of: echo(of.executor, of.hz, timed=False),
+    "timed_echo": lambda of: echo(of.executor, of.hz, timed=True),
+    "polled_echo": lambda of: polled_echo(),
+    "idle": lambda of: idle(),
+    "timer": lambda of: timer(of.executor, of.hz, of.seconds),
+    "bare_loop": lambda of: bare_loop(of.hz, of.seconds),
+    "ticker": lambda of: ticker_node(of.hz, of.seconds),
+    "delay_monitor": lambda of: delay_monitor(of.core),
+    "controller": lambda of: controller(),
+}
+
+
 def main() -> None:
     """Run one role."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -243,17 +246,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--core", type=int, default=0)
     options, _ = parser.parse_known_args()  # the others are arguments of ROS
-    roles: dict[str, Callable[[], dict[str, Any]]] = {
-        "echo": lambda: echo(options.executor, options.hz, timed=False),
-        "timed_echo": lambda: echo(options.executor, options.hz, timed=True),
-        "idle": idle,
-        "timer": lambda: timer(options.executor, options.hz, options.seconds),
-        "bare_loop": lambda: bare_loop(options.hz, options.seconds),
-        "ticker": lambda: ticker_node(options.hz, options.seconds),
-        "delay_monitor": lambda: delay_monitor(options.core),
-        "controller": controller,
-    }
-    print(json.dumps(roles[options.role]()), flush=True)
+    print(json.dumps(ROLES[options.role](options)), flush=True)
 
 
 if __name__ == "__main__":

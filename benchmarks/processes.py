@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Child processes of the benchmarks, their output and their processor time."""
+
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+ENDS_WITHIN = 30.0  # s
+
+
+class Child:
+    """A role of benchmarks/speed_nodes.py, or a module (with a dot in its name), as a process; a context manager."""
+
+    def __init__(self, role: str, *arguments: str, within: Sequence[str] = ()) -> None:
+        module = (role,) if "." in role else ("benchmarks.speed_nodes", role)
+        command = [*within, sys.executable, "-m", *module, *arguments]
+        self.popen = psutil.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+
+    def __enter__(self) -> "Child":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.popen.poll() is None:
+            self.popen.terminate()  # a killed peer remains in the graph for two more seconds
+        try:
+            self.popen.communicate(timeout=ENDS_WITHIN)
+        except subprocess.TimeoutExpired:
+            self.popen.kill()
+            self.popen.communicate()
+
+    def cpu_ns(self) -> int:
+        """Processor time of its running threads, ns."""
+        return threads_ns(self.popen.pid)
+
+    def figures(self, timeout: float = 20.0) -> dict[str, Any]:
+        """Wait for its end and return its JSON output. Raises RuntimeError without any."""
+        output, _ = self.popen.communicate(timeout=timeout)
+        lines = [line for line in output.splitlines() if line.startswith("{")]
+        if not lines:
+            raise RuntimeError(f"{' '.join(self.popen.args)} ended with status {self.popen.returncode} and without output")
+        figures: dict[str, Any] = json.loads(lines[-1])
+        return figures
+
+    def stop(self) -> dict[str, Any]:
+        """Send SIGTERM and return its JSON output."""
+        self.popen.terminate()
+        return self.figures()
+
+
+def threads_ns(pid: int) -> int:
+    """Processor time of the threads of a process, ns, from the kernel's schedstat: psutil resolves 10 ms only."""
+    total = 0
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            total += int((task / "schedstat").read_text(encoding="ascii").split()[0])
+    return total
