@@ -43,7 +43,6 @@ def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) ->
         period=period,
         lower=-wide,
         upper=wide,
-        rate=np.full(1, np.inf),
     )
 
 

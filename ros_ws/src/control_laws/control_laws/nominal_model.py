@@ -34,7 +34,6 @@ class NominalModel(NamedTuple):
     period: float  # of the law, s
     lower: FloatArray  # (m,) limits of u, deviations from trim; infinite without one
     upper: FloatArray  # (m,)
-    rate: FloatArray  # (m,) per s
 
     @property
     def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name
@@ -49,8 +48,8 @@ class NominalModel(NamedTuple):
 
     @property
     def limits(self) -> Limits:
-        """The limits as arguments of a law, shape (m, 1)."""
-        return Limits(self.lower[:, None], self.upper[:, None], self.rate[:, None])
+        """The limits as arguments of a law, shape (m, 1); the rate of u has none."""
+        return Limits(self.lower[:, None], self.upper[:, None], np.full((len(self.lower), 1), np.inf))
 
 
 def params_of_gains(kind: Callable[..., Any]) -> Callable[[dict[str, FloatArray], NominalModel], Any]:

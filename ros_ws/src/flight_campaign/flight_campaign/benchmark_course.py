@@ -30,8 +30,8 @@ WIND_ANGLE = {"vertical": "alpha", "lateral": "beta"}
 """Angle that a wind along an axis changes: alpha_air = alpha - w/V0, beta_air = beta - v/V0, small angles."""
 
 
-class Course(NamedTuple):
-    """T ticks of the controller, the last at the end of the flight; channels in the law's order, states in the airframe's."""
+class Segments(NamedTuple):
+    """The parts of a course that change from tick to tick."""
 
     t: FloatArray  # (T,) s
     phase: NDArray[np.int32]  # (T,) HOLD, ENGAGE or STEP
@@ -44,6 +44,12 @@ class Course(NamedTuple):
     forcing: FloatArray  # (T, K r) mean of basis' @ f_time over each of the steps from here to the next tick
     forcing_now: FloatArray  # (T, r) at the tick
     air: FloatArray  # (T, n) wind's contribution to alpha and beta, rad
+
+
+class Course(NamedTuple):
+    """T ticks of the controller, the last at the end of the flight; channels in the law's order, states in the airframe's."""
+
+    segments: Segments
     basis: FloatArray  # (n, r) orthonormal directions of f_time in x_dot
     order: NDArray[np.int64]  # (m,) indices of the law's outputs in y
     late: int  # delay of y, ticks
@@ -85,7 +91,7 @@ def build_course(scenario: Scenario, nominal: Nominal | None = None) -> Course:
     forcing, now, air = _wind(ticks, steps, plant, airframe)
     _, sizes, rows = np.linalg.svd(forcing, full_matrices=False)
     basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
-    return Course(
+    segments = Segments(
         np.arange(ticks) * np.float64(seconds(tick_ns)),
         phase,
         dt,
@@ -97,12 +103,8 @@ def build_course(scenario: Scenario, nominal: Nominal | None = None) -> Course:
         (forcing @ basis).reshape(ticks, -1),
         now @ basis,
         air,
-        basis,
-        order,
-        late,
-        seconds(tick_ns),
-        steps,
     )
+    return Course(segments, basis, order, late, seconds(tick_ns), steps)
 
 
 def _phases(

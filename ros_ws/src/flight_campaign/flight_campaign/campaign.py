@@ -7,7 +7,7 @@ The folder of a campaign holds its definition, a file for each completed chunk, 
 
 import os
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -45,7 +45,7 @@ class Definition(Parameters):
     """All inputs of a campaign's figures, except the version of the stack and the arithmetic of the CPU."""
 
     name: str  # of the scenario
-    sections: dict[str, object]  # of the scenario, every parameter
+    sections: dict[str, dict[str, object]]  # of the scenario, every parameter
     aircraft: int = Field(ge=1, description="how many aircraft fly")
     uncertainty: float = Field(ge=0, lt=1, description="the largest part by which an entry of A and of B differs")
     seed: int = Field(ge=0, lt=2**63, description="the seed of the aircraft")
@@ -54,12 +54,12 @@ class Definition(Parameters):
 
     def scenario(self, case: int = 0) -> Scenario:
         """The scenario of a case of the sweep, the airframe as published."""
-        sections = {name: schema.validate_mapping(_mapping(self.sections[name]), name) for name, schema in SCHEMAS.items()}
+        sections = {name: schema.validate_mapping(self.sections[name], name) for name, schema in SCHEMAS.items()}
         scenario = Scenario(name=self.name, path=Path(self.name), **sections)  # type: ignore[arg-type]  # the types are those of SCHEMAS
         check_together(scenario)
         if self.sweep is None:
             return scenario
-        value, factor = getattr(scenario.controller, self.sweep.parameter), self.sweep.factors[case]
+        value, factor = getattr(scenario.controller, self.sweep.parameter), self.factor(case)
         scaled = tuple(factor * one for one in value) if isinstance(value, tuple) else factor * value
         return scenario.vary(controller={self.sweep.parameter: scaled})
 
@@ -87,11 +87,6 @@ class Definition(Parameters):
         return ((case, chunk) for case in range(self.cases) for chunk in range(chunks))
 
 
-def _mapping(values: object) -> dict[str, object]:
-    require(isinstance(values, dict), DEFINITION, values, "a section of a scenario")
-    return dict(values)  # type: ignore[call-overload]  # it is one
-
-
 def define(
     scenario: Scenario, aircraft: int, uncertainty: float, seed: int, chunk: int, sweep: Sweep | None = None
 ) -> Definition:
@@ -106,15 +101,6 @@ def define(
     for case in range(definition.cases):
         definition.scenario(case)
     return definition
-
-
-class _Prepared(NamedTuple):
-    """Data that all chunks of a case share."""
-
-    scenario: Scenario
-    course: Course
-    vehicle: "Vehicle"
-    params: RiseParams
 
 
 class Chunk(NamedTuple):
@@ -137,9 +123,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     definition = Definition.model_validate_json(text)
     case, chunk = job
     scenario, course, vehicle, params = _prepare(text, case)
-    first = chunk * definition.chunk
-    count = definition.size(job)
-    part = definition.uncertainty
+    first, count, part = chunk * definition.chunk, definition.size(job), definition.uncertainty
     # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft are dropped.
     A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), part, part, definition.seed, first, definition.chunk)
     aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course)
@@ -153,11 +137,12 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 
 
 @lru_cache(maxsize=8)
-def _prepare(text: str, case: int) -> "_Prepared":
+def _prepare(text: str, case: int) -> tuple[Scenario, Course, "Vehicle", RiseParams]:
+    """Data that all chunks of a case share."""
     from flight_campaign import fleet  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
-    return _Prepared(scenario, build_course(scenario), fleet.vehicle(scenario), rise_di.params(scenario.controller))
+    return scenario, build_course(scenario), fleet.vehicle(scenario), rise_di.params(scenario.controller)
 
 
 class Campaign:
@@ -165,7 +150,6 @@ class Campaign:
 
     def __init__(self, folder: Path, definition: Definition) -> None:
         self.folder, self.definition = folder, definition
-        self._text = definition.model_dump_json()
 
     @classmethod
     def begin(cls, folder: Path, definition: Definition) -> "Campaign":
@@ -192,7 +176,7 @@ class Campaign:
 
     def fly(self, engine: Engine) -> Iterator[int]:
         """Fly the missing chunks; yields the number of flights of each completed one."""
-        for job, tally in engine(_Work(self._text), self.missing()):
+        for job, tally in engine(partial(fly_chunk, self.definition.model_dump_json()), self.missing()):
             _write(self._path(job), tally)
             yield Tally.model_validate_json(tally).flights
 
@@ -207,16 +191,6 @@ class Campaign:
     def _path(self, job: Job) -> Path:
         case, chunk = job
         return self.folder / CHUNKS / f"{case}-{chunk:06d}.json"
-
-
-class _Work:
-    """`fly_chunk` of one campaign, as a callable that other processes can load."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-
-    def __call__(self, job: Job) -> str:
-        return fly_chunk(self._text, job)
 
 
 def _write(path: Path, text: str) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any
 
 from flight_core.parameters import ParameterError
 
@@ -17,11 +17,8 @@ Job = tuple[int, ...]
 Work = Callable[[Job], Any]
 
 
-class Engine(Protocol):
-    """Runs jobs in any order."""
-
-    def __call__(self, work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
-        """Each job with its result, in the order of completion."""
+Engine = Callable[[Work, Iterable[Job]], Iterator[tuple[Job, Any]]]
+"""Runs jobs in any order: each job with its result, in the order of completion."""
 
 
 def threads(workers: int | None = None) -> Engine:
@@ -60,17 +57,18 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
             except OSError as error:
                 raise ParameterError(f"--scheduler: found {scheduler}, expected a reachable dask scheduler ({error})") from None
             ahead = AHEAD * max(count, len(client.scheduler_info()["workers"]))
-            underway = {submit(client, work, job): job for job in islice(waiting, ahead)}
+
+            def submit(job: Job) -> Any:
+                return client.submit(work, job, pure=False)  # never a cached result
+
+            underway = {submit(job): job for job in islice(waiting, ahead)}
             done = as_completed(list(underway))
             for future in done:
                 job, result = underway.pop(future), future.result()
                 for other in islice(waiting, 1):
-                    more = submit(client, work, other)
+                    more = submit(other)
                     underway[more] = other
                     done.add(more)
                 yield job, result
-
-    def submit(client: Any, work: Work, job: Job) -> Any:
-        return client.submit(work, job, pure=False)  # never a cached result
 
     return fly

@@ -20,7 +20,7 @@ from aircraft_sim.actuators import Actuators
 from aircraft_sim.dynamics import Aircraft, Coupling
 from aircraft_sim.plant import DIVERGENCE_LIMIT, PlantParams
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_campaign.benchmark_course import Course
+from flight_campaign.benchmark_course import Course, Segments
 from flight_core.integrators import rk4
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
@@ -174,37 +174,9 @@ def fly(fleet: Fleet, vehicle: Vehicle, course: Course, control_law: ControlLaw,
     next tick, aircraft. The remainder s at the middle of a tick is extrapolated from this tick and the previous one.
     Arguments: `params` of the law, (m, 1) or (m, N).
     """
-    segments = Segments(*(jnp.asarray(getattr(course, name)) for name in Segments._fields))
-    late = int(np.max(np.asarray(fleet.late)))
-    arrays = fleet._replace(blocks=())
-    return _fly(
-        arrays,
-        vehicle,
-        segments,
-        params,
-        course.period,
-        control_law=control_law,
-        blocks=fleet.blocks,
-        steps=course.steps,
-        y_late=course.late,
-        u_late=late,
-    )
-
-
-class Segments(NamedTuple):
-    """The parts of a course that change from tick to tick."""
-
-    t: Array
-    phase: Array
-    dt: Array
-    y_m: Array
-    sampled_y_m: Array
-    sampled_y_m_dot: Array
-    u_ff: Array
-    error: Array
-    forcing: Array
-    forcing_now: Array
-    air: Array
+    static = {"control_law": control_law, "blocks": fleet.blocks, "steps": course.steps, "y_late": course.late}
+    arrays, segments = fleet._replace(blocks=()), jax.tree.map(jnp.asarray, course.segments)
+    return _fly(arrays, vehicle, segments, params, course.period, u_late=int(np.max(np.asarray(fleet.late))), **static)
 
 
 class LoopState(NamedTuple):
@@ -279,10 +251,7 @@ def _fly(
         parts = [_product(part, [moves[j] for j in block.columns]) for part, block in zip(fleet.tick, blocks, strict=True)]
         x = jnp.concatenate(parts)[places]
         x = jax.lax.cond(
-            jnp.any(segment.forcing != 0.0),
-            lambda x: x + fleet.wind * _product(fleet.forced, segment.forcing),
-            lambda x: x,
-            x,
+            jnp.any(segment.forcing != 0.0), lambda x: x + fleet.wind * _product(fleet.forced, segment.forcing), lambda x: x, x
         )
         after = LoopState(
             x,

@@ -3,6 +3,7 @@
 """Monte Carlo statistics of constant size: moments, histograms and the worst flights, summed chunk by chunk."""
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
@@ -34,9 +35,7 @@ class Figure(Parameters):
     mean: float = 0.0
     squares: float = 0.0  # sum of (value - mean)^2
     largest: float = -1.0  # none yet
-    bins: dict[int, int] = Field(
-        default_factory=dict
-    )  # counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones
+    bins: dict[int, int] = Field(default={})  # counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones
 
     @classmethod
     def of(cls, values: FloatArray) -> Self:
@@ -44,15 +43,9 @@ class Figure(Parameters):
         if not len(values):
             return cls()
         places, counts = np.unique(np.searchsorted(EDGES, values, side="right") - 1, return_counts=True)
-        mean = float(np.mean(values))
-        bins = dict(zip(places.tolist(), counts.tolist(), strict=True))
-        return cls(
-            count=len(values),
-            mean=mean,
-            squares=float(np.sum((values - mean) ** 2)),
-            largest=float(np.max(values)),
-            bins=bins,
-        )
+        mean, bins = float(np.mean(values)), dict(zip(places.tolist(), counts.tolist(), strict=True))
+        squares, largest = float(np.sum((values - mean) ** 2)), float(np.max(values))
+        return cls(count=len(values), mean=mean, squares=squares, largest=largest, bins=bins)
 
     def __add__(self, other: Self) -> Self:
         """Both together. Source: Chan, Golub, LeVeque, Updating formulae and a pairwise algorithm, 1979."""
@@ -60,15 +53,12 @@ class Figure(Parameters):
         if not count:
             return self
         gap = other.mean - self.mean
-        bins = dict(self.bins)
-        for place, found in other.bins.items():
-            bins[place] = bins.get(place, 0) + found
         return type(self)(
             count=count,
             mean=self.mean + gap * other.count / count,
             squares=self.squares + other.squares + gap**2 * self.count * other.count / count,
             largest=max(self.largest, other.largest),
-            bins=dict(sorted(bins.items())),
+            bins=dict(sorted((Counter(self.bins) + Counter(other.bins)).items())),
         )
 
     @property
@@ -100,9 +90,7 @@ class Tally(Parameters):
     flights: int = 0
     diverged: int = 0
     lost: int = 0  # loss of track: did not diverge, score above LOSS_OF_TRACK_SCORE
-    figures: dict[str, Figure] = Field(
-        default_factory=dict
-    )  # by name: "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
+    figures: dict[str, Figure] = Field(default={})  # "score", "rms.q", "max.q", "slew.elevator", of those that did not diverge
     worst: tuple[Worst, ...] = ()  # the worst first
 
     @classmethod
@@ -154,9 +142,8 @@ class Tally(Parameters):
 def score_units(outputs: Sequence[str], units: Mapping[str, str]) -> FloatArray:
     """Unit of the rms error of each channel in the score, SI, shape (m,). Raises ParameterError for an unknown unit."""
     for name in outputs:
-        require(
-            units[name] in SCORE_UNIT, "outputs", f"{name} in {units[name]}", f"units a score counts: {', '.join(SCORE_UNIT)}"
-        )
+        expected = f"units a score counts: {', '.join(SCORE_UNIT)}"
+        require(units[name] in SCORE_UNIT, "outputs", f"{name} in {units[name]}", expected)
     return np.array([SCORE_UNIT_OF.get(name, SCORE_UNIT[units[name]]) for name in outputs])
 
 

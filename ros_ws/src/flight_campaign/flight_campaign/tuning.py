@@ -108,7 +108,6 @@ def build_benchmark(scenario: Scenario) -> Benchmark:
         period=1.0 / controller.rate,
         lower=in_law_order(actuators.lower, -np.inf),
         upper=in_law_order(actuators.upper, np.inf),
-        rate=np.full(m, np.inf),
     )
     return Benchmark(
         scenario,
@@ -166,8 +165,7 @@ def evaluation(objective: str, benchmark: Benchmark) -> Evaluation:
 
 def repeat_flights(flights: Fleet, times: int) -> Fleet:
     """The same flights several times, one set after the other."""
-    arrays = flights._replace(blocks=())
-    tiled = jax.tree.map(lambda array: np.tile(np.asarray(array), times), arrays)
+    tiled = jax.tree.map(lambda array: np.tile(np.asarray(array), times), flights._replace(blocks=()))
     return tiled._replace(blocks=flights.blocks, forced_rate=flights.forced_rate)
 
 
@@ -178,26 +176,6 @@ def spread_over(params: Any, flights: int, candidates: int) -> Any:
         return np.repeat(leaf, flights, axis=-1) if leaf.shape[-1] == candidates else leaf
 
     return jax.tree.map(spread, params)
-
-
-class SearchSpace(NamedTuple):
-    """Gains as one vector of logarithms."""
-
-    names: tuple[str, ...]
-    sizes: tuple[int, ...]
-    origin: FloatArray
-
-    def gains(self, vectors: FloatArray) -> Gains:
-        """Gains by name, shape (size, N), of vectors (N, d)."""
-        ends = np.cumsum(self.sizes)[:-1]
-        return dict(zip(self.names, np.split(np.exp(vectors.T), ends), strict=True))
-
-
-def search_space(begin: Gains) -> SearchSpace:
-    """The search space around gains of shape (m, 1) or (1, 1)."""
-    return SearchSpace(
-        tuple(begin), tuple(len(gain) for gain in begin.values()), np.log(np.concatenate(list(begin.values()))[:, 0])
-    )
 
 
 class TuningResult(NamedTuple):
@@ -212,7 +190,7 @@ class TuningResult(NamedTuple):
 
 def generation_count(law: Law, benchmark: Benchmark) -> int:
     """Generations of a search."""
-    return max(GENERATIONS, GENERATIONS_PER_GAIN * len(search_space(initial_gains(law, benchmark.model)).origin))
+    return max(GENERATIONS, GENERATIONS_PER_GAIN * sum(map(len, initial_gains(law, benchmark.model).values())))
 
 
 def tune(
@@ -221,30 +199,34 @@ def tune(
     benchmark: Benchmark,
     seeds: tuple[int, ...],
     generations: int | None = None,
-    begin: Gains | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> TuningResult:
-    """Gains of the smallest cost that CMA-ES finds from `begin`, the best of several seeds; all seeds run together.
+    """Gains of the smallest cost that CMA-ES finds from the initial ones, the best of several seeds; all seeds run together.
 
     The cost of a candidate is the weighted sum over the flights of `evaluation`. `progress` receives the generation and the
     smallest cost so far. Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package `cma`.
     """
     import cma  # noqa: PLC0415 - it imports matplotlib, which nothing here uses
 
-    space = search_space(initial_gains(law, benchmark.model) if begin is None else begin)
+    begin = initial_gains(law, benchmark.model)
+    origin, ends = np.log(np.concatenate(list(begin.values()))[:, 0]), np.cumsum([len(gain) for gain in begin.values()])[:-1]
+
+    def gains_of(vectors: FloatArray) -> Gains:
+        """Gains by name, shape (size, N), of logarithms (N, d)."""
+        return dict(zip(begin, np.split(np.exp(vectors.T), ends), strict=True))
+
     flights, weight = evaluation(objective, benchmark)
     each, candidates = len(weight), POPULATION * len(seeds)
     repeated, control_law = repeat_flights(flights, candidates), law.control_law(benchmark.model)
     course = benchmark.courses[law.feedforward]
     searches = [
-        cma.CMAEvolutionStrategy(space.origin, INITIAL_SIGMA, {"seed": seed, "popsize": POPULATION, "verbose": -9})
-        for seed in seeds
+        cma.CMAEvolutionStrategy(origin, INITIAL_SIGMA, {"seed": seed, "popsize": POPULATION, "verbose": -9}) for seed in seeds
     ]
-    best: list[tuple[float, FloatArray]] = [(np.inf, space.origin)] * len(seeds)
+    best: list[tuple[float, FloatArray]] = [(np.inf, origin)] * len(seeds)
     generations = generation_count(law, benchmark) if generations is None else generations
     for generation in range(generations):
         asked = [np.array(search.ask()) for search in searches]
-        params = spread_over(law.params(space.gains(np.concatenate(asked)), benchmark.model), each, candidates)
+        params = spread_over(law.params(gains_of(np.concatenate(asked)), benchmark.model), each, candidates)
         costs = cost(fleet.fly(repeated, benchmark.vehicle, course, control_law, params), benchmark)
         of_each = costs.reshape(candidates, each) @ weight
         for k, (search, values) in enumerate(zip(searches, np.split(of_each, len(seeds)), strict=True)):
@@ -255,7 +237,7 @@ def tune(
         if progress is not None:
             progress(generation + 1, min(value for value, _ in best))
     winner = int(np.argmin([value for value, _ in best]))
-    gains = {name: [float(f"{v:.5g}") for v in gain[:, 0]] for name, gain in space.gains(best[winner][1][None]).items()}
+    gains = {name: [float(f"{v:.5g}") for v in gain[:, 0]] for name, gain in gains_of(best[winner][1][None]).items()}
     lowest = [round(value, 4) for value, _ in best]
     return TuningResult(gains, lowest[winner], seeds[winner], lowest, generations * POPULATION)
 
