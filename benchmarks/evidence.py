@@ -30,6 +30,7 @@ import psutil
 from benchmarks.evidence_page import SPEED, Measurement, Result, render
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+RISE_DI = str(Path(sys.executable).parent / "rise-di")
 RESULTS = REPOSITORY / "build" / "evidence"
 PAGE = REPOSITORY / "docs" / "evidence.md"
 
@@ -41,50 +42,30 @@ QUICK_SECONDS = 2.0
 
 
 def _speed(group: str) -> Measurement:
-    what, seconds = SPEED[group]
+    what, seconds, takes = SPEED[group]
     command = (PYTHON, "-m", "benchmarks.speed", "--only", group, "--json", FILE, "--seconds")
-    takes = {"law": "10 s", "ticks": "8 min", "latency": "3 min"}.get(group, "1 min")
     return Measurement(f"speed-{group}", (*command, f"{seconds:g}"), (*command, f"{QUICK_SECONDS:g}"), what, takes, timed=True)
-
-
-def _own(task: str, *options: str) -> tuple[str, ...]:
-    return (PYTHON, "-m", "benchmarks.evidence", "--do", task, "--json", FILE, *options)
 
 
 FAULTS = (PYTHON, "-m", "benchmarks.faults", "--json", FILE, "--times")
 CAMPAIGN = (PYTHON, "-m", "benchmarks.campaign", "--json", FILE)
+FUZZ, REPLAY = ((PYTHON, "-m", "benchmarks.evidence", "--do", task, "--json", FILE) for task in ("fuzz", "replay"))
+QUICK_CAMPAIGN = (*CAMPAIGN, "--aircraft", "2000", "--chunk", "200", "--exact", "1")
+SECURITY = (*PYTEST, "tests/ros/test_security.py")
+READERS = "readers of files and messages, coverage-guided fuzzing"
 FLEET = ("rise-di", "campaign", "osprey_servo", "--uncertainty", "0.3", "--seed", "7", "--json", "--aircraft")
 COMPARE = ("rise-di", "compare", "osprey_servo", "--tuning", "nominal,uncertain,late", "--json", FILE, "--aircraft")
 
 MEASUREMENTS = (
     *(_speed(group) for group in SPEED),
     Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), "faults injected into a flight over DDS", "20 min", timed=True),
-    Measurement(
-        "security",
-        (*PYTEST, "tests/ros/test_security.py", "tests/ros/test_policy.py"),
-        (*PYTEST, "tests/ros/test_security.py"),
-        "who can receive y and command u",
-        "2 min",
-    ),
+    Measurement("security", (*SECURITY, "tests/ros/test_policy.py"), SECURITY, "who can receive y and command u", "2 min"),
     Measurement("fuzz", (*PYTEST, "tests/fuzz"), (*PYTEST, "tests/fuzz"), "external input, fuzzed by hypothesis", "2 min"),
-    Measurement(
-        "fuzz-coverage",
-        _own("fuzz", "--seconds", "120"),
-        _own("fuzz", "--seconds", "5"),
-        "readers of files and messages, coverage-guided fuzzing",
-        "12 min",
-    ),
-    Measurement(
-        "campaign",
-        CAMPAIGN,
-        (*CAMPAIGN, "--aircraft", "2000", "--chunk", "200", "--exact", "1"),
-        "speed and accuracy of campaigns",
-        "3 min",
-        timed=True,
-    ),
+    Measurement("fuzz-coverage", (*FUZZ, "--seconds", "120"), (*FUZZ, "--seconds", "5"), READERS, "12 min"),
+    Measurement("campaign", CAMPAIGN, QUICK_CAMPAIGN, "speed and accuracy of campaigns", "3 min", timed=True),
     Measurement("campaign-fleet", (*FLEET, "10000"), (*FLEET, "1000"), "uncertain aircraft flown by the same law", "1 min"),
     Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), "other laws on the same aircraft and course", "5 min"),
-    Measurement("replay", _own("replay"), _own("replay", "--seconds", "5"), "every scenario flown and replayed", "2 min"),
+    Measurement("replay", REPLAY, (*REPLAY, "--seconds", "5"), "every scenario flown and replayed", "2 min"),
 )
 
 
@@ -98,14 +79,13 @@ def measure(one: Measurement, *, quick: bool) -> Result:
     begin, date = time.monotonic(), datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / ("result.xml" if "--junitxml=FILE" in parts else "result.json")
-        programs = {PYTHON: sys.executable, "rise-di": str(Path(sys.executable).parent / "rise-di")}
+        programs = {PYTHON: sys.executable, "rise-di": RISE_DI}
         command = [programs.get(part, part.replace(FILE, str(file))) for part in parts]
         if parts[:2] == FLEET[:2]:
             command += ["--runs", folder]
-        log = RESULTS / f"{one.name}.log"
-        with log.open("w", encoding="utf-8") as stream:
-            ran = subprocess.run(command, cwd=REPOSITORY, check=False, stdout=subprocess.PIPE, stderr=stream, text=True)  # noqa: S603
-            stream.write(ran.stdout)
+        with (RESULTS / f"{one.name}.log").open("w", encoding="utf-8") as log:
+            ran = subprocess.run(command, cwd=REPOSITORY, check=False, stdout=subprocess.PIPE, stderr=log, text=True)  # noqa: S603
+            log.write(ran.stdout)
         result = read(file, ran.stdout)
     return {
         "name": one.name,
@@ -157,27 +137,24 @@ def machine() -> dict[str, Any]:
 
 def revision() -> str:
     """The commit, with -dirty if any file but the page differs from it."""
-    changed = _output("git", "status", "--porcelain", "--", ".", f":(exclude){PAGE.relative_to(REPOSITORY)}")
-    return _output("git", "describe", "--always") + ("-dirty" if changed else "")
+    changed = _run("git", "status", "--porcelain", "--", ".", f":(exclude){PAGE.relative_to(REPOSITORY)}").stdout.strip()
+    return _run("git", "describe", "--always").stdout.strip() + ("-dirty" if changed else "")
 
 
-def _output(*command: str) -> str:
-    ran = subprocess.run(command, cwd=REPOSITORY, check=False, capture_output=True, text=True)  # noqa: S603
-    return ran.stdout.strip()
+def _run(*command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command, cwd=REPOSITORY, check=False, capture_output=True, text=True)  # noqa: S603 - this repository
 
 
 def replays(seconds: float | None) -> dict[str, Any]:
     """Fly every scenario in lockstep over topics, recorded, and recompute its u from its log."""
     from flight_bringup.scenarios import scenarios  # noqa: PLC0415 - not needed to write the page
 
-    rise_di, results = str(Path(sys.executable).parent / "rise-di"), {}
+    results = {}
     duration = [] if seconds is None else ["--duration", f"{seconds:g}"]
     for name in scenarios():
         with tempfile.TemporaryDirectory() as runs:
-            fly = [rise_di, "fly", name, "--one-process", "--runs", runs, "--json", *duration]
-            flight = subprocess.run(fly, check=False, capture_output=True, text=True)  # noqa: S603 - this stack
-            replay = [rise_di, "replay", str(Path(runs) / "latest"), "--json"]
-            replayed = subprocess.run(replay, check=False, capture_output=True, text=True)  # noqa: S603 - this stack
+            flight = _run(RISE_DI, "fly", name, "--one-process", "--runs", runs, "--json", *duration)
+            replayed = _run(RISE_DI, "replay", str(Path(runs) / "latest"), "--json")
             try:
                 results[name] = {"outcome": json.loads(flight.stdout)["outcome"]} | json.loads(replayed.stdout)
             except (ValueError, KeyError):
@@ -191,8 +168,7 @@ def fuzz(seconds: float) -> dict[str, Any]:
 
     results = {}
     for target in TARGETS:
-        command = [sys.executable, "-m", "benchmarks.fuzz", target, "--seconds", f"{seconds:.0f}"]
-        ran = subprocess.run(command, cwd=REPOSITORY, check=False, capture_output=True, text=True)  # noqa: S603 - this repository
+        ran = _run(sys.executable, "-m", "benchmarks.fuzz", target, "--seconds", f"{seconds:.0f}")
         stats = re.findall(r"^stat::(\w+):\s+(\d+)", ran.stderr, re.MULTILINE)
         covered = re.findall(r"cov: (\d+)", ran.stderr)
         results[target] = {"status": ran.returncode, "covered": int(covered[-1]) if covered else None}
@@ -205,12 +181,8 @@ def fuzz(seconds: float) -> dict[str, Any]:
 
 def load() -> dict[str, Result]:
     """The stored results, by name."""
-    results = {}
-    for one in MEASUREMENTS:
-        path = RESULTS / f"{one.name}.json"
-        if path.exists():
-            results[one.name] = json.loads(path.read_text(encoding="utf-8"))
-    return results
+    paths = {one.name: RESULTS / f"{one.name}.json" for one in MEASUREMENTS}
+    return {name: json.loads(path.read_text(encoding="utf-8")) for name, path in paths.items() if path.exists()}
 
 
 def wanted(names: Sequence[str], stored: Mapping[str, Result], *, quick: bool) -> list[Measurement]:
@@ -237,14 +209,13 @@ def main() -> int:
         result = replays(options.seconds) if options.do == "replay" else fuzz(options.seconds or 60.0)
         options.json.write_text(json.dumps(result, indent=1), encoding="utf-8")
         return 0
-    unknown = [name for name in options.again if not any(one.name.startswith(name) for one in MEASUREMENTS)]
-    if unknown:
+    if unknown := [name for name in options.again if not any(one.name.startswith(name) for one in MEASUREMENTS)]:
         parser.error(f"--again: found {unknown[0]!r}, expected one of {', '.join(one.name for one in MEASUREMENTS)}")
     RESULTS.mkdir(parents=True, exist_ok=True)
     results = load()
+    chosen = tuple(options.again) or ("",)
     todo = [] if options.render else wanted(options.again, results, quick=options.quick)
-    if options.again:
-        todo = [one for one in todo if one.name.startswith(tuple(options.again))]
+    todo = [one for one in todo if one.name.startswith(chosen)]
     failed = False
     for number, one in enumerate(todo, 1):
         takes = "" if options.quick else f" (about {one.takes})"

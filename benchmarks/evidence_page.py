@@ -34,15 +34,16 @@ class Measurement(NamedTuple):
 
 
 SPEED = {
-    "law": ("one step of the law", 10.0),
-    "node": ("the controller's tick compared with an echo's callback", 10.0),
-    "latency": ("from y sent to u received, over DDS", 10.0),
-    "ticks": ("lateness of ticks", 60.0),
-    "flight": ("CPU and memory of each process of a flight in real time", 10.0),
-    "start": ("from the start of a process to its first u", 10.0),
-    "lockstep": ("lockstep flights", 30.0),
-    "recorder": ("the recorder at 1 kHz on six topics", 30.0),
+    "law": ("one step of the law", 10.0, "10 s"),
+    "node": ("the controller's tick compared with an echo's callback", 10.0, "1 min"),
+    "latency": ("from y sent to u received, over DDS", 10.0, "3 min"),
+    "ticks": ("lateness of ticks", 60.0, "8 min"),
+    "flight": ("CPU and memory of each process of a flight in real time", 10.0, "1 min"),
+    "start": ("from the start of a process to its first u", 10.0, "1 min"),
+    "lockstep": ("lockstep flights", 30.0, "1 min"),
+    "recorder": ("the recorder at 1 kHz on six topics", 30.0, "1 min"),
 }
+"""What each group of benchmarks/speed.py measures, s a figure, and the time it takes."""
 
 
 def render(measurements: Sequence[Measurement], results: Mapping[str, Result]) -> str:
@@ -68,7 +69,7 @@ def _wrapped(paragraph: str) -> list[str]:
 
 
 def host(of: Mapping[str, Any]) -> str:
-    """A machine in a line."""
+    """A host in a line."""
     return f"{of['processor']}, {of['cores']} cores, {of['memory']} GiB, {of['system']}, Python {of['python']}"
 
 

@@ -66,15 +66,12 @@ def _summary(case: str, rows: Sequence[Row]) -> Row:
 def to_table(summaries: Sequence[Row]) -> Table:
     """The table for a terminal, ms."""
     table = Table(title="Faults, times in ms, median / worst")
-    for name, justify in (("fault", "left"), ("injected", "right"), ("detected", "right")):
-        table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for name in ("passed", "reaction", "recovery", "traffic", "pause"):
-        table.add_column(name, justify="right")
+    for name in ("fault", "injected", "detected", "passed", "reaction", "recovery", "traffic", "pause"):
+        table.add_column(name, justify="left" if name == "fault" else "right")
     for one in summaries:
         times = [_milliseconds(one[key]) for key in ("reaction", "recovery", "ready_to_traffic", "longest_pause")]
-        busy = "" if one["quiet"] else " *"
         detected = "-" if one["detected"] is None else str(one["detected"])
-        table.add_row(one["case"] + busy, str(one["injected"]), detected, str(one["passed"]), *times)
+        table.add_row(one["case"] + " *" * (not one["quiet"]), str(one["injected"]), detected, str(one["passed"]), *times)
     table.caption = "traffic: from ready until a killed node publishes all its topics; "
     table.caption += "pause: the longest of a topic that continues; "
     table.caption += f"*: every run had host delays of more than {1e3 * MAX_HOST_DELAY:g} ms"

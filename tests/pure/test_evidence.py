@@ -44,49 +44,33 @@ TIMES = {"median": 0.1234, "worst": 0.2341}
 FAULT = {
     "case": "controller killed",
     "u": "held, then ramped",
-    "injected": 10,
-    "detected": 10,
-    "passed": 10,
-    "quiet": 10,
-    "reaction": TIMES,
-    "recovery": TIMES,
-    "ready_to_traffic": TIMES,
+    **dict.fromkeys(("injected", "detected", "passed", "quiet"), 10),
+    **dict.fromkeys(("reaction", "recovery", "ready_to_traffic"), TIMES),
     "exec_to_traffic": {"median": 0.4, "worst": 0.51},
     "ready_to_caught_up": {"median": 0.4, "worst": 0.62},
     "longest_pause": None,
 }
 LEVEL = {"uncertainty": 0.3, "mean": 1.75, "worst": 2.48, "diverged": 0.0, "lost": 0.0}
-LAW = {
+LAW: dict[str, Any] = {
     "law": "rise",
     "sees": "y",
     "tuned_on": "nominal",
     "score": 1.61,
-    "levels": [LEVEL],
     "slew": {"elevator": 0.077},
     "delay": 0.02,
 }
+LAW |= {"levels": [LEVEL]}
 FIGURE = {"mean": 1.31, "q50": 1.21, "q95": 2.31, "q99": 2.71, "worst": 3.01, "deviation": 0.1}
+COVERAGE = {"status": 0, "covered": 1234, "number_of_executed_units": 98765, "peak_rss_mb": 321}
+CAMPAIGN = {"whole": 120_000.0, "flown": 150_000.0, "memory_early": 900.0, "memory": 905.0, "aircraft": 10_000, "plain": 50.0}
+CAMPAIGN |= {"integration": {"q": 0.0021, "V": 0.0005}}
 SHARE = {"count": 3, "share": 3e-4, "low": 1e-4, "high": 9e-4}
 RESULTS = {
     "speed-node": result("speed-node", {"seconds": 10.0, "rows": NODE}),
     "faults": result("faults", [FAULT]),
     "security": result("security", [{"name": "test_an_attacker_receives_nothing", "outcome": "passed", "seconds": 1.0}]),
-    "fuzz-coverage": result(
-        "fuzz-coverage",
-        {"mcap": {"status": 0, "covered": 1234, "number_of_executed_units": 98765, "peak_rss_mb": 321}},
-    ),
-    "campaign": result(
-        "campaign",
-        {
-            "whole": 120_000.0,
-            "flown": 150_000.0,
-            "memory_early": 900.0,
-            "memory": 905.0,
-            "aircraft": 10_000,
-            "plain": 50.0,
-            "integration": {"q": 0.0021, "V": 0.0005},
-        },
-    ),
+    "fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE}),
+    "campaign": result("campaign", CAMPAIGN),
     "campaign-fleet": result(
         "campaign-fleet", {"cases": [{"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}]}
     ),
@@ -256,8 +240,7 @@ def test_outcomes_of_tests_are_read_from_the_junit_file() -> None:
         <testcase name="test_c" time="0"><skipped/></testcase>
         <testcase name="test_d" time="0"><error/></testcase>
     </testsuite></testsuites>"""
-    found = [(one["name"], one["outcome"], one["seconds"]) for one in cases(junit)]
-    assert found == [
+    assert [tuple(one.values()) for one in cases(junit)] == [
         ("test_a", "passed", 0.5),
         ("test_b[x]", "failed", 1.0),
         ("test_c", "skipped", 0.0),
