@@ -15,14 +15,7 @@ from scipy.linalg import eig, eigvals
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from flight_core.vectors import FloatArray
-from rise_di_controller.decomposition import (
-    DecompositionError,
-    Pairing,
-    coupling,
-    leading_minors,
-    search,
-    signs,
-)
+from rise_di_controller.decomposition import DecompositionError, Pairing, coupling, leading_minors, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
 
 ComplexArray = NDArray[np.complex128]

@@ -130,19 +130,6 @@ def failing(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
 # Theorem 1
 
 
-def interval_samples(lower: FloatArray, upper: FloatArray, count: int, seed: int) -> FloatArray:
-    """Samples of Omega inside an interval, shape (count, m, m): the midpoint, then alternately a corner and an inner point.
-
-    lower <= Omega <= upper entry by entry, shape (m, m). Raises ParameterError if lower exceeds upper.
-    """
-    require(bool((lower <= upper).all()), "Omega", "a lower bound above its upper one", "lower <= upper in every entry")
-    generator = np.random.default_rng(seed)
-    place = generator.random((count, *lower.shape))
-    place[1::2] = np.round(place[1::2])
-    place[0] = 0.5
-    return np.asarray(lower + place * (upper - lower))
-
-
 def bound_U(Omegas: FloatArray) -> FloatArray:
     """Largest abs(U_ij), j > i, over samples of Omega, zero elsewhere; Omegas (N, m, m), result (m, m).
 
@@ -245,13 +232,6 @@ class Loop(NamedTuple):
         return np.asarray(total_lag(self.lag, self.delay, self.period))
 
 
-class ScaledGains(NamedTuple):
-    """A gain set and the input response that it is designed for."""
-
-    gains: GainSet
-    response: FloatArray  # (m,) abs(Omega_ii) in scaled inputs: 1, or less in a channel too slow for (22)
-
-
 def bandwidths(loop: Loop, crossover_lag_product: FloatArray) -> FloatArray:
     """Bandwidth of each channel, crossover_lag_product_i / (lag_i + 1.5 period + delay), shape (m,), rad/s.
 
@@ -259,11 +239,6 @@ def bandwidths(loop: Loop, crossover_lag_product: FloatArray) -> FloatArray:
     project.
     """
     return np.asarray(crossover_lag_product / loop.total)
-
-
-def order(bandwidth: FloatArray) -> tuple[int, ...]:
-    """Channels from the fastest to the slowest, ties as they stand: (22) gives the last channel the smallest K."""
-    return tuple(int(i) for i in np.argsort(-bandwidth, kind="stable"))
 
 
 def split_gain(K: FloatArray) -> tuple[float, FloatArray]:
@@ -276,8 +251,12 @@ def split_gain(K: FloatArray) -> tuple[float, FloatArray]:
     return float(K[-1]) - 1.0, np.maximum(K[:-1] - K[-1], MIN_GAIN)
 
 
-def engineering_gains(bandwidth: FloatArray, slew: FloatArray, factor: float, rate_limit: FloatArray) -> ScaledGains:
+def engineering_gains(
+    bandwidth: FloatArray, slew: FloatArray, factor: float, rate_limit: FloatArray
+) -> tuple[GainSet, FloatArray]:
     """Gains for a loop with lag, from bandwidths (rad/s) of which the last is the smallest; all arguments shape (m,).
+
+    The second result is response_i, abs(Omega_ii) in scaled inputs: 1, or less in a channel too slow for (22).
 
         K_i = max(bandwidth_i, 1.5),  response_i = bandwidth_i / K_i      K_i response_i is the bandwidth
         Lambda_i = bandwidth_i / 4
@@ -292,7 +271,7 @@ def engineering_gains(bandwidth: FloatArray, slew: FloatArray, factor: float, ra
     response = bandwidth / K
     k_g, k_d = split_gain(K)
     beta = np.maximum(np.minimum(factor * slew, MAX_BETA_TO_RATE_LIMIT * rate_limit) / response, MIN_GAIN)
-    return ScaledGains(GainSet(k_g, k_d, bandwidth / 4.0, beta), response)
+    return GainSet(k_g, k_d, bandwidth / 4.0, beta), response
 
 
 def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:

@@ -34,7 +34,7 @@ from reference_model.command import command
 from reference_model.params import ReferenceModelParameters
 from rise_di_controller.decomposition import DecompositionError, coupling, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
-from rise_di_controller.law import LawParams, Sign
+from rise_di_controller.law import Sign
 from rise_di_controller.params import ControllerParameters, FeedforwardParameters
 
 CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
@@ -192,23 +192,22 @@ def study_airframe(
     inverse = np.asarray(np.linalg.inv(Omega), dtype=np.float64)
     project = np.asarray(H.T @ (np.eye(n) - B @ inverse @ C), dtype=np.float64)
     follow = H.T @ B @ inverse
-
-    reference = _references(manoeuvre, airframe)
+    y_m, y_m_dot, y_m_ddot = _references(manoeuvre, airframe)
 
     def times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
         return np.asarray(np.einsum("Nij,jN->iN", matrices, columns))
 
     def state(k: int, eta: FloatArray) -> FloatArray:
-        return np.asarray((C.T @ reference.y[k])[:, None] + H @ eta)
+        return np.asarray((C.T @ y_m[k])[:, None] + H @ eta)
 
     def drift(t: Any, x: FloatArray) -> FloatArray:
         return np.asarray(times(A, x) + dynamics.f(t, x, aircraft))
 
     def eta_dot(t: float, eta: Array, _: None, __: None) -> Array:
         k = round(2.0 * t / STEP)
-        return times(project, drift(t, state(k, eta))) + (follow @ reference.y_dot[k]).T
+        return times(project, drift(t, state(k, eta))) + (follow @ y_m_dot[k]).T
 
-    steps = (len(reference.y) - 1) // 2
+    steps = (len(y_m) - 1) // 2
     eta = np.zeros((n - m, len(A)))
     u_dot = np.zeros((steps + 1, len(A), m))
     near = 1e-5
@@ -216,26 +215,19 @@ def study_airframe(
         t = k * STEP
         x = state(2 * k, eta)
         free = drift(t, x)
-        u = times(inverse, np.asarray(reference.y_dot[2 * k][:, None] - C @ free, dtype=np.float64))
+        u = times(inverse, np.asarray(y_m_dot[2 * k][:, None] - C @ free, dtype=np.float64))
         x_dot = free + times(B, u)
         ahead, behind = (dynamics.f(t + step, x + step * x_dot, aircraft) for step in (near, -near))
         drift_dot: FloatArray = times(A, x_dot) + (ahead - behind) / (2.0 * near)
-        u_dot[k] = times(inverse, reference.y_ddot[2 * k][:, None] - C @ drift_dot).T
+        u_dot[k] = times(inverse, y_m_ddot[2 * k][:, None] - C @ drift_dot).T
         if k < steps:
             eta = rk4(eta_dot, t, eta, None, None, STEP)
     undisturbed, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
     return Study(airframe, A[:-1], B[:-1], C, airframe.matrix_gravity(), u_dot[:, :-1], slew, undisturbed, stable, uncertainty)
 
 
-class _References(NamedTuple):
-    """The reference and its derivatives every STEP / 2, for the stages of Runge-Kutta; airframe's order, (2 T - 1, m)."""
-
-    y: FloatArray
-    y_dot: FloatArray
-    y_ddot: FloatArray
-
-
-def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> _References:
+def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta; airframe's order, each (2 T - 1, m)."""
     matrices, profile = manoeuvre.reference.model(), manoeuvre.reference.profile()
     near = 1e-5
 
@@ -252,8 +244,8 @@ def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> _References:
         rows.append([model.output(z, matrices) for z in (x, x_dot, x_ddot)])
         x = model.step(x, np.concatenate([commanded(t + part * STEP / 2.0) for part in (0.0, 0.5, 1.0)]), step)
     places = [manoeuvre.reference.outputs.index(name) for name in airframe.outputs]
-    y, y_dot, y_ddot = np.moveaxis(np.array(rows), 1, 0)[..., places]
-    return _References(y, y_dot, y_ddot)
+    y_m, y_m_dot, y_m_ddot = np.moveaxis(np.array(rows), 1, 0)[..., places]
+    return y_m, y_m_dot, y_m_ddot
 
 
 def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
@@ -295,27 +287,21 @@ def require_channels(
         problem = f"no D, for leading minor {error.minor} is zero"
     if problem:
         found = ", ".join(f"{output}-{name}" for output, name in zip(*channels, strict=True))
-        better = search(Omega, MAX_COUPLING)
-        pairs = (
-            [] if better is None else [f"{channels.outputs[i]}-{channels.inputs[j]}" for i, j in zip(*better[:2], strict=True)]
-        )
-        fits = f"another pairing: {', '.join(pairs)}" if pairs else "inputs that can be paired: no order of these can"
+        fits = "inputs that can be paired: no order of these can"
+        if better := search(Omega, MAX_COUPLING):
+            pairs = (f"{channels.outputs[i]}-{channels.inputs[j]}" for i, j in zip(*better[:2], strict=True))
+            fits = f"another pairing: {', '.join(pairs)}"
         raise ParameterError(f"controller.inputs: found {found} with {problem}, expected {fits}")
     actual = signs(Omega) * flips
     stated = actual if D is None else np.array(D, dtype=np.float64)
     wrong = [name for name, a, b in zip(channels.inputs, actual, stated, strict=True) if a != b]
     if input_signs is not None:
-        fit = _integers(flips * actual * stated)
-        require(
-            not wrong, "input_signs", list(input_signs), f"{fit} for D = {_integers(stated)}: {', '.join(wrong)} the other way"
-        )
-    expected = f"{_integers(actual)}, the signs of the minors of C B; or flip {', '.join(wrong)} and keep D"
-    require(not wrong, "controller.D", _integers(stated), expected)
+        fit = (flips * actual * stated).astype(int).tolist()
+        expected = f"{fit} for D = {stated.astype(int).tolist()}: {', '.join(wrong)} the other way"
+        require(not wrong, "input_signs", list(input_signs), expected)
+    expected = f"{actual.astype(int).tolist()}, the signs of the minors of C B; or flip {', '.join(wrong)} and keep D"
+    require(not wrong, "controller.D", stated.astype(int).tolist(), expected)
     return np.asarray(actual)
-
-
-def _integers(values: FloatArray) -> list[int]:
-    return [int(value) for value in values]
 
 
 # Selection and assessment
@@ -339,7 +325,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     products = np.array([setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT) for name in pairing.outputs])
     loop = Loop(_by_name(setting.lag, pairing.inputs, 0.0), setting.delay, 1.0 / setting.rate)
     bandwidth = gain_conditions.bandwidths(loop, products)
-    places = list(gain_conditions.order(bandwidth))
+    places = np.argsort(-bandwidth, kind="stable").tolist()  # the fastest first: (22) gives the last channel the smallest K
     channels = ChannelPairing(*(tuple(names[i] for i in places) for names in pairing))
     columns = [paired[i] for i in places]
     D = require_channels(Omega[np.ix_(places, places)], channels)
@@ -349,8 +335,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     spread = np.abs(np.einsum("Nii->Ni", (study.C @ study.B)[:, places][..., columns])).max(axis=0)
 
     def controller(gains: GainSet, response: FloatArray) -> ControllerParameters:
-        scale = unit * response
-        base_inputs = setting.base.inputs
+        scale, base_inputs = unit * response, setting.base.inputs
         has_limits = set(channels.inputs) <= set(base_inputs)
         limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if has_limits else {}
         values = setting.base.model_dump(exclude=set(INPUT_LIMITS)) | {
@@ -361,7 +346,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
             "k_d": gains.k_d.tolist(),
             "Lambda": gains.Lambda.tolist(),
             "beta": gains.beta.tolist(),
-            "D": _integers(D),
+            "D": D.astype(int).tolist(),
             "input_scale": scale.tolist(),
             "omega": (spread * scale).tolist(),
             "sign": "auto",
@@ -443,7 +428,10 @@ def assess_gains(study: Study, controller: ControllerParameters, setting: LoopSe
     gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
     C, Bs = study.C[rows], study.B[:, :, columns]
 
-    decay_rate = min(_smallest_decay(A, B, C, params) for A, B in zip(study.A[counts], Bs[counts], strict=True))
+    known = [
+        KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x) for A, B in zip(study.A[counts], Bs[counts], strict=True)
+    ]
+    decay_rate = min(float(np.linalg.eigvalsh(decay_matrix(plant, params)).min()) for plant in known)
     theorem = (
         Condition("D (11)", None, float(np.mean(holds)), 1.0),
         Condition("zero dynamics", None, float(np.mean(study.stable)), 1.0),
@@ -468,13 +456,7 @@ def assess_gains(study: Study, controller: ControllerParameters, setting: LoopSe
 
 
 def _bounds(
-    study: Study,
-    rows: list[int],
-    columns: list[int],
-    scale: FloatArray,
-    D: FloatArray,
-    Lambda: FloatArray,
-    gamma_2: float,
+    study: Study, rows: list[int], columns: list[int], scale: FloatArray, D: FloatArray, Lambda: FloatArray, gamma_2: float
 ) -> tuple[Bounds, NDArray[np.bool_], NDArray[np.bool_]]:
     """Bounds of Theorem 1 in inputs scaled by `scale` (m,); which samples have this D; which of them have stable zeros too."""
     C = study.C[rows]
@@ -498,11 +480,6 @@ def _has_signs(Omega: FloatArray, D: FloatArray) -> bool:
         return bool((signs(Omega) == D).all())
     except DecompositionError:
         return False
-
-
-def _smallest_decay(A: FloatArray, B: FloatArray, C: FloatArray, params: LawParams) -> float:
-    plant = KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x)
-    return float(np.linalg.eigvalsh(decay_matrix(plant, params)).min())
 
 
 def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) -> FloatArray:

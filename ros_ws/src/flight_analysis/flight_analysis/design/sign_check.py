@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sign check: D of the controller against the signs of a channel map, an airframe and a recorded flight."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,12 +56,7 @@ def check_scenario(channel_map: ChannelMap, scenario: Scenario, frame: Airframe,
     ):
         require(sorted(found) == sorted(expected), key, ", ".join(found), f"the controller's: {', '.join(expected)}")
     Omega = frame.matrix_c() @ frame.matrix_b()
-    in_map = Omega[
-        np.ix_(
-            [frame.outputs.index(one) for one in channel_map.outputs],
-            [list(frame.inputs).index(one) for one in channel_map.inputs],
-        )
-    ]
+    in_map = Omega[np.ix_(_places(channel_map.outputs, frame.outputs), _places(channel_map.inputs, frame.inputs))]
     measured = None
     if bag is not None:
         tape = read_run(bag).tape
@@ -83,11 +79,7 @@ def check(
     Arguments: Omega = C B of the airframe, (m, m), in the map's order; the channels and D in the controller's. Raises
     ParameterError if the map does not fit the airframe, or if Omega has no D.
     """
-    rows, columns = (
-        [list(part).index(one) for one in names]
-        for part, names in ((channel_map.outputs, outputs), (channel_map.inputs, inputs))
-    )
-    mapped = through(channel_map, Omega)[np.ix_(rows, columns)]
+    mapped = through(channel_map, Omega)[np.ix_(_places(outputs, channel_map.outputs), _places(inputs, channel_map.inputs))]
     D_mapped = [int(sign) for sign in signs(mapped)]
     sentences = [
         f"outputs.{name} of the map {channel_map.name} has the wrong sign:"
@@ -111,6 +103,10 @@ def check(
                 f" ({effect:.3g}, {ratio:.0f} standard errors), the map {channel_map.name} has the opposite sign"
             )
     return SignCheck(tuple(channels), tuple(sentences), 0 if measured is None else measured.intervals)
+
+
+def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:
+    return [list(among).index(name) for name in names]
 
 
 OPPOSITE = {
