@@ -11,14 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
-from control_laws import adaptive, indi, inversion, lqi, mackunis, riccati, rise_di, rise_observer, super_twisting
+from control_laws import adaptive, lqi, riccati, rise_observer
 from control_laws.catalogue import LAWS, initial_gains
 from control_laws.nominal_model import NominalModel, conditional_integration
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import tuning
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.law import Sign
 
 DT = 0.01
 COLUMN = (1, 1)
@@ -89,6 +88,12 @@ def gains(**values: Any) -> dict[str, FloatArray]:
     return {name: np.atleast_2d(np.asarray(value, dtype=float)) for name, value in values.items()}
 
 
+def law_of(name: str, model: NominalModel, **values: Any) -> tuple[ControlLaw, Any]:
+    """A law of the catalogue and its parameters; the initial ones of a search without gains."""
+    law = LAWS[name]
+    return law.control_law(model), law.params(gains(**values) or initial_gains(law, model), model)
+
+
 # Plain inversion
 
 
@@ -98,8 +103,7 @@ def test_inversion_cancels_the_model_and_leaves_the_error_its_own_dynamics(
     osprey: NominalModel, x_of: list[float], y_m_dot_of: list[float]
 ) -> None:
     x, y_m_dot, K = np.array(x_of)[:, None], np.array(y_m_dot_of)[:, None], np.array([[9.0], [8.0], [4.0], [2.0]])
-    control_law = inversion.control_law(osprey, vanes=False)
-    params = inversion.inversion_params({"K": K}, osprey)
+    control_law, params = law_of("di", osprey, K=K)
     y = osprey.C @ x
     measured = Measurements(y, y - 0.1, y_m_dot, 0.0 * y, 0.0 * y, 0.0 * y, x, x, 0.0 * y)
     _, u = control_law.step(control_law.start(measured, params), measured, np.array(DT), params)
@@ -111,22 +115,20 @@ def test_inversion_cancels_the_model_and_leaves_the_error_its_own_dynamics(
 def test_inversion_with_vanes_uses_the_state_relative_to_the_air(osprey: NominalModel) -> None:
     x, air = np.zeros((8, 1)), np.zeros((8, 1))
     air[1] = 0.05
-    params = inversion.inversion_params({"K": np.ones((4, 1))}, osprey)
     y = osprey.C @ x
     measured = Measurements(y, y, 0.0 * y, 0.0 * y, 0.0 * y, 0.0 * y, x, air, 0.0 * y)
     u = {}
-    for vanes in (False, True):
-        control_law = inversion.control_law(osprey, vanes=vanes)
-        u[vanes] = control_law.step(control_law.start(measured, params), measured, np.array(DT), params)[1]
-    assert not u[False].any()
-    np.testing.assert_allclose(osprey.Omega @ u[True], -osprey.C @ osprey.A @ air, atol=1e-12)
+    for name in ("di", "di_vanes"):
+        control_law, params = law_of(name, osprey, K=np.ones((4, 1)))
+        u[name] = control_law.step(control_law.start(measured, params), measured, np.array(DT), params)[1]
+    assert not u["di"].any()
+    np.testing.assert_allclose(osprey.Omega @ u["di_vanes"], -osprey.C @ osprey.A @ air, atol=1e-12)
 
 
 def test_the_integral_of_the_inversion_rejects_a_constant_disturbance() -> None:
     model = integrator()
-    control_law = inversion.control_law(model, vanes=False)
-    without = fly(control_law, inversion.inversion_params(gains(K=8.0), model), 2000, 0.0, 1.0, model)
-    with_integral = fly(control_law, inversion.inversion_params(gains(K=8.0, Lambda=2.0), model), 2000, 0.0, 1.0, model)
+    without = fly(*law_of("di", model, K=8.0), 2000, 0.0, 1.0, model)
+    with_integral = fly(*law_of("di_pi", model, K=8.0, Lambda=2.0), 2000, 0.0, 1.0, model)
     # without the integral K e = d at rest; sampling changes nothing, since y_dot is then 0
     assert without.y[-1] == pytest.approx(1.0 / 8.0, rel=1e-9)
     assert abs(with_integral.y[-1]) < 1e-9
@@ -171,8 +173,8 @@ def test_lqi_is_the_limit_of_a_long_finite_horizon(osprey: NominalModel) -> None
 
 def test_lqi_leaves_no_error_under_a_constant_disturbance() -> None:
     model = integrator()
-    params = lqi.lqi_params(gains(integral=2.0, effort=0.1, fade=4.0), model)
-    assert abs(fly(lqi.control_law(model, vanes=False), params, 3000, 0.0, 1.0, model).y[-1]) < 1e-6
+    flight = fly(*law_of("lqi", model, integral=2.0, effort=0.1, fade=4.0), 3000, 0.0, 1.0, model)
+    assert abs(flight.y[-1]) < 1e-6
 
 
 # MacKunis
@@ -180,9 +182,7 @@ def test_lqi_leaves_no_error_under_a_constant_disturbance() -> None:
 
 def test_the_acceleration_based_law_by_hand() -> None:
     model = integrator(Omega=2.0, period=0.1)
-    control_law = mackunis.control_law(model, ideal=True)
-    K, Lambda, beta, eps, none = (np.full(COLUMN, value) for value in (3.0, 2.0, 5.0, 0.4, 0.0))
-    params = mackunis.MacKunisParams(K, Lambda, beta, eps, none, model.limits)
+    control_law, params = law_of("mackunis_ideal", model, K=3.0, Lambda=2.0, beta=5.0, softening=0.24)  # eps = 5 / 3 0.24 = 0.4
     state = control_law.start(at(0.0), params)
     state, u = control_law.step(state, at(0.2, y_dot=np.full(COLUMN, -0.3)), np.array(0.1), params)
     # r = -0.3 + 2 0.2 = 0.1, Pi = 0.1 5 0.1 / 0.4 = 0.125, integral = 0.1 0.2 / 2 = 0.01: -(3 (0.2 + 0.02) + 0.125) / 2
@@ -194,8 +194,7 @@ def test_the_acceleration_based_law_by_hand() -> None:
 
 def test_the_filtered_difference_of_a_ramp_converges_to_its_slope() -> None:
     model = integrator()
-    control_law = mackunis.control_law(model, ideal=False)
-    params = mackunis.mackunis_params(gains(K=1.0, Lambda=1.0, beta=1.0, softening=1.0, filter=12.6), model)
+    control_law, params = law_of("mackunis", model, K=1.0, Lambda=1.0, beta=1.0, softening=1.0, filter=12.6)
     state = control_law.start(at(0.0), params)
     for k in range(1, 301):
         state, _ = control_law.step(state, at(0.3 * k * DT), np.array(DT), params)
@@ -208,16 +207,14 @@ def test_the_filtered_difference_of_a_ramp_converges_to_its_slope() -> None:
 
 def test_the_predictor_of_l1_estimates_a_constant_disturbance_in_one_tick() -> None:
     model = integrator()
-    control_law, params = adaptive.l1(model, feedforward=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), model)
-    flight = fly(control_law, params, 3, 0.1, 0.7, model)
+    flight = fly(*law_of("l1", model, K=3.0, bandwidth=20.0), 3, 0.1, 0.7, model)
     x = adaptive.ADAPTATION_POLE * DT
     assert flight.state.sigma_hat.item() == pytest.approx(0.7 * x / (np.exp(x) - 1.0), rel=1e-9)
 
 
 def test_l1_rejects_a_constant_disturbance_with_a_wrong_input_gain() -> None:
     model = integrator()
-    control_law, params = adaptive.l1(model, feedforward=False), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), model)
-    flight = fly(control_law, params, 1500, 0.0, 0.7, model, Omega=1.4 * model.Omega[0, 0])
+    flight = fly(*law_of("l1", model, K=3.0, bandwidth=20.0), 1500, 0.0, 0.7, model, Omega=1.4 * model.Omega[0, 0])
     # at rest y_hat - y is constant: K e = d (1 - k) where k = 0.995 is what the pole leaves of the estimate
     assert abs(flight.y[-1]) < 0.7 * 0.006 / 3.0
     assert flight.u[-1] == pytest.approx(-0.7 / (1.4 * model.Omega[0, 0]), rel=1e-6)
@@ -225,7 +222,7 @@ def test_l1_rejects_a_constant_disturbance_with_a_wrong_input_gain() -> None:
 
 def test_l1_with_feedforward_does_not_cancel_the_disturbance_twice() -> None:
     model = integrator()
-    control_law, params = adaptive.l1(model, feedforward=True), adaptive.l1_params(gains(K=3.0, bandwidth=20.0), model)
+    control_law, params = law_of("l1_ff", model, K=3.0, bandwidth=20.0)
     y, state, u = 0.0, None, np.zeros(COLUMN)
     d, y_m_dot = 0.7, 0.5
     u_ff = np.full(COLUMN, (y_m_dot - d) / model.Omega[0, 0])  # a model with d
@@ -243,17 +240,15 @@ def test_l1_with_feedforward_does_not_cancel_the_disturbance_twice() -> None:
 
 def test_the_weights_of_mrac_converge_to_the_model_error() -> None:
     model = integrator()
-    control_law = adaptive.mrac(model, vanes=False)
-    params = adaptive.mrac_params(gains(K=2.0, adaptation=20.0, bias=20.0, leak=0.0), model)
-    flight = fly(control_law, params, 4000, 0.3, 0.7, model)
+    flight = fly(*law_of("mrac", model, K=2.0, adaptation=20.0, bias=20.0, leak=0.0), 4000, 0.3, 0.7, model)
     assert abs(flight.y[-1]) < 1e-6
     assert flight.state[0, 1, 0] == pytest.approx(0.7, rel=1e-4)  # the weight of 1 is the disturbance
 
 
 def test_the_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
     model = integrator(period=1e-4)
-    control_law, K, gamma, d = adaptive.mrac(model, vanes=False), 2.0, 20.0, 0.7
-    params = adaptive.mrac_params(gains(K=K, adaptation=gamma, bias=gamma, leak=0.0), model)
+    K, gamma, d = 2.0, 20.0, 0.7
+    control_law, params = law_of("mrac", model, K=K, adaptation=gamma, bias=gamma, leak=0.0)
     W, y, u, values, decay = control_law.start(at(0.3), params), 0.3, np.zeros(COLUMN), [], 0.0
     for _ in range(10_000):
         # the weights to be learned: 0 of x, d of the constant
@@ -270,10 +265,8 @@ def test_the_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
 
 def test_indi_needs_no_model_except_the_input_gain() -> None:
     model = integrator()
-    control_law = indi.control_law(model)
-    params = indi.indi_params(gains(K=2.0, bandwidth=60.0, share=1.0), model)
     for Omega in (2.0, 1.4, 2.6):
-        flight = fly(control_law, params, 1500, 0.2, 0.7, model, Omega=Omega)
+        flight = fly(*law_of("indi", model, K=2.0, bandwidth=60.0, share=1.0), 1500, 0.2, 0.7, model, Omega=Omega)
         assert abs(flight.y[-1]) < 1e-6, Omega  # exp(-2 15) of the start and the disturbance, were it first order
         assert flight.u[-1] == pytest.approx(-0.7 / Omega, rel=1e-5)
 
@@ -284,8 +277,7 @@ def test_indi_needs_no_model_except_the_input_gain() -> None:
 def reaching(e_0: float) -> float:
     """Reaching time, s: from then on abs(e) stays below 1e-4 of its initial value."""
     model = integrator(period=2e-4)
-    control_law, params = super_twisting.control_law(model), super_twisting.twisting_params(gains(root=3.0, beta=2.0), model)
-    flight = fly(control_law, params, 15_000, e_0, 0.0, model)
+    flight = fly(*law_of("twisting", model, root=3.0, beta=2.0), 15_000, e_0, 0.0, model)
     return float((np.flatnonzero(np.abs(flight.y) > 1e-4 * e_0)[-1] + 1) * model.period)
 
 
@@ -297,11 +289,9 @@ def test_the_reaching_time_of_super_twisting_is_proportional_to_the_root_of_the_
 
 def test_super_twisting_rejects_a_ramp_disturbance() -> None:
     model = integrator(period=2e-4)
-    control_law, params = super_twisting.control_law(model), super_twisting.twisting_params(gains(root=4.0, beta=3.0), model)
-    flight = fly(control_law, params, 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model)  # d_dot = 2 < beta = 3
+    flight = fly(*law_of("twisting", model, root=4.0, beta=3.0), 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model)  # d_dot = 2 < 3
     assert np.abs(flight.y[15_000:]).max() < 3e-6  # the sliding of an explicit scheme: of the order of beta dt^2 = 1.2e-7
-    linear = fly(inversion.control_law(model, vanes=False), inversion.inversion_params(gains(K=8.0, Lambda=2.0), model),
-                 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model)  # fmt: skip
+    linear = fly(*law_of("di_pi", model, K=8.0, Lambda=2.0), 20_000, 0.5, lambda k: 2.0 * k * 2e-4, model)
     assert np.abs(linear.y[15_000:]).min() > 0.1  # d_dot / (K Lambda) = 0.125: an integral alone follows late
 
 
@@ -310,10 +300,8 @@ def test_super_twisting_rejects_a_ramp_disturbance() -> None:
 
 def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
     K, Lambda = np.array([[9.0], [8.0], [4.0], [2.0]]), np.array([[3.0], [2.0], [1.0], [0.5]])
-    params = rise_di.of_gains({"K": K, "Lambda": Lambda}, osprey)
-    control_law, e = rise_di.CONTROL_LAWS[Sign.SOFT], np.array([[0.1], [0.2], [0.0], [-0.3]])
-    zero = np.zeros((4, 1))
-    measured = Measurements(zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    control_law, params = law_of("pi", osprey, K=K, Lambda=Lambda)
+    e, measured = np.array([[0.1], [0.2], [0.0], [-0.3]]), at(np.zeros(4))
     state = control_law.start(measured, params)
     for k in range(1, 6):
         state, u = control_law.step(state, measured._replace(y=k * e), np.array(DT), params)
@@ -343,11 +331,10 @@ def test_the_observer_converges_to_states_wind_and_disturbance_of_its_model(ospr
 
 def test_the_contribution_of_the_observer_is_bounded_for_any_measurement() -> None:
     model = integrator(limit=0.5)
-    law = LAWS["rise_observer"]
-    gains_ = initial_gains(law, model) | {"K": np.full(COLUMN, 1e-6), "beta": np.full(COLUMN, 1e-6)}
-    control_law, params = law.control_law(model), law.params(gains_, model)
-    measured = at(0.0)
-    state = control_law.start(measured, params)
+    control_law, params = law_of(
+        "rise_observer", model, **initial_gains(LAWS["rise_observer"], model) | {"K": 1e-6, "beta": 1e-6}
+    )
+    state = control_law.start(at(0.0), params)
     added = []
     for k in range(200):
         state, _ = control_law.step(state, at(100.0 * (-1.0) ** (k // 40)), np.array(DT), params)
@@ -359,11 +346,9 @@ def test_the_contribution_of_the_observer_is_bounded_for_any_measurement() -> No
 
 
 def test_with_zero_observer_gain_the_law_is_the_one_with_feedforward(osprey: NominalModel) -> None:
-    law, plain = LAWS["rise_observer"], LAWS["rise_ff"]
-    gains_ = initial_gains(law, osprey)
-    params = law.params(gains_, osprey)
+    control_law, params = law_of("rise_observer", osprey)
     params = params._replace(gain=0.0 * params.gain)
-    generator, laws_ = np.random.default_rng(1), (law.control_law(osprey), plain.control_law(osprey))
+    generator, laws_ = np.random.default_rng(1), (control_law, LAWS["rise_ff"].control_law(osprey))
     looks = [
         Measurements(*(0.01 * generator.standard_normal((8 if k in {6, 7} else 4, 1)) for k in range(9))) for _ in range(5)
     ]
@@ -378,20 +363,14 @@ def test_with_zero_observer_gain_the_law_is_the_one_with_feedforward(osprey: Nom
 
 
 def test_anti_windup_stops_an_integral_in_saturation_and_releases_it_on_the_way_back() -> None:
-    before, after = np.zeros(3), np.ones(3)
-    assert conditional_integration(before, after, np.array([1.0, 1.0, 1.0]), np.array([0.5, -0.5, 0.0])).tolist() == [
-        0.0,
-        1.0,
-        1.0,
-    ]
+    integral = conditional_integration(np.zeros(3), np.ones(3), np.ones(3), np.array([0.5, -0.5, 0.0]))
+    assert integral.tolist() == [0.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize("name", list(LAWS))
 def test_every_law_keeps_its_limits_and_recovers_from_saturation(name: str) -> None:
     model = integrator(limit=0.5)
-    law = LAWS[name]
-    params = law.params(initial_gains(law, model), model)
-    flight = fly(law.control_law(model), params, 3000, 0.0, lambda k: 2.0 if k < 1000 else 0.0, model)
+    flight = fly(*law_of(name, model), 3000, 0.0, lambda k: 2.0 if k < 1000 else 0.0, model)
     assert np.abs(flight.u).max() <= 0.5  # 0.5 of 2.0 / Omega = 1.0 that the disturbance would take
     # the error is 10 after 10 s and then falls by Omega 0.5 = 1 /s for 10 s; with windup it would overshoot
     assert np.abs(flight.y[2800:]).max() < 0.2
@@ -399,14 +378,9 @@ def test_every_law_keeps_its_limits_and_recovers_from_saturation(name: str) -> N
 
 @pytest.mark.parametrize("name", list(LAWS))
 def test_every_law_is_the_same_under_numpy_and_jax_and_over_a_fleet(name: str, osprey: NominalModel) -> None:
-    law, generator = LAWS[name], np.random.default_rng(1)
-    control_law, params = law.control_law(osprey), law.params(initial_gains(law, osprey), osprey)
-
-    def look() -> Measurements:
-        shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))
-        return Measurements(*(0.1 * generator.standard_normal(shape) for shape in shapes))
-
-    looks = [look() for _ in range(4)]
+    generator, (control_law, params) = np.random.default_rng(1), law_of(name, osprey)
+    shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))
+    looks = [Measurements(*(0.1 * generator.standard_normal(shape) for shape in shapes)) for _ in range(4)]
     state, one = control_law.start(looks[0], params), [one[..., :1] for one in looks[0]]
     compiled, alone = jax.tree.map(jax.numpy.asarray, state), control_law.start(Measurements(*one), params)
     step = jax.jit(control_law.step)
