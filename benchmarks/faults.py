@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from benchmarks.evidence_page import milliseconds
+from benchmarks.sampling import new_table
 from rich.console import Console
 from rich.table import Table
 
@@ -65,21 +67,16 @@ def _summary(case: str, rows: Sequence[Row]) -> Row:
 
 def to_table(summaries: Sequence[Row]) -> Table:
     """The table for a terminal, ms."""
-    table = Table(title="Faults, times in ms, median / worst")
-    for name in ("fault", "injected", "detected", "passed", "reaction", "recovery", "traffic", "pause"):
-        table.add_column(name, justify="left" if name == "fault" else "right")
+    columns = ("fault", "injected", "detected", "passed", "reaction", "recovery", "traffic", "pause")
+    table = new_table("Faults, times in ms, median / worst", columns, texts=1)
     for one in summaries:
-        times = [_milliseconds(one[key]) for key in ("reaction", "recovery", "ready_to_traffic", "longest_pause")]
+        times = [milliseconds(one[key]) for key in ("reaction", "recovery", "ready_to_traffic", "longest_pause")]
         detected = "-" if one["detected"] is None else str(one["detected"])
         table.add_row(one["case"] + " *" * (not one["quiet"]), str(one["injected"]), detected, str(one["passed"]), *times)
     table.caption = "traffic: from ready until a killed node publishes all its topics; "
     table.caption += "pause: the longest of a topic that continues; "
     table.caption += f"*: every run had host delays of more than {1e3 * MAX_HOST_DELAY:g} ms"
     return table
-
-
-def _milliseconds(times: Row | None) -> str:
-    return "-" if times is None else f"{1e3 * times['median']:.0f} / {1e3 * times['worst']:.0f}"
 
 
 def main(
@@ -92,8 +89,7 @@ def main(
     summaries = summarise(fly(times, seed, only))
     if file is not None:
         file.write_text(json.dumps(summaries, indent=2) + "\n", encoding="utf-8")
-    console = Console()
-    Console(width=None if console.is_terminal else 160).print(to_table(summaries))
+    Console(width=None if sys.stdout.isatty() else 160).print(to_table(summaries))
     if any(one["passed"] < times for one in summaries):
         raise typer.Exit(1)
 

@@ -76,16 +76,10 @@ def fuzz(target: str, seconds: int, *, keep: bool) -> None:
     inputs.mkdir(parents=True, exist_ok=True)
     for k, seed in enumerate(SEEDS[target]()):
         (inputs / f"seed-{k}").write_bytes(seed)
-    corpora = [str(inputs), *(str(path) for path in [CORPUS / target] if path.is_dir())]
+    corpora = [str(path) for path in (inputs, CORPUS / target) if path.is_dir()]
     folder = Path(tempfile.mkdtemp(prefix="fuzz", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))  # noqa: S108 - for speed
-    options = {
-        "max_total_time": seconds,
-        "timeout": TIMEOUT,
-        "rss_limit_mb": MEMORY_MB,
-        "max_len": MAX_LENGTH,
-        "artifact_prefix": f"{findings}/",
-        "print_final_stats": 1,
-    }
+    limits = {"max_total_time": seconds, "timeout": TIMEOUT, "rss_limit_mb": MEMORY_MB, "max_len": MAX_LENGTH}
+    options = limits | {"artifact_prefix": f"{findings}/", "print_final_stats": 1}
     arguments = [sys.argv[0], *(f"-{name}={value}" for name, value in options.items()), *corpora]
     atheris.Setup(arguments, lambda data: TARGETS[target](data, folder))
     atheris.Fuzz()

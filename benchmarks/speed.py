@@ -221,13 +221,13 @@ def tick_rows(seconds: float) -> Iterator[Row]:
         floor = f"empty timer, single, {hz} Hz"
         for executor in EXECUTORS:
             with Child("timer", *options, str(short), "--executor", executor) as child:
-                yield Row(f"empty timer, {executor}, {hz} Hz", *_ticks(child, short), floor)
+                yield Row(f"empty timer, {executor}, {hz} Hz", _ticks(child, short), floor)
         with Child("bare_loop", *options, str(short)) as child:
-            yield Row(f"loop that only sleeps, {hz} Hz", *_ticks(child, short), floor)
+            yield Row(f"loop that only sleeps, {hz} Hz", _ticks(child, short), floor)
         goals = {500: [Goal(OWN_MISSES if chrt else "missed", 0)], 1000: [Goal("p99 (us)", 100.0)]}.get(hz, [])
         with delay_monitors(chrt is not None) as delays, Child("ticker", *options, str(seconds)) as child:
             figures = _ticks(child, seconds, delays)
-        yield Row(f"the stack's loop, {hz} Hz", *figures, floor, goals)
+        yield Row(f"the stack's loop, {hz} Hz", figures, floor, goals)
     if chrt is None:
         return
     within = (chrt, "-f", str(PRIORITY))
@@ -237,7 +237,7 @@ def tick_rows(seconds: float) -> Iterator[Row]:
             with Child(role, "--hz", "100", "--seconds", str(length), within=within) as child:
                 goals = [Goal("p99 (us)", 50.0)] if role == "ticker" else []
                 what, floor = (f"{one}, 100 Hz, FIFO {PRIORITY}, full load" for one in (name, "empty timer, single"))
-                yield Row(what, *_ticks(child, length), floor, goals)
+                yield Row(what, _ticks(child, length), floor, goals)
 
 
 @contextlib.contextmanager
@@ -247,23 +247,22 @@ def delay_monitors(allowed: bool) -> Iterator[Callable[[], Intervals] | None]:
         yield None
         return
     with contextlib.ExitStack() as stack:
-        monitors = [
-            stack.enter_context(Child("delay_monitor", "--core", str(core))) for core in sorted(os.sched_getaffinity(0))
-        ]
+        cores = sorted(os.sched_getaffinity(0))
+        monitors = [stack.enter_context(Child("delay_monitor", "--core", str(core))) for core in cores]
         yield lambda: [tuple(one) for child in monitors for one in child.stop()["delays"]]
 
 
-def _ticks(child: Child, seconds: float, delays: Callable[[], Intervals] | None = None) -> tuple[dict[str, float]]:
+def _ticks(child: Child, seconds: float, delays: Callable[[], Intervals] | None = None) -> dict[str, float]:
     time.sleep(seconds / 2.0)
     cpu_ns, at = child.cpu_ns(), time.monotonic()
     time.sleep(seconds / 2.0)  # it started later, so it still runs
     share = (child.cpu_ns() - cpu_ns) / 1e9 / (time.monotonic() - at)
     output = child.figures(timeout=seconds + 20.0)
     figures = {f"{name} (us)": output[name] for name in ("p50", "p99", "max")}
-    figures |= {"missed": output["missed"]}
+    figures["missed"] = output["missed"]
     if delays is not None:
         figures[OWN_MISSES] = missed_excluding_delays(output["skipped"], delays(), output["period_ns"])
-    return (figures | {"ticks": output["ticks"], "CPU (%)": 100.0 * share},)
+    return figures | {"ticks": output["ticks"], "CPU (%)": 100.0 * share}
 
 
 @contextlib.contextmanager

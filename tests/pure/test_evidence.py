@@ -13,21 +13,11 @@ from benchmarks.evidence import MEASUREMENTS, cases, read, wanted
 from benchmarks.evidence_page import BUSY, SPEED, WIDTH, Result, render
 
 MACHINE = {"processor": "a processor", "cores": 2, "memory": 8, "system": "Linux 6", "python": "3.11.7"}
+RUN = {"date": "2020-01-02 03:04 UTC", "revision": "abc1234", "machine": MACHINE, "busy": 0.0, "seconds": 1.0, "status": 0}
 
 
 def result(name: str, measured: Any, **changes: Any) -> Result:
-    return {
-        "name": name,
-        "command": f"measure {name}",
-        "quick": False,
-        "date": "2020-01-02 03:04 UTC",
-        "revision": "abc1234",
-        "machine": MACHINE,
-        "busy": 0.0,
-        "seconds": 1.0,
-        "status": 0,
-        "result": measured,
-    } | changes
+    return RUN | {"name": name, "command": f"measure {name}", "quick": False, "result": measured} | changes
 
 
 def row(what: str, figures: dict[str, float], floor: str = "", goals: tuple[dict[str, Any], ...] = ()) -> dict[str, Any]:
@@ -51,29 +41,21 @@ FAULT = {
     "longest_pause": None,
 }
 LEVEL = {"uncertainty": 0.3, "mean": 1.75, "worst": 2.48, "diverged": 0.0, "lost": 0.0}
-LAW: dict[str, Any] = {
-    "law": "rise",
-    "sees": "y",
-    "tuned_on": "nominal",
-    "score": 1.61,
-    "slew": {"elevator": 0.077},
-    "delay": 0.02,
-}
-LAW |= {"levels": [LEVEL]}
+LAW: dict[str, Any] = {"law": "rise", "sees": "y", "tuned_on": "nominal", "score": 1.61, "delay": 0.02}
+LAW |= {"levels": [LEVEL], "slew": {"elevator": 0.077}}
 FIGURE = {"mean": 1.31, "q50": 1.21, "q95": 2.31, "q99": 2.71, "worst": 3.01, "deviation": 0.1}
 COVERAGE = {"status": 0, "covered": 1234, "number_of_executed_units": 98765, "peak_rss_mb": 321}
-CAMPAIGN = {"whole": 120_000.0, "flown": 150_000.0, "memory_early": 900.0, "memory": 905.0, "aircraft": 10_000, "plain": 50.0}
-CAMPAIGN |= {"integration": {"q": 0.0021, "V": 0.0005}}
+CAMPAIGN: dict[str, Any] = {"whole": 120_000.0, "flown": 150_000.0, "memory_early": 900.0, "memory": 905.0, "aircraft": 10_000}
+CAMPAIGN |= {"plain": 50.0, "integration": {"q": 0.0021, "V": 0.0005}}
 SHARE = {"count": 3, "share": 3e-4, "low": 1e-4, "high": 9e-4}
+FLEET = {"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}
 RESULTS = {
     "speed-node": result("speed-node", {"seconds": 10.0, "rows": NODE}),
     "faults": result("faults", [FAULT]),
     "security": result("security", [{"name": "test_an_attacker_receives_nothing", "outcome": "passed", "seconds": 1.0}]),
     "fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE}),
     "campaign": result("campaign", CAMPAIGN),
-    "campaign-fleet": result(
-        "campaign-fleet", {"cases": [{"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}]}
-    ),
+    "campaign-fleet": result("campaign-fleet", {"cases": [FLEET]}),
     "compare": result("compare", {"aircraft": 200, "seed": 1, "laws": [LAW, LAW | {"law": "pi", "score": 1.72}]}),
     "replay": result("replay", {"osprey_gust": {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": True}}),
 }
@@ -203,9 +185,8 @@ def test_the_lowest_score_among_laws_with_the_same_measurements_is_bold() -> Non
 
 def test_the_score_of_a_diverged_law_is_a_word() -> None:
     lost = LAW | {"law": "di", "levels": [LEVEL | {"mean": None, "worst": None}]}
-    assert "| di | y | **1.61** | diverged (diverged) |" in page(
-        compare=result("compare", {"aircraft": 200, "seed": 1, "laws": [LAW, lost]})
-    )
+    compared = result("compare", {"aircraft": 200, "seed": 1, "laws": [LAW, lost]})
+    assert "| di | y | **1.61** | diverged (diverged) |" in page(compare=compared)
 
 
 def test_each_table_has_as_many_cells_as_headings() -> None:
