@@ -93,7 +93,7 @@ def measure(one: Measurement, *, quick: bool) -> Result:
         "quick": quick,
         "date": date,
         "revision": revision(),
-        "machine": machine(),
+        "machine": host_details(),
         "busy": busy,
         "seconds": time.monotonic() - begin,
         "status": ran.returncode,
@@ -121,7 +121,7 @@ def cases(junit: str) -> list[dict[str, Any]]:
     return outcomes
 
 
-def machine() -> dict[str, Any]:
+def host_details() -> dict[str, Any]:
     """The host of the measurement."""
     cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
     model = re.search(r"^model name\s*: (.+)$", cpuinfo, re.MULTILINE)
