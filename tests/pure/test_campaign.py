@@ -17,10 +17,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from tests.closed_loop import error
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import true_error
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define
@@ -106,15 +106,11 @@ def test_an_aircraft_of_a_campaign_has_the_same_score_in_the_single_process_simu
     path = tmp_path / "again.yaml"
     path.write_text(scenario_yaml(campaign.definition.aircraft_scenario(worst.number)), encoding="utf-8")
     again = load_scenario(path)
-    error = true_error(simulate(again))
-    assert error is not None
-    outputs = again.controller.outputs
-    at_ticks = error.stamp_ns % 10_000_000 == 0
-    rms = np.array([[np.sqrt(np.mean(error[name][at_ticks] ** 2))] for name in outputs])
-    units = again.aircraft.channels().outputs
-    assert worst.score == pytest.approx(
-        score(rms, score_units(outputs, units))[0], rel=1e-3
-    )  # as of single flights: tests of fleets
+    true, outputs = error(simulate(again)), again.controller.outputs
+    at_ticks = true.stamp_ns % 10_000_000 == 0
+    rms = np.array([[np.sqrt(np.mean(true[name][at_ticks] ** 2))] for name in outputs])
+    unit = score_units(outputs, again.aircraft.channels().outputs)
+    assert worst.score == pytest.approx(score(rms, unit)[0], rel=1e-3)  # as of single flights: tests of fleets
 
 
 def test_the_same_seed_gives_the_same_figures_in_any_order_and_engine(tmp_path: Path) -> None:

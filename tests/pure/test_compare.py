@@ -3,16 +3,18 @@
 """Comparison of control laws: cost and score, repeatable tuning, the shipped gains, the command."""
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from tests.closed_loop import error
 from typer.testing import CliRunner
 
 from control_laws.catalogue import LAWS, initial_gains
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import error_metrics, true_error
+from flight_analysis.metrics import error_metrics
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet, law_comparison, tuning
 from flight_campaign.fleet import FleetResult
@@ -64,35 +66,20 @@ def test_a_search_is_repeatable_and_lowers_the_cost_of_its_initial_gains(short: 
     assert found[0].cost == min(found[0].costs)
     assert found[0].evaluations == 6 * tuning.POPULATION
     flights, weight = tuning.evaluation(tuning.NOMINAL, short)
-    costs = [
-        float(
-            tuning.cost(fleet.fly(flights, short.vehicle, short.courses[False], law.control_law(short.model), params), short)
-            @ weight
-        )
-        for params in (law.params(begin, short.model), law.params(tuning.as_gains(found[0]), short.model))
-    ]
+    fly = partial(fleet.fly, flights, short.vehicle, short.courses[False], law.control_law(short.model))
+    params = (law.params(one, short.model) for one in (begin, tuning.as_gains(found[0])))
+    costs = [float(tuning.cost(fly(one), short) @ weight) for one in params]
     assert costs[1] == pytest.approx(found[0].cost, rel=1e-3)  # gains are written with five digits
     assert costs[1] < 0.95 * costs[0]
 
 
 def test_the_score_of_a_campaign_is_that_of_the_single_process_simulation(short: Benchmark) -> None:
     controller = short.scenario.controller
-    gains = TuningResult(
-        {
-            "K": controller.law().K.tolist(),
-            "Lambda": list(controller.Lambda),
-            "beta": list(controller.beta),
-            "softening": [controller.softening],
-        },
-        0.0,
-        0,
-        [],
-        0,
-    )
-    (found,) = law_comparison.compare(short, {"rise": {"nominal": gains}}, 1, [0.3], 1)
-    error = true_error(simulate(short.scenario))
-    assert error is not None
-    rms = np.array([error_metrics(error[name]).rms for name in controller.outputs])
+    gains = {key: list(getattr(controller, key)) for key in ("Lambda", "beta")}
+    gains |= {"K": controller.law().K.tolist(), "softening": [controller.softening]}
+    (found,) = law_comparison.compare(short, {"rise": {"nominal": TuningResult(gains, 0.0, 0, [], 0)}}, 1, [0.3], 1)
+    true = error(simulate(short.scenario))
+    rms = np.array([error_metrics(true[name]).rms for name in controller.outputs])
     # the campaign holds the nonlinear remainder over a tick, the simulation does not: far below the 1 % that a score needs
     np.testing.assert_allclose(found.rms, rms, rtol=2e-3)
     assert found.score == pytest.approx(float(np.sum(rms / short.unit)), rel=2e-3)
@@ -117,9 +104,8 @@ def test_every_law_ships_with_gains_for_the_nominal_and_the_uncertain_objective(
         assert {"nominal", "uncertain"} <= set(by_aim), law
         for found in by_aim.values():
             assert found.cost == min(found.costs) < tuning.MAX_COST
-            assert {key: len(values) for key, values in found.gains.items()} == {
-                key: len(gain) for key, gain in initial_gains(LAWS[law], benchmark.model).items()
-            }
+            expected = {key: len(gain) for key, gain in initial_gains(LAWS[law], benchmark.model).items()}
+            assert {key: len(values) for key, values in found.gains.items()} == expected
             assert all(value > 0.0 for values in found.gains.values() for value in values)
 
 

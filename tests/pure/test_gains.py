@@ -33,6 +33,7 @@ from rise_di_controller.decomposition import decompose, unit_diagonal
 from rise_di_controller.law import LawParams, Sign, engage, step
 from rise_di_controller.params import ControllerParameters
 
+AIRFRAME = load_airframe("osprey")
 SERVOS: LoopSetting = selection.loop_setting(find_scenario("osprey_servo"))._replace(delay=0.0, rate_limit={})
 HAND = Bounds(
     U=np.array([[0.0, 2.0, 1.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]),
@@ -46,8 +47,7 @@ HAND = Bounds(
 def osprey() -> Study:
     """The osprey and twenty airframes around it along the manoeuvre of the default scenario, with its gusts."""
     scenario = find_scenario("osprey_gust")
-    airframe = load_airframe("osprey")
-    return selection.study_airframe(airframe, selection.manoeuvre(scenario, airframe), samples=20)
+    return selection.study_airframe(AIRFRAME, selection.manoeuvre(scenario, AIRFRAME), samples=20)
 
 
 @pytest.fixture(scope="module")
@@ -135,9 +135,8 @@ def test_the_literal_conditions_need_bandwidths_of_the_osprey_beyond_any_servo(
     scaled: bool, Lambda: tuple[float, ...], rho: float, k_g: float, bandwidths: tuple[float, ...], k_d3: float
 ) -> None:
     # Measured before this project, in the units of the file (degrees and percent); three digits, so 1 %.
-    airframe = load_airframe("osprey")
-    A, C = airframe.matrix_a(), airframe.matrix_c()
-    Omega = C @ np.array(airframe.B)
+    A, C = AIRFRAME.matrix_a(), AIRFRAME.matrix_c()
+    Omega = C @ np.array(AIRFRAME.B)
     response = np.abs(np.diag(Omega))
     Omega = unit_diagonal(Omega) if scaled else Omega
     found = gain_conditions.rho(Omega, C @ A @ C.T, np.array(Lambda))
@@ -180,31 +179,28 @@ def test_the_slew_of_the_ideal_control_of_the_osprey_is_that_of_earlier_measurem
 def test_u_of_a_loop_with_small_error_is_the_ideal_control(osprey_gust: Scenario) -> None:
     # The rate of u in the simulation is the reference: the implicit sign keeps e below 1e-3, so u is u* up to sampling.
     short = osprey_gust.vary(flight={"duration": 4.0})
-    airframe = load_airframe("osprey")
-    found = selection.study_airframe(airframe, selection.manoeuvre(short, airframe), samples=0)
+    found = selection.study_airframe(AIRFRAME, selection.manoeuvre(short, AIRFRAME), samples=0)
     u = simulate(short)["u"]
-    slew = np.array([np.max(np.abs(np.diff(u[name]) / 0.01)) for name in airframe.inputs])
+    slew = np.array([np.max(np.abs(np.diff(u[name]) / 0.01)) for name in AIRFRAME.inputs])
     # 3 %: differences over a period average the corners of the reference's acceleration; the first input moves most
     assert slew[0] == pytest.approx(found.slew[0], rel=0.03)
 
 
 def test_uncertain_airframes_have_the_published_kinematic_rows() -> None:
-    airframe = load_airframe("osprey")
-    A, B = nominal_and_sampled(airframe, 0.3, 50, seed=1)
+    A, B = nominal_and_sampled(AIRFRAME, 0.3, 50, seed=1)
     for state in ("theta", "phi"):
-        assert (A[:, airframe.index(state)] == airframe.matrix_a()[airframe.index(state)]).all()
-    part = B[1:, airframe.index("q"), 0] / B[0, airframe.index("q"), 0] - 1.0
+        assert (A[:, AIRFRAME.index(state)] == AIRFRAME.matrix_a()[AIRFRAME.index(state)]).all()
+    part = B[1:, AIRFRAME.index("q"), 0] / B[0, AIRFRAME.index("q"), 0] - 1.0
     assert 0.2 < np.abs(part).max() <= 0.3  # fifty uniform draws: the largest is above 0.2 but for 1 in 1e9
     with pytest.raises(ParameterError, match=r"uncertainty: found 1\.5"):
-        nominal_and_sampled(airframe, 1.5, 1, seed=1)
+        nominal_and_sampled(AIRFRAME, 1.5, 1, seed=1)
 
 
 def test_an_airframe_with_an_unstable_zero_is_refused(osprey_gust: Scenario) -> None:
-    osprey = load_airframe("osprey")
-    rows = [list(row) for row in osprey.A]
-    rows[osprey.index("beta")][osprey.index("beta")] = 0.69  # the zero at -0.69 1/s is that entry
+    rows = [list(row) for row in AIRFRAME.A]
+    rows[AIRFRAME.index("beta")][AIRFRAME.index("beta")] = 0.69  # the zero at -0.69 1/s is that entry
     with pytest.raises(ParameterError, match=r"^airframe osprey: found a zero at 0\.69 1/s, expected none in the right"):
-        selection.study_airframe(osprey.model_copy(update={"A": rows}), selection.manoeuvre(osprey_gust, osprey))
+        selection.study_airframe(AIRFRAME.model_copy(update={"A": rows}), selection.manoeuvre(osprey_gust, AIRFRAME))
 
 
 # The engineering procedure
@@ -280,10 +276,9 @@ def osprey_channels(
     inputs: tuple[str, ...] = ("elevator", "thrust", "aileron", "rudder"), flipped: tuple[str, ...] = ()
 ) -> tuple[FloatArray, ChannelPairing]:
     """Omega of the osprey with its inputs in some order, some of them counted the other way."""
-    airframe = load_airframe("osprey")
-    columns = [list(airframe.inputs).index(name) for name in inputs]
+    columns = [list(AIRFRAME.inputs).index(name) for name in inputs]
     turned = np.array([-1.0 if name in flipped else 1.0 for name in inputs])
-    return (airframe.matrix_c() @ airframe.matrix_b())[:, columns] * turned, ChannelPairing(airframe.outputs, inputs)
+    return (AIRFRAME.matrix_c() @ AIRFRAME.matrix_b())[:, columns] * turned, ChannelPairing(AIRFRAME.outputs, inputs)
 
 
 def test_a_wrong_D_is_refused_with_the_one_that_fits() -> None:
@@ -341,8 +336,7 @@ def osprey_loop(
     factor: float = 3.0, K: tuple[float, ...] = (18.0, 2.0, 18.0, 9.0), Lambda: tuple[float, ...] = (5.0, 0.5, 5.0, 3.0)
 ) -> tuple[LinearPlant, LawParams]:
     """The osprey with given gains in the order q, V, p, r, and a softened sign so many total lags wide."""
-    airframe = load_airframe("osprey")
-    A, B, C = airframe.matrix_a() + airframe.matrix_gravity(), airframe.matrix_b(), airframe.matrix_c()
+    A, B, C = AIRFRAME.matrix_a() + AIRFRAME.matrix_gravity(), AIRFRAME.matrix_b(), AIRFRAME.matrix_c()
     scale, eps = 1.0 / np.abs(np.diag(C @ B)), factor * OSPREY_LOOP.total / np.array(K)
     return LinearPlant(A, B, C), law_params(K, Lambda, 1.0, sign=Sign.SOFT, input_scale=scale, eps=eps)
 

@@ -20,6 +20,7 @@ from flight_analysis.design.identification import (
     SPAN,
     Fly,
     IdentifiedAircraft,
+    Responses,
     fly_all,
     identify,
     moderate_turbulence,
@@ -52,6 +53,13 @@ def lagged(Omega: FloatArray, lag: FloatArray) -> Fly:
     return fly
 
 
+def respond(fly: Fly, upper: FloatArray = WIDE) -> Responses:
+    """Step tests of two channels, every DT."""
+    return step_responses(fly, -WIDE, upper, ("q", "p"), ("elevator", "aileron"), DT)
+
+
+STRAIGHT = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
+
 # Closed forms
 
 
@@ -68,7 +76,7 @@ def test_omega_and_lags_of_a_linear_system_are_identified(
     # The last chord begins 0.5 - 0.025 s after the step: what is left of the lag there is exp(-4.75) = 0.9 % of the slope,
     # and (0.475 + 0.1) / 0.1 times that of the lag.
     known = np.diag(np.array(Omega) * signs) @ np.array([[1.0, coupled], [coupled, 1.0]])
-    found = step_responses(lagged(known, np.array(lag)), -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+    found = respond(lagged(known, np.array(lag)))
     assert found.Omega == pytest.approx(known, rel=0.015, abs=1e-6)
     assert found.lag == pytest.approx(np.array(lag), rel=0.06)
     assert found.spread == pytest.approx(np.ones(2))
@@ -107,20 +115,17 @@ def test_drift_and_even_parts_of_the_response_cancel() -> None:
         t = DT * np.arange(round(duration / DT) + 1)[:, None]
         return np.asarray(straight(u, duration) + 0.3 * t**2 + 5.0 * t * (u @ u))
 
-    ends = (-WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
-    found, clean = step_responses(drifting, *ends), step_responses(straight, *ends)
+    found, clean = respond(drifting), respond(straight)
     assert found.Omega == pytest.approx(clean.Omega, abs=1e-9)
     assert found.lag == pytest.approx(clean.lag, abs=1e-9)
 
 
 def test_the_largest_step_determines_omega_behind_a_dead_zone() -> None:
     # Half a dead zone of 0.06 hides the step of 0.05 and removes 30 % of that of 0.2: the slope is 0.7 of the true one.
-    straight = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
-
     def dead(u: FloatArray, duration: float) -> FloatArray:
-        return straight(u - np.clip(u, -0.06, 0.06), duration)
+        return STRAIGHT(u - np.clip(u, -0.06, 0.06), duration)
 
-    found = step_responses(dead, -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+    found = respond(dead)
     assert found.size == pytest.approx([SIZES[-1]] * 2)
     assert np.diag(found.Omega) == pytest.approx([0.7 * 3.0] * 2, rel=0.01)
     assert found.rejected == ("elevator by 0.05: q does not move", "aileron by 0.05: p does not move")
@@ -128,32 +133,29 @@ def test_the_largest_step_determines_omega_behind_a_dead_zone() -> None:
 
 def test_steps_stay_inside_the_stops() -> None:
     steps: list[float] = []
-    straight = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
 
     def fly(u: FloatArray, duration: float) -> FloatArray:
         steps.append(float(np.max(np.abs(u))))
-        return straight(u, duration)
+        return STRAIGHT(u, duration)
 
-    step_responses(fly, -WIDE, np.array([0.1, 10.0]), ("q", "p"), ("elevator", "aileron"), DT)
+    respond(fly, np.array([0.1, 10.0]))
     assert sorted(set(steps)) == pytest.approx([0.05, 0.09, 0.1, 0.2])
 
 
 def test_a_step_that_ends_the_flight_is_rejected_with_its_reason() -> None:
-    straight = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
-
     def fragile(u: FloatArray, duration: float) -> FloatArray:
         if np.max(np.abs(u)) > 0.15:
             raise FlightEnded("gave up at t = 0.10 s")
-        return straight(u, duration)
+        return STRAIGHT(u, duration)
 
-    found = step_responses(fragile, -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+    found = respond(fragile)
     assert np.diag(found.Omega) == pytest.approx([3.0, 3.0], rel=0.01)
     assert found.rejected == ("elevator by 0.2: gave up at t = 0.10 s", "aileron by 0.2: gave up at t = 0.10 s")
 
 
 def test_an_output_without_response_ends_the_identification() -> None:
     with pytest.raises(FlightEnded, match=r"^p does not respond to aileron: .*p does not move"):
-        step_responses(lagged(np.diag([3.0, 0.0]), np.full(2, 0.02)), -WIDE, WIDE, ("q", "p"), ("elevator", "aileron"), DT)
+        respond(lagged(np.diag([3.0, 0.0]), np.full(2, 0.02)))
 
 
 # The manoeuvre
