@@ -177,16 +177,6 @@ def main(
         flights = pool.map(fly, sampling + gusty)
         results = list(track(flights, "flights", len(sampling + gusty), console=Console(stderr=True)))
     pairs = list(zip(results[::2], results[1::2], strict=True))
-    show(rows, pairs[: len(rows)], gust_rows, pairs[len(rows) :])
-
-
-def show(
-    rows: Sequence[tuple[str, str, float]],
-    pairs: Sequence[tuple[Figures, Figures]],
-    gust_rows: Sequence[tuple[Mapping[str, float], float]],
-    gust_pairs: Sequence[tuple[Figures, Figures]],
-) -> None:
-    """Print one table a world, and the table of the gusts."""
     console = wide_console()
     for world, meaning in WORLDS.items():
         table = new_table(
@@ -195,7 +185,7 @@ def show(
             ("sign", "dt (ms)", "at rest", "on sines", "slew at rest"),
             texts=1,
         )
-        for (of, scheme, period), (rest, sine) in zip(rows, pairs, strict=True):
+        for (of, scheme, period), (rest, sine) in zip(rows, pairs[: len(rows)], strict=True):
             if of == world:
                 table.add_row(scheme, f"{period * 1e3:g}", cells(rest.rms, 1e3), cells(sine.rms, 1e3), cells(rest.activity))
         console.print(table)
@@ -205,7 +195,7 @@ def show(
         ("beta", "dt (ms)", "with gusts", "calm"),
         texts=1,
     )
-    for (rates, period), figures in zip(gust_rows, gust_pairs, strict=True):
+    for (rates, period), figures in zip(gust_rows, pairs[len(rows) :], strict=True):
         beta = cells(np.array(list(rates.values())))
         table.add_row(beta, f"{period * 1e3:g}", *(cells(one.rms, 1e3) for one in figures))
     console.print(table)

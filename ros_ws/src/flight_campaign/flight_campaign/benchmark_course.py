@@ -57,8 +57,8 @@ class Course(NamedTuple):
     steps: int  # of the integration from tick to tick
 
 
-def build_course(scenario: Scenario, nominal: Nominal | None = None) -> Course:
-    """The course of a scenario; `nominal` is the model of its feedforward, by default that of its controller.
+def build_course(scenario: Scenario) -> Course:
+    """The course of a scenario, with the feedforward of its controller.
 
     Raises ParameterError for a scenario that a campaign cannot fly: an aircraft of JSBSim, a delay of y by a part of a tick,
     dropouts of a y with another rate than the ticks, or dropouts longer than the age limit.
@@ -98,7 +98,7 @@ def build_course(scenario: Scenario, nominal: Nominal | None = None) -> Course:
         y_m,
         y_m[used],
         y_m_dot[used],
-        _feedforward(controller.nominal() if nominal is None else nominal, phase, dt, y_m[used]),
+        _feedforward(controller.nominal(), phase, dt, y_m[used]),
         error[:, order],
         (forcing @ basis).reshape(ticks, -1),
         now @ basis,

@@ -7,6 +7,7 @@ ticks of the controller an aircraft is linear up to a small remainder: all steps
 """
 
 from functools import partial
+from itertools import accumulate, repeat
 from typing import Any, NamedTuple
 
 import jax
@@ -105,13 +106,12 @@ def assemble(A: FloatArray, B: FloatArray, plant: PlantParams, course: Course, w
     K, count = course.steps, len(A)
     L = A + aircraft.gravity
     eye = np.broadcast_to(np.eye(A.shape[1]), A.shape)
-    Phi, Gamma = (rk4(_linear, 0.0, x, u, L, dt) for x, u in ((eye, 0.0 * eye), (0.0 * eye, eye)))
-    powers = [eye]
-    for _ in range(K):
-        powers.append(Phi @ powers[-1])
+    pairs = ((eye, 0.0 * eye), (0.0 * eye, eye))
+    Phi, Gamma = (rk4(lambda t, x, u, L: L @ x + u, 0.0, x, u, L, dt) for x, u in pairs)
+    powers = list(accumulate(repeat(Phi, K), lambda power, one: one @ power, initial=eye))
     held = [powers[K - 1 - k] @ Gamma for k in range(K)]
     tick = [powers[K], *(of_step @ B for of_step in held), sum(held)[..., remainder_rows(aircraft)]]
-    rate = np.concatenate([A + aircraft.gravity, B], axis=2)
+    rate = np.concatenate([L, B], axis=2)
     C = aircraft.C[course.order]
 
     def last(array: FloatArray) -> Array:
@@ -161,10 +161,6 @@ def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
     number, part = connected_components(moves[:, : len(moves)], directed=False)
     rows = [np.flatnonzero(part == k) for k in range(number)]
     return tuple(StateBlock(tuple(row.tolist()), tuple(np.flatnonzero(moves[row].any(axis=0)).tolist())) for row in rows)
-
-
-def _linear(t: Any, x: Array, u: Array, L: Array) -> Array:
-    return L @ x + u
 
 
 def fly(fleet: Fleet, vehicle: Vehicle, course: Course, control_law: ControlLaw, params: Any) -> FleetResult:

@@ -209,14 +209,6 @@ def example(dt: float, duration: float) -> Example:
     t = dt * np.arange(round(duration / dt) + 1)
     y_m = np.column_stack([0.5 * np.sin(t), 0.4 * np.sin(0.6 * t + 1.0)])
     K, beta = np.array([6.0, 4.0]), np.array([5.0, 3.0])
-    params = LawParams(
-        K=K,
-        Lambda=np.array([1.0, 1.0]),
-        beta=beta,
-        D=D,
-        input_scale=np.ones(2),
-        omega=np.array([2.0, 2.0]),
-        eps=beta / K * 3.0 * 1.5 * dt,
-        sign=Sign.IMPLICIT,
-    )
+    ones, eps = np.ones(2), beta / K * 3.0 * 1.5 * dt
+    params = LawParams(K=K, Lambda=ones, beta=beta, D=D, input_scale=ones, omega=2.0 * ones, eps=eps, sign=Sign.IMPLICIT)
     return Example(KnownPlant(A, B, np.eye(2, 4), f), y_m, params, np.array([0.5, 0.0, 0.0, 0.0]))
