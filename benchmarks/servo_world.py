@@ -43,6 +43,7 @@ from rich.progress import track
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.gain_conditions import LinearPlant, Loop, delay_margin
+from flight_analysis.design.gain_selection import law_order
 from flight_analysis.metrics import ErrorMetrics, error_metrics
 from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
@@ -217,8 +218,7 @@ def linear_loop(scenario: Scenario) -> tuple[LinearPlant, LawParams, Loop]:
     """The linear sampled loop with a softened sign or without a sign (PI), in the law's order."""
     airframe, _ = scenario.aircraft.load()
     controller, lags = scenario.controller, scenario.aircraft.actuators.lag
-    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
-    rows = [list(airframe.outputs).index(name) for name in controller.outputs]
+    rows, columns = law_order(airframe, controller)
     A, B = airframe.matrix_a() + airframe.matrix_gravity(), airframe.matrix_b()[:, columns]
     law, lag = controller.law(), np.array(lags)[columns] if lags else np.zeros(len(columns))
     if scenario.controller.beta == tuple(PI["beta"]):

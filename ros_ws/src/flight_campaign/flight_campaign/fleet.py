@@ -233,7 +233,8 @@ def _fly(
         y = true + segment.error[:, None]
         if vehicle.quantum is not None:
             y = sensors.quantised(y, vehicle.quantum)
-        y, y_before = _delayed(y, now.y_before, y_late)
+        arriving = jnp.concatenate([y[None], now.y_before])
+        y, y_before = arriving[-1], arriving[:-1]
         law, u = jax.lax.switch(segment.phase, (hold, engage, step), now, y, segment)
         history = jnp.concatenate([u[None], now.u_before])
         acting = u if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
@@ -293,10 +294,3 @@ def _product(matrices: Array, vector: Any) -> Array:
     for j in range(matrices.shape[1]):
         total = total + matrices[:, j] * vector[j]
     return total
-
-
-def _delayed(value: Array, before: Array, late: int) -> tuple[Array, Array]:
-    """The value `late` ticks ago, and the queue after this tick, newest first."""
-    if not late:
-        return value, before
-    return before[-1], jnp.concatenate([value[None], before[:-1]])

@@ -15,7 +15,7 @@ from aircraft_sim.uncertainty import KINEMATIC, nominal_and_sampled
 from control_laws.catalogue import LAWS, Gains, Law, initial_gains
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.design.gain_selection import with_feedforward
+from flight_analysis.design.gain_selection import law_order, with_feedforward
 from flight_campaign import fleet, statistics
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.fleet import Fleet, FleetResult, Vehicle
@@ -82,8 +82,7 @@ def build_benchmark(scenario: Scenario) -> Benchmark:
     airframe, _ = scenario.aircraft.load()
     controller = scenario.controller
     with_model = scenario.vary(controller=with_feedforward(controller, airframe).model_dump())
-    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
-    rows = [list(airframe.outputs).index(name) for name in controller.outputs]
+    rows, columns = law_order(airframe, controller)
     actuators, m = scenario.aircraft.actuators, len(controller.inputs)
 
     def in_law_order(limits: Iterable[float], default: float) -> FloatArray:

@@ -371,7 +371,7 @@ def with_feedforward(controller: ControllerParameters, airframe: Airframe) -> Co
     lead = lag + delay + half a period, of the controller. Raises ParameterError for an airframe that cannot be the
     model, such as one with a zero in the right half plane.
     """
-    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
+    _, columns = law_order(airframe, controller)
     gravity = airframe.matrix_gravity()
     model = FeedforwardParameters(
         states=tuple(airframe.states),
@@ -417,9 +417,7 @@ def assess_gains(study: Study, controller: ControllerParameters, setting: LoopSe
     the implicit sign the linear loop is the one inside the width of the sign, dt^2 omega beta. Its margin is then the delay at
     which chatter begins, and at most half a period.
     """
-    airframe = study.airframe
-    rows = [airframe.outputs.index(name) for name in controller.outputs]
-    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
+    rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
     D = require_channels(study.Omega[np.ix_(rows, columns)], channels, controller.D)
     params = controller.law()
@@ -482,6 +480,12 @@ def _has_signs(Omega: FloatArray, D: FloatArray) -> bool:
         return False
 
 
+def law_order(airframe: Airframe, controller: ControllerParameters) -> tuple[list[int], list[int]]:
+    """Indices of the law's outputs and inputs among those of an airframe."""
+    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
+    return [airframe.outputs.index(name) for name in controller.outputs], columns
+
+
 def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) -> FloatArray:
     return np.array([values.get(name, default) for name in names])
 
@@ -533,8 +537,7 @@ def as_yaml(selection: Selection) -> str:
     """The engineering gain set as the section `/**/controller` of a scenario file, with units and reasons in comments."""
     controller, study = selection.engineering.controller, selection.study
     params = controller.law()
-    rows = [study.airframe.outputs.index(name) for name in controller.outputs]
-    columns = [list(study.airframe.inputs).index(name) for name in controller.inputs]
+    rows, columns = law_order(study.airframe, controller)
     response = np.abs(study.Omega[rows, columns]) * controller.input_scale  # abs(Omega_ii) in the inputs of the controller
     K, bandwidth, slew = (
         ", ".join(f"{value:.3g}" for value in values)
