@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time of one tick: the law, the law with anti-windup and the whole tick, relative to a NumPy multiply-add of the same size.
 
-.venv/bin/python benchmarks/law.py
+python -m benchmarks.law
 """
 
 import gc
