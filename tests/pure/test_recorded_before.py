@@ -45,7 +45,7 @@ def test_every_sample_is_that_of_an_independent_reader(run: Path) -> None:
         stamps = signal.stamp_ns.tolist()
         read = [(stamp, signal.names, row.tobytes()) for stamp, row in zip(stamps, signal.values, strict=True)]
         assert read == sorted(samples[name], key=lambda sample: sample[0]), name
-        assert len(read) > 50
+        assert len(read) > 30  # ticks of 10 ms in the shorter flight
 
 
 def test_the_summary_is_equal_to_the_last_digit(run: Path) -> None:
@@ -61,7 +61,7 @@ def test_every_bit_is_replayed(run: Path) -> None:
     result = replay(recorded.tape, recorded_parameters(recorded.scenario), changes=changes)
     assert result.equal(), result.first()
     assert result.checked.all()
-    assert len(result.number) == len(recorded.tape["internals"].stamp_ns) > 50
+    assert len(result.number) == len(recorded.tape["internals"].stamp_ns) > 30  # ticks of 10 ms in the shorter flight
     assert result.notes == ()
 
 
