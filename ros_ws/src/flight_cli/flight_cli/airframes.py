@@ -13,9 +13,7 @@ from flight_analysis.design.airframe_properties import AirframeFacts, ComplexArr
 from flight_cli.output import new_table
 
 
-def airframes(
-    as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON, nothing else.")] = False,
-) -> None:
+def airframes(as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON, nothing else.")] = False) -> None:
     """Show the airframes of the library: poles, zeros, the minors of Omega = C B, D as published and what gives D = I."""
     facts = library()
     if as_json:

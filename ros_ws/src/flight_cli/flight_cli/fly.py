@@ -29,15 +29,13 @@ def fly(
         bool, typer.Option("--in-process", help="Fly in one process without ROS, as fast as it goes.")
     ] = False,
     lockstep: Annotated[
-        bool,
-        typer.Option("--lockstep", help="Fly in lockstep over topics, as fast as possible, repeatable to the byte."),
+        bool, typer.Option("--lockstep", help="Fly in lockstep over topics, as fast as possible, repeatable to the byte.")
     ] = False,
     one_process: Annotated[bool, typer.Option("--one-process", help="Fly in lockstep with all nodes in one process.")] = False,
     bridge: Annotated[
         str | None,
         typer.Option(
-            metavar="MAP",
-            help="Fly an autopilot in place of the aircraft, by a channel map; a dry run without --send.",
+            metavar="MAP", help="Fly an autopilot in place of the aircraft, by a channel map; a dry run without --send."
         ),
     ] = None,
     send: Annotated[bool, typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged.")] = False,

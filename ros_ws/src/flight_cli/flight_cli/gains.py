@@ -54,8 +54,7 @@ def gains(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain airframes.")] = 1,
     write: Annotated[Path | None, typer.Option(help="File for the engineering gains, as a section of a scenario.")] = None,
     feedforward: Annotated[
-        bool,
-        typer.Option("--feedforward", help="Write the airframe too, as the model of the feedforward (an extension)."),
+        bool, typer.Option("--feedforward", help="Write the airframe too, as the model of the feedforward (an extension).")
     ] = False,
     check: Annotated[
         bool, typer.Option("--check", help="Check the gain set of the scenario instead of selecting one.")

@@ -31,8 +31,7 @@ def identify(
     speed: Annotated[float, typer.Option(help="True airspeed to trim and fly at, m/s.")],
     altitude: Annotated[float, typer.Option(help="Altitude above sea level to trim and fly at, m.")],
     output: Annotated[
-        Path | None,
-        typer.Option(help="Scenario file to write; by default jsbsim_NAME.yaml, which must not exist."),
+        Path | None, typer.Option(help="Scenario file to write; by default jsbsim_NAME.yaml, which must not exist.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:

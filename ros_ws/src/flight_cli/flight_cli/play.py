@@ -43,10 +43,7 @@ def play(
     from flight_bringup.clients import Player  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     end = playback.t(playback.messages[-1].due_ns)
-    with (
-        Player(playback.types, SHARED) as sender,
-        progress_bar(*CLOCK_COLUMNS) as bar,
-    ):
+    with Player(playback.types, SHARED) as sender, progress_bar(*CLOCK_COLUMNS) as bar:
         task = bar.add_task("play", total=end - start, clock="", shown=f"{', '.join(playback.types)}, stamps {stamps}")
 
         def progress(due_ns: int) -> None:

@@ -81,8 +81,7 @@ class KeyedParameters(NodeParameters):
     """Base of the parameters of a node whose messages can carry a message authentication code."""
 
     key_file: str = Field(
-        default="",
-        description="file of the key of the message authentication codes (flight_core.authentication); empty: none",
+        default="", description="file of the key of the message authentication codes (flight_core.authentication); empty: none"
     )
 
 

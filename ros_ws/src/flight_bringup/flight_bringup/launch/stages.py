@@ -131,10 +131,7 @@ def start_in_stages(
 
 def complete(run: Path, reason: str = "flight completed") -> list[Action]:
     """The actions at the end of a flight that flew its whole duration."""
-    return [
-        LogInfo(msg=f"{reason}; now: ros2 run flight_cli rise-di report {shlex.quote(str(run))}"),
-        Shutdown(reason=reason),
-    ]
+    return [LogInfo(msg=f"{reason}; now: ros2 run flight_cli rise-di report {shlex.quote(str(run))}"), Shutdown(reason=reason)]
 
 
 def _subscribe_states(context: LaunchContext) -> None:
