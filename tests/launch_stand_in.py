@@ -14,8 +14,7 @@ from typing import Any
 from flight_ros.transport import PROFILE_VARIABLE
 
 
-class Event:
-    """Base of events."""
+class Event: ...
 
 
 class LaunchContext:
@@ -29,7 +28,6 @@ class LaunchContext:
         self.asyncio_loop = self
 
     def call_soon_threadsafe(self, callback: Callable[..., None], *arguments: Any) -> None:
-        """Call at once."""
         callback(*arguments)
 
     def emit_event_sync(self, event: Event) -> None:
@@ -91,8 +89,6 @@ class LaunchDescription:
 
 @dataclass(frozen=True)
 class LaunchConfiguration:
-    """The value of an argument, by its name."""
-
     variable_name: str
 
     def perform(self, context: LaunchContext) -> str:
@@ -102,20 +98,15 @@ class LaunchConfiguration:
 
 @dataclass(frozen=True)
 class ExecutableInPackage:
-    """The path of an executable."""
-
     executable: str
     package: str
 
 
-class Action:
-    """Base of actions."""
+class Action: ...
 
 
 @dataclass(eq=False)
 class DeclareLaunchArgument(Action):
-    """An argument of a launch file."""
-
     name: str
     default_value: str | None = None
     description: str | None = None
@@ -124,37 +115,27 @@ class DeclareLaunchArgument(Action):
 
 @dataclass(eq=False)
 class OpaqueFunction(Action):
-    """A function that returns actions."""
-
     function: Callable[[LaunchContext], list[Action] | None]
 
 
 @dataclass
 class LogInfo(Action):
-    """A log message."""
-
     msg: str
 
 
 @dataclass(eq=False)
 class Shutdown(Action):
-    """The end of the launch."""
-
     reason: str
 
 
 @dataclass(eq=False)
 class TimerAction(Action):
-    """Actions after a period, s."""
-
     period: float
     actions: Sequence[Action]
 
 
 @dataclass(eq=False, kw_only=True)
 class EventHandler:
-    """Actions that follow an event."""
-
     matcher: Callable[[Event], bool]
     entities: Sequence[Any]
     handle_once: bool = False
@@ -163,15 +144,11 @@ class EventHandler:
 
 @dataclass(eq=False)
 class RegisterEventHandler(Action):
-    """Registers a handler."""
-
     event_handler: EventHandler
 
 
 @dataclass(eq=False, kw_only=True)
 class ExecuteProcess(Action):
-    """Any process."""
-
     cmd: Sequence[Any]
     name: str | None = None
     output: str = "log"
@@ -180,8 +157,6 @@ class ExecuteProcess(Action):
 
 @dataclass(eq=False, kw_only=True)
 class Node(Action):
-    """A node as a process."""
-
     executable: str
     package: str
     namespace: Any = None
@@ -193,8 +168,6 @@ class Node(Action):
 
 @dataclass
 class ProcessExited(Event):
-    """A process has ended."""
-
     process_name: str
     returncode: int
 

@@ -98,10 +98,7 @@ def swapped() -> Aircraft:
 
 @pytest.fixture(scope="module")
 def manoeuvre() -> FloatArray:
-    pulses = {
-        "q": {"start": [0.5], "stop": [1.5], "value": [0.1]},
-        "p": {"start": [1.0], "stop": [2.5], "value": [0.4]},
-    }
+    pulses = {"q": {"start": [0.5], "stop": [1.5], "value": [0.1]}, "p": {"start": [1.0], "stop": [2.5], "value": [0.4]}}
     section = CALM_SERVO.vary(reference_model={"pulses": pulses}).reference_model
     return reference_outputs(section.model(), section.profile(), FAST, round(4.0 / FAST))
 
