@@ -159,9 +159,6 @@ def _replay(file: Path) -> None:
             replay(recorded.tape, parameters, None, parameter_changes(file, "controller", ControllerParameters.model_fields))
 
 
-# Seeds
-
-
 def log(
     messages: Sequence[tuple[str, str, bytes]],
     packed: CompressionType = CompressionType.NONE,

@@ -86,9 +86,6 @@ def test_lag_comes_before_the_rate_limit_and_the_end_stop_last() -> None:
     assert step(np.zeros(6), np.full(6, 0.1), np.array(0.1), SIX)[3] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)), abs=1e-15)
 
 
-# Dead zone and faults
-
-
 def test_a_dead_zone_gives_zero_inside_and_the_excess_outside() -> None:
     # input = c - clip(c, -w, w), w = 0.1
     params = Actuators(dead_zone=np.array([0.1]))

@@ -195,9 +195,6 @@ def test_stamps_of_signals_may_differ_in_number(recorded: Path) -> None:
     assert np.diff(back["u"].stamp_ns).tolist() == [10_000_000] * 200
 
 
-# Bags of other recorders
-
-
 def record(
     folder: Path, topics: dict[str, list[bytes]], storage: StoragePlugin, compression: CompressionMode = CompressionMode.NONE
 ) -> None:
@@ -272,9 +269,6 @@ def test_a_folder_with_only_a_metadata_yaml_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}\n", encoding="utf-8")
     with pytest.raises(ParameterError, match="expected a bag of rosbag2"):
         read_run(tmp_path)
-
-
-# Decoding messages together gives the same as decoding them one by one
 
 
 def one_by_one(messages: Sequence[bytes]) -> list[tuple[tuple[str, ...], int, bytes]]:

@@ -43,9 +43,6 @@ def fly_campaign(folder: Path, of: Definition) -> Campaign:
     return campaign
 
 
-# Statistics
-
-
 @given(VALUES, st.data())
 def test_a_figure_summed_from_parts_is_that_of_the_whole(values: FloatArray, data: st.DataObject) -> None:
     cut = data.draw(st.integers(0, len(values)))
@@ -95,9 +92,6 @@ def test_a_score_counts_errors_in_their_units() -> None:
     assert score(rms, score_units(("q", "p", "r", "V"), units)) == pytest.approx([4.0])
     with pytest.raises(ParameterError, match=r"^outputs: found theta in rad, expected units a score counts: rad/s, m/s"):
         score_units(("q", "theta"), units)
-
-
-# Campaigns
 
 
 def test_an_aircraft_of_a_campaign_has_the_same_score_in_the_single_process_simulation(tmp_path: Path) -> None:
@@ -164,9 +158,6 @@ def test_an_invalid_sweep_is_refused(sweep: Sweep, sentence: str) -> None:
 def test_a_folder_without_a_campaign_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"found no campaign .*, expected the folder of one"):
         Campaign.resume(tmp_path)
-
-
-# The command, as a process: killed, resumed, over dask
 
 
 def command(*arguments: str, cwd: Path) -> "subprocess.Popen[str]":

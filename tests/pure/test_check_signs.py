@@ -115,9 +115,6 @@ def test_a_map_of_other_channels_or_motions_is_one_sentence() -> None:
         through(changed(original, "inputs", "elevator", positive="roll right"), OMEGA)
 
 
-# Estimate from a recorded flight
-
-
 def excited(Omega: FloatArray, noise: float) -> tuple[Signal, Signal]:
     """y_dot = -2 y + Omega u at 100 Hz for 20 s, each input in steps of its own period; exact between samples."""
     generator = np.random.default_rng(1)

@@ -35,9 +35,6 @@ def aircraft(**section: Any) -> Aircraft:
     return aircraft_parameters(**section).load()[1]
 
 
-# Gusts
-
-
 @pytest.mark.parametrize(
     ("feet", "reference_fps", "alleviation", "expected_fps"),
     [
@@ -75,9 +72,6 @@ def test_wind_along_an_axis_changes_the_relative_velocity() -> None:
     assert osprey.gust_direction("lateral") == pytest.approx(-A[:, osprey.index("beta")] / V0)
     assert osprey.gust_direction("vertical") == pytest.approx(-A[:, osprey.index("alpha")] / V0, abs=0.051 / V0)
     assert set(osprey.gusts) == set(AXES)
-
-
-# Biases and sines
 
 
 def test_a_bias_rises_along_half_a_cosine_and_stays() -> None:
@@ -177,8 +171,6 @@ def test_outside_assumption_2_a_shorter_period_does_not_help(name: str, channel:
     assert coarse / fine < 1.2
 
 
-# Inertial coupling
-
 INERTIA = np.array([[0.8244, 0.0, -0.1204], [0.0, 1.135, 0.0], [-0.1204, 0.0, 1.759]])  # Aerosonde, kg m^2
 PQR = [5, 2, 6]  # indices of p, q, r in the state of the osprey
 
@@ -217,8 +209,6 @@ def test_free_rotation_keeps_energy_and_angular_momentum() -> None:
     for kept in (lambda w: w @ INERTIA @ w, lambda w: np.linalg.norm(INERTIA @ w)):
         assert kept(end) == pytest.approx(kept(w), rel=1e-5)
 
-
-# Amplitude 0 has no effect, to the last bit
 
 BASELINE: dict[str, Any] = {
     "gusts": {

@@ -102,9 +102,6 @@ def largest_error(params: ControllerParameters) -> float:
     return float(max(errors))
 
 
-# Numbers of a step
-
-
 def test_one_tick_gives_the_hand_worked_numbers() -> None:
     # From x = (0, 0) to y_m = 0.1 in 0.1 s: y_m_dot = 1. The other state, eta_dot = 4 y_m - 3 eta with y_m = t, is
     # 4 (3 t - 1 + exp(-3 t)) / 9 = 0.0181414 then, and Runge-Kutta is within (3 t)^5 / 5! of it.
@@ -143,9 +140,6 @@ def test_on_the_nominal_plant_the_feedforward_alone_leaves_the_sampling_error() 
     assert coarse < 2e-3
     assert 3.5 < coarse / fine < 4.5
     assert largest_error(small_aircraft().model_copy(update={"feedforward": None})) > 0.5
-
-
-# Off by default
 
 
 def test_the_feedforward_is_off_by_default() -> None:
@@ -201,9 +195,6 @@ def test_u_is_recomputed_from_the_log_to_the_last_bit(enabled: bool) -> None:
     assert bool(u_ff.any()) is enabled
 
 
-# Bumpless transfer
-
-
 def ticks(
     params: ControllerParameters, y: Callable[[float], FloatArray], missing: tuple[float, float] = (9.0, 9.0)
 ) -> list[ControllerState]:
@@ -252,9 +243,6 @@ def test_new_gains_change_neither_the_feedforward_nor_the_input() -> None:
     assert before.u_ff.tobytes() == after.u_ff.tobytes()
 
 
-# Refusals
-
-
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
@@ -288,9 +276,6 @@ def test_a_model_without_hidden_states_or_gravity_is_accepted() -> None:
     nominal = nominal_of(small_aircraft(**square))
     assert len(feedforward.zero_dynamics(nominal)) == 0
     assert nominal.inverse @ [[2.0, 0.4], [0.3, -1.0]] == pytest.approx(np.eye(2))
-
-
-# The osprey
 
 
 def test_the_gains_command_writes_the_nominal_model_on_request_and_the_section_reads_back(tmp_path: Path) -> None:

@@ -64,9 +64,6 @@ def failing_in_loop(assessment: GainAssessment) -> list[str]:
     return names(gain_conditions.failing(assessment.loop), assessment.controller.outputs)
 
 
-# Theorem 1
-
-
 def test_beta_follows_29_and_30_from_the_last_channel_up() -> None:
     # beta_3 = 3 (1 + 0/4) = 3; beta_2 = (2 + 0.5 3) (1 + 2/2) = 7; beta_1 = (1 + 2 7 + 1 3) (1 + 1/1) = 36
     assert gain_conditions.least_beta(np.array([1.0, 2.0, 4.0]), HAND).tolist() == [36.0, 7.0, 3.0]
@@ -164,9 +161,6 @@ def test_n_d_is_minus_D_U_v_dot() -> None:
     np.testing.assert_allclose(gain_conditions.N_d(Omega, v_dot), expected, atol=1e-12)
 
 
-# The ideal control
-
-
 def test_the_slew_of_the_ideal_control_of_the_osprey_is_that_of_earlier_measurements(osprey: Study) -> None:
     # deg/s and %/s; measured with steps for commands, where these have edges of 0.1 s: thrust and rudder in calm air are
     # slower (36 and 9.3 with steps), the gusts are the same
@@ -201,9 +195,6 @@ def test_an_airframe_with_an_unstable_zero_is_refused(osprey_gust: Scenario) -> 
     rows[AIRFRAME.index("beta")][AIRFRAME.index("beta")] = 0.69  # the zero at -0.69 1/s is that entry
     with pytest.raises(ParameterError, match=r"^airframe osprey: found a zero at 0\.69 1/s, expected none in the right"):
         selection.study_airframe(AIRFRAME.model_copy(update={"A": rows}), selection.manoeuvre(osprey_gust, AIRFRAME))
-
-
-# The engineering procedure
 
 
 def test_the_engineering_gains_of_the_osprey_are_close_to_those_tuned_by_hand(selected: selection.Selection) -> None:
@@ -269,9 +260,6 @@ def test_a_scenarios_gain_set_is_judged_condition_by_condition(osprey: Study) ->
     assert {"lag product of q", "beta below rate of r"} <= set(failing_in_loop(selection.check_gains(fast, osprey)))
 
 
-# Refusals
-
-
 def osprey_channels(
     inputs: tuple[str, ...] = ("elevator", "thrust", "aileron", "rudder"), flipped: tuple[str, ...] = ()
 ) -> tuple[FloatArray, ChannelPairing]:
@@ -324,9 +312,6 @@ def test_gains_can_be_selected_for_the_pairing_that_a_refusal_proposes(osprey_gu
         selection.select_gains(found, SERVOS)
     answer = selection.select_gains(found, SERVOS._replace(inputs=("rudder", "aileron"))).engineering
     assert answer.controller.inputs == ("rudder", "aileron")
-
-
-# The linear loop
 
 
 OSPREY_LOOP = Loop(np.array([0.02, 0.1, 0.02, 0.02]), 0.0, 0.01)
@@ -426,9 +411,6 @@ def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
     assert answer.delay_margin is None
     with pytest.raises(ParameterError, match=r"^sign: found literal, expected soft or implicit"):
         gain_conditions.law_matrix(literal.controller.law(), 0.01)
-
-
-# The command line
 
 
 def rise_di(*arguments: str) -> Result:

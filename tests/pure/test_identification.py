@@ -60,8 +60,6 @@ def respond(fly: Fly, upper: FloatArray = WIDE) -> Responses:
 
 STRAIGHT = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
 
-# Closed forms
-
 
 @settings(deadline=None, max_examples=30)
 @given(
@@ -158,9 +156,6 @@ def test_an_output_without_response_ends_the_identification() -> None:
         respond(lagged(np.diag([3.0, 0.0]), np.full(2, 0.02)))
 
 
-# The manoeuvre
-
-
 @pytest.mark.parametrize(("speed", "authority"), [(30.0, 0.8), (150.0, 2.5), (250.0, 0.4)])
 def test_the_commanded_airspeed_needs_a_third_of_the_throttle(speed: float, authority: float) -> None:
     # The filter's answer to a step, 2 m/s (1 - (1 + w t) exp(-w t)), is steepest at t = 1/w: 2 m/s w / e. The pulse's edge of
@@ -179,9 +174,6 @@ def test_moderate_turbulence_has_the_parameters_of_its_altitude(altitude: float,
     assert set(moderate_turbulence(altitude)) == {"altitude", "seed"} | keys
     section = {"airframe": "jsbsim:c172p", "speed": 46.3, "altitude": altitude, "rate": 200.0, "step": 0.005}
     find_scenario("jsbsim_c172p").vary(aircraft=section | {"turbulence": moderate_turbulence(altitude)})  # is accepted
-
-
-# An aircraft
 
 
 @pytest.fixture(scope="module")
@@ -223,9 +215,6 @@ def test_shipped_aircraft_fly_closer_than_the_prototype_did(name: str) -> None:
     # In turbulence the airspeed's error is the turbulence itself, 3 m/s rms; the rates stay near their references.
     assert flights["turbulence"].rms["V"] < 3.05
     assert max(flights["turbulence"].rms[output] for output in ("q", "p", "r")) < 0.01
-
-
-# The command
 
 
 def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -58,9 +58,6 @@ def one_gust(axis: str, speed: float, length: float) -> WindModel:
     return WindModel(Gusts(ZEROS, np.array([speed * (name == axis) for name in AXES]), ZEROS + length), None)
 
 
-# Trim
-
-
 @pytest.mark.parametrize(
     "condition",
     # c172p: JSBSim's own trim. c182: JSBSim's trim fails, because the engine does not run in it. DHC6: JSBSim's trim does not
@@ -95,9 +92,6 @@ def test_end_stops_are_those_of_the_whole_command() -> None:
     assert trim.commands + trim.upper == pytest.approx([1.0, 1.0, 1.0, 1.0])
     assert trim.commands[1] + trim.lower[1] == pytest.approx(0.0)
     assert trim.lower[0] == -1.0  # the other way the stick reaches its own stop first
-
-
-# The channel map
 
 
 @pytest.mark.parametrize(
@@ -169,9 +163,6 @@ def test_actuators_act_before_the_aircraft() -> None:
     assert fly(slow, command(aileron=0.1), 0.1)["actuator.aileron"][-1] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)))
 
 
-# Repeatability, console output
-
-
 def test_two_flights_agree_to_the_last_bit() -> None:
     u = command(elevator=-0.05, throttle=0.1, aileron=0.1, rudder=0.02)
     first, second = (fly(cessna(one_gust("vertical", 5.0, 30.0)), u, 3.0) for _ in range(2))
@@ -198,9 +189,6 @@ def test_nothing_is_printed_and_nothing_written(
     fly(model, command(), 0.1)
     assert not list(tmp_path.iterdir())
     assert capfd.readouterr() == ("", "")
-
-
-# Failures
 
 
 def test_a_hang_in_the_isolated_process_times_out() -> None:
@@ -271,9 +259,6 @@ def test_a_state_that_is_not_finite_counts_as_diverged() -> None:
     assert not model.diverged()
     model._x = np.array([np.nan, *np.zeros(len(STATES) - 1)])
     assert model.diverged()
-
-
-# Parameters
 
 
 @pytest.mark.parametrize(

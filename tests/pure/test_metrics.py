@@ -73,9 +73,6 @@ def test_errors_are_split_by_part_and_the_ultimate_bound_is_the_largest_undistur
     assert table["q"]["whole"].max == 4.0
 
 
-# Transients
-
-
 def test_engagements_are_changes_of_the_mode_to_engaged() -> None:
     mode = [Mode.ENGAGED, Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]
     internals = signal([0, 10, 20, 30, 40], mode=mode)
@@ -143,9 +140,6 @@ def test_settling_is_measured_up_to_the_next_transient_of_the_channel() -> None:
     assert gust.time == {"q": pytest.approx(0.2), "p": 0.0}
 
 
-# Inputs, saturation and the sign term
-
-
 def test_control_effort_is_the_rms_about_trim_and_the_mean_rate() -> None:
     # 0 -> 2 -> -2 -> -2 in 0.1 s each: a total variation of 6 in 0.3 s. sqrt((0 + 4 + 4 + 4) / 4) = sqrt(3).
     flight = tape(u=signal([0, 100, 200, 300], elevator=[0.0, 2.0, -2.0, -2.0]))
@@ -176,9 +170,6 @@ def test_sign_switches_are_counted_on_the_increments_of_pi() -> None:
 def test_sign_switches_without_internals_are_those_of_the_error() -> None:
     y, y_m = signal([0, 10, 20], q=[1.0, -1.0, 2.0]), signal([0, 20], q=[0.0, 0.0])
     assert metrics.sign_switches(tape(y=y, y_m=y_m)) == {"q": pytest.approx(2 / 0.02)}
-
-
-# Noise floor and spectrum
 
 
 def test_the_noise_floor_is_the_recorded_noise() -> None:
@@ -214,9 +205,6 @@ def test_a_spectrum_bridges_missing_samples() -> None:
     frequency, density = metrics.spectra(Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS)
     assert frequency[-1] == 50.0
     assert np.all(density["u"] < 1e-12)  # constant, for gaps repeat the sample before
-
-
-# Timing
 
 
 def test_periods_without_a_tick_are_counted() -> None:

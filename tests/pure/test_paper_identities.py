@@ -31,8 +31,6 @@ from rise_di_controller.law import LawParams, Sign, gain
 EXACT = 1e-11  # rounding in sums of some hundred terms of size 1 to 100
 DIFFERENCED = 1e-5  # central differences over 1 ms of a solution with an error of 1e-10; measured below 1e-6
 
-# A random plant under the continuous law
-
 
 class Problem(NamedTuple):
     """A plant (1) with f = W sin(G x + omega t), a model (2) with u_m = a sin(nu t + 1), and gains."""
@@ -240,9 +238,6 @@ def close(a: FloatArray | float, b: FloatArray | float, tolerance: float) -> boo
     return bool(np.max(np.abs(np.asarray(a) - b)) < tolerance * max(1.0, float(np.max(np.abs(b)))))
 
 
-# Identities that hold
-
-
 def test_e_dot_and_so_r_of_4_are_the_derivative_of_3(loop: Loop) -> None:
     for t in INSTANTS:
         assert close(loop.e_dot(t), differenced(loop.e, t), DIFFERENCED)
@@ -344,9 +339,6 @@ def test_the_sampled_law_converges_to_20_with_its_period(loop: Loop, sign: Sign)
         flight = fly(loop.p.plant(), y_m, dt, loop.p.law(sign), X_0)
         distance.append(float(np.max(np.abs(flight.x[-1] - loop.unpack(DURATION)[0]))))
     assert all(1.7 < before / after < 2.3 for before, after in pairwise(distance))
-
-
-# Errata and their repairs
 
 
 def at_rest() -> Loop:

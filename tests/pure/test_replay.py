@@ -81,9 +81,6 @@ def test_a_replay_equals_the_flight_in_every_bit(name: str) -> None:
     assert bool(log.group("u_ff").values.any()) is ("feedforward" in name)
 
 
-# Events of real time: late and lost samples, restarts, parameter changes
-
-
 class Tick(NamedTuple):
     """Events before a tick and at it."""
 
@@ -182,9 +179,6 @@ def test_a_second_controller_in_a_log_is_noted() -> None:
     assert result.notes == ("another controller begins at t = 0.22 s",)
 
 
-# Differences
-
-
 def flipped(value: float) -> float:
     """The float64 with the lowest bit of its fraction changed."""
     return float((np.array([value]).view(np.int64) ^ 1).view(np.float64)[0])
@@ -258,9 +252,6 @@ def test_differences_are_counted_in_units_in_the_last_place() -> None:
         assert first.ulps == ulps
 
 
-# Incomplete logs
-
-
 def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
     """The tape with those samples of `internals` and `u` whose numbers `keep` accepts."""
     kept = np.asarray(keep(tape["internals"]["number"]), dtype=bool)
@@ -316,9 +307,6 @@ def test_lost_samples_of_a_log_cause_no_differences(ticks: list[Tick], lost: set
         assert replay(tape, parameters).first() is None
 
 
-# Parameters changed in flight
-
-
 def test_gains_changed_in_flight_differ_from_the_tick_of_the_change() -> None:
     tuned = {"k_g": 2.0, "Lambda": [3.0, 4.0, 2.0, 1.0], "upper": [0.02] * 4}
     tape = driven(GUST.controller, [FLY] * 30 + [Tick(changes=(tuned,))] + [FLY] * 30)
@@ -346,9 +334,6 @@ def test_a_replay_applies_successive_gain_changes_one_by_one() -> None:
     assert lost.notes == ()
 
 
-# Open loop
-
-
 def test_an_open_loop_equals_the_controller_on_the_recorded_inputs() -> None:
     others = vary(GUST.controller, {"Lambda": [3.0, 3.0, 3.0, 1.0], "beta": [20.0, 20.0, 8.0, 6.0], "upper": [0.01] * 4})
     tape = simulate(GUST)
@@ -373,9 +358,6 @@ def test_an_open_loop_continues_over_gaps_and_lost_inputs() -> None:
     assert np.isfinite(result.computed).all()
     u = result.group(result.computed, "u").values
     assert (u[0] == result.group(result.recorded, "u").values[0]).all()  # starts at the recorded u
-
-
-# Errors
 
 
 def test_a_log_of_other_channels_is_refused() -> None:
@@ -419,9 +401,6 @@ def test_each_parameter_set_has_its_own_digest() -> None:
     changes: tuple[dict[str, Any], ...] = ({"k_g": flipped(1.0)}, {"upper": [1.0] * 4}, {"sign": "implicit"})
     others = [*(vary(GUST.controller, change) for change in changes), SERVO.controller, LEADING]
     assert len({digest, *(other.digest() for other in others)}) == 6
-
-
-# The command
 
 
 def busy_scenario(folder: Path, **controller: object) -> Path:

@@ -91,9 +91,6 @@ def headings(page: str) -> list[str]:
     return [part.partition("</h2>")[0] for part in page.split("<h2>")[1:]]
 
 
-# The page
-
-
 def test_a_simulated_flight_has_every_figure(tmp_path: Path, servo: Scenario, complete: Tape) -> None:
     assert headings(page_of(tmp_path, servo, complete)) == [
         "Output y over the reference y_m",
@@ -152,9 +149,6 @@ def test_every_colour_of_a_page_has_a_dark_counterpart(tmp_path: Path, servo: Sc
     assert len(used) > 5
 
 
-# Events and intervals
-
-
 def test_each_event_is_listed_once_in_order_of_its_start() -> None:
     modes = ((20, "ENGAGED"), (10, "HOLD"), (20, "ENGAGED"), (5, "HOLD"), (5, "RAMP"), (41, "ENGAGED"))
     mode = [Mode[name] for count, name in modes for _ in range(count)]
@@ -200,9 +194,6 @@ def test_intervals_are_shaded_over_the_whole_height_of_a_figure() -> None:
     assert shapes == [(0.2, 0.3, 0, 1, "paper"), (0.5, 0.6, 0, 1, "paper")]
     assert [note.text for note in drawn.layout.annotations] == ["a gust"]
     assert len(traces(drawn, "hold")) == 1  # in the legend
-
-
-# The input
 
 
 def input_flight(**limited: list[Saturation]) -> Tape:
@@ -254,9 +245,6 @@ def test_the_actuator_is_drawn_over_the_command_by_name() -> None:
     by_axis = {trace.yaxis: trace.y[0] for trace in traces(figure, "actuator")}
     assert by_axis == {"y": pytest.approx(0.01 / DEG), "y4": pytest.approx(0.3)}
     assert len(traces(figure, "command u")) == 4
-
-
-# Signals that only a simulation records
 
 
 def test_all_states_are_drawn_in_their_unit_where_it_is_known() -> None:
@@ -322,9 +310,6 @@ def test_timing_has_a_histogram_if_it_is_not_zero() -> None:
     assert figure is not None
     assert [axis.title.text for axis in figure.select_xaxes()] == ["y sent to u sent (ms)"]
     assert [count for count in figure.data[0].y if count] == [2.0, 1.0]
-
-
-# Several flights
 
 
 @pytest.fixture(scope="module")
@@ -402,9 +387,6 @@ def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> N
     assert headings(page) == ["Tracking error", "Output y over the reference y_m", "Tracking error e = y - y_m"]
 
 
-# Transients and formats
-
-
 def test_commands_are_the_edges_of_pulses(osprey_gust: Scenario) -> None:
     pulses = {"q": {"start": [2.0, 6.0], "stop": [4.0, 8.0], "value": [0.1, -0.1]}}
     edges = summary.pulse_edges(osprey_gust.vary(reference_model={"pulses": pulses, "rise": 0.1}))
@@ -431,9 +413,6 @@ def test_slowest_settling_marks_a_transient_after_which_the_error_did_not_settle
 def test_values_have_three_digits() -> None:
     texts = {None: "-", 0.0: "0.00", 1.0: "1.00", 123.4: "123", 4.5678e-7: "4.57e-07"}
     assert [summary.format_value(value) for value in texts] == list(texts.values())
-
-
-# Curves
 
 
 def test_a_curve_is_broken_at_a_gap_and_u_is_held() -> None:

@@ -94,9 +94,6 @@ def law_of(name: str, model: NominalModel, **values: Any) -> tuple[ControlLaw, A
     return law.control_law(model), law.params(gains(**values) or initial_gains(law, model), model)
 
 
-# Plain inversion
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(-0.3, 0.3), min_size=8, max_size=8), st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))
 def test_inversion_cancels_the_model_and_leaves_the_error_its_own_dynamics(
@@ -132,9 +129,6 @@ def test_the_integral_of_the_inversion_rejects_a_constant_disturbance() -> None:
     # without the integral K e = d at rest; sampling changes nothing, since y_dot is then 0
     assert without.y[-1] == pytest.approx(1.0 / 8.0, rel=1e-9)
     assert abs(with_integral.y[-1]) < 1e-9
-
-
-# LQI
 
 
 def test_doubling_solves_the_riccati_equation(osprey: NominalModel) -> None:
@@ -177,9 +171,6 @@ def test_lqi_leaves_no_error_under_a_constant_disturbance() -> None:
     assert abs(flight.y[-1]) < 1e-6
 
 
-# MacKunis
-
-
 def test_the_acceleration_based_law_by_hand() -> None:
     model = integrator(Omega=2.0, period=0.1)
     control_law, params = law_of("mackunis_ideal", model, K=3.0, Lambda=2.0, beta=5.0, softening=0.24)  # eps = 5 / 3 0.24 = 0.4
@@ -200,9 +191,6 @@ def test_the_filtered_difference_of_a_ramp_converges_to_its_slope() -> None:
         state, _ = control_law.step(state, at(0.3 * k * DT), np.array(DT), params)
     # a filter of first order: 1 - exp(-12.6 3 s) of the slope
     assert state.e_dot.item() == pytest.approx(0.3 * (1.0 - np.exp(-12.6 * 3.0)), rel=1e-9)
-
-
-# L1
 
 
 def test_the_predictor_of_l1_estimates_a_constant_disturbance_in_one_tick() -> None:
@@ -235,9 +223,6 @@ def test_l1_with_feedforward_does_not_cancel_the_disturbance_twice() -> None:
     assert abs(y - y_m_dot * 500 * DT) < 0.01 * 0.7 / 3.0
 
 
-# MRAC
-
-
 def test_the_weights_of_mrac_converge_to_the_model_error() -> None:
     model = integrator()
     flight = fly(*law_of("mrac", model, K=2.0, adaptation=20.0, bias=20.0, leak=0.0), 4000, 0.3, 0.7, model)
@@ -260,18 +245,12 @@ def test_the_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
     np.testing.assert_allclose(values, values[0], rtol=1e-3)
 
 
-# INDI
-
-
 def test_indi_needs_no_model_except_the_input_gain() -> None:
     model = integrator()
     for Omega in (2.0, 1.4, 2.6):
         flight = fly(*law_of("indi", model, K=2.0, bandwidth=60.0, share=1.0), 1500, 0.2, 0.7, model, Omega=Omega)
         assert abs(flight.y[-1]) < 1e-6, Omega  # exp(-2 15) of the start and the disturbance, were it first order
         assert flight.u[-1] == pytest.approx(-0.7 / Omega, rel=1e-5)
-
-
-# Super-twisting
 
 
 def reaching(e_0: float) -> float:
@@ -295,9 +274,6 @@ def test_super_twisting_rejects_a_ramp_disturbance() -> None:
     assert np.abs(linear.y[15_000:]).min() > 0.1  # d_dot / (K Lambda) = 0.125: an integral alone follows late
 
 
-# RISE-DI and PI
-
-
 def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
     K, Lambda = np.array([[9.0], [8.0], [4.0], [2.0]]), np.array([[3.0], [2.0], [1.0], [0.5]])
     control_law, params = law_of("pi", osprey, K=K, Lambda=Lambda)
@@ -307,9 +283,6 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
         state, u = control_law.step(state, measured._replace(y=k * e), np.array(DT), params)
     # e rises by one step a tick from 0: its trapezoid up to tick 5 is 12.5 steps of dt
     np.testing.assert_allclose(u, -osprey.input_scale[:, None] * K * (5.0 + Lambda * 12.5 * DT) * e, rtol=1e-12)
-
-
-# The observer
 
 
 def test_the_observer_converges_to_states_wind_and_disturbance_of_its_model(osprey: NominalModel) -> None:
@@ -357,9 +330,6 @@ def test_with_zero_observer_gain_the_law_is_the_one_with_feedforward(osprey: Nom
         states[0], u = laws_[0].step(states[0], measured, np.array(DT), params)
         states[1], without = laws_[1].step(states[1], measured, np.array(DT), params.rise)
         assert np.array_equal(u, without)  # to the last bit
-
-
-# All of them
 
 
 def test_anti_windup_stops_an_integral_in_saturation_and_releases_it_on_the_way_back() -> None:

@@ -139,9 +139,6 @@ def test_a_sample_is_the_output_with_its_noise_or_is_dropped() -> None:
     assert set(arrivals) == {0, 1}
 
 
-# Bias, drift, quantisation
-
-
 def drifting(step: list[float], seed: int = 1) -> Sensors:
     return sensors([0.0] * len(step), seed=seed)._replace(drift=np.array(step))
 

@@ -81,9 +81,6 @@ def test_lost_ticks_with_nominal_dt_cost_as_much_as_in_the_prototype(name: str, 
     assert_agrees(measure(ROWS[name]._replace(seeds=seeds)), ROWS[name])
 
 
-# Delay beyond sampling, hold and servo
-
-
 @pytest.mark.parametrize(
     ("changes", "below", "above"),
     [
@@ -112,9 +109,6 @@ def test_the_loop_has_a_gain_margin_of_ten() -> None:
     plant, law, loop = linear_loop(servo_scenario())
     stable = {gain: is_stable(plant._replace(B=plant.B * gain), law, loop, np.zeros(4)) for gain in (10.0, 12.0)}
     assert stable == {10.0: True, 12.0: False}
-
-
-# Reasons for differences
 
 
 def turn_with_model_bank(scenario: Scenario) -> Callable[[FloatArray, Profile], FloatArray]:

@@ -54,9 +54,6 @@ def ensemble(model: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
     return winds
 
 
-# The published figures
-
-
 @pytest.mark.parametrize(
     ("feet", "wind", "sigma", "lengths", "intensities"),
     [
@@ -81,9 +78,6 @@ def test_lengths_and_intensities_are_those_published(
 def test_lengths_and_intensities_are_continuous_between_the_models(feet: float) -> None:
     below, above = (dryden(h * FEET, 7.7, 1.5) for h in (feet - 1e-6, feet + 1e-6))
     assert np.concatenate(above) == pytest.approx(np.concatenate(below), rel=1e-8)
-
-
-# The filters: in frequency, in time, and over one step
 
 
 def continuous(model: Dryden) -> tuple[FloatArray, FloatArray]:
@@ -141,9 +135,6 @@ def test_the_published_correlations_are_integrals_of_the_published_spectra(axis:
         weight: dict[str, Any] = {"weight": "cos", "wvar": lag} if lag else {}
         total = quad(lambda omega: float(spectrum(omega, axis, SMALL)), 0.0, np.inf, limit=500, **weight)[0]
         assert total == pytest.approx(float(correlation(np.array(lag), axis, SMALL)), abs=1e-6)
-
-
-# Statistics over an ensemble of seeds
 
 
 SEEDS, STEPS = 300, 1024
@@ -227,9 +218,6 @@ def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_the_theorem() 
     fine = ensemble(SMALL, 1e-3, 100, 64)
     mean = np.mean(np.diff(fine, axis=2) ** 2, axis=(1, 2)) / SMALL.sigma**2 * SMALL.length / (1e-3 * V0)
     assert mean == pytest.approx([2.0, 3.0, 3.0], rel=0.1)  # 6300 nearly independent increments: 1.8 % standard deviation
-
-
-# Repeatability
 
 
 def test_the_numbers_of_step_k_do_not_depend_on_the_range() -> None:
