@@ -4,8 +4,7 @@
 
 from collections.abc import Iterable, Sequence
 
-Intervals = Sequence[tuple[int, int]]
-"""Begin and end of each, monotonic ns."""
+Intervals = Sequence[tuple[int, int]]  # begin and end of each, monotonic ns
 
 
 def missed_excluding_delays(skipped: Intervals, delays: Iterable[tuple[int, int]], period_ns: int) -> int:

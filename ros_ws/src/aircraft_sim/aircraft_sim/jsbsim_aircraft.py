@@ -19,9 +19,7 @@ from flight_core.parameters import require
 from flight_core.units import SI_PER_UNIT
 from flight_core.vectors import FloatArray
 
-PREFIX = "jsbsim:"
-"""Prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p."""
-
+PREFIX = "jsbsim:"  # prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
 FOOT = SI_PER_UNIT["ft/s"]  # m, and m/s per ft/s
 
 

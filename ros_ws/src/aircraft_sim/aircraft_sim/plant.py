@@ -12,8 +12,7 @@ from flight_core.integrators import rk4
 from flight_core.rates import divide, seconds
 from flight_core.vectors import Array, array_namespace
 
-DIVERGENCE_LIMIT = 1e6
-"""SI. A state above this limit counts as diverged; no state of an aircraft in flight comes near it."""
+DIVERGENCE_LIMIT = 1e6  # SI. A state above this limit counts as diverged; no state of an aircraft in flight comes near it.
 
 
 class PlantParams(NamedTuple):

@@ -37,8 +37,7 @@ class Measured(NamedTuple):
     drift: Drift
 
 
-DelayLine = tuple[StampedVector, ...]
-"""Samples that have been measured and have not arrived yet, the oldest first."""
+DelayLine = tuple[StampedVector, ...]  # samples that have been measured and have not arrived yet, the oldest first
 
 
 def initial_drift(params: Sensors) -> Drift:

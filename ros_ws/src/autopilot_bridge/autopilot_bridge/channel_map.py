@@ -21,9 +21,7 @@ from flight_core.vectors import ChannelError
 # The path of a field: names separated by dots, each with an optional index in brackets.
 PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
 STEP = re.compile(r"(\w+)(?:\[(\d+)\])?")
-
-SEA_LEVEL_DENSITY = 1.225
-"""kg/m^3, ISO 2533. With it the speed of a dynamic pressure is the indicated airspeed."""
+SEA_LEVEL_DENSITY = 1.225  # kg/m^3, ISO 2533. With it the speed of a dynamic pressure is the indicated airspeed.
 
 
 class Line(NamedTuple):

@@ -204,8 +204,7 @@ class ChannelMap(Parameters):
         return [(f"{kind}.{name}", row.topic, row.type) for kind, named in rows.items() for name, row in named.items()]
 
 
-ROUNDING = 1e-6
-"""Tolerance for limits with six digits that are the ends of a range."""
+ROUNDING = 1e-6  # tolerance for limits with six digits that are the ends of a range
 
 
 def maps() -> list[str]:

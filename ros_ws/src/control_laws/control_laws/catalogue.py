@@ -14,8 +14,7 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import ControlLaw
 from rise_di_controller.law import Sign
 
-Gains = dict[str, FloatArray]
-"""Gains by name, shape (m, N), or (1, N) where one serves all channels; all of them positive."""
+Gains = dict[str, FloatArray]  # gains by name, shape (m, N), or (1, N) where one serves all channels; all of them positive
 
 INITIAL_CROSSOVER_LAG_PRODUCT = 0.4
 """rad, bandwidth times the lag of the loop at the start of a search: 23 degrees of phase at the crossover."""
@@ -36,8 +35,7 @@ INITIAL_CHANNEL_GAINS = {
 INITIAL_COMMON_GAINS = {"softening": 3.0, "omega": 1.5, "filter": 12.6, "leak": 0.05, "fade": 4.0, "loose": 0.01}
 """Initial gains that are common to all channels."""
 
-INITIAL_GUST_INTENSITY = 0.5
-"""m/s per root s, the same for each axis of the wind."""
+INITIAL_GUST_INTENSITY = 0.5  # m/s per root s, the same for each axis of the wind
 
 
 class Law(NamedTuple):

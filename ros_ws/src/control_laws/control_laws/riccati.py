@@ -7,8 +7,7 @@ from scipy.linalg import expm
 
 from flight_core.vectors import FloatArray
 
-MAX_DOUBLINGS = 40
-"""2^40 steps of a finite horizon: enough for a mode that decays within 1e9 of them."""
+MAX_DOUBLINGS = 40  # 2^40 steps of a finite horizon: enough for a mode that decays within 1e9 of them
 
 
 def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:

@@ -20,11 +20,8 @@ from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.guard import Limits
 from rise_di_controller.law import LawParams, LawState, Sign
 
-LEAK = 0.01
-"""1/s, decay of angles and disturbances in the observer's model: each of its modes is then observable or stable."""
-
-GUST_TIME_CONSTANT = 0.6
-"""s, time constant of the wind in the model: the time to the peak of the 1-cosine gust, H / V0."""
+LEAK = 0.01  # 1/s, decay of angles and disturbances in the observer's model: each of its modes is then observable or stable
+GUST_TIME_CONSTANT = 0.6  # s, time constant of the wind in the model: the time to the peak of the 1-cosine gust, H / V0
 
 AUTHORITY_FRACTION, RAMP_TIME = 0.6, 0.1
 """Bound of the observer's contribution to the trim, as a fraction of the limits of u, and the time from 0 to it, s. They bound

@@ -19,15 +19,13 @@ Windows = Mapping[str, tuple[float, float]]
 SETTLING_DWELL = 1.0
 """s. A transient lasts this long beyond its end. An error has settled once it stays in the band for this long."""
 
-SETTLING_BAND = 0.01
-"""Half-width of the settling band as a fraction of the largest abs(y_m)."""
+SETTLING_BAND = 0.01  # half-width of the settling band as a fraction of the largest abs(y_m)
 
 MIN_BAND_NOISE_FLOORS = 4.0
 """Least half-width of the settling band of a measured error, in noise floors. 500 samples of normal noise stay within 4 with a
 probability of 97 %."""
 
-TRUE_ERROR, MEASURED_ERROR = "true error", "measured error"
-"""Names that `best_error` returns."""
+TRUE_ERROR, MEASURED_ERROR = "true error", "measured error"  # names that `best_error` returns
 
 PARTS_LEGEND = (
     f"command: from an edge of a command to {SETTLING_DWELL:g} s after its end; gust: from the entry of a gust to"

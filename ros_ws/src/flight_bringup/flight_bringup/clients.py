@@ -29,9 +29,7 @@ __all__ = ["EngagementClient", "FlightMonitor", "Player"]
 MODES = {float(mode): mode.name for mode in Mode}
 
 SERVICE_TIMEOUT = 10.0  # s
-
-AT_REST = 20
-"""So many equal samples of u in a row: it has reached trim."""
+AT_REST = 20  # so many equal samples of u in a row: it has reached trim
 
 
 class _Client:

@@ -18,9 +18,7 @@ from flight_campaign.campaign import Definition
 from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
 from flight_core.vectors import FloatArray
 
-COARSE = PER_DECADE // 50
-"""Bins of the statistics in one bin of a figure, 5 % wide."""
-
+COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, 5 % wide
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 
 

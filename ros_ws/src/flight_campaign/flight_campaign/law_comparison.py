@@ -14,11 +14,8 @@ from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
 from flight_campaign.tuning import Benchmark, TuningResult, as_gains, benchmark_fleet, score
 from flight_core.vectors import FloatArray
 
-MAX_SCORE_RATIO = 3.0
-"""A delay is tolerated if the score is below this factor times the score without delay."""
-
-MAX_DELAY_TICKS = 12
-"""Largest delay of the search: 120 ms at 100 Hz."""
+MAX_SCORE_RATIO = 3.0  # a delay is tolerated if the score is below this factor times the score without delay
+MAX_DELAY_TICKS = 12  # largest delay of the search: 120 ms at 100 Hz
 
 
 class Level(NamedTuple):

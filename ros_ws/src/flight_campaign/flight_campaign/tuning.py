@@ -24,8 +24,7 @@ from flight_core.files import read_yaml
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 
-TUNED = Path(__file__).parent / "tuned"
-"""Folder of the tuned gains, one file a scenario."""
+TUNED = Path(__file__).parent / "tuned"  # folder of the tuned gains, one file a scenario
 
 ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
 """rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error. 60 deg/s and 600 %/s."""
@@ -49,11 +48,8 @@ POPULATION, GENERATIONS, GENERATIONS_PER_GAIN, INITIAL_SIGMA = 16, 88, 6, 0.4
 """A search has GENERATIONS, or GENERATIONS_PER_GAIN times its gains if that is more: from 15 gains on. INITIAL_SIGMA is the
 first standard deviation of log(gain)."""
 
-MAX_COST = 1000.0
-"""Cost of a flight that diverged, and upper bound of every other cost."""
-
-STEP = 0.005
-"""s. Step of the integration, or one tick if that is shorter. The scores are within 1 % of those of a finer step."""
+MAX_COST = 1000.0  # cost of a flight that diverged, and upper bound of every other cost
+STEP = 0.005  # s. Step of the integration, or one tick if that is shorter. The scores are within 1 % of those of a finer step.
 
 
 class Benchmark(NamedTuple):

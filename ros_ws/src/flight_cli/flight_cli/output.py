@@ -24,8 +24,7 @@ from flight_analysis.report.summary import (
 )
 from flight_core.files import writing
 
-ENDED_EARLY, INTERRUPTED = 3, 130
-"""Exit statuses; bad input is 2 (`flight_cli.cli`)."""
+ENDED_EARLY, INTERRUPTED = 3, 130  # exit statuses; bad input is 2 (`flight_cli.cli`)
 
 
 def show_flight(console: Console, flight: RecordedFlight) -> None:

@@ -13,8 +13,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-MAX_SENTENCE_LENGTH = 1000
-"""Characters of an error sentence, however long the bad input is."""
+MAX_SENTENCE_LENGTH = 1000  # characters of an error sentence, however long the bad input is
 
 
 def printable(text: str) -> str:

@@ -6,8 +6,7 @@ import math
 from collections.abc import Mapping
 from types import MappingProxyType
 
-GRAVITY = 9.81
-"""Standard gravity as the airframes round it, m/s^2."""
+GRAVITY = 9.81  # standard gravity as the airframes round it, m/s^2
 
 SI_PER_UNIT: Mapping[str, float] = MappingProxyType(
     {

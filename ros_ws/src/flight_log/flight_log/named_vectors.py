@@ -23,9 +23,7 @@ from flight_core.vectors import FloatArray
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
 STAMP = slice(4, 12)  # int32 seconds and uint32 nanoseconds, after the 4 bytes of the encapsulation
-
-MAX_FLIGHT_TIME = 1e9
-"""s. A larger value is not a flight time."""
+MAX_FLIGHT_TIME = 1e9  # s. A larger value is not a flight time.
 
 
 class Samples(NamedTuple):

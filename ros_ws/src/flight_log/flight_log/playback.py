@@ -12,15 +12,12 @@ from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_log.named_vectors import JOINT_STATE, decoder, flight_start_ns, stamp_of
 from flight_log.stored_messages import StoredMessage, stored_messages
 
-CLOCK = "/clock"
-"""Never played: the player publishes its own clock."""
+CLOCK = "/clock"  # never played: the player publishes its own clock
 
 SHARED = ("/diagnostics", "/parameter_events", "/rosout")
 """Topics on which every node of a domain may publish. They are played only by name."""
 
-MAX_CLOCK_OFFSET_NS = 86_400 * NANOSECONDS
-"""A stamp further than a day from the host's clock is flight time, as in lockstep."""
-
+MAX_CLOCK_OFFSET_NS = 86_400 * NANOSECONDS  # a stamp further than a day from the host's clock is flight time, as in lockstep
 NO_FIELD = re.compile(r"\s*(#|$|\S+\s+\w+\s*=)")  # a comment, an empty line, a constant
 STAMPED = re.compile(r"\s*((std_msgs/)?Header|builtin_interfaces/Time)\s")
 

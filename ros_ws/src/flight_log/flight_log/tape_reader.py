@@ -23,9 +23,7 @@ from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
 from flight_log.scan import Scan
 
 BATCH = 4096  # messages that are decoded together
-
-AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")
-"""A namespace with one of these topics is that of an aircraft."""
+AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace with one of these topics is that of an aircraft
 
 SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w.-]{0,99}\.yaml")
 """Names under which the scenario of a log may be written beside it: not metadata.yaml, and no path to another folder."""

@@ -21,10 +21,7 @@ from flight_ros.topics import CLOCK, LOCKSTEP
 
 DISCOVERY_TIME = 1.0  # s, to discover other publishers
 MATCHING_TIME = 0.5  # s, to discover the subscribers
-
-CLOCK_PERIOD_NS = 10_000_000
-"""ns of the log between two samples of `/clock`."""
-
+CLOCK_PERIOD_NS = 10_000_000  # ns of the log between two samples of `/clock`
 PROGRESS_PERIOD_NS = 100_000_000
 
 Outgoing = tuple[int, str, bytes, bool]

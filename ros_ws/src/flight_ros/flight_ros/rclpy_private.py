@@ -14,8 +14,7 @@ from rclpy.subscription import Subscription
 
 Participant: TypeAlias = Any  # the node of rclpy's C extension, without a Node
 
-DeserializationError = _rclpy.RMWError
-"""The exception of `deserialize_message` for bytes that are not a message of the type."""
+DeserializationError = _rclpy.RMWError  # the exception of `deserialize_message` for bytes that are not a message of the type
 
 ARGUMENT_ERRORS = (ParameterException, _rclpy.RCLError, _rclpy.RCLInvalidROSArgsError, _rclpy.UnknownROSArgsError)
 """The exceptions of rclpy for invalid arguments and parameter files."""

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from flight_core.integrators import rk4
 from flight_core.vectors import Array, array_namespace
 
-ZERO_REAL_PART = 1e-6
-"""1/s. A smaller real part counts as zero: rounding leaves 1e-14, and a mode of 1e-6 1/s takes 11 days."""
+ZERO_REAL_PART = 1e-6  # 1/s. A smaller real part counts as zero: rounding leaves 1e-14, and a mode of 1e-6 1/s takes 11 days.
 
 
 class Nominal(NamedTuple):

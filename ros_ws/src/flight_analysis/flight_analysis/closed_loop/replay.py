@@ -25,13 +25,10 @@ from rise_di_controller.params import ControllerParameters
 COPIED_CHANNELS = ("y_m_offset", "number", "parameters")
 """Channels of `internals` that are copied, for a tick does not compute them."""
 
-U_PREFIXES = ("u.", "published.")
-"""Prefixes of the channels of u, from `internals` and from the topic `u`."""
-
+U_PREFIXES = ("u.", "published.")  # prefixes of the channels of u, from `internals` and from the topic `u`
 OPEN_LOOP = "open loop: the recorded aircraft did not fly this u"
 
-Change = Mapping[str, Any]
-"""Parameters of the controller by dotted name that were changed in flight at one instant."""
+Change = Mapping[str, Any]  # parameters of the controller by dotted name that were changed in flight at one instant
 
 
 class Difference(NamedTuple):

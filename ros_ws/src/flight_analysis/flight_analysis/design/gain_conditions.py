@@ -30,14 +30,9 @@ from rise_di_controller.law import LawParams, LawState, Sign, total_lag
 MIN_K = 1.5
 """1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller input scale: the same loop."""
 
-MIN_GAIN = 0.01
-"""Lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2): (21), (22) require them to be positive."""
-
-K_G_MARGIN = 1.5
-"""Factor of k_g above its bound rho^2 / (4 min(Lambda, 1)). Step 2 then leaves a third of the decay to step 3."""
-
-MAX_STEP_3_FRACTION = 0.3
-"""Fraction of the decay that all of step 3 uses, out of that third."""
+MIN_GAIN = 0.01  # lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2): (21), (22) require them to be positive
+K_G_MARGIN = 1.5  # factor of k_g above its bound rho^2 / (4 min(Lambda, 1)). Step 2 then leaves a third of the decay to step 3.
+MAX_STEP_3_FRACTION = 0.3  # fraction of the decay that all of step 3 uses, out of that third
 
 MAX_CROSSOVER_LAG_PRODUCT = 0.8
 """rad, bandwidth times the lag of the loop: 46 degrees of phase at the crossover. On the `osprey` 0.63 (36 degrees) leaves a
@@ -56,8 +51,7 @@ rounding splits by the root of its size, 1e-8."""
 MAX_DELAY_MARGIN = 0.5
 """s, upper end of the search for a delay margin. A loop that tolerates more is slower than any that this stack flies."""
 
-BOUND_TOLERANCE = 1e-5
-"""Relative tolerance of a bound, since files hold gains with six digits."""
+BOUND_TOLERANCE = 1e-5  # relative tolerance of a bound, since files hold gains with six digits
 
 
 class GainSet(NamedTuple):

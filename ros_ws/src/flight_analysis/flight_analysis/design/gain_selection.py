@@ -41,8 +41,7 @@ CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, 
 """Bandwidth of a channel times the lag of its loop, rad, by output. 0.63, 0.32 and 0.23 cost 36, 18 and 13 degrees of phase at
 the crossover. Yaw has a margin for the dutch roll, speed for the engine."""
 
-DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23
-"""rad, for an output that is not in CROSSOVER_LAG_PRODUCTS."""
+DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23  # rad, for an output that is not in CROSSOVER_LAG_PRODUCTS
 
 BETA_TO_SLEW = 1.25
 """beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing on the `osprey`."""
@@ -55,8 +54,7 @@ airframes of the library."""
 STEP = 0.01
 """s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to 1e-6 of their size."""
 
-INPUT_LIMITS = ("lower", "upper", "slew")
-"""Limits of the controller, one an input. They are reordered with the inputs."""
+INPUT_LIMITS = ("lower", "upper", "slew")  # limits of the controller, one an input. They are reordered with the inputs.
 
 
 class Manoeuvre(NamedTuple):

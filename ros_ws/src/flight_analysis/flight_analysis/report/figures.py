@@ -61,11 +61,9 @@ FREQUENCIES = [digit * 10.0**power for power in range(-4, 4) for digit in (1, 2,
 MIN_VISIBLE_FRACTION = 1 / 500  # of the axis, about two pixels: shorter intervals are lengthened to it
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times the largest u
 
-Limits = Mapping[str, tuple[float, float]]
-"""Lower and upper limit by input, SI; infinite without a limit."""
+Limits = Mapping[str, tuple[float, float]]  # lower and upper limit by input, SI; infinite without a limit
 
-Runs = Mapping[str, tuple[Tape, int]]
-"""Tape and period of the ticks in ns, by label of the flight."""
+Runs = Mapping[str, tuple[Tape, int]]  # tape and period of the ticks in ns, by label of the flight
 
 
 def plot_context(tape: Tape, units: Mapping[str, DisplayUnit], gusts: Windows) -> PlotContext:

@@ -39,8 +39,7 @@ class DisplayUnit(NamedTuple):
     factor: float
 
 
-NO_UNIT = DisplayUnit("", 1.0)
-"""For a channel of unknown unit: its SI value without a unit."""
+NO_UNIT = DisplayUnit("", 1.0)  # for a channel of unknown unit: its SI value without a unit
 
 
 def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
