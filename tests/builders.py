@@ -22,7 +22,6 @@ def aircraft_parameters(**values: Any) -> AircraftParameters:
 
 
 def truth_of(simulator: Simulator) -> dict[str, float]:
-    """The current truth by channel."""
     return dict(zip(simulator.truth_names, simulator.truth(), strict=True))
 
 

@@ -199,8 +199,6 @@ def _event() -> bytes:
 
 _SAMPLE = vector(1_000_000, ("q", "V"), (0.5, -1.0), "/aircraft#1")
 _PLAIN = log([("/y", JOINT_STATE, vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k), "a")) for k in range(8)])
-
-
 FLIGHT = {"/y": ("q", "V"), "/y_m": ("q", "V"), "/u": ("elevator", "thrust"), "/truth": ("t", "x.q")}
 
 

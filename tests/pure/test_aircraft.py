@@ -31,8 +31,7 @@ def osprey(**gusts: dict[str, float]) -> Aircraft:
 def final_state(x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, aircraft: Aircraft) -> FloatArray:
     """State x after `duration_ns` with u held and ideal actuators."""
     params = aircraft_parameters().plant()._replace(aircraft=aircraft, step_ns=step_ns)
-    end = advance(0, AircraftState(x, np.zeros_like(u)), u, duration_ns, params)
-    return np.asarray(end.x)
+    return np.asarray(advance(0, AircraftState(x, np.zeros_like(u)), u, duration_ns, params).x)
 
 
 def test_without_f_the_plant_follows_the_matrix_exponential() -> None:

@@ -45,7 +45,6 @@ PUBLISHED = {
     "navion_longitudinal": Published((-1, 1), 0.0),
     "osprey": Published((1, 1, 1, 1), 0.06),
 }
-
 PUBLISHED_POLES: Mapping[str, tuple[complex, ...]] = {
     # MATLAB Control System Toolbox, "Yaw Damper Design for a 747 Jet Aircraft"
     "b747_lateral": (-0.5627, -0.0329 - 0.9467j, -0.0329 + 0.9467j, -0.0073),
@@ -64,7 +63,6 @@ PUBLISHED_POLES: Mapping[str, tuple[complex, ...]] = {
 
 @pytest.fixture(params=NAMES)
 def airframe(request: pytest.FixtureRequest) -> Airframe:
-    """Each airframe of the library."""
     return load_airframe(request.param)
 
 

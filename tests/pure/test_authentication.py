@@ -90,9 +90,7 @@ def test_a_key_is_the_32_bytes_of_its_file(mode: int, tmp_path: Path) -> None:
         (b"", 0o600, "of 0 bytes"),
     ],
 )
-def test_a_key_file_with_open_permissions_or_another_size_is_rejected(
-    content: bytes, mode: int, found: str, tmp_path: Path
-) -> None:
+def test_a_key_file_with_open_mode_or_another_size_is_rejected(content: bytes, mode: int, found: str, tmp_path: Path) -> None:
     path = key_file(tmp_path, content, mode)
     with pytest.raises(ParameterError) as rejected:
         read_key(path, "controller.key_file")

@@ -128,8 +128,7 @@ def test_a_stopped_campaign_resumes_with_the_missing_chunks(tmp_path: Path) -> N
     part = Campaign.begin(tmp_path / "part", definition())
     next(part.fly(engines.threads(1)))
     resumed = Campaign.resume(tmp_path / "part")
-    there = len(resumed.missing())
-    assert 0 < there < 3
+    assert 0 < len(resumed.missing()) < 3
     list(resumed.fly(engines.threads(1)))
     assert resumed.missing() == []
     assert resumed.tally(0) == whole.tally(0)
@@ -139,8 +138,7 @@ def test_a_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
     campaign = fly_campaign(tmp_path / "sweep", definition(20, 20, Sweep(parameter="beta", factors=(0.25, 1.0))))
     weak, strong = (campaign.tally(case).figures["score"].mean for case in (0, 1))
     assert weak > 1.05 * strong  # beta far below the slew of the ideal control follows worse
-    plain = fly_campaign(tmp_path / "plain", definition(20, 20))
-    assert plain.tally(0) == campaign.tally(1)
+    assert fly_campaign(tmp_path / "plain", definition(20, 20)).tally(0) == campaign.tally(1)
 
 
 @pytest.mark.parametrize(
@@ -196,8 +194,7 @@ def test_a_killed_campaign_resumes_to_the_figures_of_an_uninterrupted_one(tmp_pa
     folder = wait_for_chunks(tmp_path / "part", 2, stopped)
     stopped.send_signal(signal.SIGKILL)
     stopped.communicate()
-    there = len(list((folder / CHUNKS).glob("*.json")))
-    assert 2 <= there < 20, "the campaign ended before the kill"
+    assert 2 <= len(list((folder / CHUNKS).glob("*.json"))) < 20, "the campaign ended before the kill"
     assert figures(command("--resume", str(folder), cwd=tmp_path)) == whole
 
 

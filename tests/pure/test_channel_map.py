@@ -25,8 +25,6 @@ from flight_core.vectors import ChannelError
 
 MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
 LINES = st.builds(Line, st.sampled_from((-1, 1)), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
-
-
 FLU = Message(x=0.3, y=-0.2, z=-0.1)  # roll right at 0.3 rad/s, nose up at 0.2, nose right at 0.1
 FRD = np.array([0.3, 0.2, 0.1], dtype=np.float32)  # the same motion as a fixed array of a message
 MOTION = {"p": 0.3, "q": 0.2, "r": 0.1}  # the expected channels for each map
@@ -62,8 +60,7 @@ def test_each_output_comes_in_si_and_frd(name: str, channel: str) -> None:
 
 @pytest.mark.parametrize("name", MAPS)
 def test_each_input_is_sent_in_the_autopilots_unit_and_sign(name: str) -> None:
-    channel_map = load_map(name)
-    for (path, expected), row in zip(SENT[name].items(), channel_map.inputs.values(), strict=True):
+    for (path, expected), row in zip(SENT[name].items(), load_map(name).inputs.values(), strict=True):
         assert path in (row.field, f"{row.message}.{row.field}")
         assert to_raw(row.trim + 0.1, row.line) == pytest.approx(expected, abs=1e-3)  # the fields in us are integers
 

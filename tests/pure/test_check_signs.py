@@ -24,11 +24,8 @@ from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 
 app = application([*COMMANDS])
-
 MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
-
-
 AIRFRAME = load_airframe("osprey")
 OMEGA: FloatArray = AIRFRAME.matrix_c() @ AIRFRAME.matrix_b()
 

@@ -23,7 +23,6 @@ from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 
 app = application([*COMMANDS])
-
 SHIPPED = ("osprey_servo", "osprey_gust")
 
 

@@ -36,7 +36,7 @@ def aircraft(**section: Any) -> Aircraft:
 
 
 @pytest.mark.parametrize(
-    ("feet", "reference_fps", "alleviation", "expected_fps"),
+    ("feet", "ref_fps", "alleviation", "expected_fps"),
     [
         (350.0, 56.0, 1.0, 56.0),  # U_ref itself, at sea level
         (350.0, 44.0, 0.8, 35.2),  # at 15 000 ft
@@ -44,10 +44,8 @@ def aircraft(**section: Any) -> Aircraft:
         (107.0 / 0.3048, 56.0, 1.0, 56.028),  # the longest, in the figures of CS-25
     ],
 )
-def test_the_design_gust_speed_is_that_of_25_341(
-    feet: float, reference_fps: float, alleviation: float, expected_fps: float
-) -> None:
-    speed = design_gust_speed(feet * 0.3048, reference_fps * 0.3048, alleviation)
+def test_the_design_gust_speed_is_that_of_25_341(feet: float, ref_fps: float, alleviation: float, expected_fps: float) -> None:
+    speed = design_gust_speed(feet * 0.3048, ref_fps * 0.3048, alleviation)
     assert speed / 0.3048 == pytest.approx(expected_fps, rel=1e-4)
 
 
@@ -78,9 +76,7 @@ def test_a_bias_rises_along_half_a_cosine_and_stays() -> None:
     params = single(Bias, 2.0, 0.3, 4.0)
     at = [float(bias(np.array(t), params)[0]) for t in (0.0, 2.0, 3.0, 4.0, 5.0, 6.0, 60.0)]
     # 0.15 (1 - cos(pi s)) at s = 0, 1/4, 1/2, 3/4, 1
-    assert at == pytest.approx(
-        [0.0, 0.0, 0.15 - 0.15 / math.sqrt(2.0), 0.15, 0.15 + 0.15 / math.sqrt(2.0), 0.3, 0.3], abs=1e-15
-    )
+    assert at == pytest.approx([0.0, 0.0, 0.15 - 0.15 / math.sqrt(2), 0.15, 0.15 + 0.15 / math.sqrt(2), 0.3, 0.3], abs=1e-15)
 
 
 def test_a_bias_without_a_rise_is_a_step() -> None:
@@ -99,8 +95,7 @@ def test_biases_and_sines_act_on_the_state_they_name() -> None:
         bias={"q": {"start": 1.0, "value": 0.3, "rise": 0.0}, "V": {"start": 0.0, "value": -2.0, "rise": 1.0}},
         sines={"r": {"amplitude": 0.1, "frequency": 2.0}, "q": {"amplitude": 0.2, "frequency": 1.0, "phase": 1.0}},
     )
-    osprey = load_airframe("osprey")
-    f = dict(zip(osprey.states, dynamics.f(3.0, np.zeros(8), params), strict=True))
+    f = dict(zip(load_airframe("osprey").states, dynamics.f(3.0, np.zeros(8), params), strict=True))
     assert f["q"] == pytest.approx(0.3 + 0.2 * math.sin(4.0))
     assert f["V"] == pytest.approx(-2.0)
     assert f["r"] == pytest.approx(0.1 * math.sin(6.0))
@@ -183,8 +178,7 @@ def coupled(scale: float) -> Aircraft:
 
 def test_the_coupling_is_that_of_eulers_equations() -> None:
     # J w_dot = -w x (J w); the file keeps six digits
-    rng = np.random.default_rng(3)
-    for w in rng.uniform(-2.0, 2.0, (20, 3)):
+    for w in np.random.default_rng(3).uniform(-2.0, 2.0, (20, 3)):
         x = np.zeros(8)
         x[PQR] = w
         w_dot = np.linalg.solve(INERTIA, -np.cross(w, INERTIA @ w))
@@ -252,7 +246,6 @@ def baseline(osprey_gust: Scenario) -> Scenario:
 
 @pytest.fixture(scope="module")
 def baseline_bytes(baseline: Scenario) -> dict[str, bytes]:
-    """The topics of the baseline flight."""
     return published(baseline)
 
 

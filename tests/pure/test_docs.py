@@ -11,10 +11,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 TOP = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docker/README.md")
 PAGES = [*(REPOSITORY / name for name in TOP), *sorted((REPOSITORY / "docs").glob("*.md"))]
 MAX_LINE = 200
-
 TEXTS = {".py", ".md", ".yaml", ".xml", ".jinja", ".js", ".sh", ".c"}
 FOLDERS = ("ros_ws/src", "tests", "benchmarks", "docs", "docker")
-
 REPLACED = {
     "anew": "again",
     "crowd": "peers",

@@ -30,7 +30,6 @@ from rise_di_controller.guard import ControllerState
 from rise_di_controller.params import ControllerParameters
 
 app = application([*COMMANDS])
-
 MS = 1_000_000
 SERVO = find_scenario("osprey_servo")
 BY_HAND = Nominal(

@@ -47,7 +47,6 @@ def fly(
     control_law: ControlLaw = CONTROL_LAW,
     params: Any = PARAMS,
 ) -> fleet.FleetResult:
-    """The aircraft of these matrices in one fleet."""
     course = build_course(scenario)
     aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, wind, late)
     return fleet.fly(aircraft, fleet.vehicle(scenario), course, control_law, params)

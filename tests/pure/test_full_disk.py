@@ -26,22 +26,19 @@ SIZE = 2_000_000
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 2 MB."""
     with small_disk(tmp_path / "disk", SIZE) as folder:
         yield folder
 
 
 NAMES = [f"channel.{k}" for k in range(40)]
-GENERATOR = np.random.default_rng(1)
+RANDOM = np.random.default_rng(1)
 
 
 def write(bag: BagWriter, channel: BagChannel, count: int) -> None:
     """Write messages of 40 noisy channels, which do not compress; every tenth ends a chunk, as at 1 kHz and 0.1 s."""
     for _ in range(count):
         stamp_ns = 1_000_000 * (channel.messages + 1)
-        bag.write(
-            channel, stamp_ns, stamp_ns, channel.messages + 1, vector(stamp_ns, NAMES, GENERATOR.normal(size=40).tolist())
-        )
+        bag.write(channel, stamp_ns, stamp_ns, channel.messages + 1, vector(stamp_ns, NAMES, RANDOM.normal(size=40).tolist()))
         if channel.messages % 10 == 0:
             bag.flush()
 

@@ -221,8 +221,7 @@ def test_the_gains_of_theorem_1_are_unstable_on_the_osprey_with_servos(selected:
 
 
 def test_a_channel_too_slow_for_22_gets_a_smaller_input_scale() -> None:
-    loop = Loop(np.array([0.02, 1.0]), 0.0, 0.01)
-    bandwidth = gain_conditions.bandwidths(loop, np.array([0.63, 0.23]))
+    bandwidth = gain_conditions.bandwidths(Loop(np.array([0.02, 1.0]), 0.0, 0.01), np.array([0.63, 0.23]))
     gains, response = gain_conditions.engineering_gains(bandwidth, np.ones(2), 1.25, np.full(2, np.inf))
     np.testing.assert_allclose(gains.K, [18.0, 1.5])
     np.testing.assert_allclose(gains.K * response, bandwidth)  # the same loop

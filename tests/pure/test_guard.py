@@ -258,7 +258,6 @@ def test_new_gains_transfer_without_a_bump(state: LawState, k: float, Lambda: fl
 
 
 def logged(state: ControllerState, inputs: guard.TickInputs, limits: Limits, *others: Any) -> dict[str, float]:
-    """The internals of a tick by name."""
     values = internals.values(state, inputs, limits, *others)
     return dict(zip(internals.names(PARAMS.outputs, PARAMS.inputs), values, strict=True))
 

@@ -230,9 +230,7 @@ def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
         ("jsbsim:dr1", 3, "error: jsbsim:dr1 does not trim at 46 m/s and 900 m: its model needs the property "),
     ],
 )
-def test_an_airframe_that_cannot_be_identified_gives_one_sentence(
-    airframe: str, status: int, sentence: str, tmp_path: Path
-) -> None:
+def test_an_unidentifiable_airframe_gives_one_sentence(airframe: str, status: int, sentence: str, tmp_path: Path) -> None:
     done = rise_di(airframe, "--speed", "46", "--altitude", "900", cwd=tmp_path)
     assert done.returncode == status
     assert done.stderr.startswith(sentence)

@@ -33,7 +33,6 @@ from flight_ros.topics import NodeState
 from flight_ros.transport import DISCOVERY_VARIABLE, PROFILE_VARIABLE
 
 app = application([*COMMANDS])
-
 FILES = sorted((REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "launch").glob("*.launch.py"))
 INSTALLED = REPOSITORY / "ros_ws" / "install"
 NODES: dict[str, type[Parameters]] = {name: schema for name, schema in SCHEMAS.items() if name != "flight"}
@@ -59,7 +58,6 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture(scope="module", autouse=True)
 def process() -> Iterator[None]:
-    """A process of this launch."""
     global PID  # noqa: PLW0603 - one process for all tests
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
         PID = child.pid
@@ -68,7 +66,6 @@ def process() -> Iterator[None]:
 
 
 def described(name: str) -> Sequence[Any]:
-    """The entities of a launch file."""
     path = next(file for file in FILES if file.name == f"{name}.launch.py")
     entities: Sequence[Any] = runpy.run_path(str(path))["generate_launch_description"]().entities
     return entities
@@ -123,7 +120,6 @@ def ends(actions: Sequence[Any]) -> bool:
 
 
 def every(kind: type[T], actions: Sequence[Any]) -> list[T]:
-    """The actions of a kind."""
     return [one for one in actions if isinstance(one, kind)]
 
 

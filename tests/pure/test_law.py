@@ -88,8 +88,7 @@ def test_zero_error_leaves_the_input_at_zero(sign: Sign) -> None:
 @given(errors=st.lists(st.floats(-10, 10), min_size=3, max_size=20))
 def test_the_law_is_odd_in_the_error(sign: Sign, errors: list[float]) -> None:
     # Every term of (20), (21) is odd in e, and so is each sampling of them.
-    mirrored = respond(one_channel(sign), [-e for e in errors])
-    assert mirrored == [-u for u in respond(one_channel(sign), errors)]
+    assert respond(one_channel(sign), [-e for e in errors]) == [-u for u in respond(one_channel(sign), errors)]
 
 
 @given(e=st.lists(st.floats(-1, 1), min_size=2, max_size=2))

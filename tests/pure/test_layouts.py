@@ -34,7 +34,6 @@ CURVES = {
 }
 TABS = {"tracking": 4, "error": 4, "input": 4, "integrals": 8, "controller": 4, "wind": 3}  # title: number of plots
 COLOUR = re.compile("#[0-9a-f]{6}")
-
 SHOWN = dict.fromkeys(("showXAxisLabels", "showYAxisLabels", "showLegend", "isSynced"), True)
 PANEL = SHOWN | {"showPlotValuesInLegend": False, "legendDisplay": "floating", "xAxisVal": "timestamp", "sidebarDimension": 240}
 """The fixed part of a Plot panel of Foxglove."""

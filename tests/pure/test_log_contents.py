@@ -53,9 +53,7 @@ def recorder_attachments(scenario: Scenario, run: Path, *, one_process: bool) ->
     return LogAttachments(scenario.path, tuple(map(Path, attach)), Path(str(metadata)))
 
 
-def test_the_parameters_in_a_log_are_a_scenario_of_the_same_flight(
-    recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path
-) -> None:
+def test_logged_parameters_are_a_scenario_of_that_flight(recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:
     again = load_scenario(stored(recorded, "parameters.yaml", tmp_path))
     assert again.flight.duration == 0.5  # that of the flight, not of the file
     for name in SCHEMAS:

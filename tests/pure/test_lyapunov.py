@@ -39,7 +39,6 @@ TOO_SMALL = 0.05  # times beta: 0.25 and 0.15, where (29), (30) require 1.7 and 
 
 
 def fly_example(dt: float, duration: float, **gains: Any) -> tuple[Example, LawParams, Evidence]:
-    """The example under changed gains."""
     case = example(dt, duration)
     params = case.params._replace(**gains)
     return case, params, evidence(case.plant, fly(case.plant, case.y_m, dt, params, case.x_0), params)

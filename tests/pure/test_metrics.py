@@ -65,8 +65,7 @@ def test_each_instant_belongs_to_one_part_of_the_flight() -> None:
 
 
 def test_errors_are_split_by_part_and_the_ultimate_bound_is_the_largest_undisturbed_error() -> None:
-    y = signal([0, 1000, 2000], q=[3.0, 4.0, 0.0])
-    flight = tape(y=y, y_m=signal([0, 2000], q=[0.0, 0.0]))
+    flight = tape(y=signal([0, 1000, 2000], q=[3.0, 4.0, 0.0]), y_m=signal([0, 2000], q=[0.0, 0.0]))
     table = metrics.errors_by_part(flight, [Transient("gust", "g", 0.9, 1.1)], settle=0.0)
     assert table["q"]["gust"] == (4.0, 4.0)
     assert tuple(table["q"]["calm"]) == pytest.approx((math.sqrt(4.5), 3.0))
@@ -124,8 +123,7 @@ def test_settling_is_measured_up_to_the_next_transient_of_the_channel() -> None:
     stamps = [100.0 * k for k in range(81)]
     t = np.array(stamps) / 1000.0
     error = np.where(((t > 0.95) & (t < 1.15)) | ((t > 4.95) & (t < 5.15)), 0.5, 0.0)
-    y = signal(stamps, q=1.0 + error, p=0.0)
-    flight = tape(y=y, y_m=signal(stamps, q=1.0, p=0.0))
+    flight = tape(y=signal(stamps, q=1.0 + error, p=0.0), y_m=signal(stamps, q=1.0, p=0.0))
     transients = [
         Transient("gust", "late", 9.0, 9.5),  # after the end of the flight
         Transient("command", "q", 1.0, 1.1),
@@ -219,15 +217,13 @@ def test_periods_without_a_tick_are_counted() -> None:
 
 def test_jitter_is_the_deviation_from_a_whole_number_of_periods() -> None:
     # 10 + 0.3, 10 - 0.4 and 20 ms: sqrt((0.09 + 0.16 + 0) / 3) ms
-    internals = signal([0, 10.3, 19.9, 39.9], late=0.0, age=0.0)
-    result = metrics.tick_metrics(tape(internals=internals), 10 * MS)
+    result = metrics.tick_metrics(tape(internals=signal([0, 10.3, 19.9, 39.9], late=0.0, age=0.0)), 10 * MS)
     assert result is not None
     assert result.jitter == pytest.approx(math.sqrt(0.25 / 3) * 1e-3)
 
 
 def test_latency_has_metrics_if_it_is_recorded() -> None:
-    latency = signal([0, 10, 20], y_to_u=[1e-3, 3e-3, 2e-3])
-    result = metrics.latency_metrics(tape(latency=latency))
+    result = metrics.latency_metrics(tape(latency=signal([0, 10, 20], y_to_u=[1e-3, 3e-3, 2e-3])))
     assert result is not None
     assert (result.median, result.max) == (2e-3, 3e-3)
     assert metrics.latency_metrics(tape()) is None
@@ -247,7 +243,6 @@ def test_groups_of_channels_lose_their_prefix() -> None:
 
 def test_a_lost_sample_counts_like_a_missed_tick() -> None:
     # Ticks at 0, 10, 30 ms: at 20 ms there was no new y, and no tick was late.
-    internals = signal([0, 10, 30], late=0.0, age=0.0)
-    result = metrics.tick_metrics(tape(internals=internals), 10 * MS)
+    result = metrics.tick_metrics(tape(internals=signal([0, 10, 30], late=0.0, age=0.0)), 10 * MS)
     assert result is not None
     assert (result.ticks, result.without_new_y, result.late_max) == (3, 1, 0.0)

@@ -197,7 +197,6 @@ class Loop:
 
 
 def run(p: Problem, x_0: FloatArray, x_m0: FloatArray, duration: float) -> Loop:
-    """Integrate the closed loop."""
     n, m = p.B.shape
     e_0 = p.C @ (x_0 - x_m0)
 
@@ -475,9 +474,7 @@ def test_a_matrix_without_a_leading_minor_has_no_decomposition_though_it_can_be_
 
 def hidden_state(pole: float) -> tuple[float, float]:
     """The largest x_2 and the last e of x_1_dot = x_2 + u, x_2_dot = pole x_2 + x_1, y = x_1 on sin t: its zero is `pole`."""
-    plant = KnownPlant(
-        np.array([[0.0, 1.0], [1.0, pole]]), np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]]), lambda *_: np.zeros(2)
-    )
+    plant = KnownPlant(np.array([[0.0, 1.0], [1.0, pole]]), np.eye(2, 1), np.eye(1, 2), lambda *_: np.zeros(2))
     params = law_params(8.0, 1.0, 5.0, omega=2.0)
     t = 0.01 * np.arange(1501)
     flight = fly(plant, np.sin(t)[:, None], 0.01, params, np.zeros(2))
@@ -508,9 +505,7 @@ def test_a_servo_between_u_and_the_plant_makes_Omega_zero() -> None:
 def behind_a_servo(T_eps: float) -> float:
     """The largest e over eps in the last of 10 s: y_dot = u behind a servo of 20 ms, softened sign, e(0) = eps / 2."""
     tau, K, beta, dt = 0.02, 10.0, 3.0, 0.0005
-    plant = KnownPlant(
-        np.array([[0.0, 1.0], [0.0, -1.0 / tau]]), np.array([[0.0], [1.0 / tau]]), np.eye(1, 2), lambda *_: np.zeros(2)
-    )
+    plant = KnownPlant(np.array([[0, 1], [0, -1 / tau]]), np.array([[0], [1 / tau]]), np.eye(1, 2), lambda *_: np.zeros(2))
     eps = beta / K * T_eps
     params = law_params(K, 1.0, beta, sign=Sign.SOFT, eps=eps)
     flight = fly(plant, np.zeros((20001, 1)), dt, params, np.array([eps / 2.0, 0.0]))

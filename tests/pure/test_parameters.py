@@ -76,9 +76,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("change", "sentence"), BAD.items(), ids=[change[1].strip()[:40] for change in BAD])
-def test_an_invalid_scenario_is_one_sentence(
-    change: tuple[str, str], sentence: str, osprey_gust: Scenario, tmp_path: Path
-) -> None:
+def test_a_bad_scenario_is_one_sentence(change: tuple[str, str], sentence: str, osprey_gust: Scenario, tmp_path: Path) -> None:
     text = osprey_gust.path.read_text(encoding="utf-8")
     assert text.count(change[0]) >= 1, f"the scenario no longer holds {change[0]!r}"
     bad = tmp_path / "bad.yaml"
@@ -149,9 +147,7 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("section", "values", "sentence"), [(section, *row) for section, rows in BAD_AIRCRAFT.items() for row in rows]
-)
+@pytest.mark.parametrize(("section", "values", "sentence"), [(key, *row) for key, rows in BAD_AIRCRAFT.items() for row in rows])
 def test_an_invalid_section_of_the_aircraft_is_refused_by_name(section: str, values: Any, sentence: str) -> None:
     with pytest.raises(ParameterError, match=rf"^aircraft\.{section}{sentence}"):
         aircraft_parameters(rate=500.0, **{section: values})

@@ -50,8 +50,7 @@ def test_a_repaired_truncated_log_is_read_in_full_by_rosbags(fraction: float, re
     assert done.files[0].damaged.read_bytes() == before
     read = messages(run)
     assert len(read) == done.files[0].kept > 0
-    every = messages(recorded)
-    assert read == every[: len(read)]
+    assert read == messages(recorded)[: len(read)]
     after = read_run(run)
     assert after.tape.notes == ()
     assert after.tape.time("truth")[-1] == readable.tape.time("truth")[-1]
@@ -91,8 +90,7 @@ def test_damage_inside_loses_only_its_chunk(recorded: Path, run: Path) -> None:
     content = bytearray(file.read_bytes())
     content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
     file.write_bytes(content)
-    done = repair(run)
-    assert done.files[0].faults == "1 damaged parts"
+    assert repair(run).files[0].faults == "1 damaged parts"
     kept, every = set(messages(run)), set(messages(recorded))
     assert kept < every
     assert all(chunk.message_start_time <= stamp_ns <= chunk.message_end_time for _, stamp_ns, _ in every - kept)

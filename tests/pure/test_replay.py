@@ -39,7 +39,6 @@ from rise_di_controller.guard import Mode
 from rise_di_controller.params import ControllerParameters
 
 app = application([*COMMANDS])
-
 GUST = find_scenario("osprey_gust").vary(
     flight={"duration": 4.0}, aircraft={"gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}}
 )
@@ -47,7 +46,6 @@ SERVO = find_scenario("osprey_servo").vary(flight={"duration": 4.0})
 LEADING = with_feedforward(SERVO.controller, load_airframe("osprey"))
 LOST = {"rate": 100.0, "sensors": {"noise": [0.0017, 0.03, 0.0017, 0.0017], "delay": 0.01, "dropout": 0.6, "seed": 3}}
 SHORT = {"max_age": 0.025, "hold": 0.01, "ramp": 0.03}
-
 SCENARIOS = {
     "osprey_gust": GUST,
     "osprey_servo": SERVO,
@@ -143,8 +141,7 @@ PATIENT = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
 def test_a_replay_equals_a_flight_with_late_and_lost_samples(ticks: list[Tick], hold: bool, with_feedforward: bool) -> None:
     changes = QUICK | {"on_deactivate": "hold" if hold else "trim", "slew": [0.3] * 4}
     parameters = vary(LEADING if with_feedforward else GUST.controller, changes)
-    tape = driven(parameters, [FLY, FLY, *ticks])
-    result = replay(tape, parameters)
+    result = replay(driven(parameters, [FLY, FLY, *ticks]), parameters)
     assert equal(result), result.first()
 
 

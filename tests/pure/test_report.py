@@ -280,8 +280,7 @@ def test_ticks_have_a_figure_if_one_was_late_or_y_was_old_or_dt_changed() -> Non
 
 def test_a_visible_noise_floor_is_drawn_on_both_sides_of_zero() -> None:
     tape = flight(y=signal([0, 1000], **dict.fromkeys(OUTPUTS, (1.0, 0.0))))
-    figure = figures.error_figure(context(tape), {"q": 0.5, "V": 1e-9})
-    (floor,) = traces(figure, "noise floor")
+    (floor,) = traces(figures.error_figure(context(tape), {"q": 0.5, "V": 1e-9}), "noise floor")
     assert (floor.yaxis, set(floor.y)) == ("y", {0.5, -0.5})  # only that of q is visible
 
 
@@ -337,8 +336,7 @@ def test_less_error_is_better_and_less_input_is_neither() -> None:
         ratios = (0.5, 1.01, 2.0, None)
         rows = [comparison.ComparisonRow("rms", ("1", "2"), (1.0, ratio), lower_is_better) for ratio in ratios]
         group = TableGroup([comparison.ComparisonTable("q", tuple(rows))], colours=comparison.COLOURS[:2])
-        page = page_html(Page("", [], [group], [], SampleStore()))
-        return re.findall('class="(better|same|worse)"', page)
+        return re.findall('class="(better|same|worse)"', page_html(Page("", [], [group], [], SampleStore())))
 
     assert verdicts(True) == ["better", "same", "worse", "same"]
     assert verdicts(False) == ["same"] * 4
@@ -355,8 +353,7 @@ def test_curves_of_several_flights_are_drawn_over_one_reference(pair: list[Recor
 
 
 def test_each_distinct_reference_is_drawn(pair: list[RecordedFlight], servo: Scenario) -> None:
-    other = flight(y_m=signal([0, 1000], **dict.fromkeys(OUTPUTS, (0.0, 2.0))))
-    three = [*pair, recorded("c", servo, other)]
+    three = [*pair, recorded("c", servo, flight(y_m=signal([0, 1000], **dict.fromkeys(OUTPUTS, (0.0, 2.0)))))]
     drawn = comparison.tracking_figure(comparison.plot_context(three), three)
     assert [trace.name for trace in drawn.data if trace.yaxis == "y"] == ["y_m a", "y_m c", "a", "b", "c"]
 

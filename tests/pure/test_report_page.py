@@ -20,7 +20,6 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-
 DRAWN = "Number(document.body?.dataset.drawn ?? 0)"  # counts the views of all figures
 PLOTS = "[...document.querySelectorAll('figure > div')]"
 MAX_DRAW_TIME = 2.0  # s until all figures are drawn; measured 0.9 s, twice that beside four other tests
@@ -100,8 +99,7 @@ def test_a_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, 
     t = servo.tape.time("y")
     x, values = curve(browser, 0, "y", row=2)
     assert values == pytest.approx(np.interp(x, t, y["V"]), rel=1e-6)  # float32
-    ranges = browser.run(f"{PLOTS}.slice(0, 3).map(plot => plot._fullLayout.xaxis4.range)")
-    assert ranges == [[2.0, 2.1]] * 3
+    assert browser.run(f"{PLOTS}.slice(0, 3).map(plot => plot._fullLayout.xaxis4.range)") == [[2.0, 2.1]] * 3
     zoom(browser, 0.0, 7.0, plot=2)
     again, _ = curve(browser, 0, "y")
     assert len(again) < len(t)
@@ -140,8 +138,7 @@ def test_the_dark_page_has_its_own_colours_and_follows_the_scheme(browser: Brows
 def test_a_page_prints_in_light_colours_and_returns_to_the_screen(browser: Browser, page: Path) -> None:
     open_page(browser, page, "dark")
     zoom(browser, 2.0, 3.0)
-    pdf = base64.b64decode(browser.call("Page.printToPDF")["data"])
-    assert pdf.startswith(b"%PDF")
+    assert base64.b64decode(browser.call("Page.printToPDF")["data"]).startswith(b"%PDF")
     browser.wait_for(f"{DRAWN} === 3")
     assert browser.run(f"{PLOTS}[0].layout.xaxis.range") == [2.0, 3.0]
     assert browser.run(f"{PLOTS}[0].clientWidth") > 900

@@ -48,8 +48,7 @@ def integrator(Omega: float = 2.0, period: float = DT, limit: float = np.inf) ->
 @pytest.fixture(scope="module")
 def osprey() -> NominalModel:
     """The osprey without actuators or limits."""
-    scenario = find_scenario("osprey_gust").vary(flight={"duration": 0.1})
-    return tuning.build_benchmark(scenario).model
+    return tuning.build_benchmark(find_scenario("osprey_gust").vary(flight={"duration": 0.1})).model
 
 
 def at(y: Any, y_m: Any = 0.0, **others: Any) -> Measurements:
@@ -68,16 +67,14 @@ class Flight(NamedTuple):
     state: Any
 
 
-def fly(
-    control_law: ControlLaw, params: Any, ticks: int, y: float, d: Any, model: NominalModel, Omega: float | None = None
-) -> Flight:
+def fly(law: ControlLaw, params: Any, ticks: int, y: float, d: Any, model: NominalModel, Omega: float | None = None) -> Flight:
     """The exact flight of y_dot = Omega u + d with u held over a tick and d its mean over one, y_m = 0, actuators ideal."""
     response = model.Omega[0, 0] if Omega is None else Omega
     measured, ys, us = at(y), [], []
-    state = control_law.start(measured, params)
+    state = law.start(measured, params)
     u = np.zeros(COLUMN)
     for k in range(ticks):
-        state, u = control_law.step(state, at(y, u_before=u, position=u), np.array(model.period), params)
+        state, u = law.step(state, at(y, u_before=u, position=u), np.array(model.period), params)
         ys.append(y)
         us.append(u.item())
         y += model.period * (response * u.item() + (d(k) if callable(d) else d))
@@ -297,8 +294,7 @@ def test_the_observer_converges_to_states_wind_and_disturbance_of_its_model(ospr
         z, z_hat = estimator.F @ z + estimator.G @ u, estimator.F @ z_hat + estimator.G @ u
     # angles and disturbances that only together move V end within 1 / LEAK = 100 s, so exp(-0.3) of them is left after 30 s;
     # the combination that acts on the outputs is observable: compare the prediction of e one second ahead
-    ahead = np.linalg.matrix_power(estimator.F, 100)
-    assert np.abs(estimator.H @ ahead @ (z - z_hat)).max() < 1e-4
+    assert np.abs(estimator.H @ np.linalg.matrix_power(estimator.F, 100) @ (z - z_hat)).max() < 1e-4
     assert np.abs(np.linalg.eigvals(estimator.F - estimator.F @ correction @ estimator.H)).max() < 1.0
 
 
@@ -321,10 +317,8 @@ def test_the_contribution_of_the_observer_is_bounded_for_any_measurement() -> No
 def test_with_zero_observer_gain_the_law_is_the_one_with_feedforward(osprey: NominalModel) -> None:
     control_law, params = law_of("rise_observer", osprey)
     params = params._replace(gain=0.0 * params.gain)
-    generator, laws_ = np.random.default_rng(1), (control_law, LAWS["rise_ff"].control_law(osprey))
-    looks = [
-        Measurements(*(0.01 * generator.standard_normal((8 if k in {6, 7} else 4, 1)) for k in range(9))) for _ in range(5)
-    ]
+    rng, laws_ = np.random.default_rng(1), (control_law, LAWS["rise_ff"].control_law(osprey))
+    looks = [Measurements(*(0.01 * rng.standard_normal((8 if k in {6, 7} else 4, 1)) for k in range(9))) for _ in range(5)]
     states = [control_law.start(looks[0], given_) for control_law, given_ in zip(laws_, (params, params.rise), strict=True)]
     for measured in looks:
         states[0], u = laws_[0].step(states[0], measured, np.array(DT), params)

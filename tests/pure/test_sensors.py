@@ -39,8 +39,7 @@ def test_noise_has_mean_zero_and_the_specified_variance(samples: FloatArray) -> 
     # 99.95 % of seeds for four channels of mean and variance together. The seed is fixed: the test is deterministic.
     assert np.abs(samples.mean(axis=0)).max() < 4.0 / np.sqrt(COUNT)
     assert np.abs(samples.var(axis=0) - 1.0).max() < 4.0 * np.sqrt(2.0 / COUNT)
-    scaled = np.array([noise(k, sensors(NOISE)) for k in range(5)])
-    assert (scaled == samples[:5] * NOISE).all()
+    assert (np.array([noise(k, sensors(NOISE)) for k in range(5)]) == samples[:5] * NOISE).all()
 
 
 def test_noise_is_gaussian(samples: FloatArray) -> None:
@@ -293,8 +292,7 @@ def test_a_delay_inside_the_margin_costs_little_and_one_beyond_it_loses_track(se
 def test_effect_of_gyro_noise_without_gusts(servo: Scenario, gyro: float, expected: float, activity: float) -> None:
     # q in mrad/s and mean abs(u_dot) of the elevator in deg/s, within 10 % of the prototype.
     # Measured 2.05, 3.85, 7.03 and 4.5, 22.3, 44.6.
-    no_gusts = servo.vary(aircraft={"gusts": {}})
-    tape = simulate(with_sensors(no_gusts, noise=[gyro, 0.0, gyro, gyro]))
+    tape = simulate(with_sensors(servo.vary(aircraft={"gusts": {}}), noise=[gyro, 0.0, gyro, gyro]))
     elevator = tape["u"]["elevator"]
     assert rms(tape)[0] == pytest.approx(expected, rel=0.1)
     assert np.rad2deg(np.mean(np.abs(np.diff(elevator))) / 0.01) == pytest.approx(activity, rel=0.1)
@@ -303,9 +301,7 @@ def test_effect_of_gyro_noise_without_gusts(servo: Scenario, gyro: float, expect
 @pytest.mark.parametrize(
     ("dropout", "expected"), [(0.05, [7.6, 0.088, 9.9, 6.4]), (0.2, [7.6, 0.088, 9.8, 6.4])], ids=("5 %", "20 %")
 )
-def test_missed_ticks_cost_nothing_because_the_real_dt_is_integrated(
-    servo: Scenario, dropout: float, expected: list[float]
-) -> None:
+def test_missed_ticks_cost_nothing_as_the_real_dt_is_integrated(servo: Scenario, dropout: float, expected: list[float]) -> None:
     # With the nominal dt the prototype had 8.9, 0.093, 11.8, 7.5 at 20 %. Measured 7.66, 0.090, 9.90, 6.80.
     assert rms(simulate(with_sensors(servo, dropout=dropout))) == pytest.approx(expected, rel=0.1)
 

@@ -131,7 +131,7 @@ def turn_with_model_bank(scenario: Scenario) -> Callable[[FloatArray, Profile], 
     return turned
 
 
-def test_r_differs_in_calm_air_because_turns_are_coordinated_to_the_bank_of_the_command(
+def test_r_differs_in_calm_air_as_turns_are_coordinated_to_the_bank_of_the_command(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # The prototype uses the bank of the reference model: max of r 14 mrad/s with the softened sign, PI 4.7 rms and max 23.

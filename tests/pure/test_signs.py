@@ -116,9 +116,7 @@ def test_rudder_before_aileron_needs_another_d_and_is_a_bad_pairing(swapped: Air
     assert factors.U[2, 3] == pytest.approx(-83.5, abs=0.1)
 
 
-def test_rudder_before_aileron_with_the_right_d_is_poor_and_improves_with_k_of_p(
-    swapped: Aircraft, manoeuvre: FloatArray
-) -> None:
+def test_rudder_before_aileron_with_the_right_d_is_poor_and_improves_with_k_p(swapped: Aircraft, manoeuvre: FloatArray) -> None:
     # Measured rms for K_3 times 5, 25, 125: p 19, 1.2, 0.10 mrad/s and r 43, 6.2, 1.1. The prototype, in
     # another manoeuvre: p 430, 67, 7.6. Each factor of 5 in K reduces the rms by at least 4.
     rms = {}

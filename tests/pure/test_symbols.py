@@ -60,7 +60,6 @@ def listed_tests(text: str) -> list[tuple[str, tuple[str, ...]]]:
 
 
 def rows_of(text: str) -> list[Row]:
-    """Rows of the tables of a page."""
     rows: list[list[Any]] = []
     table = ""
     for line in text.partition("\n## Tests\n")[0].splitlines():
@@ -109,7 +108,6 @@ def resolve(name: str) -> object:
 
 @cache
 def functions_of(path: Path) -> frozenset[str]:
-    """Names of the test functions of a file."""
     body = ast.parse(path.read_text(encoding="utf-8")).body
     return frozenset(node.name for node in body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"))
 
@@ -184,9 +182,7 @@ def test_every_row_names_a_test_and_every_test_exists(row: Row) -> None:
 
 
 @EVERY_ROW
-def test_every_topic_field_is_published_and_every_parameter_is_in_its_schema(
-    row: Row, channels: Mapping[str, Sequence[str]]
-) -> None:
+def test_topic_fields_are_published_and_parameters_are_in_their_schema(row: Row, channels: Mapping[str, Sequence[str]]) -> None:
     for name in row.shown:
         if not name.startswith("rise-di "):
             assert is_field(name, channels) if ": " in name else is_parameter(name), name
