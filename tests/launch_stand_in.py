@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+# ruff: noqa: D101, D102 - launch documents its classes and methods
 """Stand-in for the parts of `launch` and `launch_ros` that the launch files use, on machines without them. It runs nothing.
 
 Names and arguments are those of launch 3.4.3 and launch_ros 0.26.6 (branch jazzy); any other argument is a TypeError.
@@ -130,7 +131,7 @@ class Shutdown(Action):
 
 @dataclass(eq=False)
 class TimerAction(Action):
-    period: float
+    period: float  # s
     actions: Sequence[Action]
 
 
