@@ -14,13 +14,13 @@ import time
 import numpy as np
 import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from tests.ros.peer import INPUTS
 
 from flight_core.authentication import MessageAuthenticator, read_key
 from flight_ros.messages import Encoder
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import NEWEST_SAMPLES, U, Y
 
-INPUTS = ("elevator", "thrust", "aileron", "rudder")
 ENOUGH = 50  # samples of y received, and samples of u sent
 
 # Compatible with every subscriber that does not request transient-local durability.

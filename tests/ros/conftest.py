@@ -10,12 +10,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Self
 
 import psutil
 import pytest
+from mcap.records import Channel, Message
+from tests.ros.peer import Peer, peer
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_log.scan import Scan
 
 _numbers = itertools.count(os.getpid())
 
@@ -26,14 +31,8 @@ class Process:
     """A process under test and the lines of its output."""
 
     def __init__(self, *arguments: str, cwd: Path, within: Sequence[str] = (), stdin: int | None = None) -> None:
-        self.popen = subprocess.Popen(
-            [*within, sys.executable, "-m", *arguments],
-            cwd=cwd,
-            stdin=stdin,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        command, pipe = [*within, sys.executable, "-m", *arguments], subprocess.PIPE
+        self.popen = subprocess.Popen(command, cwd=cwd, stdin=stdin, stdout=pipe, stderr=subprocess.STDOUT, text=True)
         self.lines: list[str] = []
         self._changed = threading.Condition()
         self._reader = threading.Thread(target=self._read)
@@ -51,11 +50,12 @@ class Process:
         """The output so far."""
         return "\n".join(self.lines)
 
-    def wait_for(self, text: str, timeout: float = 30.0) -> None:
+    def wait_for(self, text: str, timeout: float = 30.0) -> Self:
         """Wait until a line contains the text."""
         with self._changed:
             logged = self._changed.wait_for(lambda: any(text in line for line in self.lines), timeout)
         assert logged, f"{text!r} not logged within {timeout} s; output:\n{self.output}"
+        return self
 
     def children(self) -> list[psutil.Process]:
         """Its child processes."""
@@ -65,17 +65,36 @@ class Process:
         """Its child process of this module."""
         return next(child for child in self.children() if module in child.cmdline())
 
-    def wait_for_log(self, folder: Path, size: int, timeout: float = 60.0) -> None:
-        """Wait until the logs below a folder have this size in bytes. The process must not end before."""
+    def until(self, condition: Callable[[], bool], timeout: float = 30.0) -> None:
+        """Poll until a condition holds. The process must not end before."""
         deadline = time.monotonic() + timeout
-        while sum(path.stat().st_size for path in folder.rglob("*.mcap")) < size:
-            assert time.monotonic() < deadline, self.output
+        while not condition():
+            assert time.monotonic() < deadline, f"not within {timeout} s; output:\n{self.output}"
             assert self.popen.poll() is None, self.output
-            time.sleep(0.005)  # nothing signals the growth of a file
+            time.sleep(0.005)
 
-    def interrupt(self) -> None:
+    def wait_for_log(self, folder: Path, size: int, timeout: float = 60.0) -> None:
+        """Wait until the logs below a folder have this size in bytes."""
+        self.until(lambda: sum(path.stat().st_size for path in folder.rglob("*.mcap")) >= size, timeout)
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """SIGSTOP until the block is left."""
+        self.popen.send_signal(signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self.popen.send_signal(signal.SIGCONT)
+
+    def interrupt(self) -> Self:
         """Send SIGINT, as Ctrl-C does."""
         self.popen.send_signal(signal.SIGINT)
+        return self
+
+    def succeed(self, timeout: float = 30.0) -> Self:
+        """Wait for the end with status 0."""
+        assert self.end(timeout) == 0, self.output
+        return self
 
     def end(self, timeout: float = 30.0) -> int:
         """Wait for the end. Returns the exit status."""
@@ -124,3 +143,21 @@ def start_node(start: Start, osprey_gust: Scenario) -> Start:
     return lambda package, *arguments, within=(): start(
         f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path), *arguments, within=within
     )
+
+
+@pytest.fixture
+def peer_node(request: pytest.FixtureRequest) -> Iterator[Peer]:
+    """A peer with subscriptions to the topics that the module names in PEER_TOPICS."""
+    with peer(getattr(request.module, "PEER_TOPICS", ())) as made:
+        yield made
+
+
+def logged(run: Path) -> Iterator[tuple[str, Message]]:
+    """All messages of a log, which may still grow, with their topics."""
+    for path in run.glob("*.mcap"):
+        topics: dict[int, str] = {}
+        for record in Scan(path).records():
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                yield topics[record.channel_id], record

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -20,7 +22,7 @@ from flight_ros import transport
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
 
-OUTPUTS = ("q", "V", "p", "r")
+OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
 
 
 class Peer:
@@ -45,11 +47,20 @@ class Peer:
             if each is not None:
                 each()
 
+    def spin(self, duration: float, each: Callable[[], None] | None = None) -> None:
+        """Spin for a duration in s."""
+        end = time.monotonic() + duration
+        self.until(lambda: time.monotonic() > end, timeout=duration + 5.0, each=each)
+
     def send(self, y: float = 0.0, y_m: float = 0.0) -> None:
         """Publish one sample of y and one of y_m, with equal channels, stamped now."""
         now_ns = time.time_ns()
         for name, value in (("y_m", y_m), ("y", y)):
             self.publish(name, to_message(now_ns, OUTPUTS, np.full(4, value), "peer"))
+
+    def command(self, *u: float, sender: str = "peer") -> None:
+        """Publish u, stamped now."""
+        self.publish("u", to_message(time.time_ns(), INPUTS, np.array(u), sender))
 
     def publish(self, topic: str, message: JointState) -> None:
         """Publish a named vector on a topic."""
@@ -64,6 +75,16 @@ class Peer:
         future = client.call_async(request)
         self.until(future.done, each=each)
         return future.result()
+
+    def transition(self, number: int) -> bool:
+        """Request a transition of the controller; whether it succeeded."""
+        request = ChangeState.Request(transition=Transition(id=number))
+        return bool(self.call(ChangeState, "controller/change_state", request).success)
+
+    def counted(self, key: str, more_than: int = 0) -> bool:
+        """Whether a counter in the received diagnostics has been above a number."""
+        values = [value for array in self.received["/diagnostics"] for status in array.status for value in status.values]
+        return any(value.key == key and int(value.value) > more_than for value in values)
 
     def modes(self) -> list[int]:
         """The sequence of modes in `internals`, without repetitions."""

@@ -7,7 +7,6 @@ the map, not that the map agrees with ArduPilot.
 """
 
 import math
-import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -20,7 +19,6 @@ import pytest
 import yaml
 from geometry_msgs.msg import Twist, TwistStamped, Vector3, Vector3Stamped
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import FluidPressure, Imu, Joy
@@ -36,7 +34,6 @@ from flight_cli.cli import COMMANDS, application
 from flight_core.rates import NANOSECONDS
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
-from flight_ros.messages import to_message
 
 app = application([*COMMANDS])
 
@@ -48,7 +45,6 @@ FULL = math.radians(30.0)  # full deflection of a surface in the map
 EARLY = 0.05  # s; the last u may be some periods older than the instant that the test takes for it
 MAX_AGE, RELEASE = 0.5, 0.5  # s; MAX_AGE replaces the map's 0.2 s, for hosts under load
 LATE = 0.2  # s, scheduling delay of a host under load; without load a tick of 5 ms and a message period of 20 ms
-INPUTS = ("elevator", "thrust", "aileron", "rudder")
 
 
 class BridgeSetup:
@@ -88,44 +84,30 @@ class BridgeSetup:
         """Start a node of the stack by its module, with the scenario's parameters."""
         return self._start(name, "--ros-args", "--params-file", str(SCENARIO))
 
-    def command(self, *u: float) -> None:
-        """Publish u, stamped now."""
-        self.peer.publish("u", to_message(time.time_ns(), INPUTS, np.array(u), "test"))
-
     def engage(self, each: Callable[[], None] | None = None) -> str:
         """Call the service; the reason of a refusal, empty where there is none."""
         return str(self.peer.call(SetBool, "bridge/engage", SetBool.Request(data=True), each).message)
 
-    def law(self, transition: int) -> None:
-        """Activate or deactivate the controller."""
-        request = ChangeState.Request(transition=Transition(id=transition))
-        assert self.peer.call(ChangeState, "controller/change_state", request).success
-
     def engage_from_trim(self) -> None:
         """Engage as in docs/autopilots.md: deactivate, wait for trim, engage, activate."""
-        self.law(Transition.TRANSITION_DEACTIVATE)
+        assert self.peer.transition(Transition.TRANSITION_DEACTIVATE)
         self.peer.received["u"].clear()
         self.peer.until(lambda: self.peer.received["u"] and not any(self.peer.received["u"][-1].position))
         self.peer.until(lambda: self.engage() == "")
-        self.law(Transition.TRANSITION_ACTIVATE)
+        assert self.peer.transition(Transition.TRANSITION_ACTIVATE)
         self.wait_for_joys()
 
     def engage_by_command(self) -> None:
         """Engage by `rise-di engage`."""
         command = self._start("flight_cli.cli", "engage")
         self.peer.until(lambda: command.popen.poll() is not None, timeout=60.0)
-        assert command.end() == 0, command.output
+        command.succeed()
         self.wait_for_joys()
 
     def wait_for_joys(self) -> None:
         """Wait for six further messages to the autopilot."""
         self.joys.clear()
         self.peer.until(lambda: len(self.joys) > 5)
-
-    def spin(self, duration: float, each: Callable[[], None] | None = None) -> None:
-        """Receive messages for a duration in s."""
-        end = time.monotonic() + duration
-        self.peer.until(lambda: time.monotonic() > end, timeout=duration + 5.0, each=each)
 
     def after(self, t: float) -> tuple[list[float], list[float]]:
         """Times at which finite values and NaN were sent, s after an instant of the system clock."""
@@ -157,14 +139,13 @@ def true_error(autopilot: Process, setup: BridgeSetup) -> dict[str, Any]:
     return {name: rows[window, 1 + k] - np.interp(t[window], t_m, y_m[name]) for k, name in enumerate(y_m)}
 
 
-def test_the_unchanged_controller_tracks_through_the_map_and_a_killed_controller_releases_the_channels(
+def test_the_unchanged_controller_tracks_through_the_map_and_when_killed_releases_the_channels(
     setup: BridgeSetup,
 ) -> None:
     assert CliRunner().invoke(app, ["check-signs", setup.map, "--scenario", str(SCENARIO)]).exit_code == 0
     autopilot = setup.autopilot()
     bridge = setup.bridge("-p", "dry_run:=false")
-    controller = setup.node("rise_di_controller.main")
-    controller.wait_for("ready")
+    controller = setup.node("rise_di_controller.main").wait_for("ready")
     setup.node("reference_model.main")
     setup.peer.until(lambda: setup.peer.received["u"])
     assert not setup.joys  # nothing is sent before it is engaged
@@ -183,7 +164,7 @@ def test_the_unchanged_controller_tracks_through_the_map_and_a_killed_controller
     controller.popen.kill()
     killed = time.time()
     bridge.wait_for("RELEASE -> DISENGAGED: u is")
-    setup.spin(0.3)
+    setup.peer.spin(0.3)
     finite, released = setup.after(killed)
     assert max(finite) < MAX_AGE + LATE
     assert MAX_AGE - 0.05 < min(released) < MAX_AGE + LATE  # the last u may be a period of 20 ms older than the kill
@@ -207,7 +188,7 @@ def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the
     pressed = time.time()
     gamepad.publish(Joy(buttons=[1]))
     bridge.wait_for("ENGAGED -> RELEASE: pilot override by gamepad", timeout=2.0)
-    setup.spin(RELEASE + LATE)
+    setup.peer.spin(RELEASE + LATE)
     finite, released = setup.after(pressed)
     assert max(finite, default=0.0) < LATE  # at once
     assert min(released) < LATE
@@ -215,22 +196,20 @@ def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the
     gamepad.publish(Joy(buttons=[0]))
 
     setup.engage_from_trim()
-    autopilot.popen.send_signal(signal.SIGSTOP)
-    stopped = time.time()
-    bridge.wait_for("RELEASE -> DISENGAGED: q is")
-    autopilot.popen.send_signal(signal.SIGCONT)
-    setup.spin(0.1)
+    with autopilot.stopped():
+        stopped = time.time()
+        bridge.wait_for("RELEASE -> DISENGAGED: q is")
+    setup.peer.spin(0.1)
     finite, released = setup.after(stopped)
     assert max(finite) < MAX_AGE + LATE
     assert max(released) < MAX_AGE + RELEASE + LATE
     setup.joys.clear()
-    setup.spin(0.5)
+    setup.peer.spin(0.5)
     assert not setup.joys  # y is fresh again; the bridge does not re-engage by itself
 
     setup.engage_by_command()
-    bridge.interrupt()
-    assert bridge.end() == 0
-    setup.spin(0.1)
+    bridge.interrupt().succeed()
+    setup.peer.spin(0.1)
     assert len(setup.joys) > 5
     assert all(map(math.isnan, setup.joys[-1].axes))
 
@@ -257,7 +236,7 @@ def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_t
     def command() -> None:
         nonlocal last
         last = time.time()
-        setup.command(commanded, 0.0, 0.0, 0.0)
+        setup.peer.command(commanded, 0.0, 0.0, 0.0)
 
     received = setup.peer.received
     setup.peer.until(lambda: received["y"] and received["bridge/would_send"], timeout=60.0, each=command)
@@ -266,7 +245,7 @@ def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_t
     stale = last
 
     setup.peer.until(lambda: any("RELEASE -> DISENGAGED: u is" in line for line in bridge.lines))
-    setup.spin(0.3)
+    setup.peer.spin(0.3)
     sent = [(stamp(joy) - stale, [float(axis) for axis in joy.axes]) for joy in setup.joys]
     engaged = [at for at, axes in sent if axes[1] == pytest.approx(commanded / FULL, abs=1e-6)]
     neutral = [at for at, axes in sent if axes == [0.0, 0.0, 0.0, 0.0]]
@@ -279,7 +258,7 @@ def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_t
     assert MAX_AGE + NEUTRAL + RELEASE - LATE < max(released) < MAX_AGE + NEUTRAL + RELEASE + 2 * LATE
 
     setup.joys.clear()
-    setup.spin(0.5, each=command)
+    setup.peer.spin(0.5, each=command)
     assert not setup.joys  # u is fresh again; the bridge does not re-engage by itself
     assert sum("-> ENGAGED" in line for line in bridge.lines) == 1
 
@@ -290,15 +269,12 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
     autopilot = setup.autopilot()
     bag = tmp_path / "bag"
     topics = ("/ap/twist/filtered", "/ap/airspeed")
-    recorder = start(
-        "flight_recorder.main",
-        *("--ros-args", "-p", f"directory:={bag}", "-p", f"topics:=[{', '.join(topics)}]", "-p", "rate:=50.0"),
-    )
+    parameters = (f"directory:={bag}", f"topics:=[{', '.join(topics)}]", "rate:=50.0")
+    recorder = start("flight_recorder.main", "--ros-args", *(word for one in parameters for word in ("-p", one)))
     recorder.wait_for("ready")
     begin = len(autopilot.lines)
     setup.peer.until(lambda: len(autopilot.lines) > begin + 150)  # 3 s
-    recorder.interrupt()
-    assert recorder.end() == 0, recorder.output
+    recorder.interrupt().succeed()
     autopilot.popen.kill()
     recorded = [deserialize_message(one.data, TwistStamped) for one in stored_messages(bag) if one.topic == topics[0]]
     rates = {(-one.twist.angular.y, one.twist.angular.x, -one.twist.angular.z) for one in recorded}
@@ -306,9 +282,9 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
 
     setup.bridge()
     player = start("flight_cli.cli", "play", str(bag), "--topics", ",".join(topics))
-    command = partial(setup.command, 0.1, 0.0, 0.0, 0.0)
+    command = partial(setup.peer.command, 0.1, 0.0, 0.0, 0.0)
     setup.peer.until(lambda: player.popen.poll() is not None, timeout=60.0, each=command)
-    assert player.end() == 0, player.output
+    player.succeed()
     received = setup.peer.received["y"]
     assert len(received) > 50  # those with both topics fresh at a tick of the bridge
     assert all(list(y.name) == ["q", "V", "p", "r"] for y in received)
@@ -318,9 +294,7 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
     assert not setup.joys
 
 
-def test_rise_di_fly_starts_the_bridge_and_logs_the_topics_of_the_autopilot(
-    setup: BridgeSetup, start: Start, tmp_path: Path
-) -> None:
+def test_rise_di_fly_starts_the_bridge_and_logs_the_autopilot_topics(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:
     setup.autopilot()
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "12", "--json")
     setup.peer.until(lambda: setup.peer.received["bridge/would_send"], timeout=60.0)
@@ -328,7 +302,7 @@ def test_rise_di_fly_starts_the_bridge_and_logs_the_topics_of_the_autopilot(
     setup.peer.until(lambda: flight.popen.poll() is not None, timeout=90.0)
     assert refused.end() == 1
     assert "error: not engaged: dry_run is true: nothing is sent" in refused.output
-    assert flight.end() == 0, flight.output
+    flight.succeed()
     run = tmp_path / "runs" / "latest"
     log = read_run(run)
     assert {"y", "y_m", "u", "internals", "bridge/would_send"} <= log.tape.signals.keys()
@@ -350,7 +324,7 @@ def test_a_map_with_a_wrong_sign_is_refused(setup: BridgeSetup, start: Start) ->
 def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeSetup) -> None:
     setup.autopilot()
     setup.bridge()
-    command = partial(setup.command, 0.1, 0.1, 9.0, -0.1)
+    command = partial(setup.peer.command, 0.1, 0.1, 9.0, -0.1)
     received = setup.peer.received["bridge/would_send"]
     setup.peer.until(lambda: len(received) > 20 and setup.peer.received["y"], each=command)
     assert list(received[-1].name) == ["joy.axes[1]", "joy.axes[2]", "joy.axes[0]", "joy.axes[3]"]
@@ -358,7 +332,7 @@ def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeS
     assert list(setup.peer.received["y"][-1].name) == ["q", "V", "p", "r"]
     assert np.abs(setup.peer.received["y"][-1].position).max() < 0.2  # at trim: noise of 0.03 m/s in V
     assert setup.engage() == "dry_run is true: nothing is sent"
-    setup.spin(0.3)
+    setup.peer.spin(0.3)
     assert not setup.joys
 
 

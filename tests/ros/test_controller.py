@@ -4,7 +4,6 @@
 
 import math
 import os
-import signal
 import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -35,13 +34,9 @@ Instants = np.ndarray[Any, np.dtype[np.int64]]
 PERIOD_NS = NANOSECONDS // 100  # of the ticks, as in the default scenario
 MAX_AGE_NS = NANOSECONDS // 10  # of y and y_m, as in the default scenario
 LONG_MAX_AGE = ("-p", "max_age:=2.0")  # no input times out, also on a busy host
-
 STOPS = 4  # each would shift a schedule that drifts by up to a period
-
 CHANGED: dict[str, Any] = {"k_g": 3.0, "Lambda": [1, 1, 1, 1], "beta": [10.0, 10.0, 10.0, 5.0]}
-
 KERNEL_TICK_NS = NANOSECONDS // os.sysconf("SC_CLK_TCK")
-
 EXACT = 1e-12  # of values that are multiplied once
 
 
@@ -107,10 +102,6 @@ class HostDelay:
         return self._counted_ns() - self._before_ns + KERNEL_TICK_NS
 
 
-def controller(start: Start, scenario: Scenario, *arguments: str) -> Process:
-    return start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario.path), *arguments)
-
-
 def engage(peer_node: Peer, y: float = 0.01) -> None:
     peer_node.until(
         lambda: Mode.ENGAGED in peer_node.modes() and len(peer_node.received["u"]) > 20, each=lambda: peer_node.send(y)
@@ -130,18 +121,17 @@ def wait_for_messages(peer_node: Peer, topic: str, count: int, each: Callable[[]
     peer_node.until(lambda: len(peer_node.received[topic]) > before + count, each=each)
 
 
-def test_engages_bumpless_from_zero(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
-    controller(start, osprey_gust)
+def test_engages_bumpless_from_zero(start_node: Start, peer_node: Peer) -> None:
+    start_node("rise_di_controller")
     engage(peer_node)
     assert (peer_node.u()[0] == 0).all()
-    first = peer_node.received["internals"][0]
-    assert first.position[first.name.index("e.q")] == 0.01
+    assert channel(peer_node.received["internals"][0], "e.q") == 0.01
 
 
-def test_failsafe_holds_u_ramps_to_trim_and_re_engages_bumpless(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
+def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(start_node: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
     """Mode and u are checked at the instant of each tick. Ticks may overrun or be missed, with no other effect on u."""
     hold_ns, ramp_ns, y = NANOSECONDS // 10, NANOSECONDS, 0.05
-    process = controller(start, osprey_gust, "-p", "hold:=0.1", "-p", "ramp:=1.0")
+    process = start_node("rise_di_controller", "-p", "hold:=0.1", "-p", "ramp:=1.0")
     engage(peer_node)
     host_delay = HostDelay(process)
     peer_node.until(lambda: peer_node.modes()[-1] == Mode.HOLD)  # y and y_m have stopped
@@ -188,19 +178,13 @@ def test_failsafe_holds_u_ramps_to_trim_and_re_engages_bumpless(start: Start, os
     assert (moved <= np.outer(dt, law.input_scale * (law.K * law.Lambda * y + law.beta)) + EXACT).all()
 
 
-def test_stopped_controller_publishes_no_stale_u_and_re_engages_from_trim(
-    start: Start, osprey_gust: Scenario, peer_node: Peer
-) -> None:
-    process = controller(start, osprey_gust, "-p", "hold:=0.1", "-p", "ramp:=0.2")
+def test_stopped_controller_publishes_no_stale_u_and_re_engages_from_trim(start_node: Start, peer_node: Peer) -> None:
+    process = start_node("rise_di_controller", "-p", "hold:=0.1", "-p", "ramp:=0.2")
     engage(peer_node)
     peer_node.until(lambda: np.abs(peer_node.u()[-1]).max() > 1e-3, each=lambda: peer_node.send(0.05))
-    process.popen.send_signal(signal.SIGSTOP)
-    try:
-        again = time.monotonic() + 0.6  # s: beyond its age limit, hold and ramp
-        peer_node.until(lambda: time.monotonic() > again, each=lambda: peer_node.send(0.05))
+    with process.stopped():
+        peer_node.spin(0.6, each=lambda: peer_node.send(0.05))  # 0.6 s is beyond its age limit, hold and ramp
         before = len(peer_node.received["u"])  # all that was published before the stop has arrived
-    finally:
-        process.popen.send_signal(signal.SIGCONT)
     peer_node.until(lambda: len(peer_node.received["u"]) > before + 2, each=lambda: peer_node.send(0.05))
     assert (peer_node.u()[before] == 0.0).all()
 
@@ -217,27 +201,22 @@ def test_stopped_controller_publishes_no_stale_u_and_re_engages_from_trim(
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_malformed_sample_is_refused_counted_and_never_used(
-    name: str, message: JointState, reason: str, start: Start, osprey_gust: Scenario, peer_node: Peer
+    name: str, message: JointState, reason: str, start_node: Start, peer_node: Peer
 ) -> None:
-    controller(start, osprey_gust, *LONG_MAX_AGE)
+    start_node("rise_di_controller", *LONG_MAX_AGE)
     engage(peer_node)
 
     def send_both() -> None:
         peer_node.send(0.01)
         peer_node.publish("y", message)
 
-    def counted() -> bool:
-        values = [v for array in peer_node.received["/diagnostics"] for status in array.status for v in status.values]
-        return any(value.key == f"refused {reason}" and int(value.value) > 0 for value in values)
-
-    peer_node.until(counted, each=send_both)
+    peer_node.until(lambda: peer_node.counted(f"refused {reason}"), each=send_both)
     assert peer_node.modes() == [Mode.ENGAGED]
-    used = [m.position[m.name.index("y.q")] for m in peer_node.received["internals"]]
-    assert set(used) == {0.01}
+    assert {channel(message, "y.q") for message in peer_node.received["internals"]} == {0.01}
 
 
-def test_gains_change_in_flight_bumpless(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
-    process = controller(start, osprey_gust, "-p", "sign:=soft", *LONG_MAX_AGE)
+def test_gains_change_in_flight_bumpless(start_node: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
+    process = start_node("rise_di_controller", "-p", "sign:=soft", *LONG_MAX_AGE)
     engage(peer_node, 0.0)
     y, messages = 0.2, peer_node.received["internals"]
 
@@ -246,8 +225,7 @@ def test_gains_change_in_flight_bumpless(start: Start, osprey_gust: Scenario, pe
 
     peer_node.until(lambda: channel(messages[-1], "y.q") == y, each=send)
     since = len(messages) - 1
-    accepted = set_parameters(peer_node, send, **CHANGED)
-    assert accepted == (True, "")
+    assert set_parameters(peer_node, send, **CHANGED) == (True, "")
     process.wait_for("k_g: 1.0 -> 3.0")
     wait_for_messages(peer_node, "internals", 5, each=send)
     # With e = y the law moves u by K Lambda e dt + beta dt in a tick; the new gains alone would have moved it by more than 2 e.
@@ -259,8 +237,8 @@ def test_gains_change_in_flight_bumpless(start: Start, osprey_gust: Scenario, pe
     assert (moved <= np.outer(log.dt[since + 1 :], rate) + EXACT).all()
 
 
-def test_saturation_limits_can_be_added_in_flight(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
-    controller(start, osprey_gust)
+def test_saturation_limits_can_be_added_in_flight(start_node: Start, peer_node: Peer) -> None:
+    start_node("rise_di_controller")
     engage(peer_node)
     assert set_parameters(peer_node, upper=[0.001, 0.001, 0.001, 0.001]) == (True, "")
     peer_node.received["u"].clear()
@@ -282,9 +260,9 @@ def test_saturation_limits_can_be_added_in_flight(start: Start, osprey_gust: Sce
     ],
 )
 def test_invalid_change_is_rejected_with_its_reason_and_has_no_effect(
-    changes: dict[str, Any], sentence: str, start: Start, osprey_gust: Scenario, peer_node: Peer
+    changes: dict[str, Any], sentence: str, start_node: Start, peer_node: Peer
 ) -> None:
-    controller(start, osprey_gust)
+    start_node("rise_di_controller")
     engage(peer_node)
     successful, reason = set_parameters(peer_node, **changes)
     assert not successful
@@ -295,25 +273,19 @@ def test_invalid_change_is_rejected_with_its_reason_and_has_no_effect(
     wait_for_messages(peer_node, "u", 5, each=lambda: peer_node.send(0.01))
 
 
-def transition(peer_node: Peer, number: int) -> bool:
-    request = ChangeState.Request(transition=Transition(id=number))
-    return bool(peer_node.call(ChangeState, "controller/change_state", request).success)
-
-
-def test_waits_for_configure_and_activate_without_autostart(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
-    process = controller(start, osprey_gust, "-p", "autostart:=false")
-    process.wait_for("waiting to be configured")
+def test_waits_for_configure_and_activate_without_autostart(start_node: Start, peer_node: Peer) -> None:
+    start_node("rise_di_controller", "-p", "autostart:=false").wait_for("waiting to be configured")
     assert peer_node.call(GetState, "controller/get_state", GetState.Request()).current_state.label == "unconfigured"
-    assert transition(peer_node, Transition.TRANSITION_CONFIGURE)
+    assert peer_node.transition(Transition.TRANSITION_CONFIGURE)
     assert peer_node.received["u"] == []
-    assert transition(peer_node, Transition.TRANSITION_ACTIVATE)
+    assert peer_node.transition(Transition.TRANSITION_ACTIVATE)
     engage(peer_node)
-    assert transition(peer_node, Transition.TRANSITION_DEACTIVATE)
+    assert peer_node.transition(Transition.TRANSITION_DEACTIVATE)
     peer_node.until(lambda: peer_node.modes()[-1] == Mode.INACTIVE, each=lambda: peer_node.send(0.01))
 
 
-def test_node_survives_an_invalid_transition(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
-    process = controller(start, osprey_gust)
+def test_node_survives_an_invalid_transition(start_node: Start, peer_node: Peer) -> None:
+    process = start_node("rise_di_controller")
     engage(peer_node)
     client = peer_node.node.create_client(ChangeState, "controller/change_state")
     peer_node.until(client.service_is_ready)
@@ -322,23 +294,22 @@ def test_node_survives_an_invalid_transition(start: Start, osprey_gust: Scenario
     wait_for_messages(peer_node, "u", 20, each=lambda: peer_node.send(0.01))
 
 
-def test_incompatible_type_and_quality_of_service_are_reported_with_the_peer(start: Start, osprey_gust: Scenario) -> None:
-    arguments = ("--ros-args", "--params-file", str(osprey_gust.path))
+def test_incompatible_type_and_quality_of_service_are_reported_with_the_peer(start_node: Start) -> None:
     with peer(topics=()) as peer_node:
-        process = start("aircraft_sim.main", *arguments)
+        process = start_node("aircraft_sim")
         peer_node.node.create_publisher(Float64MultiArray, "u", QoSProfile(depth=1))
         process.wait_for("/u: /peer publishes std_msgs/msg/Float64MultiArray, expected sensor_msgs/msg/JointState")
-        recorder = start("flight_recorder.main", *arguments)
+        recorder = start_node("flight_recorder")
         peer_node.node.create_publisher(JointState, "truth", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
         recorder.wait_for("/truth: /peer publishes with incompatible quality of service")
 
 
-def test_tick_rate_is_kept_over_overruns(start: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
+def test_tick_rate_is_kept_over_overruns(start_node: Start, peer_node: Peer) -> None:
     """Deadlines are absolute: after an overrun a tick is late, or skipped and counted. The deadlines after it do not move."""
-    process = controller(start, osprey_gust, "-p", "max_age:=1.0")
+    process = start_node("rise_di_controller", "-p", "max_age:=1.0")
     engage(peer_node)
     host_delay, begin_ns, stopped_ns = HostDelay(process), time.time_ns(), 0
-    peer_node.until(lambda: time.time_ns() - begin_ns > NANOSECONDS, each=lambda: peer_node.send(0.01))
+    peer_node.spin(1.0, each=lambda: peer_node.send(0.01))
     peer_node.until(lambda: peer_node.modes()[-1] == Mode.HOLD)  # y and y_m have stopped: each tick now publishes internals
     timeout_ns = stamp_ns(peer_node.received["internals"][-1])
     peer_node.until(lambda: len(missed(peer_node, timeout_ns)) >= 1)
@@ -350,7 +321,7 @@ def test_tick_rate_is_kept_over_overruns(start: Start, osprey_gust: Scenario, pe
     counted = missed(peer_node, timeout_ns)
     peer_node.until(lambda: stamp_ns(peer_node.received["internals"][-1]) > max(counted))
     again_ns = time.time_ns()
-    peer_node.until(lambda: time.time_ns() - again_ns > NANOSECONDS, each=lambda: peer_node.send(0.01))
+    peer_node.spin(1.0, each=lambda: peer_node.send(0.01))
     host_delay_ns = host_delay.limit_ns() + stopped_ns
 
     log = ticks(peer_node)
@@ -378,12 +349,8 @@ def test_tick_rate_is_kept_over_overruns(start: Start, osprey_gust: Scenario, pe
 def stop_for(process: Process, peer_node: Peer, pause_ns: int) -> int:
     """SIGSTOP, then SIGCONT; upper limit of the duration, ns."""
     begin_ns = time.monotonic_ns()
-    process.popen.send_signal(signal.SIGSTOP)
-    try:
-        stopped_ns = time.monotonic_ns()
-        peer_node.until(lambda: time.monotonic_ns() - stopped_ns > pause_ns)
-    finally:
-        process.popen.send_signal(signal.SIGCONT)
+    with process.stopped():
+        peer_node.spin(pause_ns / NANOSECONDS)
     return time.monotonic_ns() - begin_ns
 
 

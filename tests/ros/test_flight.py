@@ -42,21 +42,15 @@ def short_scenario(osprey_gust: Scenario, tmp_path: Path) -> Path:
     return path
 
 
-def fly(start: Start, scenario: Path, *arguments: str) -> Process:
-    return start("flight_cli.cli", "fly", str(scenario), *arguments)
-
-
 Engaged = tuple[Process, list[psutil.Process]]
 
 
 @pytest.fixture
 def engaged(start: Start, short_scenario: Path, tmp_path: Path) -> Engaged:
     """A flight whose controller has engaged, and its four processes."""
-    flight = fly(start, short_scenario)
-    deadline = time.monotonic() + 30.0
-    while not any("ENGAGED" in log.read_text(encoding="utf-8") for log in tmp_path.glob("runs/*/log/controller.log")):
-        assert time.monotonic() < deadline, f"the controller did not engage within 30 s: {flight.output}"
-        time.sleep(0.02)
+    flight = start("flight_cli.cli", "fly", str(short_scenario))
+    logs = tmp_path / "runs"
+    flight.until(lambda: any("ENGAGED" in log.read_text(encoding="utf-8") for log in logs.glob("*/log/controller.log")))
     return flight, flight.children()
 
 
@@ -74,8 +68,7 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
     # more than a quarter of its period, or the aircraft by more than a sample.
     all_late = True
     for _ in range(4):
-        flight = fly(start, short_scenario)
-        assert flight.end(60.0) == 0, flight.output
+        start("flight_cli.cli", "fly", str(short_scenario)).succeed(60.0)
         run = (tmp_path / "runs" / "latest").resolve()
         tape = read_run(run).tape
         ticks = json.loads((run / "summary.json").read_text(encoding="utf-8"))["ticks"]
@@ -110,8 +103,7 @@ def test_interrupt_ends_all_processes_and_keeps_the_log(engaged: Engaged, tmp_pa
     assert len(nodes) == 4
     time_of_interrupt = time.monotonic()
     flight.interrupt()
-    _, alive = psutil.wait_procs(nodes, timeout=3.0)
-    assert not alive
+    assert not psutil.wait_procs(nodes, timeout=3.0)[1]
     assert time.monotonic() - time_of_interrupt < 3.0
     assert flight.end() == 130, flight.output
     assert "Traceback" not in flight.output
@@ -140,7 +132,7 @@ def test_a_second_interrupt_does_not_interrupt_the_shutdown(engaged: Engaged, tm
 
 @pytest.mark.parametrize("seconds", [0.3, 1.0])  # an earlier interrupt stops the interpreter itself
 def test_an_early_interrupt_causes_no_traceback(seconds: float, start: Start, short_scenario: Path) -> None:
-    flight = fly(start, short_scenario)
+    flight = start("flight_cli.cli", "fly", str(short_scenario))
     with pytest.raises(subprocess.TimeoutExpired):  # the instant of the interrupt is the test case
         flight.popen.wait(seconds + 0.05)
     nodes = flight.children()
@@ -151,7 +143,7 @@ def test_an_early_interrupt_causes_no_traceback(seconds: float, start: Start, sh
 
 
 def test_two_flights_on_one_domain_do_not_mix(start: Start, short_scenario: Path, engaged: Engaged) -> None:
-    second = fly(start, short_scenario)
+    second = start("flight_cli.cli", "fly", str(short_scenario))
     assert second.end() == 2
     assert "a domain of its own for each flight: set ROS_DOMAIN_ID" in second.output
     first, _ = engaged
@@ -163,10 +155,10 @@ def test_a_flight_with_a_wrong_sign_ends_when_it_diverges(start: Start, short_sc
     wrong = short_scenario.with_name("wrong.yaml")
     text = short_scenario.read_text(encoding="utf-8")
     wrong.write_text(text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"), encoding="utf-8")
-    flight = fly(start, wrong)
+    flight = start("flight_cli.cli", "fly", str(wrong))
     assert flight.end(60.0) == 3
     assert "aircraft ended with status 3: diverged at t = " in flight.output
-    in_process = fly(start, wrong, "--in-process")
+    in_process = start("flight_cli.cli", "fly", str(wrong), "--in-process")
     assert in_process.end() == 3
     assert "outcome: diverged at t = " in in_process.output
 

@@ -13,10 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.records import Channel, Message
-from mcap.stream_reader import StreamReader
 from tests import recordings
-from tests.ros.conftest import Process, Start
+from tests.ros.conftest import Process, Start, logged
 
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -42,21 +40,15 @@ def scenario_file(folder: Path, duration: float, name: str = "osprey_servo", **s
 
 def fly(start: Start, scenario: Path, runs: str, *options: str) -> Path:
     """Fly to the end; return the folder of the run."""
-    process = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", runs, *options)
-    assert process.end(timeout=120) == 0, process.output
+    start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", runs, *options).succeed(120.0)
     return scenario.parent / runs / "latest"
 
 
 def payloads(run: Path) -> dict[str, list[bytes]]:
     """The bytes of every message by topic, in the order of sending."""
-    topics: dict[int, str] = {}
     by_topic: dict[str, list[tuple[int, bytes]]] = {}
-    with min(run.glob("*.mcap")).open("rb") as stream:
-        for record in StreamReader(stream).records:
-            if isinstance(record, Channel):
-                topics[record.id] = record.topic
-            elif isinstance(record, Message):
-                by_topic.setdefault(topics[record.channel_id], []).append((record.sequence, record.data))
+    for topic, record in logged(run):
+        by_topic.setdefault(topic, []).append((record.sequence, record.data))
     return {topic: [data for _, data in sorted(messages)] for topic, messages in by_topic.items()}
 
 

@@ -23,18 +23,13 @@ from flight_ros.topics import NODE_STATE, STATES
 def received_states(peer_node: Peer, topic: str = NODE_STATE.name) -> dict[str, str]:
     """The newest state by process, filled while the peer spins."""
     states: dict[str, str] = {}
-
-    def receive(message: KeyValue) -> None:
-        states[message.key] = message.value
-
-    peer_node.node.create_subscription(KeyValue, topic, receive, STATES)
+    peer_node.node.create_subscription(KeyValue, topic, lambda one: states.update({one.key: one.value}), STATES)
     return states
 
 
-def test_a_late_subscriber_gets_the_state_of_each_process(start: Start, osprey_gust: Scenario) -> None:
-    arguments = ("--ros-args", "--params-file", str(osprey_gust.path), "-r", "__ns:=/one")
-    modules = {"controller": "rise_di_controller", "aircraft": "aircraft_sim"}
-    nodes = {name: start(f"{module}.main", *arguments) for name, module in modules.items()}
+def test_a_late_subscriber_gets_the_state_of_each_process(start_node: Start) -> None:
+    packages = {"controller": "rise_di_controller", "aircraft": "aircraft_sim"}
+    nodes = {name: start_node(package, "-r", "__ns:=/one") for name, package in packages.items()}
     for node in nodes.values():
         node.wait_for("ready")
     with peer(topics=()) as peer_node:
@@ -45,13 +40,12 @@ def test_a_late_subscriber_gets_the_state_of_each_process(start: Start, osprey_g
 
 
 def test_the_aircraft_completes_a_lockstep_flight_and_the_process_has_its_id(
-    start: Start, osprey_gust: Scenario, tmp_path: Path
+    start_node: Start, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     short = osprey_gust.vary(flight={"duration": 0.2})
     overrides = parameter_overrides(ONE_PROCESS, short, tmp_path, 0.0, lockstep=True)
     words = [word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}")]
-    flight = start("flight_bringup.main", "--ros-args", "--params-file", str(osprey_gust.path), *words)
-    flight.wait_for("flight completed at t = 0.2 s")
+    flight = start_node("flight_bringup", *words).wait_for("flight completed at t = 0.2 s")
     with peer(topics=()) as peer_node:
         states = received_states(peer_node)
         roles = ("aircraft", "controller", "recorder", "reference_model")
@@ -59,13 +53,11 @@ def test_the_aircraft_completes_a_lockstep_flight_and_the_process_has_its_id(
         peer_node.until(lambda: states == expected)
 
 
-def test_a_monitor_tells_a_node_from_one_of_another_flight(start: Start, osprey_gust: Scenario) -> None:
-    node = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
+def test_a_monitor_tells_a_node_from_one_of_another_flight(start_node: Start, osprey_gust: Scenario) -> None:
+    node = start_node("rise_di_controller")
     with FlightMonitor(osprey_gust.controller.outputs, lockstep=True) as monitor:
-        pid, deadline = node.popen.pid, time.monotonic() + 30.0
-        while not monitor.is_ready("controller", pid):
-            assert time.monotonic() < deadline, node.output
-            time.sleep(0.01)
+        pid = node.popen.pid
+        node.until(lambda: monitor.is_ready("controller", pid))
         assert not monitor.is_ready("controller", pid + 1)
         assert not monitor.is_ready("recorder", pid)
 
@@ -97,9 +89,7 @@ def test_a_log_line_does_not_start_a_flight(only_stage: Path, osprey_gust: Scena
     assert "[controller]: ready" in (tmp_path / "run" / "log" / "controller.log").read_text(encoding="utf-8")
 
 
-def test_a_process_that_ends_while_others_wait_is_named_at_once(
-    only_stage: Path, osprey_gust: Scenario, tmp_path: Path
-) -> None:
+def test_a_process_ending_while_others_wait_is_named_at_once(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
     only_stage.write_text("import sys\nprint('error: no such airframe')\nsys.exit(2)\n", encoding="utf-8")
     begin = time.monotonic()
     with pytest.raises(ParameterError, match=r"^controller ended with status 2: no such airframe$"):
@@ -108,10 +98,9 @@ def test_a_process_that_ends_while_others_wait_is_named_at_once(
 
 
 def test_the_state_of_a_node_in_another_flight_does_not_start_this_one(
-    start: Start, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+    start_node: Start, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
-    other = start("rise_di_controller.main", "--ros-args", "--params-file", str(osprey_gust.path))
-    other.wait_for("ready")
+    other = start_node("rise_di_controller").wait_for("ready")
     only_stage.write_text("import time\ntime.sleep(60)\n", encoding="utf-8")
     with pytest.raises(ParameterError, match="timed out waiting for controller"):
         start_stage(osprey_gust, tmp_path / "run")

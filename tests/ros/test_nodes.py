@@ -8,8 +8,9 @@ import subprocess
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Start
-from tests.ros.peer import peer
+from tests.ros.peer import Peer
 
+PEER_TOPICS = ("/diagnostics",)
 NODES = {
     "aircraft_sim": "aircraft",
     "reference_model": "reference_model",
@@ -49,8 +50,7 @@ def test_an_invalid_parameter_is_one_sentence(arguments: list[str], sentence: st
 def test_a_node_without_a_publisher_warns_keeps_waiting_and_shuts_down_cleanly(
     package: str, waits_for: str, number: signal.Signals, start_node: Start
 ) -> None:
-    node = start_node(package)
-    node.wait_for(f"waiting for {waits_for}: no publisher")
+    node = start_node(package).wait_for(f"waiting for {waits_for}: no publisher")
     assert node.popen.poll() is None
     node.popen.send_signal(number)
     assert node.end(5.0) == 0
@@ -58,34 +58,30 @@ def test_a_node_without_a_publisher_warns_keeps_waiting_and_shuts_down_cleanly(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_that_is_stopped_during_its_start_shuts_down_cleanly(number: signal.Signals, start_node: Start) -> None:
-    with peer(topics=()) as peer_node:
-        node = start_node("rise_di_controller")
-        early_participant = f"_start_{node.popen.pid}"
-        # The start may be faster than the discovery.
-        peer_node.until(lambda: early_participant in peer_node.node.get_node_names() or "ready" in node.output)
-        node.popen.send_signal(number)
-        assert node.end(5.0) == 0
-        assert "Traceback" not in node.output
+def test_a_node_stopped_during_its_start_shuts_down_cleanly(number: signal.Signals, start_node: Start, peer_node: Peer) -> None:
+    node = start_node("rise_di_controller")
+    early_participant = f"_start_{node.popen.pid}"
+    # The start may be faster than the discovery.
+    peer_node.until(lambda: early_participant in peer_node.node.get_node_names() or "ready" in node.output)
+    node.popen.send_signal(number)
+    assert node.end(5.0) == 0
+    assert "Traceback" not in node.output
 
 
-def test_the_early_participant_is_destroyed_once_the_node_exists(start_node: Start) -> None:
-    with peer(topics=()) as peer_node:
-        node = start_node("rise_di_controller")
-        node.wait_for("ready")
-        peer_node.until(lambda: set(peer_node.node.get_node_names()) == {"peer", "controller"})
+def test_the_early_participant_is_destroyed_once_the_node_exists(start_node: Start, peer_node: Peer) -> None:
+    start_node("rise_di_controller").wait_for("ready")
+    peer_node.until(lambda: set(peer_node.node.get_node_names()) == {"peer", "controller"})
 
 
-def test_no_module_is_imported_once_a_node_is_ready(start_node: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_module_is_imported_by_a_ready_node(start_node: Start, monkeypatch: pytest.MonkeyPatch, peer_node: Peer) -> None:
     # A library function that imports modules at its first call would do so inside a tick.
     monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
-    with peer(topics=("/diagnostics",)) as peer_node:
-        nodes = [start_node(package) for package in NODES]
+    nodes = [start_node(package) for package in NODES]
 
-        def reports(name: str) -> int:
-            return sum(one.status[0].name == f"/{name}" for one in peer_node.received["/diagnostics"])
+    def reports(name: str) -> int:
+        return sum(one.status[0].name == f"/{name}" for one in peer_node.received["/diagnostics"])
 
-        peer_node.until(lambda: all(reports(name) >= 3 for name in NODES.values()))
+    peer_node.until(lambda: all(reports(name) >= 3 for name in NODES.values()))
     assert any("ENGAGED" in node.output for node in nodes)
     for node in nodes:
         assert [line for line in node.output.partition("]: ready")[2].splitlines() if "import time:" in line] == []
@@ -93,8 +89,7 @@ def test_no_module_is_imported_once_a_node_is_ready(start_node: Start, monkeypat
 
 def test_a_burst_of_signals_ends_a_node_as_one_signal_does(start_node: Start) -> None:
     # A lock in the signal handler would deadlock here: the second signal interrupts the first handler.
-    node = start_node("aircraft_sim")
-    node.wait_for("waiting for /u")
+    node = start_node("aircraft_sim").wait_for("waiting for /u")
     for _ in range(50):
         node.popen.send_signal(signal.SIGTERM)
         node.popen.send_signal(signal.SIGINT)

@@ -3,15 +3,13 @@
 """rise-di play: subscribers get every byte of a recorded flight in time; a controller reproduces its u."""
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rclpy.node import Node
 from tests.ros.conftest import Start
-from tests.ros.peer import peer
+from tests.ros.peer import Peer, peer
 
 from flight_core.rates import NANOSECONDS
 from flight_log.playback import read_playback
@@ -43,23 +41,17 @@ class Receiver:
             time.sleep(0.002)
 
 
-@contextmanager
-def receiver(*topics: Topic) -> Iterator[Receiver]:
-    with peer(()) as peer_node:
-        yield Receiver(peer_node.node, *topics)
-
-
 def of(run: Path, topic: str) -> list[bytes]:
     return [message.data for message in read_playback(run, [topic]).messages]
 
 
-def test_a_flight_is_played_byte_by_byte_with_its_timing_and_its_clock(run: Path, start: Start) -> None:
-    with receiver(Y, Y_M, CLOCK) as receiving:
-        process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "2")
-        receiving.until(Y, 1001)
-        receiving.until(Y_M, 1001)
-        assert process.end() == 0, process.output
-        receiving.until(CLOCK, 201)
+def test_a_flight_is_played_byte_by_byte_with_its_timing_and_its_clock(run: Path, start: Start, peer_node: Peer) -> None:
+    receiving = Receiver(peer_node.node, Y, Y_M, CLOCK)
+    process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "2")
+    receiving.until(Y, 1001)
+    receiving.until(Y_M, 1001)
+    process.succeed()
+    receiving.until(CLOCK, 201)
     assert receiving.received["y"] == of(run, "y")
     assert receiving.received["y_m"] == of(run, "y_m")
     assert [stamp_of(clock) for clock in receiving.received["/clock"]] == [k * 10 * MS for k in range(201)]
@@ -69,11 +61,11 @@ def test_a_flight_is_played_byte_by_byte_with_its_timing_and_its_clock(run: Path
     assert np.median(np.abs(late)) < 0.02
 
 
-def test_stamps_are_moved_to_now_and_all_other_bytes_are_unchanged(run: Path, start: Start) -> None:
-    with receiver(Y) as receiving:
-        process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--rate", "2", "--start", "1.5")
-        receiving.until(Y, 251)
-        assert process.end() == 0, process.output
+def test_stamps_are_moved_to_now_and_all_other_bytes_are_unchanged(run: Path, start: Start, peer_node: Peer) -> None:
+    receiving = Receiver(peer_node.node, Y)
+    process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--rate", "2", "--start", "1.5")
+    receiving.until(Y, 251)
+    process.succeed()
     stamps = np.array([stamp_of(message) for message in receiving.received["y"]])
     assert set(np.diff(stamps)) == {MS}  # 2 ms at twice the rate
     assert np.median(np.abs(stamps - np.array(receiving.sent["y"]))) < 50 * MS  # as fresh as they were
@@ -81,53 +73,50 @@ def test_stamps_are_moved_to_now_and_all_other_bytes_are_unchanged(run: Path, st
     assert received == recorded
 
 
-def test_a_domain_with_a_publisher_of_the_topic_is_an_error(run: Path, start: Start, domain: int) -> None:
-    with peer(()) as peer_node:
-        peer_node.publish("y", to_message(0, ("q",), np.zeros(1), "peer"))
-        process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
-        assert process.end() == 2
+def test_a_domain_with_a_publisher_of_the_topic_is_an_error(run: Path, start: Start, domain: int, peer_node: Peer) -> None:
+    peer_node.publish("y", to_message(0, ("q",), np.zeros(1), "peer"))
+    process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
+    assert process.end() == 2
     (message,) = process.lines
     sentence = "found 1 publishers of /y already, expected no publisher: set ROS_DOMAIN"
     assert message.startswith(f"error: ROS_DOMAIN_ID {domain}: {sentence}")
 
 
-def test_a_loop_repeats_until_it_is_interrupted(run: Path, start: Start) -> None:
-    with receiver(Y) as receiving:
-        process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--start", "1.9", "--loop")
-        receiving.until(Y, 3 * 51 + 1)
-        process.interrupt()
-        begin = time.monotonic()
-        assert process.end() == 130
+def test_a_loop_repeats_until_it_is_interrupted(run: Path, start: Start, peer_node: Peer) -> None:
+    receiving = Receiver(peer_node.node, Y)
+    process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--start", "1.9", "--loop")
+    receiving.until(Y, 3 * 51 + 1)
+    process.interrupt()
+    begin = time.monotonic()
+    assert process.end() == 130
     assert time.monotonic() - begin < 3.0
     assert "Traceback" not in process.output
     stamps = [stamp_of(message) for message in receiving.received["y"]]
     assert stamps == sorted(stamps)  # also from one pass to the next
 
 
-def test_a_controller_reproduces_a_lockstep_flight_to_the_byte(start: Start, start_node: Start, tmp_path: Path) -> None:
+def test_a_controller_reproduces_a_flight_to_the_byte(start: Start, start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
     flight = start("flight_cli.cli", "fly", "osprey_gust", "--one-process", "--duration", "2", "--runs", str(tmp_path))
-    assert flight.end(timeout=120) == 0, flight.output
+    flight.succeed(120)
     recorded = tmp_path / "latest"
     u, internals = of(recorded, "u"), of(recorded, "internals")
-    with receiver(U, INTERNALS) as receiving:
-        node = start_node("rise_di_controller", "-p", "lockstep:=true", "-p", "y_rate:=500.0")
-        node.wait_for("ready")
-        process = start("flight_cli.cli", "play", str(recorded), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "3")
-        receiving.until(U, len(u))
-        receiving.until(INTERNALS, len(internals))
-        assert process.end() == 0, process.output
+    receiving = Receiver(peer_node.node, U, INTERNALS)
+    start_node("rise_di_controller", "-p", "lockstep:=true", "-p", "y_rate:=500.0").wait_for("ready")
+    process = start("flight_cli.cli", "play", str(recorded), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "3")
+    receiving.until(U, len(u))
+    receiving.until(INTERNALS, len(internals))
+    process.succeed()
     assert receiving.received["u"] == u
     assert receiving.received["internals"] == internals
 
 
 def test_a_controller_in_real_time_follows_a_recorded_flight(run: Path, start: Start, start_node: Start) -> None:
     with peer() as peer_node:
-        node = start_node("rise_di_controller")
-        node.wait_for("ready")
+        node = start_node("rise_di_controller").wait_for("ready")
         process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
         node.wait_for("WAITING -> ENGAGED")
         peer_node.until(lambda: process.popen.poll() is not None)
-        assert process.end() == 0, process.output
+        process.succeed()
         u = peer_node.u()
     # The recorded aircraft does not respond to this u, and these ticks use other samples of y than the recorded ones. So
     # both u are close but not equal. In 2 s the recorded u reaches 0.06.

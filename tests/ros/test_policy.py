@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Start
-from tests.ros.peer import Peer, peer
+from tests.ros.peer import Peer
 
 from autopilot_bridge.params import LIBRARY, load_map
 from flight_analysis.closed_loop.scenario import Scenario
@@ -76,46 +76,43 @@ def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
 
     for _ in range(3):  # the endpoints of a node are discovered one by one
         peer_node.until(settled, timeout=60.0)
-        waited = peer_node.node.get_clock().now().nanoseconds + 500_000_000
-        peer_node.until(lambda end=waited: peer_node.node.get_clock().now().nanoseconds > end)  # type: ignore[misc]
+        peer_node.spin(0.5)
     return found
 
 
 ROLES = ("aircraft", "reference_model", "controller", "recorder")
 
 
-def test_the_policy_allows_exactly_the_topics_and_services_of_a_flight(start_node: Start, tmp_path: Path) -> None:
+def test_the_policy_allows_exactly_the_topics_and_services_of_nodes(start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
     policy, packages = allowed(), ("rise_di_controller", "reference_model", "aircraft_sim", "flight_recorder")
-    with peer(topics=()) as peer_node:
-        processes = [start_node(package) for package in packages]
-        for process in processes:
-            process.wait_for("ready", timeout=60.0)
-        real_time = discovered(peer_node, ROLES)
-        for process in processes:
-            process.interrupt()
-            process.end()
-        overrides = [f"{role}:lockstep:=true" for role in ROLES] + ["aircraft:control_rate:=100.0", "controller:y_rate:=500.0"]
-        overrides.append(f"recorder:directory:={tmp_path / 'run'}")
-        start_node("flight_bringup", *(word for one in overrides for word in ("-p", one)))
-        lockstep = discovered(peer_node, ROLES)
+    processes = [start_node(package) for package in packages]
+    for process in processes:
+        process.wait_for("ready", timeout=60.0)
+    real_time = discovered(peer_node, ROLES)
+    for process in processes:
+        process.interrupt()
+        process.end()
+    overrides = [f"{role}:lockstep:=true" for role in ROLES] + ["aircraft:control_rate:=100.0", "controller:y_rate:=500.0"]
+    overrides.append(f"recorder:directory:={tmp_path / 'run'}")
+    start_node("flight_bringup", *(word for one in overrides for word in ("-p", one)))
+    lockstep = discovered(peer_node, ROLES)
     for role in ROLES:
         assert real_time[role].merged(lockstep[role]) == policy[role], role
 
 
-def test_the_policy_allows_exactly_those_of_the_flight_monitor(osprey_gust: Scenario) -> None:
-    with peer(topics=()) as peer_node, FlightMonitor(osprey_gust.controller.outputs, lockstep=False):
+def test_the_policy_allows_exactly_those_of_the_flight_monitor(osprey_gust: Scenario, peer_node: Peer) -> None:
+    with FlightMonitor(osprey_gust.controller.outputs, lockstep=False):
         assert discovered(peer_node, ("monitor",))["monitor"] == allowed()["monitor"]
 
 
-def test_the_policy_allows_exactly_those_of_the_bridge_with_every_map(start: Start) -> None:
+def test_the_policy_allows_exactly_those_of_the_bridge_with_every_map(start: Start, peer_node: Peer) -> None:
     maps = [load_map(path.stem) for path in sorted(LIBRARY.glob("*.yaml"))]
     used = [row for channel_map in maps for row in channel_map.used_topics()]
     published = {topic for key, topic, _ in used if key.startswith("messages.")}
     subscribed = {topic for key, topic, _ in used if not key.startswith("messages.")}
     policy = allowed()["bridge"]
-    with peer(topics=()) as peer_node:
-        start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot").wait_for("dry run")
-        own = discovered(peer_node, ("bridge",))["bridge"]
+    start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot").wait_for("dry run")
+    own = discovered(peer_node, ("bridge",))["bridge"]
     assert own.publish | published == policy.publish
     assert own.subscribe | subscribed == policy.subscribe
     assert (own.reply, own.request) == (policy.reply, policy.request)

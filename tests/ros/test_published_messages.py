@@ -6,13 +6,11 @@ None of them is on PyPI. On a full ROS 2: apt install ros-jazzy-mavros-msgs; bui
 in a workspace that is sourced. Without them tests/pure/test_channel_map.py tests each row with the published fields.
 """
 
-import time
 from importlib import import_module
 from importlib.util import find_spec
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
@@ -24,11 +22,9 @@ from tests.ros.peer import Peer, peer
 
 from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field, to_channel, to_raw
 from autopilot_bridge.params import ChannelMap, load_map
-from flight_ros.messages import to_message
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 AS_PYTHON = {"float32": "float", "bool": "boolean"}  # as rclpy names the types of a definition
-INPUTS = ("elevator", "thrust", "aileron", "rudder")
 
 
 def needs(*packages: str) -> None:
@@ -97,13 +93,10 @@ class Px4:
         types, node = import_module("px4_msgs.msg"), peer_node.node
         self._peer = peer_node
         # nose up and 2 m/s fast
-        messages = {
-            "vehicle_odometry": fill(types.VehicleOdometry(), RATES["px4"]),
-            "airspeed_validated": fill(types.AirspeedValidated(), AIRSPEED["px4"]),
-        }
+        odometry, airspeed = fill(types.VehicleOdometry(), RATES["px4"]), fill(types.AirspeedValidated(), AIRSPEED["px4"])
         self._publishers = [
             (node.create_publisher(type(message), f"/fmu/out/{topic}", BEST_EFFORT), message)
-            for topic, message in messages.items()
+            for topic, message in (("vehicle_odometry", odometry), ("airspeed_validated", airspeed))
         ]
         self.received: dict[str, list[Any]] = {}
         for topic in ("offboard_control_mode", "vehicle_torque_setpoint", "vehicle_thrust_setpoint"):
@@ -115,19 +108,13 @@ class Px4:
         """Publish a sample of y, and of u: elevator 0.02 rad."""
         for publisher, message in self._publishers:
             publisher.publish(message)
-        self._peer.publish("u", to_message(time.time_ns(), INPUTS, np.array([0.02, 0.0, 0.0, 0.0]), "test"))
-
-
-def spin(peer_node: Peer, duration: float) -> None:
-    end = time.monotonic() + duration
-    peer_node.until(lambda: time.monotonic() > end)
+        self._peer.command(0.02, 0.0, 0.0, 0.0)
 
 
 def test_a_bridge_exchanges_the_messages_of_px4(start: Start) -> None:
     """Offboard heartbeats with fresh y and u, setpoints while engaged; a stale u ends both."""
     needs("px4_msgs")
-    bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false")
-    bridge.wait_for("ready")
+    bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false").wait_for("ready")
     with peer(topics=("y",)) as peer_node:
         px4 = Px4(peer_node)
         peer_node.until(lambda: peer_node.received["y"] and len(px4.received["OffboardControlMode"]) > 2, each=px4.publish)
@@ -144,8 +131,8 @@ def test_a_bridge_exchanges_the_messages_of_px4(start: Start) -> None:
         assert list(px4.received["VehicleTorqueSetpoint"][-1].xyz) == pytest.approx([0.0, 0.02 / 0.523599, 0.0], abs=1e-6)
         assert list(px4.received["VehicleThrustSetpoint"][-1].xyz) == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
         peer_node.until(lambda: any("-> DISENGAGED: " in line for line in bridge.lines))
-        spin(peer_node, 0.2)  # for messages in transit
+        peer_node.spin(0.2)  # for messages in transit
         for messages in px4.received.values():
             messages.clear()
-        spin(peer_node, 0.5)
+        peer_node.spin(0.5)
         assert not any(px4.received.values())

@@ -12,11 +12,12 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Empty, Int64
-from tests.ros.peer import peer
+from tests.conftest import REPOSITORY
+from tests.ros.peer import Peer
 
 from flight_ros import rclpy_private
 
-SOURCES = Path(__file__).resolve().parents[2] / "ros_ws" / "src"
+SOURCES = REPOSITORY / "ros_ws" / "src"
 
 
 @pytest.mark.parametrize("path", sorted(SOURCES.glob("*/**/*.py")), ids=lambda path: path.name)
@@ -30,18 +31,17 @@ def test_private_names_of_rclpy_are_in_one_file(path: Path) -> None:
         assert not {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute) and node.attr == "handle"}
 
 
-def test_a_serialised_message_published_raw_is_taken_without_an_executor() -> None:
-    with peer(()) as one:
-        context = one.node.context
-        subscription = one.node.create_subscription(Int64, "number", lambda _: None, QoSProfile(depth=10), raw=True)
-        publish = rclpy_private.raw_publish(one.node.create_publisher(Int64, "number", QoSProfile(depth=10)))
-        wait_set = rclpy_private.WaitSet([subscription], context)
-        assert not wait_set.wait(0)
-        one.until(lambda: one.node.count_subscribers("number") == 1)
-        one.until(lambda: wait_set.wait(1_000_000), each=lambda: publish(serialize_message(Int64(data=7))))
-        raw, information = rclpy_private.take_messages(subscription, 1)[0]
-        assert deserialize_message(raw, Int64).data == 7
-        assert information["source_timestamp"] <= information["received_timestamp"]
+def test_a_serialised_message_published_raw_is_taken_without_an_executor(peer_node: Peer) -> None:
+    context = peer_node.node.context
+    subscription = peer_node.node.create_subscription(Int64, "number", lambda _: None, QoSProfile(depth=10), raw=True)
+    publish = rclpy_private.raw_publish(peer_node.node.create_publisher(Int64, "number", QoSProfile(depth=10)))
+    wait_set = rclpy_private.WaitSet([subscription], context)
+    assert not wait_set.wait(0)
+    peer_node.until(lambda: peer_node.node.count_subscribers("number") == 1)
+    peer_node.until(lambda: wait_set.wait(1_000_000), each=lambda: publish(serialize_message(Int64(data=7))))
+    raw, information = rclpy_private.take_messages(subscription, 1)[0]
+    assert deserialize_message(raw, Int64).data == 7
+    assert information["source_timestamp"] <= information["received_timestamp"]
 
 
 def test_bytes_that_are_no_message_raise_the_error_that_the_nodes_catch() -> None:
@@ -49,38 +49,36 @@ def test_bytes_that_are_no_message_raise_the_error_that_the_nodes_catch() -> Non
         deserialize_message(b"\x00", Int64)
 
 
-def test_a_participant_is_in_the_graph_until_it_is_destroyed() -> None:
-    with peer(()) as one:
-        participant = rclpy_private.create_participant("_early", one.node.context)
-        one.until(lambda: "_early" in one.node.get_node_names())
-        rclpy_private.destroy_participant(participant)
-        one.until(lambda: "_early" not in one.node.get_node_names())
+def test_a_participant_is_in_the_graph_until_it_is_destroyed(peer_node: Peer) -> None:
+    participant = rclpy_private.create_participant("_early", peer_node.node.context)
+    peer_node.until(lambda: "_early" in peer_node.node.get_node_names())
+    rclpy_private.destroy_participant(participant)
+    peer_node.until(lambda: "_early" not in peer_node.node.get_node_names())
 
 
-def test_a_ready_callback_is_executed_and_raises_what_it_raises() -> None:
-    with peer(()) as one:
-        context: Context = one.node.context
-        node = Node("served", context=context)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
+def test_a_ready_callback_is_executed_and_raises_what_it_raises(peer_node: Peer) -> None:
+    context: Context = peer_node.node.context
+    node = Node("served", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
 
-        def fail(_: Empty) -> None:
-            raise RuntimeError("of the callback")
+    def fail(_: Empty) -> None:
+        raise RuntimeError("of the callback")
 
-        node.create_subscription(Empty, "call", fail, QoSProfile(depth=1))
-        publisher = one.node.create_publisher(Empty, "call", QoSProfile(depth=1))
-        while (execute := rclpy_private.ready_callback(executor)) is not None:
-            execute()  # what rclpy itself has to do for a new node
-        found = []
+    node.create_subscription(Empty, "call", fail, QoSProfile(depth=1))
+    publisher = peer_node.node.create_publisher(Empty, "call", QoSProfile(depth=1))
+    while (execute := rclpy_private.ready_callback(executor)) is not None:
+        execute()  # what rclpy itself has to do for a new node
+    found = []
 
-        def look() -> None:
-            publisher.publish(Empty())
-            if (execute := rclpy_private.ready_callback(executor)) is not None:
-                try:
-                    execute()
-                except RuntimeError as error:
-                    found.append(str(error))
+    def look() -> None:
+        publisher.publish(Empty())
+        if (execute := rclpy_private.ready_callback(executor)) is not None:
+            try:
+                execute()
+            except RuntimeError as error:
+                found.append(str(error))
 
-        one.until(lambda: bool(found), each=look)
-        assert found[0] == "of the callback"
-        node.destroy_node()
+    peer_node.until(lambda: bool(found), each=look)
+    assert found[0] == "of the callback"
+    node.destroy_node()

@@ -13,24 +13,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 from builtin_interfaces.msg import Time
 from lifecycle_msgs.msg import State
-from mcap.records import Channel, Message
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import FluidPressure, JointState, Temperature
 from std_msgs.msg import String
 from tests.conftest import REPOSITORY
 from tests.recordings import messages
-from tests.ros.conftest import Process, Start
-from tests.ros.peer import Peer, peer
+from tests.ros.conftest import Process, Start, logged
+from tests.ros.peer import Peer
 from tests.small_disk import small_disk
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.rates import NANOSECONDS, period_ns
-from flight_log.scan import Scan
 from flight_log.tape_reader import read_run
 from flight_ros.messages import stamp_of, to_message
 from flight_ros.subscriptions import PolledSubscription
@@ -40,29 +37,18 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-@pytest.fixture
-def peer_node() -> Iterator[Peer]:
-    with peer(topics=("/diagnostics",)) as made:
-        yield made
-
+PEER_TOPICS = ("/diagnostics",)
+SIGNALS = ("/y", "/y_m", "/u", "/internals", "/truth")
 
 Recorder = Callable[..., Process]
 
 
 @pytest.fixture
-def recorder(start: Start, osprey_gust: Scenario) -> Recorder:
+def recorder(start_node: Start) -> Recorder:
     """Start a recorder with a folder and further parameters."""
-
-    def begin(folder: Path | str, *parameters: str) -> Process:
-        arguments = [word for one in (f"directory:={folder}", *parameters) for word in ("-p", one)]
-        return start("flight_recorder.main", "--ros-args", "--params-file", str(osprey_gust.path), *arguments)
-
-    return begin
-
-
-def stop(process: Process) -> None:
-    process.interrupt()
-    assert process.end() == 0, process.output
+    return lambda folder, *parameters: start_node(
+        "flight_recorder", *(word for one in (f"directory:={folder}", *parameters) for word in ("-p", one))
+    )
 
 
 def diagnostics(peer_node: Peer) -> tuple[int, str, dict[str, str]]:
@@ -95,7 +81,7 @@ def test_rosout_and_parameter_events_are_recorded(recorder: Recorder, peer_node:
     peer_node.until(lambda: recorded(peer_node, "/rosout") > 1)
     peer_node.node.declare_parameter("gain", 3.0)
     peer_node.until(lambda: recorded(peer_node, "/parameter_events") > 0)
-    stop(process)
+    process.interrupt().succeed()
     with AnyReader([tmp_path / "run"]) as reader:
         recorded_messages = [(one.topic, reader.deserialize(data, one.msgtype)) for one, _, data in reader.messages()]
     texts = [message.msg for topic, message in recorded_messages if topic == "/rosout"]  # type: ignore[attr-defined]
@@ -115,7 +101,7 @@ def test_further_topics_are_recorded_with_any_offered_qos(recorder: Recorder, pe
     late = peer_node.node.create_publisher(Temperature, "/late", QoSProfile(depth=5))
     peer_node.until(lambda: recorded(peer_node, "/late") > 2, each=lambda: late.publish(Temperature(temperature=1.0)))
     peer_node.until(lambda: recorded(peer_node, "/latched") > 0)
-    stop(process)
+    process.interrupt().succeed()
     counts = count_messages(tmp_path / "run")
     assert counts["/latched"] == 1  # published before the recorder started
     assert counts["/relative/pressure"] > 2
@@ -131,7 +117,7 @@ def test_a_later_publisher_with_a_weaker_qos_is_recorded(recorder: Recorder, pee
     weak = peer_node.node.create_publisher(String, "/mixed", BEST_EFFORT)
     process.wait_for("/mixed: now recorded with best_effort")
     peer_node.until(lambda: recorded(peer_node, "/mixed") > 3, each=lambda: weak.publish(String(data="weak")))
-    stop(process)
+    process.interrupt().succeed()
     texts = [data for topic, _, data in messages(tmp_path / "run") if topic == "/mixed"]
     assert sum(b"strong" in text for text in texts) == 1
     assert sum(b"weak" in text for text in texts) > 2
@@ -141,7 +127,7 @@ def test_a_topic_without_a_publisher_is_named(recorder: Recorder, peer_node: Pee
     process = recorder("run", "topics:=[/never]")
     process.wait_for("no publisher of /never; recording starts with the first one")
     peer_node.until(lambda: diagnostics(peer_node)[2].get("missing /never") == "no publisher")
-    stop(process)
+    process.interrupt().succeed()
     assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: it had no publisher" in line)
 
 
@@ -152,14 +138,14 @@ def test_a_topic_whose_type_is_not_installed_is_named(recorder: Recorder, peer_n
     peer_node.node.create_publisher(State, "/strange", LATCHED)
     process = recorder("run", "topics:=[/strange]")
     process.wait_for("/strange is not recorded: its type lifecycle_msgs/msg/State is not installed")
-    stop(process)
+    process.interrupt().succeed()
 
 
 def test_a_publisher_of_another_type_is_named(recorder: Recorder, peer_node: Peer) -> None:
     peer_node.node.create_publisher(String, "/u_m", LATCHED)
     process = recorder("run")
     process.wait_for("/u_m: /peer publishes std_msgs/msg/String, expected sensor_msgs/msg/JointState")
-    stop(process)
+    process.interrupt().succeed()
 
 
 def test_an_invalid_topic_name_is_rejected(recorder: Recorder, tmp_path: Path) -> None:
@@ -182,19 +168,15 @@ def test_lost_messages_are_counted_and_reported(recorder: Recorder, peer_node: P
             sent += 1
             publisher.publish(to_message(sent, names, np.full(100, float(sent)), "peer"))
 
-    def send_to_a_suspended_recorder(count: int) -> None:
-        recording = psutil.Process(process.popen.pid)
-        recording.suspend()
-        send(count)
-        recording.resume()
-
-    send_to_a_suspended_recorder(1500)  # a publisher keeps a history of 2000
+    with process.stopped():
+        send(1500)  # a publisher keeps a history of 2000
     peer_node.until(lambda: recorded(peer_node, "/truth") == sent)
     assert "lost /truth" not in diagnostics(peer_node)[2]
-    send_to_a_suspended_recorder(8000)  # more than that history and the socket buffer hold
+    with process.stopped():
+        send(8000)  # more than that history and the socket buffer hold
     peer_node.until(lambda: int(diagnostics(peer_node)[2].get("lost /truth", 0)) > 0)
     peer_node.until(lambda: sent == recorded(peer_node, "/truth") + int(diagnostics(peer_node)[2]["lost /truth"]))
-    stop(process)
+    process.interrupt().succeed()
     run = read_run(tmp_path / "run")
     lost = int(run.metadata["rise_di_lost"]["/truth"])
     assert lost > 0
@@ -214,8 +196,8 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 @pytest.fixture
 def publisher(domain: int) -> Iterator[subprocess.Popen[str]]:
     """Six topics at 1 kHz, as wide as those of a flight, until the test ends."""
-    command = [sys.executable, str(REPOSITORY / "benchmarks" / "recorder.py"), "--publish", "--duration=120"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "benchmarks.recorder", "--publish", "--duration=120"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY)
     yield process
     process.terminate()
     process.communicate(timeout=20.0)
@@ -238,7 +220,7 @@ def test_a_full_disk_ends_the_recording_with_one_error_and_not_the_flight(
     received: list[object] = []
     peer_node.node.create_subscription(Time, "recorded", received.append, QoSProfile(depth=10))
     peer_node.until(lambda: len(received) > 5)
-    stop(process)
+    process.interrupt().succeed()
     (error,) = errors(process)
     assert "recording ended" in error
     counts = {f"messages {topic}": str(count) for topic, count in count_messages(disk / "run").items()}
@@ -258,20 +240,13 @@ def test_too_little_space_at_the_start_is_rejected(recorder: Recorder, disk: Pat
 
 def stamps_and_sequences(folder: Path) -> dict[str, tuple[list[int], list[int]]]:
     """Stamps and sequences in the file of a recorder, running or not, by topic."""
-    names: dict[int, str] = {}
     by_topic: dict[str, tuple[list[int], list[int]]] = {}
-    for path in folder.glob("*.mcap"):
-        for record in Scan(path).records():
-            if isinstance(record, Channel):
-                names[record.id] = record.topic
-            elif isinstance(record, Message) and names[record.channel_id] in SIGNALS:
-                stamps, sequences = by_topic.setdefault(names[record.channel_id], ([], []))
-                stamps.append(stamp_of(record.data))
-                sequences.append(record.sequence)
+    for topic, record in logged(folder):
+        if topic in SIGNALS:
+            stamps, sequences = by_topic.setdefault(topic, ([], []))
+            stamps.append(stamp_of(record.data))
+            sequences.append(record.sequence)
     return by_topic
-
-
-SIGNALS = ("/y", "/y_m", "/u", "/internals", "/truth")
 
 
 def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
@@ -284,9 +259,7 @@ def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
 
 
 @pytest.mark.usefixtures("publisher")
-def test_twenty_killed_recorders_lose_at_most_three_tenths_of_a_second(
-    recorder: Recorder, tmp_path: Path, peer_node: Peer
-) -> None:
+def test_20_killed_recorders_lose_at_most_three_tenths_of_a_second(recorder: Recorder, tmp_path: Path, peer_node: Peer) -> None:
     generator = np.random.default_rng(1)
     witness = PolledSubscription(peer_node.node, Y, NEWEST_SAMPLES, raw=True)
     missing = []
@@ -316,9 +289,7 @@ def test_twenty_killed_recorders_lose_at_most_three_tenths_of_a_second(
     assert max(missing) < 0.3, missing
 
 
-def test_a_flight_with_a_killed_recorder_has_a_report_and_a_repairable_log(
-    start: Start, osprey_gust: Scenario, tmp_path: Path
-) -> None:
+def test_the_log_of_a_killed_recorder_is_reported_and_repairable(start: Start, osprey_gust: Scenario, tmp_path: Path) -> None:
     flight = start("flight_cli.cli", "fly", str(osprey_gust.path), "--duration", "30")
     flight.wait_for_log(tmp_path / "runs", 150_000, timeout=30.0)
     node = flight.child("flight_recorder.main")
@@ -333,12 +304,10 @@ def test_a_flight_with_a_killed_recorder_has_a_report_and_a_repairable_log(
     assert {stored.name for stored in before.attachments} == {"parameters.yaml", "airframe.yaml"}
     filled = {name for name in before.metadata if before.metadata[name]}
     assert filled >= {"rise_di_flight", "rise_di_host", "rise_di_versions"}
-    report = start("flight_cli.cli", "report", str(run))
-    assert report.end(60.0) == 0, report.output
+    report = start("flight_cli.cli", "report", str(run)).succeed(60.0)
     assert "is truncated: read up to its last complete chunk, t = " in " ".join(report.output.split())
     assert (run / "report.html").stat().st_size > 10_000
-    repair = start("flight_cli.cli", "repair", str(run))
-    assert repair.end(60.0) == 0, repair.output
+    repair = start("flight_cli.cli", "repair", str(run)).succeed(60.0)
     assert "of the 30 s of the scenario" in repair.output
     assert count_messages(run)["/y"] == len(before.tape["y"].stamp_ns)
     after = read_run(run)

@@ -3,16 +3,15 @@
 """Replay of flights over real DDS from their logs: bit by bit, after faults of the controller and of the recorder too."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from lifecycle_msgs.msg import Transition
 from tests import recordings
-from tests.ros.conftest import Process, Start
-from tests.ros.peer import Peer, peer
-from tests.ros.test_controller import set_parameters, transition
+from tests.ros.conftest import Start
+from tests.ros.peer import Peer
+from tests.ros.test_controller import set_parameters
 from tests.ros.test_lockstep import ROUGH, both_cores_busy, scenario_file
 
 from aircraft_sim.airframe import load_airframe
@@ -23,11 +22,7 @@ from flight_log.tape_reader import read_run
 from flight_ros.topics import PUBLISH
 from rise_di_controller.guard import Mode
 
-
-@pytest.fixture
-def peer_node() -> Iterator[Peer]:
-    with peer(("internals",)) as made:
-        yield made
+PEER_TOPICS = ("internals",)
 
 
 def replayed(start: Start, run: Path, *settings: str, status: int = 0) -> dict[str, Any]:
@@ -37,10 +32,6 @@ def replayed(start: Start, run: Path, *settings: str, status: int = 0) -> dict[s
     output: dict[str, Any] = json.loads(process.output)
     assert output["equal"] is (status == 0)
     return output
-
-
-def fly(start: Start, scenario: Path, *options: str) -> Process:
-    return start("flight_cli.cli", "fly", str(scenario), *options)
 
 
 def receive_more(peer_node: Peer, count: int) -> None:
@@ -61,8 +52,8 @@ def with_limits(path: Path) -> Path:
 def test_lockstep_with_feedforward_saturation_and_lost_samples_is_replayed(
     options: tuple[str, ...], start: Start, tmp_path: Path
 ) -> None:
-    flight = fly(start, with_limits(scenario_file(tmp_path, 4.0, aircraft=ROUGH)), *options)
-    assert flight.end(timeout=120) == 0, flight.output
+    flight = start("flight_cli.cli", "fly", str(with_limits(scenario_file(tmp_path, 4.0, aircraft=ROUGH))), *options)
+    flight.succeed(120.0)
     run = tmp_path / "runs" / "latest"
     output = replayed(start, run)
     assert output["ticks"] == output["checked"] > 300
@@ -75,7 +66,7 @@ def test_lockstep_with_feedforward_saturation_and_lost_samples_is_replayed(
 def test_a_flight_in_real_time_is_replayed_with_parameter_changes_outages_and_a_busy_host(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
-    flight = fly(start, scenario_file(tmp_path, 120.0, "osprey_gust"))  # ended below
+    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 120.0, "osprey_gust")))  # ended below
 
     def modes() -> list[int]:
         return peer_node.modes()[-1:]
@@ -86,12 +77,12 @@ def test_a_flight_in_real_time_is_replayed_with_parameter_changes_outages_and_a_
     assert set_parameters(peer_node, upper=[0.01] * 4)[0]
     with both_cores_busy():  # ticks are late, and some are missed
         receive_more(peer_node, 50)
-    assert transition(peer_node, Transition.TRANSITION_DEACTIVATE)
+    assert peer_node.transition(Transition.TRANSITION_DEACTIVATE)
     peer_node.until(lambda: modes() == [Mode.INACTIVE])
     receive_more(peer_node, 20)
-    assert transition(peer_node, Transition.TRANSITION_CLEANUP)
-    assert transition(peer_node, Transition.TRANSITION_CONFIGURE)  # the law re-engages from its last u
-    assert transition(peer_node, Transition.TRANSITION_ACTIVATE)
+    assert peer_node.transition(Transition.TRANSITION_CLEANUP)
+    assert peer_node.transition(Transition.TRANSITION_CONFIGURE)  # the law re-engages from its last u
+    assert peer_node.transition(Transition.TRANSITION_ACTIVATE)
     peer_node.until(lambda: modes() == [Mode.ENGAGED])
     receive_more(peer_node, 50)
     flight.interrupt()
@@ -106,7 +97,7 @@ def test_a_flight_in_real_time_is_replayed_with_parameter_changes_outages_and_a_
 
 
 def test_the_log_of_a_killed_recorder_is_replayed(start: Start, tmp_path: Path) -> None:
-    flight = fly(start, scenario_file(tmp_path, 30.0, "osprey_gust"), "--lockstep")
+    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 30.0, "osprey_gust")), "--lockstep")
     flight.wait_for_log(tmp_path, 200_000)
     flight.child("flight_recorder.main").kill()
     assert flight.end(timeout=60) == 3, flight.output
@@ -119,18 +110,15 @@ def test_a_late_recorder_leaves_its_first_tick_unchecked_and_notes_the_missing_s
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
     scenario = scenario_file(tmp_path, 1e3, "osprey_gust")
-    for module in ("rise_di_controller", "aircraft_sim", "reference_model"):
-        start(f"{module}.main", "--ros-args", "--params-file", str(scenario))
+    parameters = ("--ros-args", "--params-file", str(scenario))
+    for package in ("rise_di_controller", "aircraft_sim", "reference_model"):
+        start(f"{package}.main", *parameters)
     more_than_history = PUBLISH.depth + 200
     peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_history, timeout=90.0)
-    recorder = start(
-        *("flight_recorder.main", "--ros-args", "--params-file", str(scenario)),
-        *("-p", f"scenario_file:={scenario}", "-p", "directory:=run"),
-    )
+    recorder = start("flight_recorder.main", *parameters, "-p", f"scenario_file:={scenario}", "-p", "directory:=run")
     recorder.wait_for("recording to")
     receive_more(peer_node, 201)
-    recorder.interrupt()
-    assert recorder.end() == 0, recorder.output
+    recorder.interrupt().succeed()
     output = replayed(start, tmp_path / "run")
     assert output["checked"] == output["ticks"] - 1 > 200
     assert any(note.startswith("the log begins with sample ") for note in output["notes"])

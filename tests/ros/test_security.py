@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 from tests.conftest import REPOSITORY
 from tests.recordings import scenario_file
 from tests.ros.conftest import Process, Start
-from tests.ros.peer import Peer, peer
+from tests.ros.peer import INPUTS, Peer
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.authentication import MessageAuthenticator
@@ -27,7 +28,7 @@ from flight_ros.topics import U
 from flight_ros.transport import LOOPBACK_PROFILE
 
 Keys = tuple[Path, Path]
-INPUTS = ("elevator", "thrust", "aileron", "rudder")
+PEER_TOPICS = ("/diagnostics",)
 KEY, OTHER_KEY = bytes(range(32)), bytes(range(1, 33))
 PATIENCE = 5.0
 """s of an attack. A successful one takes 1 s on an idle host (discovery 0.1 s, then y at 500 Hz)."""
@@ -117,9 +118,7 @@ def keys(tmp_path: Path) -> Keys:
 
 
 def aircraft(start_node: Start, *arguments: str, within: tuple[str, ...] = ()) -> Process:
-    process = start_node("aircraft_sim", *arguments, within=within)
-    process.wait_for("ready", BUSY)
-    return process
+    return start_node("aircraft_sim", *arguments, within=within).wait_for("ready", BUSY)
 
 
 def environment(**variables: str) -> tuple[str, ...]:
@@ -131,7 +130,7 @@ ON_LOOPBACK = environment(FASTRTPS_DEFAULT_PROFILES_FILE=str(LOOPBACK_PROFILE), 
 
 def received(attacker: Process) -> int:
     """Number of samples of y that the attacker received until its end."""
-    assert attacker.end(BUSY) == 0, attacker.output
+    attacker.succeed(BUSY)
     return int(json.loads(attacker.lines[-1])["received"])
 
 
@@ -158,22 +157,6 @@ def test_a_process_of_this_host_receives_y_and_commands_u_unless_it_lacks_the_ke
     assert not_logged not in node.output
 
 
-@pytest.fixture
-def peer_node() -> Iterator[Peer]:
-    with peer(topics=("/diagnostics",)) as made:
-        yield made
-
-
-def is_rejected(peer_node: Peer, reason: str) -> Callable[[], bool]:
-    """Condition: the diagnostics count samples of u that were rejected for this reason."""
-
-    def counted() -> bool:
-        values = [value for array in peer_node.received["/diagnostics"] for status in array.status for value in status.values]
-        return any(value.key == f"refused u: {reason}" and int(value.value) > 0 for value in values)
-
-    return counted
-
-
 def test_a_replayed_u_is_rejected_also_after_a_restart(start_node: Start, keys: Keys, peer_node: Peer) -> None:
     before = time.time_ns()
     first = aircraft(start_node, "-p", f"key_file:={keys[0]}")
@@ -187,26 +170,22 @@ def test_a_replayed_u_is_rejected_also_after_a_restart(start_node: Start, keys: 
 
     peer_node.until(lambda: "receiving u from" in first.output, BUSY, each=send)
     replayed = recorded[-1]
-    peer_node.until(is_rejected(peer_node, "order"), BUSY, each=lambda: publisher.publish(replayed))
-    first.interrupt()
-    assert first.end(BUSY) == 0
+    peer_node.until(partial(peer_node.counted, "refused u: order"), BUSY, each=lambda: publisher.publish(replayed))
+    first.interrupt().succeed(BUSY)
     # A restarted aircraft has no memory of the last stamp, but rejects samples from before its start.
     peer_node.received["/diagnostics"].clear()
     second = aircraft(start_node, "-p", f"key_file:={keys[0]}")
-    peer_node.until(is_rejected(peer_node, "order"), BUSY, each=lambda: publisher.publish(replayed))
-    peer_node.until(is_rejected(peer_node, "mac"), BUSY, each=lambda: publisher.publish(u_message(before)))
+    peer_node.until(partial(peer_node.counted, "refused u: order"), BUSY, each=lambda: publisher.publish(replayed))
+    peer_node.until(partial(peer_node.counted, "refused u: mac"), BUSY, each=lambda: publisher.publish(u_message(before)))
     assert "receiving u from" not in second.output
 
 
-def test_a_flight_with_a_key_is_signed_and_replays_exactly(
-    start: Start, osprey_gust: Scenario, keys: Keys, tmp_path: Path
-) -> None:
+def test_a_keyed_flight_is_signed_and_replays_exactly(start: Start, osprey_gust: Scenario, keys: Keys, tmp_path: Path) -> None:
     keyed = {node: {"key_file": str(keys[0])} for node in ("aircraft", "reference_model", "controller")}
     scenario = scenario_file(tmp_path / "keyed.yaml", osprey_gust.path, **keyed)
     flight = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--duration", "2", "--runs", str(tmp_path / "runs"))
-    assert flight.end(BUSY) == 0, flight.output
-    node = start("flight_cli.cli", "replay", str(tmp_path / "runs" / "latest"))
-    assert node.end(BUSY) == 0, node.output
+    flight.succeed(BUSY)
+    node = start("flight_cli.cli", "replay", str(tmp_path / "runs" / "latest")).succeed(BUSY)
     assert "every bit equal" in node.output
 
 
@@ -219,9 +198,7 @@ def test_a_flight_with_a_key_is_signed_and_replays_exactly(
         (None, 0, "cannot be read (No such file or directory), expected"),
     ],
 )
-def test_an_invalid_key_file_stops_the_node(
-    content: bytes | None, mode: int, sentence: str, start_node: Start, tmp_path: Path
-) -> None:
+def test_an_invalid_key_is_an_error(content: bytes | None, mode: int, sentence: str, start_node: Start, tmp_path: Path) -> None:
     path = tmp_path / "bad"
     if content is not None:
         path.write_bytes(content)

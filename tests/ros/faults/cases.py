@@ -30,8 +30,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from tests.conftest import REPOSITORY
-from tests.ros.conftest import Process
-from tests.ros.faults.flight import INPUTS, MAX_AGE, OUTPUTS, OWN_SESSION, PUBLISHED, U_MAX_AGE, Flight, logged
+from tests.ros.conftest import Process, logged
+from tests.ros.faults.flight import INPUTS, MAX_AGE, OUTPUTS, OWN_SESSION, PUBLISHED, U_MAX_AGE, Flight
 from tests.ros.peer import peer
 from tests.small_disk import fill, small_disk
 
@@ -46,13 +46,9 @@ SLACK = 0.05
 (`Flight.host_delay`) are allowed in addition."""
 
 REFUSAL_PERIOD, QOS_PERIOD = 2.1, 5.1  # s, after which a refusal and incompatible QoS are logged again; with 0.1 s to spare
-
 REPORT = 1.0  # s, the period of the diagnostics
-
 DISCOVERY = 0.5  # s, of a new node by all others
-
 RESTART = 0.5  # s, from being ready to full traffic, and until a recorder has received the history of the publishers
-
 STOP = 1.2  # s: beyond the age limits, hold and ramp
 
 
@@ -127,9 +123,7 @@ def conflicting(topic: str, publisher: str) -> Detection:
 
 def until_logged_again(flight: Flight, role: str, pattern: str, period: float) -> None:
     """Wait until the rate limit of a log line is over, so that a node would log it again at once."""
-    flight.until(
-        lambda: flight.first_line(role, pattern, time.time() - period) is None, 10.0, "end of the rate limit of the log"
-    )
+    flight.until(lambda: flight.first_line(role, pattern, time.time() - period) is None, 10.0, "end of the rate limit")
 
 
 def until_refusal_logged_again(flight: Flight, topic: str, reason: str) -> None:
@@ -194,9 +188,9 @@ def full_traffic(flight: Flight, role: str, begin: float) -> float | None:
 def recorded_since(run: Path, begin: float) -> float | None:
     """When the log had a message of every topic that was sent after an instant."""
     firsts: dict[str, float] = {}
-    for one in logged(run):
-        if one.sent >= begin:
-            firsts.setdefault(one.topic, one.written)
+    for topic, record in logged(run):
+        if seconds(record.publish_time) >= begin:
+            firsts.setdefault(topic, seconds(record.log_time))
     topics = ("/y", "/y_m", "/u", "/internals", "/truth")
     return max(firsts[topic] for topic in topics) if set(topics) <= set(firsts) else None
 
@@ -207,7 +201,7 @@ def stop(role: str) -> Injection:
     def inject(flight: Flight, random: Generator) -> None:
         at_random(flight, random)
         flight.begin_fault()
-        with flight.stopped(role):
+        with flight.processes[role].stopped():
             pause(flight, STOP)
         flight.end_fault()
 
@@ -248,14 +242,10 @@ Names = tuple[str, ...]
 BadSample = tuple[float, Names, FloatArray]  # the offset of its stamp from the present, s; names; values
 
 
-def not_finite(value: float, names: Names, random: Generator) -> BadSample:
-    bad = random.uniform(-1.0, 1.0, len(names))
+def not_finite(values: tuple[float, ...], names: Names, random: Generator) -> BadSample:
+    value, bad = random.choice(values), random.uniform(-1.0, 1.0, len(names))
     bad[random.integers(len(names))] = value
     return 0.0, names, bad
-
-
-def infinite(names: Names, random: Generator) -> BadSample:
-    return not_finite(random.choice((-math.inf, math.inf)), names, random)
 
 
 def wrong_names(names: Names, random: Generator) -> BadSample:
@@ -274,12 +264,12 @@ def wrong_stamp(sign: float, names: Names, random: Generator) -> BadSample:
 
 
 BAD: dict[str, tuple[Callable[[Names, Generator], BadSample], str, str]] = {  # sample, key of the counter, log line
-    "NaN": (partial(not_finite, math.nan), "finite", "is not finite"),
+    "NaN": (partial(not_finite, (math.nan,)), "finite", "is not finite"),
     "wrong names": (wrong_names, "name", "expected once among"),
     "wrong length": (wrong_length, "length", "names for"),
     "past stamps": (partial(wrong_stamp, -1.0), "order", "(after|before) the last one"),
     "future stamps": (partial(wrong_stamp, 1.0), "future", "ahead of the clock"),
-    "Inf": (infinite, "finite", "is not finite"),
+    "Inf": (partial(not_finite, (-math.inf, math.inf)), "finite", "is not finite"),
 }
 BAD_COUNT = 20
 
@@ -360,20 +350,14 @@ def incompatible_qos(role: str, create: Callable[[Node], object], detection: Det
     return inject
 
 
-def best_effort_publisher(node: Node) -> object:
-    """A best effort publisher of y: the recorder requests a reliable one."""
-    return node.create_publisher(JointState, "y", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
-
-
-def subscriber_with_deadline(node: Node) -> object:
-    """A subscriber of u that requests a deadline, which the controller does not offer."""
-    return node.create_subscription(JointState, "u", lambda _: None, QoSProfile(depth=1, deadline=Duration(seconds=0.02)))
-
-
+WEAK = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # the recorder requests a reliable publisher of y
+STRONG = QoSProfile(depth=1, deadline=Duration(seconds=0.02))  # the controller does not offer a deadline for u
 UNRELIABLE = logs("recorder", r"/y: .*/peer .*[Rr]eliab")
 DEADLINE = logs("controller", r"/u: .*/peer.*[Dd]eadline")
-weaker_qos = incompatible_qos("recorder", best_effort_publisher, UNRELIABLE)
-stronger_qos = incompatible_qos("controller", subscriber_with_deadline, DEADLINE)
+weaker_qos = incompatible_qos("recorder", lambda node: node.create_publisher(JointState, "y", WEAK), UNRELIABLE)
+stronger_qos = incompatible_qos(
+    "controller", lambda node: node.create_subscription(JointState, "u", lambda _: None, STRONG), DEADLINE
+)
 
 
 def step_of_clock(by: float) -> Injection:
@@ -386,9 +370,7 @@ def step_of_clock(by: float) -> Injection:
         pause(flight, 3.0)
         flight.set_clock(0.0)
         flight.end_fault()
-        flight.until(
-            lambda: flight.first_line("controller", "it is correct again", flight.end), 5.0, "a report of the correction"
-        )
+        flight.until(lambda: flight.first_line("controller", "it is correct again", flight.end), 5.0, "a corrected clock")
 
     return inject
 
@@ -468,7 +450,8 @@ def parameters(flight: Flight, random: Generator) -> None:
             while done < len(futures) and futures[done].done():
                 done += 1
             while len(futures) < CHANGES and len(futures) - done < IN_FLIGHT:
-                futures.append(request(*(valid_change(random) if valid[len(futures)] else invalid_change(random))))
+                within_a_tenth = ("k_g", float(random.uniform(0.9, 1.1)))
+                futures.append(request(*(within_a_tenth if valid[len(futures)] else invalid_change(random))))
 
         feed()
         peer_node.until(lambda: done == CHANGES, 100.0, each=feed)
@@ -477,11 +460,6 @@ def parameters(flight: Flight, random: Generator) -> None:
         accepted = [future.result().results[0].successful for future in futures]
         assert accepted == valid.tolist()
         peer_node.until(request("k_g", 1.0).done)
-
-
-def valid_change(random: Generator) -> tuple[str, object]:
-    """A gain within a tenth of its value."""
-    return "k_g", float(random.uniform(0.9, 1.1))
 
 
 def invalid_change(random: Generator) -> tuple[str, object]:

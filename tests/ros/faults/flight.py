@@ -11,8 +11,8 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -20,17 +20,15 @@ from unittest.mock import patch
 import numpy as np
 import rclpy
 import yaml
-from mcap.records import Channel, Message
 from rcl_interfaces.msg import Log
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from tests.ros.conftest import Process
+from tests.ros.conftest import Process, logged
 
 from flight_bringup.processes import end_with_parent
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.vectors import FloatArray, StampedVector
-from flight_log.scan import Scan
 from flight_ros import transport
 from flight_ros.messages import Decoder
 from flight_ros.rclpy_private import WaitSet
@@ -189,26 +187,6 @@ TICK_CHANNELS += tuple(f"{group}.{name}" for group in ("y", "y_m") for name in O
 ACTUATORS = tuple(f"actuator.{name}" for name in INPUTS)
 
 
-class Logged(NamedTuple):
-    """A message in a log, when it was sent and written, s of the system clock."""
-
-    topic: str
-    sent: float
-    written: float
-    data: bytes
-
-
-def logged(run: Path) -> Iterator[Logged]:
-    """All messages of a log, which may still grow."""
-    for path in run.glob("*.mcap"):
-        topics: dict[int, str] = {}
-        for record in Scan(path).records():
-            if isinstance(record, Channel):
-                topics[record.id] = record.topic
-            elif isinstance(record, Message):
-                yield Logged(topics[record.channel_id], seconds(record.publish_time), seconds(record.log_time), record.data)
-
-
 def steady_scenario(source: Path, folder: Path) -> Path:
     """The default scenario in a steady flight 0.1 m/s above trim, without an end: u is not 0, so that a change of it shows."""
     tree = yaml.safe_load(source.read_text(encoding="utf-8"))
@@ -275,12 +253,8 @@ class Flight:
         words = [word for one in parameters for word in ("-p", one)]
         preload = {} if self._clock is None else {"LD_PRELOAD": str(self._clock), "FAULTS_CLOCK": str(self._step)}
         with patch.dict(os.environ, preload):
-            process = Process(
-                f"{PACKAGES[role]}.main",
-                *("--ros-args", "--params-file", str(self.scenario), *words),
-                cwd=self.folder,
-                within=OWN_SESSION,
-            )
+            arguments = (f"{PACKAGES[role]}.main", "--ros-args", "--params-file", str(self.scenario), *words)
+            process = Process(*arguments, cwd=self.folder, within=OWN_SESSION)
         self._all.append(process)
         self.probe.monitored.append(process)
         return process
@@ -306,16 +280,6 @@ class Flight:
         self.processes[role].popen.kill()
         assert self.processes[role].end() == -signal.SIGKILL
         self._killed.append(Killed(role, self.instance(role), alive, time.time()))
-
-    @contextmanager
-    def stopped(self, role: str) -> Iterator[None]:
-        """SIGSTOP until the block is left."""
-        process = self.processes[role].popen
-        process.send_signal(signal.SIGSTOP)
-        try:
-            yield
-        finally:
-            process.send_signal(signal.SIGCONT)
 
     def instance(self, role: str) -> str:
         """The `frame_id` of the messages of a role's present process."""
@@ -354,8 +318,8 @@ class Flight:
     def engaged_ticks(self, begin: float, until: float) -> Ticks | None:
         """The engaged ticks with samples from `begin` on, from the log, which is complete; None before it reaches `until`."""
         decoder, found = Decoder(TICK_CHANNELS), []
-        for one in logged(self.runs[-1]):
-            sample = self._decode(decoder, one.data) if one.topic == "/internals" else None
+        for topic, record in logged(self.runs[-1]):
+            sample = self._decode(decoder, record.data) if topic == "/internals" else None
             if sample is not None and seconds(sample.stamp_ns) >= begin - MAX_AGE:
                 found.append(sample)
         if not found or seconds(found[-1].stamp_ns) < until:

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from rcl_interfaces.msg import Log
 from rclpy.serialization import deserialize_message
+from tests.ros.conftest import logged
 from tests.ros.faults.cases import CASES, RESTART, SLACK, Case, Response
 from tests.ros.faults.conftest import Flights, Row
-from tests.ros.faults.flight import HOLD, INPUTS, MAX_AGE, RAMP, TICK, U_MAX_AGE, Flight, logged
+from tests.ros.faults.flight import HOLD, INPUTS, MAX_AGE, RAMP, TICK, U_MAX_AGE, Flight
 
 from rise_di_controller.guard import Mode
 
@@ -31,7 +32,6 @@ QUIET = 0.02
 delay, and the delay is added to the time limits."""
 
 EXACT = 1e-12  # of values that are copied, or multiplied once
-
 SETTLING = 0.2  # s, until the effect of a fault on u shows
 
 
@@ -75,11 +75,11 @@ def test_log_holds_every_received_message_of_each_fault(flights: Flights) -> Non
 def contents(runs: list[Path]) -> tuple[set[bytes], set[tuple[str, str]]]:
     """All `internals` of some logs, and all log lines with their nodes."""
     internals, lines = set(), set()
-    for one in (message for run in runs for message in logged(run)):
-        if one.topic == "/internals":
-            internals.add(one.data)
-        elif one.topic == "/rosout":
-            line = deserialize_message(one.data, Log)
+    for topic, record in (message for run in runs for message in logged(run)):
+        if topic == "/internals":
+            internals.add(record.data)
+        elif topic == "/rosout":
+            line = deserialize_message(record.data, Log)
             lines.add((line.name, line.msg))
     return internals, lines
 
