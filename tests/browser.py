@@ -24,14 +24,13 @@ class Browser:
             raise FileNotFoundError("no Chromium on the path")
         commands, self._commands = os.pipe()
         self._responses, responses = os.pipe()
+        ends, null = (commands, responses), subprocess.DEVNULL
         flags = [*FLAGS, f"--window-size={width},{height}", f"--user-data-dir={profile}", "about:blank"]
         # The shell moves the ends of the pipes to the descriptors that Chromium uses.
         redirect = f'exec "$0" "$@" 3<&{commands} 4>&{responses}'
         command = ["/bin/bash", "-c", redirect, CHROMIUM, *flags]
-        self._process = subprocess.Popen(
-            command, pass_fds=(commands, responses), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        for end in (commands, responses):
+        self._process = subprocess.Popen(command, pass_fds=ends, stdout=null, stderr=null)
+        for end in ends:
             os.close(end)
         self._unread = b""
         self._number = 0
