@@ -26,17 +26,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
-from benchmarks.sampling import (
-    MOVING,
-    NO_SIGN,
-    REST,
-    cells,
-    new_table,
-    sampling_scenario,
-    scaled_beta,
-    true_error_of,
-    wide_console,
-)
+from benchmarks import sampling
 from rich.console import Console
 from rich.progress import track
 
@@ -124,7 +114,7 @@ def largest_rate(flight: WindowedFlight) -> FloatArray:
 
 def settling(flight: WindowedFlight) -> FloatArray:
     """Time from the entry of a gust to the last error above SETTLED, s, by channel of SETTLED."""
-    error, gusts = true_error_of(flight.tape), flight.scenario.gust_windows()
+    error, gusts = sampling.true_error_of(flight.tape), flight.scenario.gust_windows()
     entries = sorted(start for start, _ in gusts.values())
     times = []
     for name, (gust, bound) in SETTLED.items():
@@ -148,7 +138,7 @@ METRICS: dict[str, Callable[[WindowedFlight], FloatArray]] = {
 
 
 def _errors(flight: WindowedFlight, read: Callable[[ErrorMetrics], float]) -> FloatArray:
-    error, units = flight.inside(true_error_of(flight.tape)), display_units(flight.scenario)
+    error, units = flight.inside(sampling.true_error_of(flight.tape)), display_units(flight.scenario)
     return np.array([read(error_metrics(error[name])) * units[name].factor for name in error.names])
 
 
@@ -185,7 +175,7 @@ def _nominal_dt() -> Iterator[None]:
 
 def score(scenario: Scenario) -> float:
     """Score of a flight: the sum over the channels of the rms true error in its unit."""
-    error = true_error_of(simulate(scenario))
+    error = sampling.true_error_of(simulate(scenario))
     unit = score_units(error.names, scenario.aircraft.channels().outputs)
     return float(sum(error_metrics(error[name]).rms / one for name, one in zip(error.names, unit.tolist(), strict=True)))
 
@@ -242,11 +232,11 @@ def servo_scenario(period: float = 0.01, *, gusts: bool = True, **controller: An
 
 def _beta(elevator: float, thrust: float, aileron: float, rudder: float) -> list[float]:
     rates = {"elevator": elevator, "thrust": thrust, "aileron": aileron, "rudder": rudder}
-    return scaled_beta(find_scenario("osprey_servo"), rates)
+    return sampling.scaled_beta(find_scenario("osprey_servo"), rates)
 
 
 Changes = dict[str, Any]
-PI: Changes = {"beta": [NO_SIGN * beta for beta in find_scenario("osprey_servo").controller.beta]}
+PI: Changes = {"beta": [sampling.NO_SIGN * beta for beta in find_scenario("osprey_servo").controller.beta]}
 LITERAL: Changes = {"sign": "literal"}
 IMPLICIT: Changes = {"sign": "implicit"}
 # K in rad/s of q, p, r, V: 12, 12, 6, 1.5 and 22, 26, 11, 2.5
@@ -297,10 +287,11 @@ def sampling_rows() -> list[Row]:
     }
     rows = []
     for (scheme, sine), figures in published.items():
-        scenario = sampling_scenario(find_scenario("osprey_servo"), "servo", scheme, 0.01, sine=sine)
+        scenario = sampling.sampling_scenario(find_scenario("osprey_servo"), "servo", scheme, 0.01, sine=sine)
         wide = {"softening": 1.0, "lag": [0.13 - 0.015] * 4} if scheme == "soft" else {}
         scenario = scenario.vary(aircraft={"gusts": {}, "step": FINE_STEP}, controller=wide)
-        rows.append(Row(f"{scheme}, {'on sines' if sine else 'at rest'}", scenario, figures, MOVING if sine else REST))
+        name, window = ("on sines", sampling.MOVING) if sine else ("at rest", sampling.REST)
+        rows.append(Row(f"{scheme}, {name}", scenario, figures, window))
     return rows
 
 
@@ -389,7 +380,7 @@ def main(
     processes: Annotated[int, typer.Option(min=1, help="Flights at a time.")] = os.cpu_count() or 1,
 ) -> None:
     """Print metrics of the osprey with servos beside those of the prototype, and their ratio."""
-    console, bar = wide_console(), Console(stderr=True)
+    console, bar = sampling.wide_console(), Console(stderr=True)
     require(table in (None, *NAMES), "--table", repr(table), f"one of {', '.join(NAMES)}")
     console.print("q / V / p / r in mrad/s and m/s; elevator / thrust / aileron / rudder in deg and %")
     with ProcessPoolExecutor(processes) as pool:
@@ -397,18 +388,18 @@ def main(
             if table in (None, name):
                 rows = make()
                 measured = track(pool.map(measure, rows), name, len(rows), console=bar)
-                output = new_table(title, ("flight", "metric", "here", "prototype", "ratio"), texts=2)
+                output = sampling.new_table(title, ("flight", "metric", "here", "prototype", "ratio"), texts=2)
                 for row, metrics in zip(rows, measured, strict=True):
                     for key, values in metrics.items():
                         published = np.array(row.published[key])
                         ratios = " / ".join(f"{ratio:.2f}" for ratio in values / published)
-                        output.add_row(row.name, key, cells(values), cells(published), ratios)
+                        output.add_row(row.name, key, sampling.cells(values), sampling.cells(published), ratios)
                 console.print(output)
         if table in (None, "delays"):
             delays = delay_rows()
             loops = [row.scenario for row in delays]
             tripled = list(track(pool.map(tripling_delay, loops), "delays", len(loops), console=bar))
-            output = new_table(
+            output = sampling.new_table(
                 "Delay of a tripled score and of linear instability, ms",
                 ("loop", "tripled", "prototype", "ratio", "linear", "prototype", "ratio"),
                 texts=1,

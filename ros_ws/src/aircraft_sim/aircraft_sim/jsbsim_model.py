@@ -7,23 +7,10 @@ import math
 import jsbsim
 import numpy as np
 
-from aircraft_sim import actuators, turbulence
+from aircraft_sim import actuators, jsbsim_trim, turbulence
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, one_minus_cosine
 from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
-from aircraft_sim.jsbsim_trim import (
-    CONTACT,
-    HEADING,
-    HEIGHT,
-    WIND,
-    command_paths,
-    engine_count,
-    error_text,
-    running_property,
-    settle,
-    trim_solution,
-    trimmed_fdm,
-)
 from aircraft_sim.plant import DIVERGENCE_LIMIT
 from flight_core.outcome import FlightEnded
 from flight_core.rates import divide, seconds
@@ -45,20 +32,24 @@ class JsbsimModel:
 
     def __init__(self, condition: FlightCondition, actuator_model: Actuators, wind_model: WindModel) -> None:
         self.condition = condition
-        self._fdm, self.trim = trimmed_fdm(condition, trim_solution(condition))
-        engines = engine_count(self._fdm)
-        self._commands = [[self._node(path) for path in command_paths(command, engines)] for command in INPUTS.values()]
+        self._fdm, self.trim = jsbsim_trim.trimmed_fdm(condition, jsbsim_trim.trim_solution(condition))
+        engines = jsbsim_trim.engine_count(self._fdm)
+        self._commands = [
+            [self._node(path) for path in jsbsim_trim.command_paths(command, engines)] for command in INPUTS.values()
+        ]
         self._trim_commands = [[node.get_double_value() for node in nodes] for nodes in self._commands]
-        self._wind_nodes = [self._node(path) for path in WIND]
+        self._wind_nodes = [self._node(path) for path in jsbsim_trim.WIND]
         self._state_nodes = [(self._node(quantity.property), quantity.si) for quantity in STATES.values()]
-        self._heading, self._height, self._contact = (self._node(path) for path in (HEADING, HEIGHT, CONTACT))
-        self._engines = [self._node(running_property(i)) for i in range(engines)]
+        self._heading, self._height, self._contact = (
+            self._node(path) for path in (jsbsim_trim.HEADING, jsbsim_trim.HEIGHT, jsbsim_trim.CONTACT)
+        )
+        self._engines = [self._node(jsbsim_trim.running_property(i)) for i in range(engines)]
         self._actuator_model, self._wind_model = actuator_model, wind_model
         self._no_wind = wind_model.turbulence is None and not wind_model.gusts.speed.any()
         self._z = None if wind_model.turbulence is None else turbulence.initial_state(wind_model.turbulence)
         self._position = np.zeros(len(INPUTS))
         self._apply_wind(self._wind(0))
-        settle(self._fdm, seconds(condition.step_ns))  # one step: the wind of t = 0 acts from t = 0 on
+        jsbsim_trim.settle(self._fdm, seconds(condition.step_ns))  # one step: the wind of t = 0 acts from t = 0 on
         self._x = self._deviations()
         self.truth_names = (
             *(f"x.{name}" for name in STATES),
@@ -90,7 +81,7 @@ class JsbsimModel:
                 self._fdm.run()
             except jsbsim.BaseError as error:
                 title, after = self.condition.title, seconds(after_ns)
-                raise FlightEnded(f"{title} failed at t = {after:.2f} s: {error_text(error)}") from None
+                raise FlightEnded(f"{title} failed at t = {after:.2f} s: {jsbsim_trim.error_text(error)}") from None
         self._x = self._deviations()
         now = f"at t = {seconds(t_ns + duration_ns):.2f} s"
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:

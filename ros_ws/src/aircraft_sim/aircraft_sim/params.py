@@ -17,17 +17,9 @@ from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, FlightConditio
 from aircraft_sim.plant import PlantParams
 from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
+from flight_core import parameters
 from flight_core.failsafe import failsafe_scale
-from flight_core.parameters import (
-    KeyedParameters,
-    NonNegative,
-    ParameterError,
-    Parameters,
-    Positive,
-    as_tuple,
-    require,
-    require_length,
-)
+from flight_core.parameters import KeyedParameters, NonNegative, ParameterError, Parameters, Positive, require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray
 
@@ -96,11 +88,11 @@ class UncertaintyParameters(Parameters):
 
 
 # One value per channel; an empty list means ideal channels. A limit may be infinite (.inf in YAML): no limit on that channel.
-NonNegativesOrNone = Annotated[tuple[Annotated[float, Field(ge=0)], ...], BeforeValidator(as_tuple)]
-Lower = Annotated[tuple[Annotated[float, Field(le=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
-Upper = Annotated[tuple[Annotated[float, Field(ge=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
-Rates = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...], BeforeValidator(as_tuple)]
-NumbersOrNone = Annotated[tuple[float, ...], BeforeValidator(as_tuple)]
+NonNegativesOrNone = Annotated[tuple[Annotated[float, Field(ge=0)], ...], BeforeValidator(parameters.as_tuple)]
+Lower = Annotated[tuple[Annotated[float, Field(le=0, allow_inf_nan=True)], ...], BeforeValidator(parameters.as_tuple)]
+Upper = Annotated[tuple[Annotated[float, Field(ge=0, allow_inf_nan=True)], ...], BeforeValidator(parameters.as_tuple)]
+Rates = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...], BeforeValidator(parameters.as_tuple)]
+NumbersOrNone = Annotated[tuple[float, ...], BeforeValidator(parameters.as_tuple)]
 Times = Upper  # from 0 on, .inf for never
 
 
@@ -189,10 +181,10 @@ class AircraftParameters(KeyedParameters):
         channels = self.channels()
         for key, values in self.actuators:
             if values:
-                require_length(f"actuators.{key}", values, list(channels.inputs))
+                parameters.require_length(f"actuators.{key}", values, list(channels.inputs))
         for key in ("bias", "drift", "noise", "quantisation"):
             if values := getattr(self.sensors, key):
-                require_length(f"sensors.{key}", values, list(channels.outputs))
+                parameters.require_length(f"sensors.{key}", values, list(channels.outputs))
         require(
             nanoseconds(self.sensors.delay) % period == 0,
             "sensors.delay",
@@ -282,9 +274,8 @@ class AircraftParameters(KeyedParameters):
     def plant(self) -> PlantParams:
         """The plant as arrays: equation (1), the actuators and the turbulence."""
         airframe, aircraft = self.load()
-        return PlantParams(
-            aircraft, self.actuator_model(), self.step_ns, self._turbulence(airframe.speed, list(airframe.gusts))
-        )
+        turbulence = self._turbulence(airframe.speed, list(airframe.gusts))
+        return PlantParams(aircraft, self.actuator_model(), self.step_ns, turbulence)
 
     def actuator_model(self) -> Actuators:
         """The actuators as arrays."""

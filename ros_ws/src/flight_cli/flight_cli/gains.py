@@ -11,17 +11,9 @@ import typer
 from rich.console import Console
 
 from aircraft_sim.airframe import Airframe, load_airframe
+from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import MAX_DELAY_MARGIN, Condition, failing
-from flight_analysis.design.gain_selection import (
-    GainAssessment,
-    Study,
-    as_yaml,
-    check_gains,
-    loop_setting,
-    manoeuvre,
-    select_gains,
-    study_airframe,
-)
+from flight_analysis.design.gain_selection import GainAssessment, Study
 from flight_analysis.report.summary import finite_or_null
 from flight_bringup.scenarios import find_scenario
 from flight_cli.output import new_table, parse_numbers, write_text
@@ -72,23 +64,23 @@ def gains(
     options = {"rate": rate, "delay": delay, "lag": None if lag is None else _parse_lags(lag, frame)}
     loop: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     paired = tuple(inputs.split(",")) if inputs else ()
-    setting = loop_setting(chosen, gamma_2)._replace(inputs=paired, feedforward=feedforward, **loop)
+    setting = gain_selection.loop_setting(chosen, gamma_2)._replace(inputs=paired, feedforward=feedforward, **loop)
     if check:
         for option, given in (("--write", write is not None), ("--feedforward", feedforward)):
             require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
-        require(
-            not loop and inputs is None, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs"
-        )
+        own_loop = not loop and inputs is None
+        require(own_loop, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
         known, named = chosen.controller.outputs, f"airframe {frame.name}"
         require(sorted(known) == sorted(frame.outputs), named, ", ".join(frame.outputs), f"the outputs {', '.join(known)}")
     console = Console(quiet=as_json)
     with console.status("simulating the ideal control on uncertain airframes"):
-        found = study_airframe(frame, manoeuvre(chosen, frame), uncertainty, samples, seed)
+        found = gain_selection.study_airframe(frame, gain_selection.manoeuvre(chosen, frame), uncertainty, samples, seed)
         if check:
-            answers, text = {"scenario": check_gains(chosen, found, gamma_2)}, None
+            answers, text = {"scenario": gain_selection.check_gains(chosen, found, gamma_2)}, None
         else:
-            selection = select_gains(found, setting)
-            answers, text = {"theorem": selection.theorem, "engineering": selection.engineering}, as_yaml(selection)
+            selection = gain_selection.select_gains(found, setting)
+            answers = {"theorem": selection.theorem, "engineering": selection.engineering}
+            text = gain_selection.as_yaml(selection)
     if write is not None and text is not None:
         write_text("--write", write, HEADER + text)
     if as_json:

@@ -7,17 +7,8 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from flight_core.parameters import (
-    KeyedParameters,
-    Names,
-    Numbers,
-    ParameterError,
-    Parameters,
-    Positive,
-    Positives,
-    require,
-    require_length,
-)
+from flight_core import parameters
+from flight_core.parameters import KeyedParameters, Names, Numbers, ParameterError, Parameters, Positive, Positives, require
 from flight_core.rates import period_ns
 from flight_core.units import GRAVITY
 from reference_model.command import Profile
@@ -34,7 +25,7 @@ class Pulses(Parameters):
     @model_validator(mode="after")
     def _check(self) -> Self:
         for key in ("stop", "value"):
-            require_length(key, getattr(self, key), [f"pulse {k + 1}" for k in range(len(self.start))])
+            parameters.require_length(key, getattr(self, key), [f"pulse {k + 1}" for k in range(len(self.start))])
         for k, (start, stop) in enumerate(zip(self.start, self.stop, strict=True)):
             require(stop > start, f"stop[{k}]", stop, f"later than start[{k}] = {start:g} s")
         return self
@@ -105,7 +96,7 @@ class ReferenceModelParameters(KeyedParameters):
         key = "second_order.damping"
         if self.second_order is not None:
             for name in ("natural_frequency", "damping"):
-                require_length(f"second_order.{name}", getattr(self.second_order, name), self.outputs)
+                parameters.require_length(f"second_order.{name}", getattr(self.second_order, name), self.outputs)
         elif self.linear is not None:
             key, n, m = "linear.A_m", len(self.linear.states), len(self.outputs)
             for name, rows, columns in (("A_m", n, n), ("B_m", n, m)):

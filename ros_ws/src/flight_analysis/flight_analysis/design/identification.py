@@ -24,18 +24,8 @@ from aircraft_sim.jsbsim_trim import sideslip_zero
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_selection import (
-    ChannelPairing,
-    LoopSetting,
-    Manoeuvre,
-    Selection,
-    Study,
-    as_yaml,
-    require_channels,
-    select_gains,
-    study_airframe,
-    yaml_template,
-)
+from flight_analysis.design import gain_selection
+from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre, Selection, Study
 from flight_analysis.metrics import best_error, error_metrics
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.rates import divide, nanoseconds
@@ -273,7 +263,7 @@ def identify(name: str, speed: float, altitude: float, progress: Callable[[str],
     authority = abs(measured.Omega[throttle, throttle]) * min(-trim.lower[throttle], trim.upper[throttle])
     commands = reference_parameters(speed, float(authority))
     scaled = measured.Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
-    require_channels(scaled, ChannelPairing(outputs, inputs))
+    gain_selection.require_channels(scaled, ChannelPairing(outputs, inputs))
     studied = _study(condition, measured.Omega, commands)
     setting = _setting(trim, measured.lag)
 
@@ -281,10 +271,10 @@ def identify(name: str, speed: float, altitude: float, progress: Callable[[str],
         return _text(condition, trim, measured, commands, selection)
 
     progress("slew of the inputs")
-    first = select_gains(studied, setting)
+    first = gain_selection.select_gains(studied, setting)
     turbulent = _load(scenario_text(first)).vary(aircraft={"turbulence": moderate_turbulence(altitude)})
     tape = simulate(without_beta(turbulent))
-    chosen = select_gains(studied._replace(slew=_slew(tape, measured.lag)), setting)
+    chosen = gain_selection.select_gains(studied._replace(slew=_slew(tape, measured.lag)), setting)
     text = scenario_text(chosen)
     flights = fly_all(_load(text), progress)
     return IdentifiedAircraft(condition, trim, measured, coupling(scaled), chosen, text, sideslip_zero(condition), flights)
@@ -334,7 +324,7 @@ def _study(condition: FlightCondition, Omega: FloatArray, commands: Mapping[str,
         f"airframe {condition.title}",
     )
     manoeuvre = Manoeuvre(ReferenceModelParameters.validate_mapping(commands, "reference_model"), {}, DURATION)
-    return study_airframe(airframe, manoeuvre, samples=SAMPLES)
+    return gain_selection.study_airframe(airframe, manoeuvre, samples=SAMPLES)
 
 
 def _setting(trim: Trim, lag: FloatArray) -> LoopSetting:
@@ -368,7 +358,7 @@ def _load(text: str) -> Scenario:
         return load_scenario(path)
 
 
-SCENARIO_YAML = yaml_template("""\
+SCENARIO_YAML = gain_selection.yaml_template("""\
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 #
@@ -422,21 +412,19 @@ commands on every channel, a gust from above.
 """)
 
 
-def _text(
-    condition: FlightCondition, trim: Trim, measured: Responses, commands: Mapping[str, Any], selection: Selection
-) -> str:
+def _text(condition: FlightCondition, trim: Trim, steps: Responses, commands: Mapping[str, Any], selection: Selection) -> str:
     """The scenario file."""
     return SCENARIO_YAML.render(
         condition=condition,
         trim=trim,
         inputs=list(INPUTS),
         outputs=list(OUTPUTS),
-        Omega=measured.Omega,
+        Omega=steps.Omega,
         duration=DURATION,
         rate=RATE,
         step=STEP,
         gust={"start": GUST_START, "speed": GUST_SPEED, "length": GUST_LENGTH},
         turbulence=moderate_turbulence(condition.altitude),
         commands=commands,
-        controller=as_yaml(selection),
+        controller=gain_selection.as_yaml(selection),
     )

@@ -9,22 +9,9 @@ import numpy as np
 import plotly.graph_objects as go
 
 from flight_analysis.metrics import best_error
-from flight_analysis.report import figures
+from flight_analysis.report import figures, summary
 from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, time_series_figure
-from flight_analysis.report.summary import (
-    ERROR_COLUMNS,
-    NO_UNIT,
-    NO_VALUE,
-    SWITCH_COLUMN,
-    Column,
-    DisplayUnit,
-    RecordedFlight,
-    channel_label,
-    display_units,
-    format_value,
-    metric,
-    slowest_settling,
-)
+from flight_analysis.report.summary import Column, DisplayUnit, RecordedFlight
 from flight_core.tape import Signal, Tape
 
 # Okabe and Ito 2008, distinct to the colour blind too; lighter on a dark page.
@@ -79,7 +66,7 @@ def labels(flights: Sequence[RecordedFlight]) -> list[str]:
 
 def units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
     """Units by channel, those of the first flight that has it."""
-    return {name: unit for flight in reversed(flights) for name, unit in display_units(flight.scenario).items()}
+    return {name: unit for flight in reversed(flights) for name, unit in summary.display_units(flight.scenario).items()}
 
 
 # ---- Tables
@@ -91,13 +78,13 @@ def metric_tables(
     """Metrics of "errors" or "inputs" of the summaries: a table per channel, a row per column that has any value."""
     display, tables = units(flights), []
     for channel in dict.fromkeys(name for flight in flights for name in flight.summary[key]):
-        factor = display.get(channel, NO_UNIT).factor
+        factor = display.get(channel, summary.NO_UNIT).factor
         rows = []
         for group, head, path, scaled in columns:
             row = _row(flights, f"{group} {head}".strip(), (key, channel, *path), factor if scaled else 1.0)
-            if set(row.texts) != {NO_VALUE}:
+            if set(row.texts) != {summary.NO_VALUE}:
                 rows.append(row._replace(lower_is_better=lower_is_better))
-        tables.append(ComparisonTable(channel_label(channel, display), tuple(rows), channel))
+        tables.append(ComparisonTable(summary.channel_label(channel, display), tuple(rows), channel))
     return tables
 
 
@@ -105,30 +92,35 @@ def error_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
     """Metrics of the error and settling times, by channel."""
     return [
         table._replace(rows=(*table.rows, *_settling_rows(flights, table.channel)))
-        for table in metric_tables(flights, "errors", (*ERROR_COLUMNS, SWITCH_COLUMN), lower_is_better=True)
+        for table in metric_tables(flights, "errors", (*summary.ERROR_COLUMNS, summary.SWITCH_COLUMN), lower_is_better=True)
     ]
 
 
 def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[ComparisonRow]:
-    times = {kind: tuple(slowest_settling(flight.summary, channel, kind) for flight in flights) for kind in ("command", "gust")}
+    times = {
+        kind: tuple(summary.slowest_settling(flight.summary, channel, kind) for flight in flights)
+        for kind in ("command", "gust")
+    }
     no_ratios = (None,) * len(flights)
     return [
-        ComparisonRow(f"settling, {kind} (s)", texts, no_ratios) for kind, texts in times.items() if set(texts) != {NO_VALUE}
+        ComparisonRow(f"settling, {kind} (s)", texts, no_ratios)
+        for kind, texts in times.items()
+        if set(texts) != {summary.NO_VALUE}
     ]
 
 
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
     """Timing metrics of the controllers, in one table; none where all of them are 0."""
     rows = [_row(flights, name, path, 1e3) for name, path in TIMING_METRICS.items()]
-    nonzero = tuple(row for row in rows if set(row.texts) - {NO_VALUE, format_value(0.0)})
+    nonzero = tuple(row for row in rows if set(row.texts) - {summary.NO_VALUE, summary.format_value(0.0)})
     return [ComparisonTable("Ticks of the controller", nonzero)] if nonzero else []
 
 
 def _row(flights: Sequence[RecordedFlight], name: str, path: Sequence[str], factor: float) -> ComparisonRow:
-    values = [metric(flight.summary, *path) for flight in flights]
+    values = [summary.metric(flight.summary, *path) for flight in flights]
     first = values[0]
     ratios = tuple(None if value is None or not first else value / first for value in values)
-    return ComparisonRow(name, tuple(format_value(value, factor) for value in values), ratios)
+    return ComparisonRow(name, tuple(summary.format_value(value, factor) for value in values), ratios)
 
 
 # ---- Figures
