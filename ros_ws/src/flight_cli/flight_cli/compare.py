@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di compare`: RISE-DI and other control laws on the same aircraft, each tuned by the same gain_tuning."""
+"""`rise-di compare`: RISE-DI and other control laws on the same aircraft, each tuned by the same procedure."""
 
 import json
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ def compare(
     gains: Annotated[Path | None, typer.Option(help="File of tuned gains; by default the one of the stack.")] = None,
     to_json: Annotated[Path | None, typer.Option("--json", help="File to write the figures to, SI.")] = None,
 ) -> None:
-    """Fly RISE-DI and other laws side by side: same aircraft, reference, gusts, noise, limits, uncertainty, tuning gain_tuning.
+    """Fly RISE-DI and other laws side by side: same aircraft, reference, gusts, noise, limits, uncertainty, tuning procedure.
 
     Exit status: 0, or 2 bad input.
     """
