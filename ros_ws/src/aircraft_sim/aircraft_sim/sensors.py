@@ -92,9 +92,8 @@ def walk(number: int, drift: Drift, params: Sensors) -> Drift:
         return drift
     value = drift.value
     for k in range(drift.number + 1, number + 1):
-        value = value + params.drift * random_streams.generator(k, random_streams.DRIFT, params.seed).standard_normal(
-            len(value)
-        )
+        generator = random_streams.generator(k, random_streams.DRIFT, params.seed)
+        value = value + params.drift * generator.standard_normal(len(value))
     return Drift(number, value)
 
 

@@ -86,7 +86,8 @@ def build_course(scenario: Scenario) -> Course:
         y_m[k] = reference.sample(k * tick_ns // reference.period_ns)[places]
         y_m_dot[k] = reference.rate()[places]
 
-    phase, dt = _phases(ticks, late, seconds(tick_ns), scenario, [sensors.arrives(k, errors) for k in range(ticks)])
+    arrives = [sensors.arrives(k, errors) for k in range(ticks)]
+    phase, dt = _phases(ticks, late, seconds(tick_ns), scenario.controller.max_age, arrives)
     used = np.maximum(np.arange(ticks) - late, 0)
     forcing, now, air = _wind(ticks, steps, plant, airframe)
     _, sizes, rows = np.linalg.svd(forcing, full_matrices=False)
@@ -107,9 +108,7 @@ def build_course(scenario: Scenario) -> Course:
     return Course(segments, basis, order, late, seconds(tick_ns), steps)
 
 
-def _phases(
-    ticks: int, late: int, period: float, scenario: Scenario, arrives: list[bool]
-) -> tuple[NDArray[np.int32], FloatArray]:
+def _phases(ticks: int, late: int, period: float, max_age: float, arrives: list[bool]) -> tuple[NDArray[np.int32], FloatArray]:
     phase, dt = np.full(ticks, HOLD, dtype=np.int32), np.zeros(ticks)
     last: int | None = None
     for k in range(late, ticks):
@@ -119,7 +118,7 @@ def _phases(
             phase[k] = ENGAGE
         else:
             gap = (k - last + late) * period
-            require(gap <= scenario.controller.max_age, "sensors.dropout", f"{gap:g} s without y", "less than max_age")
+            require(gap <= max_age, "sensors.dropout", f"{gap:g} s without y", "less than max_age")
             phase[k], dt[k] = STEP, min(max((k - last) * period, DT_RANGE[0] * period), DT_RANGE[1] * period)
         last = k
     return phase, dt

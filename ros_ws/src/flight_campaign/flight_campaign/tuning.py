@@ -214,9 +214,8 @@ def tune(
     each, candidates = len(weight), POPULATION * len(seeds)
     repeated, control_law = repeat_flights(flights, candidates), law.control_law(benchmark.model)
     course = benchmark.courses[law.feedforward]
-    searches = [
-        cma.CMAEvolutionStrategy(origin, INITIAL_SIGMA, {"seed": seed, "popsize": POPULATION, "verbose": -9}) for seed in seeds
-    ]
+    options = {"popsize": POPULATION, "verbose": -9}
+    searches = [cma.CMAEvolutionStrategy(origin, INITIAL_SIGMA, options | {"seed": seed}) for seed in seeds]
     best: list[tuple[float, FloatArray]] = [(np.inf, origin)] * len(seeds)
     generations = generation_count(law, benchmark) if generations is None else generations
     for generation in range(generations):

@@ -36,9 +36,8 @@ def airframes(as_json: Annotated[bool, typer.Option("--json", help="Print the fa
     console.print(assumptions)
     roots = _table("Poles and zeros in 1/s, leading minors of C B in SI", "airframe", "poles", "zeros at", "minors")
     for one in facts:
-        roots.add_row(
-            one.name, _format_roots(one.poles), _format_roots(one.zeros), "  ".join(f"{minor:.3g}" for minor in one.minors)
-        )
+        minors = "  ".join(f"{minor:.3g}" for minor in one.minors)
+        roots.add_row(one.name, _format_roots(one.poles), _format_roots(one.zeros), minors)
     console.print(roots)
     outside = [one.name for one in facts if not one.in_theorem]
     console.print(f"Outside the theorem: {', '.join(outside) or 'none'}. Coupling is max abs(U - I).", soft_wrap=True)

@@ -152,9 +152,8 @@ def _show(console: Console, definition: Definition, case: int, tally: Tally, fig
     for name, figure in tally.figures.items():
         kind, _, channel = name.partition(".")
         unit = units.get(channel)
-        factor, label = (
-            (1.0, name) if unit is None else (unit.factor, f"{kind} {channel}, {unit.unit}{'/s' * (kind == 'slew')}")
-        )
+        per_second = "/s" * (kind == "slew")
+        factor, label = (1.0, name) if unit is None else (unit.factor, f"{kind} {channel}, {unit.unit}{per_second}")
         values = (figure.mean, figure.quantile(0.5), figure.quantile(0.95), figure.quantile(0.99), figure.largest)
         table.add_row(label, *(f"{value * factor:.3g}" for value in values))
     console.print(table)

@@ -88,9 +88,8 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
     console.print(responses)
     for name, spread in zip(INPUTS, steps.spread, strict=True):
         if spread < LINEAR:
-            console.print(
-                f"{name} is not linear: the slopes of its steps differ by a factor of {1.0 / spread:.2g}; the largest is used"
-            )
+            differ = f"the slopes of its steps differ by a factor of {1.0 / spread:.2g}"
+            console.print(f"{name} is not linear: {differ}; the largest is used")
     for sentence in steps.rejected:
         console.print(f"rejected: {sentence}", highlight=False, soft_wrap=True)
 

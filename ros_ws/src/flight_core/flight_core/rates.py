@@ -20,9 +20,8 @@ def nanoseconds(time: float) -> int:
 def period_ns(rate: float, key: str) -> int:
     """Period of a rate in Hz. Raises ParameterError naming `key` where 1e9 / rate is not a whole number of nanoseconds."""
     period = nanoseconds(1.0 / rate)
-    require(
-        abs(period * rate - NANOSECONDS) < 1e-3, key, f"{rate:g} Hz", "a rate whose period is a whole number of nanoseconds"
-    )
+    whole = abs(period * rate - NANOSECONDS) < 1e-3
+    require(whole, key, f"{rate:g} Hz", "a rate whose period is a whole number of nanoseconds")
     return period
 
 

@@ -61,9 +61,8 @@ def read_run(run: Path, namespace: str | None = None) -> RecordedRun:
     start_ns = _start_ns(signals)
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
     notes = [*log.notes_at(end), *(note for topic, name in names.items() if (note := log.topics[topic].note(name)))]
-    return RecordedRun(
-        Tape(signals, start_ns, tuple(map(printable, notes))), log.scenario, log.metadata, tuple(log.attachments)
-    )
+    tape = Tape(signals, start_ns, tuple(map(printable, notes)))
+    return RecordedRun(tape, log.scenario, log.metadata, tuple(log.attachments))
 
 
 def _names_of_one_aircraft(topics: Collection[str], namespace: str | None, where: str) -> dict[str, str]:

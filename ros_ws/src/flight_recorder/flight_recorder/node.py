@@ -233,9 +233,8 @@ class RecorderNode(FlightNode[RecorderParameters]):
             self.get_logger().warning(f"{name} is not recorded: its type {message_type} is not installed")
             return
         offered = self._offered(name, message_type)
-        self._topics.append(
-            self._record(self._poll(Topic(name, message, foreign=True), strongest_compatible(offered)), offered)
-        )
+        topic = self._poll(Topic(name, message, foreign=True), strongest_compatible(offered))
+        self._topics.append(self._record(topic, offered))
 
     def check_graph(self) -> None:
         super().check_graph()

@@ -141,18 +141,16 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
                 node.publish_diagnostics()
                 node.check_graph()
             if not began and now_ns - begin_ns > PEER_TIMEOUT_NS:
-                raise FlightEnded(
-                    f"timed out waiting for {nodes[0].awaited_topic()}: no message in {seconds(PEER_TIMEOUT_NS):g} s"
-                )
+                awaited = nodes[0].awaited_topic()
+                raise FlightEnded(f"timed out waiting for {awaited}: no message in {seconds(PEER_TIMEOUT_NS):g} s")
 
 
 def _run_real_time(node: FlightNode[Any], stop: _Stop) -> None:
     executor = _start([node])
     start_ns = node.start_ns() or time.time_ns()
     if (age := time.time_ns() - start_ns) > MAX_START_AGE_NS:
-        raise ParameterError(
-            f"{node.get_name()}.start_time: found an instant {seconds(age):.0f} s ago, expected a future one, or 0"
-        )
+        key = f"{node.get_name()}.start_time"
+        raise ParameterError(f"{key}: found an instant {seconds(age):.0f} s ago, expected a future one, or 0")
     begin_ns = time.monotonic_ns() + start_ns - time.time_ns()
     node.time_offset_ns = start_ns - begin_ns
     ticker = Ticker(node.period_ns(), begin_ns)

@@ -122,9 +122,8 @@ class FlightNode(Node, Generic[P]):
 
     def subscribe(self, topic: Topic, qos: QoSProfile | None = None) -> PolledSubscription:
         """Create a subscription that is polled at the tick, as bytes. Its publishers are checked once a second."""
-        subscription = PolledSubscription(
-            self, topic, qos or (LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES), raw=True
-        )
+        default = LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES
+        subscription = PolledSubscription(self, topic, qos or default, raw=True)
         self.polled_subscriptions.append(subscription)
         return subscription
 
@@ -237,11 +236,9 @@ class FlightNode(Node, Generic[P]):
                 self._log_mismatches(topic, peers, own.topic_type, own.qos_profile)
                 return
 
-    def _log_mismatches(
-        self, topic: str, peers: Sequence[TopicEndpointInfo], message_type: str, qos: QoSProfile | None
-    ) -> None:
+    def _log_mismatches(self, topic: str, peers: Sequence[TopicEndpointInfo], type_name: str, qos: QoSProfile | None) -> None:
         for peer in peers:
-            sentence = mismatch(topic, peer, message_type, qos)
+            sentence = mismatch(topic, peer, type_name, qos)
             if sentence and self._log_due(sentence, MISMATCH_THROTTLE_NS):
                 self.get_logger().error(sentence)
 

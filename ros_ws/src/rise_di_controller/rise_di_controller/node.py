@@ -165,9 +165,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
     def advance(self) -> bool:
         if not self._y_due:
             self._y_due.extend(self._received(self._y_subscription, self._y_decoder))
-        self._y_m_due.extend(
-            sample for sample in self._received(self._y_m_subscription, self._y_m_decoder) if sample is not None
-        )
+        received = self._received(self._y_m_subscription, self._y_m_decoder)
+        self._y_m_due.extend(sample for sample in received if sample is not None)
         advanced = False
         while self._y_due:
             now_ns = self._number * self._y_period_ns
