@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
 from tests import recordings
-from tests.ros.conftest import Process, Start, logged
+from tests.ros.conftest import Process, Start
 
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -45,10 +46,11 @@ def fly(start: Start, scenario: Path, runs: str, *options: str) -> Path:
 
 
 def payloads(run: Path) -> dict[str, list[bytes]]:
-    """The bytes of every message by topic, in the order of sending."""
+    """The bytes of every message by topic, in the order of sending, by mcap's own reader."""
     by_topic: dict[str, list[tuple[int, bytes]]] = {}
-    for topic, record in logged(run):
-        by_topic.setdefault(topic, []).append((record.sequence, record.data))
+    with min(run.glob("*.mcap")).open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            by_topic.setdefault(channel.topic, []).append((message.sequence, message.data))
     return {topic: [data for _, data in sorted(messages)] for topic, messages in by_topic.items()}
 
 
