@@ -18,7 +18,7 @@ IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "lyapunov.png"
 DT, DURATION = 0.01, 60.0  # s
 TOO_SMALL = 0.05
 COLOURS = ("#1f6f8b", "#c8553d")
-DPI, PALETTE = 150, 64  # pixels per inch, and colours of the file: sharp on a page, below 100 KB
+DPI, PALETTE = 110, 16  # pixels per inch, and colours of the file
 
 
 def flights() -> dict[str, Evidence]:
