@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identify and fly aircraft of JSBSim by the procedure of `rise-di identify`, and print the tables of docs/experiments.md.
 
-.venv/bin/python benchmarks/jsbsim_fleet.py               the aircraft of FLEET, some ten seconds each
-.venv/bin/python benchmarks/jsbsim_fleet.py f16 c172p     the named aircraft
-.venv/bin/python benchmarks/jsbsim_fleet.py --all         every aircraft of JSBSim, with the reason where one does not fly
+.venv/bin/python -m benchmarks.jsbsim_fleet               the aircraft of FLEET, some ten seconds each
+.venv/bin/python -m benchmarks.jsbsim_fleet f16 c172p     the named aircraft
+.venv/bin/python -m benchmarks.jsbsim_fleet --all         every aircraft of JSBSim, with the reason where one does not fly
 """
 
 import sys

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plots docs/images/lyapunov.png: V1, V2, e and r of the small example, for a beta that meets (29), (30) and one that does not.
 
-python benchmarks/lyapunov.py
+python -m benchmarks.lyapunov
 """
 
 from io import BytesIO

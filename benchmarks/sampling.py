@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sampling of the sign in equation (21): residual errors and chatter by scheme, period and world.
 
-python benchmarks/sampling.py          # periods of 20, 10 and 5 ms, a minute or two
-python benchmarks/sampling.py --all    # 2 and 1 ms too
+python -m benchmarks.sampling          # periods of 20, 10 and 5 ms, a minute or two
+python -m benchmarks.sampling --all    # 2 and 1 ms too
 """
 
 import os
