@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Linear-quadratic design for many sets of weights at once: zero-order hold, and the discrete Riccati equation by doubling."""
+"""Linear-quadratic design for many models and sets of weights at once: zero-order hold, and the discrete Riccati equation.
+
+Leading axes of the arguments of a function are broadcast against each other.
+"""
 
 import numpy as np
 from scipy.linalg import expm
@@ -11,44 +14,69 @@ MAX_DOUBLINGS = 40  # 2^40 steps of a finite horizon: enough for a mode that dec
 
 
 def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
-    """exp(A period) and integral_0^period exp(A s) ds B (C. Van Loan, IEEE TAC 23(3), 1978): u held over a period."""
-    n, m = B.shape
-    exponential = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * period)
-    return exponential[:n, :n], exponential[:n, n:]
+    """exp(A period) and integral_0^period exp(A s) ds B: u held over a period, for A (.., n, n) and B (.., n, m).
+
+    Source: C. Van Loan, IEEE TAC 23(3), 1978.
+    """
+    n, m = B.shape[-2:]
+    augmented = np.zeros((*np.broadcast_shapes(A.shape[:-2], B.shape[:-2]), n + m, n + m))
+    augmented[..., :n, :n], augmented[..., :n, n:] = A, B
+    exponential = expm(augmented * period)
+    return exponential[..., :n, :n], exponential[..., :n, n:]
 
 
 def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
-    """The stabilising P = F'P F - F'P G (R + G'P G)^-1 G'P F + Q, shape (.., s, s), for weights (.., s, s) and (.., m, m).
+    """The stabilising P = F'P F - F'P G (R + G'P G)^-1 G'P F + Q by doubling, shape (.., s, s).
 
     Each doubling squares the horizon's transition: with W = I + G_k P_k,
 
         P+ = P + F'P W^-1 F,  G+ = G + F W^-1 G F',  F+ = F W^-1 F,  from G R^-1 G', Q and F
 
-    scipy.linalg.solve_discrete_are solves one at a time and is eight times slower. Source: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin,
-    C.-S. Wang, Int. J. Control 77(8), 2004.
+    scipy.linalg.solve_discrete_are solves one at a time and is eight times slower. Shapes: F, Q (.., s, s), G (.., s, m),
+    R (.., m, m). Source: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin, C.-S. Wang, Int. J. Control 77(8), 2004.
     """
-    eye = np.eye(len(F))
-    P, gramian, transition = Q, G @ np.linalg.solve(R, np.broadcast_to(G.T, (*R.shape[:-2], *G.T.shape))), F
+    batch = np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (F, G, Q, R)))
+    F, G, P, R = (np.broadcast_to(matrix, (*batch, *matrix.shape[-2:])) for matrix in (F, G, Q, R))
+    eye, transition = np.eye(F.shape[-1]), F
+    gramian = G @ np.linalg.solve(R, transpose(G))
     for _ in range(MAX_DOUBLINGS):
-        both = np.concatenate([np.broadcast_to(transition, P.shape), gramian], axis=-1)
-        solved = np.linalg.solve(eye + gramian @ P, both)
+        solved = np.linalg.solve(eye + gramian @ P, np.concatenate([transition, gramian], axis=-1))
         moved, reached = np.split(solved, 2, axis=-1)
-        transposed = np.swapaxes(transition, -1, -2)
-        more = transposed @ P @ moved
-        gramian = gramian + transition @ reached @ transposed
+        more = transpose(transition) @ P @ moved
+        gramian = gramian + transition @ reached @ transpose(transition)
         transition = transition @ moved
-        P = P + (more + np.swapaxes(more, -1, -2)) / 2.0
+        P = P + (more + transpose(more)) / 2.0
         if np.all(np.abs(more) <= 1e-13 * np.max(np.abs(P), axis=(-1, -2), keepdims=True)):
             break
     return np.asarray(P)
 
 
+def transpose(matrix: FloatArray) -> FloatArray:
+    """The transpose of matrices (.., n, m), shape (.., m, n)."""
+    return np.swapaxes(matrix, -1, -2)
+
+
+def diagonal(values: FloatArray) -> FloatArray:
+    """Diagonal matrices, (.., s, s), of diagonals (.., s)."""
+    return np.asarray(values[..., :, None] * np.eye(values.shape[-1]))
+
+
 def diagonals(values: FloatArray) -> FloatArray:
     """Diagonal matrices, (N, s, s), of diagonals in columns, (s, N)."""
-    return np.asarray(values.T[:, :, None] * np.eye(len(values)))
+    return diagonal(values.T)
 
 
 def gain_of(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
     """The gain (R + G'P G)^-1 G'P F of u = -gain z that minimises the sum of z'Q z + u'R u, shape (.., m, s)."""
     P = riccati(F, G, Q, R)
-    return np.asarray(np.linalg.solve(R + G.T @ P @ G, G.T @ P @ F))
+    return np.asarray(np.linalg.solve(R + transpose(G) @ P @ G, transpose(G) @ P @ F))
+
+
+def correction_of(F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray) -> FloatArray:
+    """The gain S H'(H S H' + noise)^-1 of the stationary Kalman filter z + gain (y - H z), shape (.., s, m).
+
+    S is the covariance of the predicted state. Arguments: covariances `process` of the state in a step, (.., s, s), and `noise`
+    of y, (.., m, m); H (.., m, s). Source: B. D. O. Anderson, J. B. Moore, "Optimal Filtering", 4.4.
+    """
+    S = riccati(transpose(F), transpose(H), process, noise)
+    return transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))

@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Design of the observer: its model in discrete time and its two linear-quadratic gains, for many models and weights at once.
+
+Two models: `aircraft_observer` knows A, B, f, wind and lags of an airframe, `extended_state_observer` Omega and lags alone.
+A, B, wind and the weights may have leading axes, which are broadcast against each other: N aircraft, or N sets of weights, are
+N designs. Phi, Gamma, H, L, F are those of the observer of `rise_di_controller.observer`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from control_laws.nominal_model import NominalModel
+from control_laws.riccati import correction_of, diagonal, gain_of, transpose, zero_order_hold
+from flight_core.vectors import FloatArray
+
+LEAK = 0.01  # 1/s, decay of angles and disturbances in the model: each of its modes is then observable or stable
+MIN_LAG = 1e-4  # s, lag of an ideal actuator in the model
+ACTUATOR_NOISE = 1e-6  # rad or 1 per root s, noise of the actuators' positions: negligible
+
+
+class Names(NamedTuple):
+    """Names of the channels of a model, in the order of its arrays."""
+
+    states: tuple[str, ...]  # n
+    inputs: tuple[str, ...]  # m, in the order of the columns of B
+    outputs: tuple[str, ...]  # m, in the order of the rows of C
+    winds: tuple[str, ...]  # G, axes of the wind
+
+
+class Weights(NamedTuple):
+    """Weights of the design with the aircraft's model. The units of the states are `NominalModel.size`, "sizes" below."""
+
+    effort: FloatArray  # (.., m) error that costs as much as an input of unit response, s
+    drift: FloatArray  # (.., m) noise of the disturbances, sizes/s per root s
+    gust: FloatArray  # (.., G) noise of the wind, m/s per root s
+    wind_time: FloatArray  # (.., G) time constants of the wind, s
+    loose: FloatArray  # (.., n), or (.., 1) for all states: noise of the states, for the model error, sizes per root s
+
+
+class ExtendedStateWeights(NamedTuple):
+    """Weights of the design without the aircraft's A."""
+
+    effort: FloatArray  # (.., m) as in `Weights`, s
+    drift: FloatArray  # (.., m) noise of the disturbances, sizes/s per root s
+    rate_drift: FloatArray  # (.., m) noise of the disturbances' rates, sizes/s^2 per root s
+    decay: FloatArray  # (.., m) decay of these rates, 1/s
+
+
+class ObserverModel(NamedTuple):
+    """A model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u - u_ff), e = H z."""
+
+    states: tuple[str, ...]  # names of z, such as x.alpha, position.elevator, wind.vertical, disturbance.q
+    Phi: FloatArray  # (.., s, s)
+    Gamma: FloatArray  # (.., s, m)
+    H: FloatArray  # (m, s)
+
+
+class ObserverDesign(NamedTuple):
+    """A model with its gains: z_hat = z + L (e - H z), u - u_ff = -F z_hat, z+ = Phi z_hat + Gamma (u - u_ff)."""
+
+    states: tuple[str, ...]
+    Phi: FloatArray  # (.., s, s)
+    Gamma: FloatArray  # (.., s, m)
+    H: FloatArray  # (m, s)
+    L: FloatArray  # (.., s, m)
+    F: FloatArray  # (.., m, s)
+
+
+def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> ObserverModel:
+    """The aircraft around its reference, its actuators, wind and a disturbance of each output: z = [x, position, w, d].
+
+        x_dot        = (A + gravity) x + B position + wind w + C' d
+        position_dot = (u - u_ff - position) / lag,  w_dot = -w / wind_time,  d_dot = -LEAK d
+
+    Angles decay with LEAK too. u_ff produces the motion along the reference: the model is that of small deviations from it.
+    s = n + m + G + m. A, B and wind of the model and `wind_time`, (.., G), may have leading axes.
+    """
+    A, (n, m), G = model.A + model.gravity - LEAK * np.diag(model.kinematic), model.B.shape[-2:], model.wind.shape[-1]
+    x, p, w, d = np.split(np.arange(n + m + G + m), [n, n + m, n + m + G])
+    batch = np.broadcast_shapes(A.shape[:-2], model.B.shape[:-2], model.wind.shape[:-2], wind_time.shape[:-1])
+    motion = np.zeros((*batch, n + m + G + m, n + m + G + m))
+    motion[..., x[:, None], x], motion[..., x[:, None], p], motion[..., x[:, None], w] = A, model.B, model.wind
+    motion[..., x[:, None], d] = model.C.T
+    motion[..., w, w], motion[..., d, d] = -1.0 / wind_time, -LEAK
+    groups = {"x": names.states, "position": names.inputs, "wind": names.winds, "disturbance": names.outputs}
+    return _sampled(groups, motion, p, model.C, model)
+
+
+def extended_state_model(model: NominalModel, names: Names, decay: FloatArray) -> ObserverModel:
+    """Outputs that integrate Omega times the actuators and a disturbance of second order: z = [x, position, d, d_dot].
+
+        x_dot        = Omega position + d,  position_dot = (u - u_ff - position) / lag
+        d_dot        = disturbance_rate - LEAK d,  disturbance_rate_dot = -decay disturbance_rate
+
+    x are the outputs. s = 4 m. Of the model it uses Omega, the lags and the period. `decay` (.., m), 1/s. Source: J. Han, "From
+    PID to Active Disturbance Rejection Control", IEEE Trans. Industrial Electronics 56(3), 2009.
+    """
+    m = len(model.C)
+    x, p, d, rate = np.split(np.arange(4 * m), 4)
+    motion = np.zeros((*np.broadcast_shapes(model.Omega.shape[:-2], decay.shape[:-1]), 4 * m, 4 * m))
+    motion[..., x[:, None], p], motion[..., x, d], motion[..., d, rate] = model.Omega, 1.0, 1.0
+    motion[..., d, d], motion[..., rate, rate] = -LEAK, -decay
+    groups = {"x": names.outputs, "position": names.inputs, "disturbance": names.outputs, "disturbance_rate": names.outputs}
+    return _sampled(groups, motion, p, np.eye(m), model)
+
+
+def _sampled(
+    groups: dict[str, tuple[str, ...]], motion: FloatArray, p: NDArray[np.int64], C: FloatArray, model: NominalModel
+) -> ObserverModel:
+    """A model in discrete time; the actuators' positions are the states p, the first states have the outputs C."""
+    lag, (m, n) = np.maximum(model.lag, MIN_LAG), C.shape
+    drive, H = np.zeros((motion.shape[-1], m)), np.zeros((m, motion.shape[-1]))
+    motion[..., p, p], drive[p, np.arange(m)], H[:, :n] = -1.0 / lag, 1.0 / lag, C
+    states = tuple(f"{group}.{name}" for group, members in groups.items() for name in members)
+    return ObserverModel(states, *zero_order_hold(motion, drive, model.period), H)
+
+
+def aircraft_observer(model: NominalModel, names: Names, weights: Weights) -> ObserverDesign:
+    """The observer over `aircraft_model`, with the gains of two Riccati equations.
+
+    F minimises the sum of (e / size)^2 + (effort (u - u_ff) / (input_scale size))^2, and L the variance of the estimate: white
+    noise of `gust` drives the wind, of `drift` the disturbances, of `loose` the states, and e has the noise of the model.
+    Source: H. Kwakernaak, R. Sivan, "Linear Optimal Control Systems", ch. 5 and 6.
+    """
+    sampled = aircraft_model(model, names, weights.wind_time)
+    return ObserverDesign(*sampled, aircraft_correction(sampled, model, weights), feedback_gain(sampled, model, weights.effort))
+
+
+def aircraft_correction(sampled: ObserverModel, model: NominalModel, weights: Weights) -> FloatArray:
+    """L of `aircraft_observer`, shape (.., s, m)."""
+    positions = np.full(len(model.lag), ACTUATOR_NOISE)
+    intensities = [weights.loose * model.size, positions, weights.gust, weights.drift * (model.C @ model.size)]
+    return _correction(sampled, model, intensities)
+
+
+def extended_state_observer(model: NominalModel, names: Names, weights: ExtendedStateWeights) -> ObserverDesign:
+    """The observer over `extended_state_model`, with gains as in `aircraft_observer`."""
+    sampled, size = extended_state_model(model, names, weights.decay), model.C @ model.size
+    intensities = [0.0 * size, np.full(len(size), ACTUATOR_NOISE), weights.drift * size, weights.rate_drift * size]
+    L = _correction(sampled, model, intensities)
+    return ObserverDesign(*sampled, L, feedback_gain(sampled, model, weights.effort))
+
+
+def feedback_gain(sampled: ObserverModel, model: NominalModel, effort: FloatArray) -> FloatArray:
+    """F of `aircraft_observer`, shape (.., m, s), for `effort` (.., m), s."""
+    size = model.C @ model.size
+    Q = transpose(sampled.H) @ np.diag(1.0 / size**2) @ sampled.H
+    return gain_of(sampled.Phi, sampled.Gamma, Q, diagonal((effort / model.input_scale / size) ** 2))
+
+
+def _correction(sampled: ObserverModel, model: NominalModel, intensities: list[FloatArray]) -> FloatArray:
+    """L for white noise of these intensities, (.., k) each, on the states in their order, SI per root s."""
+    batch = np.broadcast_shapes(*(intensity.shape[:-1] for intensity in intensities))
+    process = np.concatenate([np.broadcast_to(one, (*batch, one.shape[-1])) for one in intensities], axis=-1)
+    return correction_of(sampled.Phi, sampled.H, diagonal(process**2 * model.period), np.diag(model.noise**2))
