@@ -16,7 +16,7 @@ from rich.console import Console
 from flight_bringup.scenarios import find_scenario
 from flight_core.vectors import StampedVector
 from rise_di_controller import guard
-from rise_di_controller.law import engage, step
+from rise_di_controller.law import engage, step, step_with_anti_windup
 
 REPEATS = 20_000
 
@@ -41,26 +41,25 @@ FLOOR = "NumPy a * x + b"
 def measure() -> dict[str, tuple[float, float, float]]:
     """Median, 99.9th percentile and maximum in us of a law step, a step with anti-windup, a tick, and the multiply-add."""
     controller = find_scenario("osprey_gust").controller
-    law, limits = controller.law(), controller.guard()
+    law, tuned, limits = controller.law_params(), controller.tuned_law(), controller.guard()
     rng = np.random.default_rng(1)
     y, y_m = rng.normal(size=(REPEATS, 4)) * 0.01, np.zeros(4)
     dt, zero = 0.01, np.zeros(4)
     law_state = engage(y[0], y_m)
-    engaged, _ = guard.tick(guard.initial_state(4), 0, StampedVector(0, y[0]), [StampedVector(0, y_m)], limits, law)
+    engaged, _ = guard.tick(guard.initial_state(4), 0, StampedVector(0, y[0]), [StampedVector(0, y_m)], limits, tuned)
 
     def with_anti_windup(k: int) -> object:
-        return guard.step_with_anti_windup(law_state, y[k], y_m, dt, zero, zero, law, limits.limits)
+        return step_with_anti_windup(law_state, y[k], y_m, dt, zero, zero, law, limits.limits)
 
     def whole_tick(k: int) -> object:
         stamp_ns = limits.period_ns
-        return guard.tick(
-            engaged, stamp_ns, StampedVector(stamp_ns, y[k]), [StampedVector(0, y_m), StampedVector(stamp_ns, y_m)], limits, law
-        )
+        references = [StampedVector(0, y_m), StampedVector(stamp_ns, y_m)]
+        return guard.tick(engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned)
 
     return {
         FLOOR: percentiles(lambda k: law.K * y[k] + y_m),
         "law.step": percentiles(lambda k: step(law_state, y[k], y_m, dt, law)),
-        "guard.step_with_anti_windup": percentiles(with_anti_windup),
+        "law.step_with_anti_windup": percentiles(with_anti_windup),
         "guard.tick": percentiles(whole_tick),
     }
 

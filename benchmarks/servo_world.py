@@ -32,7 +32,6 @@ from rich.progress import track
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_conditions import LinearPlant, Loop, delay_margin
 from flight_analysis.design.gain_selection import law_order
 from flight_analysis.metrics import ErrorMetrics, error_metrics
 from flight_analysis.report.summary import display_units
@@ -42,7 +41,8 @@ from flight_core.parameters import require
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller import guard
-from rise_di_controller.law import LawParams
+from rise_di_controller.law import tuned
+from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law
 
 NOISE = [0.0017, 0.03, 0.0017, 0.0017]  # q, V, p, r in rad/s and m/s, rms per sample of 10 ms
 SETTLED = {"q": ("vertical", 0.005), "V": ("vertical", 0.1), "r": ("lateral", 0.005)}  # rad/s, m/s: settled below it
@@ -204,16 +204,17 @@ def tripling_delay(scenario: Scenario) -> float:
     return DELAY_STEP * (below + (TRIPLED - ratios[below]) / (ratios[above] - ratios[below]))
 
 
-def linear_loop(scenario: Scenario) -> tuple[LinearPlant, LawParams, Loop]:
+def linear_loop(scenario: Scenario) -> tuple[LinearPlant, LinearLaw, Loop]:
     """The linear sampled loop with a softened sign or without a sign (PI), in the law's order."""
     airframe, _ = scenario.aircraft.load()
-    controller, lags = scenario.controller, scenario.aircraft.actuators.lag
+    controller, lags = scenario.rise_di(), scenario.aircraft.actuators.lag
     rows, columns = law_order(airframe, controller)
     A, B = airframe.matrix_a() + airframe.matrix_gravity(), airframe.matrix_b()[:, columns]
-    law, lag = controller.law(), np.array(lags)[columns] if lags else np.zeros(len(columns))
-    if scenario.controller.beta == tuple(PI["beta"]):
+    law, lag = controller.law_params(), np.array(lags)[columns] if lags else np.zeros(len(columns))
+    if controller.beta == tuple(PI["beta"]):
         law = law._replace(eps=np.full(len(columns), 1e9))  # the slope beta / eps of no sign
-    return LinearPlant(A, B, airframe.matrix_c()[rows]), law, Loop(lag, 0.0, 1.0 / controller.rate)
+    loop = Loop(lag, 0.0, 1.0 / controller.rate)
+    return LinearPlant(A, B, airframe.matrix_c()[rows]), linear_law(tuned(law), len(columns), loop.period), loop
 
 
 # The flights
@@ -236,7 +237,7 @@ def _beta(elevator: float, thrust: float, aileron: float, rudder: float) -> list
 
 
 Changes = dict[str, Any]
-PI: Changes = {"beta": [sampling.NO_SIGN * beta for beta in find_scenario("osprey_servo").controller.beta]}
+PI: Changes = {"beta": [sampling.NO_SIGN * beta for beta in find_scenario("osprey_servo").rise_di().beta]}
 LITERAL: Changes = {"sign": "literal"}
 IMPLICIT: Changes = {"sign": "implicit"}
 # K in rad/s of q, p, r, V: 12, 12, 6, 1.5 and 22, 26, 11, 2.5

@@ -34,7 +34,7 @@ from flight_log.rosbag2_metadata import FileContents, TopicCount, bag_metadata_y
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
 from flight_log.tape_reader import read_run
 from rise_di_controller.controller import Controller
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.rise_di import RiseDiParameters
 
 MAX_SENTENCE_LENGTH = 2000
 """Characters of an error sentence, however long the input is."""
@@ -128,7 +128,7 @@ def message(data: bytes, folder: Path) -> None:
     rejected(lambda: read_run(run))
     rejected(lambda: latency(run))
     rejected(lambda: read_playback(run))
-    rejected(lambda: parameter_changes(run, "controller", ControllerParameters.model_fields))
+    rejected(lambda: parameter_changes(run, "controller", RiseDiParameters.model_fields))
 
 
 TARGETS: Mapping[str, Target] = {
@@ -156,7 +156,7 @@ def _replay(file: Path) -> None:
     if recorded.scenario is not None:
         parameters = recorded_parameters(recorded.scenario)
         with np.errstate(all="ignore"):
-            replay(recorded.tape, parameters, None, parameter_changes(file, "controller", ControllerParameters.model_fields))
+            replay(recorded.tape, parameters, None, parameter_changes(file, "controller", type(parameters).model_fields))
 
 
 def log(

@@ -195,7 +195,7 @@ def servo() -> Scenario:
 
 
 def test_the_servo_scenario_uses_the_softened_sign(servo: Scenario) -> None:
-    assert servo.controller.sampled_sign()[0] is Sign.SOFT
+    assert servo.rise_di().sampled_sign()[0] is Sign.SOFT
 
 
 def test_error_through_servos_with_and_without_gusts(servo: Scenario) -> None:
@@ -216,7 +216,7 @@ def test_the_softened_sign_leaves_no_limit_cycle_behind_servos(servo: Scenario) 
     rest = tape.time("u") > 55.0  # gusts and commands end before 50 s
     # The literal sign would keep moving every input by beta: 15 deg/s, 60 %/s. Here the slow spiral mode is left.
     slew = np.abs(np.diff(tape["u"].values[rest], axis=0)).mean(axis=0) / 0.01
-    beta = np.array(servo.controller.beta) * np.array(servo.controller.input_scale)
+    beta = np.array(servo.rise_di().beta) * np.array(servo.controller.input_scale)
     assert (slew < 0.01 * beta).all()
     e = error(tape)
     assert np.abs(e.values[(e.stamp_ns - tape.start_ns) > 55 * 10**9]).max() < 5e-4

@@ -75,7 +75,7 @@ def test_a_search_is_repeatable_and_lowers_the_cost_of_its_initial_gains(short: 
 def test_the_score_of_a_campaign_is_that_of_the_single_process_simulation(short: Benchmark) -> None:
     controller = short.scenario.controller
     gains = {key: list(getattr(controller, key)) for key in ("Lambda", "beta")}
-    gains |= {"K": controller.law().K.tolist(), "softening": [controller.softening]}
+    gains |= {"K": controller.law_params().K.tolist(), "softening": [short.scenario.rise_di().softening]}
     (found,) = law_comparison.compare(short, {"rise": {"nominal": TuningResult(gains, 0.0, 0, [], 0)}}, 1, [0.3], 1)
     true = error(simulate(short.scenario))
     rms = np.array([error_metrics(true[name]).rms for name in controller.outputs])

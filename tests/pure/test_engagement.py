@@ -75,10 +75,10 @@ def fly(
 ) -> list[Tick]:
     """Simulate the scenario, or the reference y_m from the state x_0. Without latching e_0 is 0.
 
-    New parameters are taken between two ticks by `retune`, as in the node.
+    New parameters are taken between two ticks by `guard.retune`, as in the node.
     """
     hardware = SERVO.aircraft.plant()
-    aircraft, state, old = plant.initial_state(hardware), guard.initial_state(4), conditions(0).parameters.law()
+    aircraft, state, old = plant.initial_state(hardware), guard.initial_state(4), conditions(0).parameters.tuned_law()
     aircraft = aircraft if x_0 is None else aircraft._replace(x=x_0)
     y: StampedVector | None = None
     samples: list[StampedVector] = []
@@ -90,13 +90,14 @@ def fly(
         measured = dynamics.y(aircraft.x, hardware.aircraft)[OUTPUTS]
         y = StampedVector(now_ns, measured) if now.y else y
         samples = [*samples[-15:], StampedVector(now_ns, reference)] if now.y_m else samples
-        before, law = state, now.parameters.law()
-        if state.law is not None and now.parameters != conditions(max(k - 1, 0)).parameters:
-            state = state._replace(law=retune(state.law, old, law))
+        before, law = state, now.parameters.tuned_law()
+        if now.parameters != conditions(max(k - 1, 0)).parameters:
+            state = guard.retune(state, old, law)
         state, inputs = guard.tick(state, now_ns, y, samples, now.parameters.guard(), law, now.active)
         if k == 0 and not latched and state.law is not None:
             state = state._replace(law=state.law._replace(e_0=np.zeros(4)))
-        records.append(Tick(before, state, old, law, inputs.dt if inputs is not None else 0.0, measured - reference))
+        dt = inputs.dt if inputs is not None else 0.0
+        records.append(Tick(before, state, old.params, law.params, dt, measured - reference))
         old = law
     return records
 
@@ -182,7 +183,7 @@ def test_re_engagement_after_deactivation_is_bumpless(policy: str) -> None:
 
 def gains(rng: np.random.Generator, sign: str) -> ControllerParameters:
     """The scenario's gains, each times a random factor between 0.6 and 1.4."""
-    section, changes = SERVO.controller, {}
+    section, changes = SERVO.rise_di(), {}
     for key in ("k_d", "Lambda", "beta"):
         values = np.array(getattr(section, key))
         changes[key] = (values * rng.uniform(0.6, 1.4, len(values))).tolist()

@@ -84,7 +84,7 @@ def nominal_of(params: ControllerParameters) -> Nominal:
 
 def largest_error(params: ControllerParameters) -> float:
     """Largest error in 6 s with the guard, sampled at the controller's rate, integrated in steps of a tenth of a period."""
-    limits, law, state, x = params.guard(), params.law(), guard.initial_state(2), np.zeros(4)
+    limits, law, state, x = params.guard(), params.tuned_law(), guard.initial_state(2), np.zeros(4)
     samples: list[StampedVector] = []
     errors = []
 
@@ -166,7 +166,7 @@ def short(**changes: Any) -> Scenario:
 
 def recomputed(params: ControllerParameters, tape: Tape) -> tuple[FloatArray, FloatArray]:
     """Inputs u and u_ff of every step of a tape, from its y, y_m and dt only."""
-    log, limits, law = tape["internals"], params.guard(), params.law()
+    log, limits, law = tape["internals"], params.guard(), params.law_params()
     y, y_m = log.group("y").values, log.group("y_m").values
     u = log.group("u").values[0]
     u_trim, state = u, rise.engage(y[0], y_m[0])
@@ -177,7 +177,7 @@ def recomputed(params: ControllerParameters, tape: Tape) -> tuple[FloatArray, Fl
         if ff_state is not None and limits.nominal is not None:
             ff_state, u_ff = feedforward.step(ff_state, y_m[k], dt, limits.nominal)
             start = u_trim + u_ff
-        state, _, u = guard.step_with_anti_windup(state, y[k], y_m[k], dt, start, u, law, limits.limits)
+        state, _, u = rise.step_with_anti_windup(state, y[k], y_m[k], dt, start, u, law, limits.limits)
         us.append(u)
         added.append(u_ff)
     return np.array(us), np.array(added)
@@ -204,7 +204,7 @@ def ticks(
         t, now_ns = k / 100, k * 10 * MS
         if not missing[0] < t < missing[1]:
             y_now, y_m_samples = StampedVector(now_ns, y(t)), [*y_m_samples[-2:], StampedVector(now_ns, reference(t))]
-        state, _ = guard.tick(state, now_ns, y_now, y_m_samples, params.guard(), params.law())
+        state, _ = guard.tick(state, now_ns, y_now, y_m_samples, params.guard(), params.tuned_law())
         states.append(state)
     return states
 
@@ -233,12 +233,12 @@ def test_new_gains_change_neither_the_feedforward_nor_the_input() -> None:
     new = ControllerParameters.validate_mapping(values, "controller")
     state = ticks(old, lambda t: reference(t) + 0.1 * t)[-1]
     assert state.law is not None
-    law = rise.retune(state.law, old.law(), new.law())
+    law = rise.retune(state.law, old.law_params(), new.law_params())
     retuned = state._replace(law=law)
-    assert rise.control(law, law, new.law()) == pytest.approx(rise.control(state.law, state.law, old.law()))
+    assert rise.control(law, law, new.law_params()) == pytest.approx(rise.control(state.law, state.law, old.law_params()))
     now = StampedVector(1500 * MS, reference(1.5))
-    before, _ = guard.tick(state, now.stamp_ns, now, [now], old.guard(), old.law())
-    after, _ = guard.tick(retuned, now.stamp_ns, now, [now], new.guard(), new.law())
+    before, _ = guard.tick(state, now.stamp_ns, now, [now], old.guard(), old.tuned_law())
+    after, _ = guard.tick(retuned, now.stamp_ns, now, [now], new.guard(), new.tuned_law())
     assert before.u_ff.tobytes() == after.u_ff.tobytes()
 
 

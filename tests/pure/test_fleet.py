@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vectorised flights of N aircraft: each is the single-process simulation, independent of the others."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from tests.closed_loop import error
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import sampled_matrices
-from control_laws import rise_di
+from control_laws.nominal_model import campaign_law
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.gain_selection import with_feedforward
@@ -20,6 +20,7 @@ from flight_campaign.benchmark_course import build_course
 from flight_core.parameters import ParameterError
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.saturation import Limits
 
 SERVO = find_scenario("osprey_servo").vary(
     flight={"duration": 9.0},
@@ -30,7 +31,8 @@ SERVO = find_scenario("osprey_servo").vary(
         }
     },
 )
-CONTROL_LAW, PARAMS = rise_di.CONTROL_LAWS[SERVO.controller.law().sign], rise_di.params(SERVO.controller)
+CONTROL_LAW, PARAMS = SERVO.controller.tuned_law()
+PARAMS = fleet.shared(PARAMS)
 
 
 def sampled(part: float, seed: int, count: int) -> tuple[FloatArray, FloatArray]:
@@ -102,7 +104,7 @@ def test_each_aircraft_of_a_fleet_flies_as_in_the_single_process_simulation(name
     # does not. In the gust the difference is at most 1e-4 of the error; 1e-3 bounds it. A quantised y sometimes rounds to the
     # next step, after which u differs: 2e-2.
     scenario = SERVO.vary(**VARIATIONS[name])
-    within, params = 2e-2 if scenario.aircraft.sensors.quantisation else 1e-3, rise_di.params(scenario.controller)
+    within, params = 2e-2 if scenario.aircraft.sensors.quantisation else 1e-3, fleet.shared(scenario.controller.law_params())
     together = fly(scenario, *sampled(0.3, 5, 2), params=params)
     for number in range(2):
         for key, values in alone(scenario, number).items():
@@ -125,17 +127,24 @@ def test_every_aircraft_can_have_its_own_gains_wind_and_delay() -> None:
     assert not np.allclose(rms[:, 3], rms[:, 0], rtol=1e-3)
 
 
+class Ticks(NamedTuple):
+    """State of the pulse."""
+
+    count: Array
+
+
 def _pulse(delay: int) -> ControlLaw:
     """An open-loop control law: one pulse of the elevator, delayed by so many ticks."""
 
-    def start(measured: Measurements, params: Any) -> Array:
-        return 0.0 * measured.y[:1] + 1.0
+    def engage(measured: Measurements, params: Any) -> Ticks:
+        return Ticks(0.0 * measured.y[:1] + 1.0)
 
-    def step(state: Array, measured: Measurements, dt: Array, params: Any) -> tuple[Array, Array]:
-        inside = (state >= 10.0 + delay) & (state < 30.0 + delay)
-        return state + 1.0, 0.0 * measured.y + 0.05 * inside * np.array([[1.0], [0.0], [0.0], [0.0]])
+    def limited(state: Ticks, measured: Measurements, dt: Array, params: Any, limits: Limits) -> tuple[Ticks, Array, Array]:
+        inside = (state.count >= 10.0 + delay) & (state.count < 30.0 + delay)
+        u = 0.0 * measured.y + 0.05 * inside * np.array([[1.0], [0.0], [0.0], [0.0]])
+        return Ticks(state.count + 1.0), u, u
 
-    return ControlLaw(start, step)
+    return campaign_law(Ticks, engage, limited)
 
 
 def test_a_late_u_acts_that_many_ticks_later() -> None:
@@ -152,9 +161,10 @@ def test_an_aircraft_that_diverges_is_marked_and_does_not_affect_the_others() ->
     A, B = sampled(0.0, 1, 2)
     B = B * np.array([1.0, -1.0])[:, None, None]  # every sign is wrong: the loop is unstable
     vehicle = vehicle._replace(actuators=vehicle.actuators._replace(lower=None, upper=None, rate=None))
-    free = PARAMS.limits._replace(lower=-np.inf + 0.0 * PARAMS.D, upper=np.inf + 0.0 * PARAMS.D)
+    infinite = np.full((4, 1), np.inf)
+    vehicle = vehicle._replace(limits=Limits(-infinite, infinite, infinite))
     aircraft = fleet.assemble(A, B, SERVO.aircraft.plant(), course)
-    both = fleet.fly(aircraft, vehicle, course, CONTROL_LAW, PARAMS._replace(limits=free))
+    both = fleet.fly(aircraft, vehicle, course, CONTROL_LAW, PARAMS)
     assert np.asarray(both.diverged).tolist() == [False, True]
     assert np.isfinite(np.asarray(both.rms)[:, 0]).all()
 

@@ -22,7 +22,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import gain_conditions
 from flight_analysis.design import gain_selection as selection
-from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet, LinearPlant, Loop
+from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet
 from flight_analysis.design.gain_selection import ChannelPairing, GainAssessment, LoopSetting, Manoeuvre, Study
 from flight_bringup.scenarios import find_scenario
 from flight_cli.airframes import airframes
@@ -30,8 +30,10 @@ from flight_cli.gains import gains as gains_command
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import decompose, unit_diagonal
-from rise_di_controller.law import LawParams, Sign, engage, step
+from rise_di_controller.law import LawParams, Sign, engage, step, tuned
+from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law
 from rise_di_controller.params import ControllerParameters
+from rise_di_controller.rise_di import RiseDiParameters
 
 AIRFRAME = load_airframe("osprey")
 SERVOS: LoopSetting = selection.loop_setting(find_scenario("osprey_servo"))._replace(delay=0.0, rate_limit={})
@@ -199,7 +201,7 @@ def test_an_airframe_with_an_unstable_zero_is_refused(osprey_gust: Scenario) -> 
 
 def test_the_engineering_gains_of_the_osprey_are_close_to_those_tuned_by_hand(selected: selection.Selection) -> None:
     controller = selected.engineering.controller
-    params = controller.law()
+    params = controller.law_params()
     assert controller.outputs == ("q", "p", "r", "V")  # the slowest last, as (22) wants it
     # Tuned by hand in flight: K = (18, 18, 9, 2). The crossover lag products are those of these gains, rounded: 2 %.
     np.testing.assert_allclose(params.K, [18.0, 18.0, 9.0, 2.0], rtol=0.02)
@@ -230,7 +232,7 @@ def test_a_channel_too_slow_for_22_gets_a_smaller_input_scale() -> None:
 
 def test_beta_stays_below_the_rate_of_the_actuators(osprey: Study) -> None:
     limited = selection.select_gains(osprey, SERVOS._replace(rate_limit={"thrust": 1.2})).engineering
-    params = limited.controller.law()
+    params = limited.controller.law_params()
     assert params.beta[3] * params.input_scale[3] == pytest.approx(0.7 * 1.2)  # the slew of the ideal thrust is 1.14 1/s
     assert failing_in_loop(limited) == ["beta above slew of V"]
 
@@ -238,7 +240,7 @@ def test_beta_stays_below_the_rate_of_the_actuators(osprey: Study) -> None:
 def test_a_written_gain_set_is_read_back(selected: selection.Selection) -> None:
     text = selection.as_yaml(selected)
     section = yaml.safe_load(text)["/**/controller"]["ros__parameters"]
-    read = ControllerParameters.validate_mapping(section, "controller")
+    read = RiseDiParameters.validate_mapping(section, "controller")
     written = selected.engineering.controller
     for key, value in written.model_dump(exclude_none=True).items():
         if isinstance(value, (str, bool)) or key in {"outputs", "inputs", "D"}:
@@ -316,13 +318,18 @@ def test_gains_can_be_selected_for_the_pairing_that_a_refusal_proposes(osprey_gu
 OSPREY_LOOP = Loop(np.array([0.02, 0.1, 0.02, 0.02]), 0.0, 0.01)
 
 
+def linear(params: LawParams) -> LinearLaw:
+    return linear_law(tuned(params), len(params.K), 0.01)
+
+
 def osprey_loop(
     factor: float = 3.0, K: tuple[float, ...] = (18.0, 2.0, 18.0, 9.0), Lambda: tuple[float, ...] = (5.0, 0.5, 5.0, 3.0)
-) -> tuple[LinearPlant, LawParams]:
+) -> tuple[LinearPlant, LinearLaw]:
     """The osprey with given gains in the order q, V, p, r, and a softened sign so many total lags wide."""
     A, B, C = AIRFRAME.matrix_a() + AIRFRAME.matrix_gravity(), AIRFRAME.matrix_b(), AIRFRAME.matrix_c()
     scale, eps = 1.0 / np.abs(np.diag(C @ B)), factor * OSPREY_LOOP.total / np.array(K)
-    return LinearPlant(A, B, C), law_params(K, Lambda, 1.0, sign=Sign.SOFT, input_scale=scale, eps=eps)
+    params = law_params(K, Lambda, 1.0, sign=Sign.SOFT, input_scale=scale, eps=eps)
+    return LinearPlant(A, B, C), linear(params)
 
 
 @pytest.mark.parametrize(
@@ -338,7 +345,7 @@ def test_delay_margins_of_the_osprey_are_those_of_an_independent_prototype(
     factor: float, K: tuple[float, ...], Lambda: tuple[float, ...], margin: float
 ) -> None:
     # given as 45, 64, 61 and 30 to 31 ms
-    found = gain_conditions.delay_margin(*osprey_loop(factor, K, Lambda), OSPREY_LOOP)
+    found = delay_margin(*osprey_loop(factor, K, Lambda), OSPREY_LOOP)
     assert found == pytest.approx(margin, abs=0.001)
 
 
@@ -378,7 +385,7 @@ def test_the_predicted_delay_margin_is_where_the_simulated_loop_begins_to_grow(l
     omega, period = 0.98, 0.01
     params = scalar(omega, factor * (lag + 1.5 * period))
     plant = LinearPlant(np.zeros((1, 1)), np.array([[omega]]), np.eye(1))
-    margin = gain_conditions.delay_margin(plant, params, Loop(np.array([lag]), 0.0, period))
+    margin = delay_margin(plant, linear(params), Loop(np.array([lag]), 0.0, period))
     # 0.75 ms: the simulated delay comes in steps of 0.25 ms, the predicted one in 0.1 ms, and growth has to show in 9 s
     assert 0.003 < margin < 0.1
     assert not grows(params, omega, lag, margin - 0.00075)
@@ -389,18 +396,18 @@ def test_a_softened_sign_narrower_than_the_lag_of_the_loop_is_unstable() -> None
     loop = Loop(np.array([0.02]), 0.0, 0.01)
     plant = LinearPlant(np.zeros((1, 1)), np.eye(1), np.eye(1))
     wide, narrow = (scalar(1.0, factor * 0.035) for factor in (1.7, 0.5))
-    assert gain_conditions.delay_margin(plant, wide, loop) > 0.0
-    assert gain_conditions.delay_margin(plant, narrow, loop) == 0.0
+    assert delay_margin(plant, linear(wide), loop) > 0.0
+    assert delay_margin(plant, linear(narrow), loop) == 0.0
     conditions = gain_conditions.check_loop(narrow, loop, *(np.ones(1),) * 3, np.full(1, np.inf))
     assert names(gain_conditions.failing(conditions), ("y",)) == ["softening of y"]
 
 
 def test_delay_that_the_loop_has_already_counts_against_the_margin() -> None:
-    plant, params = osprey_loop()
-    free = gain_conditions.delay_margin(plant, params, OSPREY_LOOP)
-    spent = gain_conditions.delay_margin(plant, params, OSPREY_LOOP._replace(delay=0.013))
+    plant, law = osprey_loop()
+    free = delay_margin(plant, law, OSPREY_LOOP)
+    spent = delay_margin(plant, law, OSPREY_LOOP._replace(delay=0.013))
     assert spent == pytest.approx(free - 0.013, abs=2e-4)
-    alone = [gain_conditions.delay_margin(plant, params, OSPREY_LOOP, channel) for channel in range(4)]
+    alone = [delay_margin(plant, law, OSPREY_LOOP, channel) for channel in range(4)]
     assert min(alone) < 0.05 < max(alone)  # thrust bears three times what the surfaces bear
 
 
@@ -409,7 +416,7 @@ def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
     answer: GainAssessment = selection.check_gains(literal, osprey)
     assert answer.delay_margin is None
     with pytest.raises(ParameterError, match=r"^sign: found literal, expected soft or implicit"):
-        gain_conditions.law_matrix(literal.controller.law(), 0.01)
+        linear_law(literal.controller.tuned_law(), 4, 0.01)
 
 
 def rise_di(*arguments: str) -> Result:

@@ -14,10 +14,11 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard, internals
-from rise_di_controller.guard import ControllerState, Limits, Mode, align
+from rise_di_controller.guard import ControllerState, Mode, align
 from rise_di_controller.internals import Saturation
-from rise_di_controller.law import LawState, Sign, control, engage, retune, step
+from rise_di_controller.law import LawState, Sign, control, engage, retune, step, step_with_anti_windup
 from rise_di_controller.params import ControllerParameters
+from rise_di_controller.saturation import Limits, saturate
 
 MS = 1_000_000
 PARAMS = find_scenario("osprey_gust").controller
@@ -68,7 +69,7 @@ def tick(
     params: ControllerParameters = PARAMS,
     active: bool = True,
 ) -> tuple[ControllerState, guard.TickInputs | None]:
-    return guard.tick(state, round(ms * MS), y, y_m, params.guard(), params.law(), active)
+    return guard.tick(state, round(ms * MS), y, y_m, params.guard(), params.tuned_law(), active)
 
 
 def run(
@@ -90,7 +91,7 @@ def test_waits_until_both_signals_are_received_then_engages_with_zero_input() ->
 def test_each_new_sample_is_one_step_of_the_law_with_its_measured_dt() -> None:
     first, second = run((0, sample(0, 1.0), [sample(0)]), (12, sample(12, 1.1), [sample(12)]))
     law_state = engage(np.full(4, 1.0), np.zeros(4))
-    _, u = step(law_state, np.full(4, 1.1), np.zeros(4), np.array(0.012), PARAMS.law())
+    _, u = step(law_state, np.full(4, 1.1), np.zeros(4), np.array(0.012), PARAMS.law_params())
     assert first.u.tolist() == [0.0] * 4
     assert second.u.tolist() == u.tolist()
 
@@ -193,7 +194,7 @@ def test_anti_windup_without_saturation_leaves_the_law_to_the_last_bit(sign: Sig
     law = TWO._replace(sign=sign)
     zero, dt = np.zeros(2), np.array(0.01)
     after, u = step(state, y, zero, dt, law)
-    limited_state, u_free, limited = guard.step_with_anti_windup(state, y, zero, dt, zero, u, law, limits_of(np.inf))
+    limited_state, u_free, limited = step_with_anti_windup(state, y, zero, dt, zero, u, law, limits_of(np.inf))
     assert limited.tobytes() == u_free.tobytes() == (zero + u).tobytes()
     assert [part.tobytes() for part in limited_state] == [part.tobytes() for part in after]
 
@@ -204,7 +205,7 @@ def test_saturation_keeps_the_limits_and_leaves_an_input_inside_them_unchanged(
 ) -> None:
     limits = limits_of(bound, rate)
     before = np.clip(before, -bound, bound)
-    limited = guard.saturate(u, before, np.array(0.01), limits)
+    limited = saturate(u, before, np.array(0.01), limits)
     assert (np.abs(limited) <= bound).all()
     assert (np.abs(limited - before) <= rate * 0.01 + 1e-12).all()
     inside = (np.abs(u) <= bound) & (np.abs(u - before) <= rate * 0.01)
@@ -212,7 +213,7 @@ def test_saturation_keeps_the_limits_and_leaves_an_input_inside_them_unchanged(
 
 
 def test_saturation_clips_an_input_that_starts_outside_its_limits() -> None:
-    limited = guard.saturate(np.array([5.0, -5.0]), np.array([3.0, -3.0]), np.array(0.01), limits_of(1.0, 10.0))
+    limited = saturate(np.array([5.0, -5.0]), np.array([3.0, -3.0]), np.array(0.01), limits_of(1.0, 10.0))
     assert limited.tolist() == [1.0, -1.0]
 
 
@@ -224,8 +225,8 @@ def test_integrals_stop_only_in_the_direction_that_worsens_saturation(
     limits = limits_of(1.0) if limited_in == "magnitude" else limits_of(np.inf, 10.0)
     zero, dt = np.zeros(2), np.array(0.01)
     free, u = step(state, y, zero, dt, TWO)
-    limited_state, _, _ = guard.step_with_anti_windup(state, y, zero, dt, trim, zero, TWO, limits)
-    beyond = trim + u - guard.saturate(trim + u, zero, dt, limits)
+    limited_state, _, _ = step_with_anti_windup(state, y, zero, dt, trim, zero, TWO, limits)
+    beyond = trim + u - saturate(trim + u, zero, dt, limits)
     outward = -TWO.D * (free.integral_e - state.integral_e) * beyond > 0
     assert (limited_state.integral_e == np.where(outward, state.integral_e, free.integral_e)).all()
     outward = -TWO.D * (free.Pi - state.Pi) * beyond > 0
@@ -240,7 +241,7 @@ def test_an_input_reaches_its_limit_however_large_a_tick_of_the_integrals_is() -
     zero, e = np.zeros(2), np.array([-0.2, 0.2])
     state, u = engage(e, zero), zero
     for _ in range(20):
-        state, _, u = guard.step_with_anti_windup(state, e, zero, np.array(0.01), zero, u, TWO, limits)
+        state, _, u = step_with_anti_windup(state, e, zero, np.array(0.01), zero, u, TWO, limits)
     assert u == pytest.approx([0.01, 0.01], rel=1e-12)
 
 
@@ -259,7 +260,7 @@ def test_new_gains_transfer_without_a_bump(state: LawState, k: float, Lambda: fl
 
 def logged(state: ControllerState, inputs: guard.TickInputs, limits: Limits, *others: Any) -> dict[str, float]:
     values = internals.values(state, inputs, limits, *others)
-    return dict(zip(internals.names(PARAMS.outputs, PARAMS.inputs), values, strict=True))
+    return dict(zip(internals.names(PARAMS.logged_groups()), values, strict=True))
 
 
 def test_internals_hold_the_integrals_and_what_limited_each_input() -> None:
@@ -268,7 +269,7 @@ def test_internals_hold_the_integrals_and_what_limited_each_input() -> None:
     state = guard.initial_state(4)._replace(
         law=law_state, u_free=np.array([0.5, 5.0, -5.0, 0.9]), u=np.array([0.5, 1.0, -1.0, 0.7]), u_trim=np.full(4, 0.1)
     )
-    values = logged(state, guard.TickInputs(0, np.zeros(4), np.zeros(4), 0.0, 0.01), limits, 0.0, 0.0, 7, 8)
+    values = logged(state, guard.TickInputs(0, np.ones(4), np.zeros(4), 0.0, 0.01), limits, 0.0, 0.0, 7, 8)
     assert (values["e.q"], values["e_0.q"], values["integral_e.q"], values["Pi.q"]) == (1.0, 0.0, 2.0, 3.0)
     assert (values["u_free.aileron"], values["u.aileron"], values["u_trim.aileron"]) == (5.0, 1.0, 0.1)
     limited = [values[f"limited.{name}"] for name in PARAMS.inputs]

@@ -49,7 +49,7 @@ def osprey(rate: float, beta_factor: float = 1.0, duration: float = 12.0) -> tup
     scenario = find_scenario("osprey_gust")
     starts = {"lateral": 4.0, "vertical": 8.0}
     gusts = {name: gust.model_dump() | {"start": starts[name]} for name, gust in scenario.aircraft.gusts.items()}
-    beta = [beta_factor * value for value in scenario.controller.beta]
+    beta = [beta_factor * value for value in scenario.rise_di().beta]
     scenario = scenario.vary(
         flight={"duration": duration},
         aircraft={"rate": rate, "step": 0.0025, "gusts": gusts},
@@ -57,7 +57,7 @@ def osprey(rate: float, beta_factor: float = 1.0, duration: float = 12.0) -> tup
         controller={"rate": rate, "beta": beta, "sign": "implicit"},
     )
     plant, flight = from_tape(scenario, simulate(scenario))
-    return scenario, plant, evidence(plant, flight, scenario.controller.law())
+    return scenario, plant, evidence(plant, flight, scenario.controller.law_params())
 
 
 def tail(signal: np.ndarray[Any, Any], t: np.ndarray[Any, Any], after: float) -> float:
@@ -171,13 +171,13 @@ def test_along_the_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> Non
         scenario, plant, found = osprey(rate)
         _, D, U = decompose(plant.C @ plant.B)
         needed = np.max(np.abs(np.linalg.solve(D[:, None] * U * D, found.N_d.T)), axis=1)
-        predicted = np.array(scenario.controller.omega) * needed / rate**2
+        predicted = np.array(scenario.rise_di().omega) * needed / rate**2
         assert np.max(np.abs(found.e), axis=0) == pytest.approx(predicted, rel=0.05)  # 2.4e-3, 4.9e-5, 7.4e-4, 7.2e-4
 
 
 def test_along_the_osprey_P_needs_beta_above_the_largest_N_d() -> None:
     scenario, _, good = osprey(200.0)
-    beta = np.array(scenario.controller.beta)
+    beta = np.array(scenario.rise_di().beta)
     assert np.all(np.max(np.abs(good.N_d), axis=0) < beta)  # q, p, r, V: 23.8, 0.9, 7.4, 7.2 against 29.4, 22.5, 10.2, 7.8
     assert good.P.min() > -1e-6  # measured -3e-9 with zeta_b = beta e(0) = 0
     _, _, bad = osprey(200.0, beta_factor=0.1)
@@ -187,7 +187,7 @@ def test_along_the_osprey_P_needs_beta_above_the_largest_N_d() -> None:
 
 def test_the_osprey_flies_with_gains_below_what_steps_2_and_3_ask_for() -> None:
     scenario, plant, _ = osprey(100.0, duration=0.1)
-    law = scenario.controller.law()
+    law = scenario.controller.law_params()
     assert np.linalg.eigvalsh(decay_matrix(plant, law)).min() < -7.0  # measured -7.8
     raised = law._replace(K=np.array([30.0, 50.0, 18.0, 4.0]), Lambda=np.array([1.0, 1.0, 1.0, 0.5]))
     assert np.linalg.eigvalsh(decay_matrix(plant, raised)).min() > 0.25  # measured 0.30

@@ -180,7 +180,7 @@ def test_an_invalid_section_of_an_airframe_is_refused_by_name(section: str, valu
 
 
 def test_an_integer_is_accepted_as_a_number(osprey_gust: Scenario) -> None:
-    assert osprey_gust.vary(controller={"k_g": 1, "Lambda": [5, 5, 3, 1]}).controller.Lambda == (5.0, 5.0, 3.0, 1.0)
+    assert osprey_gust.vary(controller={"k_g": 1, "Lambda": [5, 5, 3, 1]}).rise_di().Lambda == (5.0, 5.0, 3.0, 1.0)
 
 
 def test_the_error_for_an_unknown_scenario_lists_the_scenarios() -> None:

@@ -37,6 +37,7 @@ from flight_log.tape_writer import write_run
 from rise_di_controller.controller import Controller
 from rise_di_controller.guard import Mode
 from rise_di_controller.params import ControllerParameters
+from rise_di_controller.rise_di import RiseDiParameters
 
 app = application([*COMMANDS])
 GUST = find_scenario("osprey_gust").vary(
@@ -185,7 +186,7 @@ def flipped(value: float) -> float:
 @pytest.mark.parametrize("channel", range(4))
 def test_one_bit_of_one_gain_is_found(name: str, channel: int) -> None:
     scenario = SCENARIOS[name].vary(reference_model={"pulses": BUSY})
-    gains = list(scenario.controller.Lambda)
+    gains = list(scenario.rise_di().Lambda)
     gains[channel] = flipped(gains[channel])
     tape = simulate(scenario)
     assert equal(replay(tape, scenario.controller))
@@ -277,7 +278,7 @@ def test_one_bit_of_one_gain_is_found_after_a_gap(name: str) -> None:
     assert result.first() is None
     assert (~result.checked).sum() == 1
     assert "11 samples of internals are missing: a gap before t = 0.70 s" in result.notes
-    gains = list(scenario.controller.beta)
+    gains = list(scenario.rise_di().beta)
     assert replay(tape, vary(scenario.controller, {"beta": [flipped(gains[0]), *gains[1:]]})).first() is not None
 
 
@@ -520,5 +521,5 @@ def test_changes_of_parameters_are_read_from_the_log(tmp_path: Path) -> None:
         channel = bag.add_topic("/parameter_events", PARAMETER_EVENT, "")
         for number, message in enumerate(events):
             bag.write(channel, number, number, number, bytes(STORE.serialize_cdr(message, PARAMETER_EVENT)))
-    changes = parameter_changes(tmp_path / "run", "controller", ControllerParameters.model_fields)
+    changes = parameter_changes(tmp_path / "run", "controller", RiseDiParameters.model_fields)
     assert changes == [{"k_g": 2.5, "sign": "soft", "upper": None}, {"Lambda": [1.0, 2.0]}]

@@ -24,9 +24,9 @@ from tests.pure.test_saturation import last_beyond, pulse, state, with_stops
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_conditions import is_stable
 from flight_core.vectors import FloatArray
 from reference_model.command import Profile, command
+from rise_di_controller.linear_loop import is_stable
 
 ROWS = {row.name: row for _, rows in TABLES.values() for row in rows()}
 

@@ -148,7 +148,7 @@ def channels(osprey_gust: Scenario) -> Mapping[str, Sequence[str]]:
         "y_m": outputs,
         "u_m": outputs,
         "u": inputs,
-        "internals": internals.names(outputs, inputs),
+        "internals": internals.names(osprey_gust.controller.logged_groups()),
         "truth": Simulator(osprey_gust.aircraft).truth_names,
     }
 

@@ -168,7 +168,7 @@ def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(start_node: Start, o
     assert all(message.position.tolist() == logged[stamp_ns(message)] for message in published)
 
     # bumpless transfer: re-engaged at the present u, then steps no larger than those of the law at a constant e
-    law = osprey_gust.controller.law()
+    law = osprey_gust.controller.law_params()
     again = resumed + int(np.flatnonzero(log.mode[resumed:] == Mode.ENGAGED)[0])
     assert log.dt[again] == 0.0
     assert (log.u[again] == log.u[again - 1]).all()
@@ -231,7 +231,7 @@ def test_gains_change_in_flight_bumpless(start_node: Start, osprey_gust: Scenari
     # With e = y the law moves u by K Lambda e dt + beta dt in a tick; the new gains alone would have moved it by more than 2 e.
     log = ticks(peer_node)
     assert len({channel(one, "parameters") for one in messages[since:]}) == 2  # those before and after
-    laws = [one.controller.law() for one in (osprey_gust, osprey_gust.vary(controller=CHANGED))]
+    laws = [one.controller.law_params() for one in (osprey_gust, osprey_gust.vary(controller=CHANGED))]
     rate = np.max([law.input_scale * (law.K * law.Lambda * y + law.beta) for law in laws], axis=0)
     moved = np.abs(np.diff(log.u[since:], axis=0))
     assert (moved <= np.outer(log.dt[since + 1 :], rate) + EXACT).all()

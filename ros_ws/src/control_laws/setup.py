@@ -5,9 +5,18 @@ from setuptools import setup
 setup(
     name="control_laws",
     version="0.1.0",
-    description="Control laws other than RISE-DI, each a module of equations.",
+    description="Control laws other than RISE-DI, each a module of equations; the controller flies those of y alone.",
     license="Apache-2.0",
     packages=["control_laws"],
+    entry_points={
+        "rise_di_controller.laws": [
+            "pi = control_laws.pi:PiParameters",
+            "l1 = control_laws.l1:L1Parameters",
+            "lqg = control_laws.lqg:LqgParameters",
+            "indi = control_laws.indi:IndiParameters",
+            "lqi = control_laws.lqi:LqiParameters",
+        ]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/control_laws"]),
         ("share/control_laws", ["package.xml"]),

@@ -8,11 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from control_laws import adaptive, indi, inversion, lqi, mackunis, rise_di, rise_observer, super_twisting
+from control_laws import indi, inversion, l1, lqg, lqi, mackunis, mrac, observed, pi, rise_di, super_twisting
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
+from rise_di_controller import law as rise
 from rise_di_controller.control_law import ControlLaw
 from rise_di_controller.law import Sign
+from rise_di_controller.observer import ObserverParams, with_observer
 
 Gains = dict[str, FloatArray]  # gains by name, shape (m, N), or (1, N) where one serves all channels; all of them positive
 
@@ -29,13 +31,17 @@ INITIAL_CHANNEL_GAINS = {
     "bias": 10.0,
     "integral": 2.0,
     "effort": 0.05,
+    "rate_drift": 0.5,
+    "decay": 5.0,
 }
 """Initial gains of a search in every channel, in scaled inputs and SI; K and Lambda start from the lag of the loop."""
 
 INITIAL_COMMON_GAINS = {"softening": 3.0, "omega": 1.5, "filter": 12.6, "leak": 0.05, "fade": 4.0, "loose": 0.01}
 """Initial gains that are common to all channels."""
 
-INITIAL_GUST_INTENSITY = 0.5  # m/s per root s, the same for each axis of the wind
+INITIAL_WIND_GAINS = {"gust": 0.5, "wind_time": 2.0}
+"""Noise of the wind, m/s per root s, and its time constant, s, the same for each axis. Dryden's L / V0 at 100 m and 25 m/s is
+4 s vertically and 10 s along the flight; a design gust of 15 m peaks after 0.6 s."""
 
 
 class Law(NamedTuple):
@@ -43,7 +49,7 @@ class Law(NamedTuple):
 
     title: str
     measurements: str  # of the aircraft, besides y_m
-    model_data: str  # of the nominal aircraft, besides D and the input scale
+    model_data: str  # of the nominal aircraft, besides D
     control_law: Callable[[NominalModel], ControlLaw]
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of its gains
@@ -56,37 +62,85 @@ def initial_gains(law: Law, model: NominalModel) -> Gains:
     gains = {"K": K, "Lambda": K / 4.0}
     gains |= {name: np.full(K.shape, value) for name, value in INITIAL_CHANNEL_GAINS.items()}
     gains |= {name: np.full((1, 1), value) for name, value in INITIAL_COMMON_GAINS.items()}
-    gains["gust"] = np.full((model.wind.shape[1], 1), INITIAL_GUST_INTENSITY)
+    gains |= {name: np.full((model.wind.shape[1], 1), value) for name, value in INITIAL_WIND_GAINS.items()}
     return {name: gains[name] for name in law.tuned}
 
 
-_rise, _rise_gains = rise_di.of_gains, ("K", "Lambda", "beta", "softening")
-_observer, _observer_gains = rise_observer.observer_params, ("effort", "gust", "drift", "loose")
+def _over(
+    of_law: Callable[[Gains, NominalModel], Any], part: float = observed.PART
+) -> Callable[[Gains, NominalModel], ObserverParams]:
+    """Parameters of an observer with the aircraft's model over a law, from the function for the law's own parameters."""
+    return lambda gains, model: observed.of_design(observed.aircraft_design(gains, model), of_law(gains, model), model, part)
+
+
+def _extended_state(gains: Gains, model: NominalModel) -> ObserverParams:
+    return observed.of_design(observed.extended_state_design(gains, model), pi.params_of(gains, model), model)
+
+
+def _fixed(law: ControlLaw) -> Callable[[NominalModel], ControlLaw]:
+    """A law that does not depend on the model."""
+    return lambda _: law
+
+
+_rise_gains, _observer_gains = ("K", "Lambda", "beta", "softening"), ("effort", "gust", "wind_time", "drift", "loose")
+_soft, _implicit = (_fixed(rise.CONTROL_LAWS[sign]) for sign in (Sign.SOFT, Sign.IMPLICIT))
 _filtered, _ideal = (partial(mackunis.control_law, ideal=ideal) for ideal in (False, True))
-_l1_ff, _model = partial(adaptive.l1, feedforward=True), "A, B, f"
-_soft, _implicit = (partial(rise_di.control_law, sign=sign) for sign in (Sign.SOFT, Sign.IMPLICIT))
-_bounded, _lqg = (partial(rise_observer.control_law, authority=one) for one in (rise_observer.AUTHORITY_FRACTION, 1.0))
+_l1, _l1_ff = (_fixed(l1.CONTROL_LAWS[feedforward]) for feedforward in (False, True))
+_model, _wind = "A, B, f", "A, B, f, wind, lags, noise"
 
 FULL_STATE: dict[str, tuple[str, Callable[..., ControlLaw], Callable[[Gains, NominalModel], Any], tuple[str, ...]]] = {
     "di": ("dynamic inversion", inversion.control_law, inversion.inversion_params, ("K",)),
     "di_pi": ("dynamic inversion + PI", inversion.control_law, inversion.inversion_params, ("K", "Lambda")),
-    "mrac": ("MRAC", adaptive.mrac, adaptive.mrac_params, ("K", "adaptation", "bias", "leak")),
+    "mrac": ("MRAC", mrac.control_law, mrac.mrac_params, ("K", "adaptation", "bias", "leak")),
     "lqi": ("LQI", lqi.control_law, lqi.lqi_params, ("integral", "effort", "fade")),
 }
 """Title, law, parameters and tuned gains of the laws of the full state; each also flies with vanes, relative to the air."""
 
 LAWS: dict[str, Law] = {
-    "rise": Law("RISE-DI, softened sign", "y", "", _soft, _rise, _rise_gains),
-    "rise_implicit": Law("RISE-DI, implicit sign", "y", "", _implicit, _rise, ("K", "Lambda", "beta", "omega")),
-    "rise_ff": Law("RISE-DI + feedforward", "y", _model, _soft, _rise, _rise_gains, feedforward=True),
-    "rise_observer": Law(
-        "RISE-DI + feedforward + observer", "y", f"{_model}, wind", _bounded, _observer, _rise_gains + _observer_gains, True
+    "rise": Law("RISE-DI, softened sign", "y", "Omega_ii", _soft, rise_di.params_of, _rise_gains),
+    "rise_implicit": Law(
+        "RISE-DI, implicit sign", "y", "Omega_ii", _implicit, rise_di.params_of, ("K", "Lambda", "beta", "omega")
     ),
-    "lqg": Law("LQG + feedforward", "y", f"{_model}, wind", _lqg, _observer, _observer_gains, feedforward=True),
-    "pi": Law("PI", "y", "", _soft, _rise, ("K", "Lambda")),
-    "pi_ff": Law("PI + feedforward", "y", _model, _soft, _rise, ("K", "Lambda"), feedforward=True),
-    "l1": Law("L1", "y", "Omega", partial(adaptive.l1, feedforward=False), adaptive.l1_params, ("K", "bandwidth")),
-    "l1_ff": Law("L1 + feedforward", "y", _model, _l1_ff, adaptive.l1_params, ("K", "bandwidth"), feedforward=True),
+    "rise_ff": Law("RISE-DI + feedforward", "y", _model, _soft, rise_di.params_of, _rise_gains, True),
+    "rise_observer": Law(
+        "RISE-DI + feedforward + observer",
+        "y",
+        _wind,
+        _fixed(with_observer(rise.CONTROL_LAWS[Sign.SOFT])),
+        _over(rise_di.params_of),
+        _rise_gains + _observer_gains,
+        True,
+    ),
+    "pi_observer": Law(
+        "PI + feedforward + observer",
+        "y",
+        _wind,
+        _fixed(with_observer(pi.CONTROL_LAW)),
+        _over(pi.params_of),
+        ("K", "Lambda", *_observer_gains),
+        True,
+    ),
+    "lqg": Law(
+        "LQG + feedforward",
+        "y",
+        _wind,
+        _fixed(with_observer(lqg.CONTROL_LAW)),
+        _over(lqg.params_of, 1.0),
+        _observer_gains,
+        True,
+    ),
+    "eso": Law(
+        "PI + extended-state observer",
+        "y",
+        "Omega, lags, noise",
+        _fixed(with_observer(pi.CONTROL_LAW)),
+        _extended_state,
+        ("K", "Lambda", "effort", "drift", "rate_drift", "decay"),
+    ),
+    "pi": Law("PI", "y", "Omega_ii", _fixed(pi.CONTROL_LAW), pi.params_of, ("K", "Lambda")),
+    "pi_ff": Law("PI + feedforward", "y", _model, _fixed(pi.CONTROL_LAW), pi.params_of, ("K", "Lambda"), True),
+    "l1": Law("L1", "y", "Omega", _l1, l1.params_of, ("K", "bandwidth")),
+    "l1_ff": Law("L1 + feedforward", "y", _model, _l1_ff, l1.params_of, ("K", "bandwidth"), True),
     "twisting": Law(
         "super-twisting", "y", "Omega", super_twisting.control_law, super_twisting.twisting_params, ("root", "beta")
     ),

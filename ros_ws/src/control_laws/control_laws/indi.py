@@ -4,23 +4,23 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, filter_gain, params_of_gains, saturate
+from control_laws.nominal_model import NominalModel, campaign_law, filter_gain, params_of_gains, saturate
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.guard import Limits
+from rise_di_controller.params import ControllerParameters
+from rise_di_controller.saturation import Limits
 
 
 class IndiParams(NamedTuple):
-    """Gains over m channels, (m, 1) or (m, N)."""
+    """Gains over m channels, (m,)."""
 
     K: Array  # 1/s
     bandwidth: Array  # of both filters, rad/s
     share: Array  # factor of Omega^-1 in an increment, 1 in the textbook
-    limits: Limits
 
 
 class IndiState(NamedTuple):
-    """State of the law from tick to tick, (m, N)."""
+    """State of the law between two ticks, (m,)."""
 
     y: Array
     y_dot: Array  # filtered difference of y
@@ -39,18 +39,27 @@ def control_law(model: NominalModel) -> ControlLaw:
     """
     inverse = model.inverse
 
-    def start(measured: Measurements, params: IndiParams) -> IndiState:
+    def engage(measured: Measurements, params: IndiParams) -> IndiState:
         return IndiState(measured.y, array_namespace(measured.y).zeros_like(measured.y), measured.position)
 
-    def step(state: IndiState, measured: Measurements, dt: Array, params: IndiParams) -> tuple[IndiState, Array]:
+    def limited(
+        state: IndiState, measured: Measurements, dt: Array, params: IndiParams, limits: Limits
+    ) -> tuple[IndiState, Array, Array]:
         a = filter_gain(params.bandwidth, dt)
         y_dot = state.y_dot + a * ((measured.y - state.y) / dt - state.y_dot)
         position = state.position + a * (measured.position - state.position)
         nu = measured.y_m_dot - params.K * (measured.y - measured.y_m) - y_dot
-        u, _ = saturate(position + params.share * (inverse @ nu), measured, dt, params.limits)
-        return IndiState(measured.y, y_dot, position), u
+        u_free = position + params.share * (inverse @ nu)
+        u, _ = saturate(u_free, measured, dt, limits)
+        return IndiState(measured.y, y_dot, position), u_free, u
 
-    return ControlLaw(start, step)
+    return campaign_law(IndiState, engage, limited)
 
 
 indi_params = params_of_gains(IndiParams)
+
+
+class IndiParameters(ControllerParameters):
+    """INDI, which only campaigns fly."""
+
+    needs = "the positions of the actuators"

@@ -4,18 +4,25 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import ErrorIntegral, NominalModel, conditional_integration, saturate, start_integral
+from control_laws.nominal_model import (
+    ErrorIntegral,
+    NominalModel,
+    campaign_law,
+    conditional_integration,
+    saturate,
+    start_integral,
+    state_of,
+)
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.guard import Limits
+from rise_di_controller.saturation import Limits
 
 
 class InversionParams(NamedTuple):
-    """Gains over m channels, (m, 1) or (m, N)."""
+    """Gains over m channels, (m,)."""
 
     K: Array  # 1/s
     Lambda: Array  # 1/s, 0 for inversion without an integral
-    limits: Limits
 
 
 def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
@@ -30,20 +37,23 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
     drift, gravity = model.C @ model.A, model.C @ model.gravity
     Omega, inverse = model.Omega, model.inverse
 
-    def step(state: ErrorIntegral, measured: Measurements, dt: Array, params: InversionParams) -> tuple[ErrorIntegral, Array]:
-        x = measured.x_air if vanes else measured.x
+    def limited(
+        state: ErrorIntegral, measured: Measurements, dt: Array, params: InversionParams, limits: Limits
+    ) -> tuple[ErrorIntegral, Array, Array]:
+        x = state_of(measured, vanes=vanes)
         e = measured.y - measured.y_m
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
         model_part = drift @ x + gravity @ array_namespace(e).sin(x)
         nu = measured.y_m_dot - model_part - params.K * (e + params.Lambda * integral_e)
-        u, beyond = saturate(inverse @ nu, measured, dt, params.limits)
+        u_free = measured.u_trim + inverse @ nu
+        u, beyond = saturate(u_free, measured, dt, limits)
         effect = -params.K * params.Lambda * increment
-        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, effect, Omega @ beyond)), u
+        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, effect, Omega @ beyond)), u_free, u
 
-    return ControlLaw(start_integral, step)
+    return campaign_law(ErrorIntegral, start_integral, limited)
 
 
 def inversion_params(gains: dict[str, FloatArray], model: NominalModel) -> InversionParams:
     """Parameters from gains K and, for DI with an integral, Lambda, shapes (m, N)."""
-    return InversionParams(gains["K"], gains.get("Lambda", 0.0 * gains["K"]), model.limits)
+    return InversionParams(gains["K"], gains.get("Lambda", 0.0 * gains["K"]))

@@ -6,11 +6,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from control_laws.nominal_model import ErrorIntegral, NominalModel, conditional_integration, saturate, start_integral
-from control_laws.riccati import gain_of, zero_order_hold
+from control_laws.nominal_model import (
+    ErrorIntegral,
+    NominalModel,
+    campaign_law,
+    conditional_integration,
+    saturate,
+    start_integral,
+    state_of,
+)
+from control_laws.riccati import gain_of
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.guard import Limits
+from rise_di_controller.linear_loop import zero_order_hold
+from rise_di_controller.params import ControllerParameters
+from rise_di_controller.saturation import Limits
 
 LEAK = 0.01
 """1/s, decay of the angles and of y_m in the design model: modes that inputs and cost do not reach have to be stable."""
@@ -20,7 +30,6 @@ class LqiParams(NamedTuple):
     """The gain over z = [x, y_m, y_m_dot, integral of e]."""
 
     gain: Array  # (m, n + 3 m, 1) or (m, n + 3 m, N)
-    limits: Limits
 
 
 def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
@@ -30,19 +39,28 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
     the increment has the sign of the excess.
     """
 
-    def step(state: ErrorIntegral, measured: Measurements, dt: Array, params: LqiParams) -> tuple[ErrorIntegral, Array]:
+    def limited(
+        state: ErrorIntegral, measured: Measurements, dt: Array, params: LqiParams, limits: Limits
+    ) -> tuple[ErrorIntegral, Array, Array]:
         xp = array_namespace(measured.y)
         e = measured.y - measured.y_m
         increment = dt * (e + state.e) / 2.0
         integral_e = state.integral_e + increment
         none = xp.zeros_like(e)
-        z = xp.concat([measured.x_air if vanes else measured.x, measured.y_m + none, measured.y_m_dot + none, integral_e])
-        u, beyond = saturate(-xp.sum(params.gain * z[None, :, :], axis=1), measured, dt, params.limits)
+        z = xp.concat([state_of(measured, vanes=vanes), measured.y_m + none, measured.y_m_dot + none, integral_e])
+        u_free = measured.u_trim - xp.sum(params.gain * z[None, :, :], axis=1)
+        u, beyond = saturate(u_free, measured, dt, limits)
         m = e.shape[0]
         own = xp.stack([params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)])
-        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, -own * increment, beyond)), u
+        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, -own * increment, beyond)), u_free, u
 
-    return ControlLaw(start_integral, step)
+    return campaign_law(ErrorIntegral, start_integral, limited)
+
+
+class LqiParameters(ControllerParameters):
+    """LQI, which only campaigns fly."""
+
+    needs = "the full state"
 
 
 def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -86,4 +104,4 @@ def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
         weights = np.concatenate([np.ones(len(size)), gains["integral"][:, k] ** 2]) / np.tile(size[:, 0] ** 2, 2)
         R = np.diag((gains["effort"][:, k] / model.input_scale / size[:, 0]) ** 2)
         solved.append(gain_of(F, G, E.T @ np.diag(weights) @ E, R))
-    return LqiParams(np.stack(solved, axis=-1), model.limits)
+    return LqiParams(np.stack(solved, axis=-1))

@@ -4,25 +4,24 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, conditional_integration, filter_gain, saturate
+from control_laws.nominal_model import NominalModel, campaign_law, conditional_integration, filter_gain, saturate
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.guard import Limits
+from rise_di_controller.saturation import Limits
 
 
 class MacKunisParams(NamedTuple):
-    """Gains over m channels, (m, 1) or (m, N)."""
+    """Gains over m channels, (m,)."""
 
     K: Array  # 1/s
     Lambda: Array  # 1/s
     beta: Array  # units of y / s^2
     eps: Array  # half-width of the softened sign, units of y / s
     bandwidth: Array  # of the filtered difference, rad/s; unused with a perfect y_dot
-    limits: Limits
 
 
 class MacKunisState(NamedTuple):
-    """State of the law from tick to tick, (m, N)."""
+    """State of the law between two ticks, (m,)."""
 
     e_0: Array
     e: Array
@@ -45,12 +44,14 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
     """
     Omega, inverse = model.Omega, model.inverse
 
-    def start(measured: Measurements, params: MacKunisParams) -> MacKunisState:
+    def engage(measured: Measurements, params: MacKunisParams) -> MacKunisState:
         e = measured.y - measured.y_m
         zero = array_namespace(e).zeros_like(e)
         return MacKunisState(e, e, zero, zero, zero)
 
-    def step(state: MacKunisState, measured: Measurements, dt: Array, params: MacKunisParams) -> tuple[MacKunisState, Array]:
+    def limited(
+        state: MacKunisState, measured: Measurements, dt: Array, params: MacKunisParams, limits: Limits
+    ) -> tuple[MacKunisState, Array, Array]:
         xp = array_namespace(measured.y)
         e = measured.y - measured.y_m
         e_dot = state.e_dot + filter_gain(params.bandwidth, dt) * ((e - state.e) / dt - state.e_dot)
@@ -60,12 +61,14 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         increment = dt * (e + state.e) / 2.0
         integral_e, Pi = state.integral_e + increment, state.Pi + Pi_step
         nu = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
-        u, beyond = saturate(inverse @ nu, measured, dt, params.limits)
+        u_free = measured.u_trim + inverse @ nu
+        u, beyond = saturate(u_free, measured, dt, limits)
         excess = Omega @ beyond
         integral_e = conditional_integration(state.integral_e, integral_e, -increment, excess)
-        return MacKunisState(state.e_0, e, e_dot, integral_e, conditional_integration(state.Pi, Pi, -Pi_step, excess)), u
+        Pi = conditional_integration(state.Pi, Pi, -Pi_step, excess)
+        return MacKunisState(state.e_0, e, e_dot, integral_e, Pi), u_free, u
 
-    return ControlLaw(start, step)
+    return campaign_law(MacKunisState, engage, limited)
 
 
 def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKunisParams:
@@ -75,4 +78,4 @@ def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKun
     """
     K, beta = gains["K"], gains["beta"]
     eps = beta / K * gains["softening"]
-    return MacKunisParams(K, gains["Lambda"], beta, eps, gains.get("filter", 0.0) + 0.0 * K, model.limits)
+    return MacKunisParams(K, gains["Lambda"], beta, eps, gains.get("filter", 0.0) + 0.0 * K)

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nominal model of a model-based law, and what all laws share: parameters, saturation of u, anti-windup of integrals.
+"""The nominal model of a model-based law, and what all laws share: saturation of u, anti-windup of integrals.
 
-Arrays hold N aircraft in their last axis. Channels are in the law's order, states in the airframe's.
+Channels are in the law's order, states in the airframe's.
 """
 
 from collections.abc import Callable
@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flight_core.vectors import Array, FloatArray, array_namespace
-from rise_di_controller import guard
-from rise_di_controller.control_law import Measurements
-from rise_di_controller.guard import Limits
+from rise_di_controller import saturation
+from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.saturation import Limits
 
 
 class NominalModel(NamedTuple):
@@ -53,12 +53,25 @@ class NominalModel(NamedTuple):
 
 
 def params_of_gains(kind: Callable[..., Any]) -> Callable[[dict[str, FloatArray], NominalModel], Any]:
-    """Parameters of a law whose fields are its gains, shapes (m, N) or (1, N), and the limits of the model."""
-    return lambda gains, model: kind(**gains, limits=model.limits)
+    """Parameters of a law whose fields are its gains, shapes (m, N) or (1, N)."""
+    return lambda gains, model: kind(**gains)
+
+
+def campaign_law(
+    state: type[Any],
+    engage: Callable[[Measurements, Any], Any],
+    limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
+) -> ControlLaw:
+    """A control law that only campaigns fly, since the topics lack what it needs. It cannot be retuned in flight."""
+
+    def retune(state: Any, old: Any, new: Any) -> Any:
+        raise NotImplementedError("a law that only campaigns fly has no retuning")
+
+    return ControlLaw(state, engage, without_limits(limited), limited, retune)
 
 
 class ErrorIntegral(NamedTuple):
-    """State of a law with an integral of the error from tick to tick, (m, N)."""
+    """State of a law with an integral of the error between two ticks, (m,)."""
 
     e: Array
     integral_e: Array
@@ -70,9 +83,17 @@ def start_integral(measured: Measurements, _: Any) -> ErrorIntegral:
     return ErrorIntegral(e, array_namespace(e).zeros_like(e))
 
 
+def state_of(measured: Measurements, *, vanes: bool = False) -> Array:
+    """The full state, shape (n, N), with `vanes` relative to the air. Raises ValueError where it is not measured."""
+    x = measured.x_air if vanes else measured.x
+    if x is None:
+        raise ValueError("measurements: found no state, expected the full state")
+    return x
+
+
 def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:
-    """Saturation: the commanded u inside its limits, and the excess of the requested u, both shape (m, N)."""
-    commanded = guard.saturate(u, measured.u_before, dt, limits)
+    """Saturation: the commanded u inside its limits, and the excess of the requested u, both shape (m,)."""
+    commanded = saturation.saturate(u, measured.u_before, dt, limits)
     return commanded, u - commanded
 
 

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from control_laws.nominal_model import NominalModel
-from control_laws.riccati import correction_of, diagonal, gain_of, transpose, zero_order_hold
+from control_laws.riccati import correction_of, diagonal, gain_of, transpose
 from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import zero_order_hold
 
 LEAK = 0.01  # 1/s, decay of angles and disturbances in the model: each of its modes is then observable or stable
 MIN_LAG = 1e-4  # s, lag of an ideal actuator in the model

@@ -1,28 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Linear-quadratic design for many models and sets of weights at once: zero-order hold, and the discrete Riccati equation.
+"""Linear-quadratic design for many models and sets of weights at once: the discrete Riccati equation.
 
 Leading axes of the arguments of a function are broadcast against each other.
 """
 
 import numpy as np
-from scipy.linalg import expm
 
 from flight_core.vectors import FloatArray
 
 MAX_DOUBLINGS = 40  # 2^40 steps of a finite horizon: enough for a mode that decays within 1e9 of them
-
-
-def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
-    """exp(A period) and integral_0^period exp(A s) ds B: u held over a period, for A (.., n, n) and B (.., n, m).
-
-    Source: C. Van Loan, IEEE TAC 23(3), 1978.
-    """
-    n, m = B.shape[-2:]
-    augmented = np.zeros((*np.broadcast_shapes(A.shape[:-2], B.shape[:-2]), n + m, n + m))
-    augmented[..., :n, :n], augmented[..., :n, n:] = A, B
-    exponential = expm(augmented * period)
-    return exponential[..., :n, :n], exponential[..., :n, n:]
 
 
 def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:

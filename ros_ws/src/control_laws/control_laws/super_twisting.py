@@ -4,18 +4,23 @@
 
 from typing import NamedTuple
 
-from control_laws.nominal_model import NominalModel, conditional_integration, params_of_gains, saturate
+from control_laws.nominal_model import NominalModel, campaign_law, conditional_integration, params_of_gains, saturate
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.guard import Limits
+from rise_di_controller.saturation import Limits
 
 
 class TwistingParams(NamedTuple):
-    """Gains over m channels, (m, 1) or (m, N)."""
+    """Gains over m channels, (m,)."""
 
     root: Array  # on sgn(e) sqrt(abs(e)), (units of y)^(1/2) / s
     beta: Array  # on the integral of sgn(e), units of y / s^2
-    limits: Limits
+
+
+class TwistingState(NamedTuple):
+    """State of the law between two ticks, (m,)."""
+
+    z: Array  # integral of the sign, units of y / s
 
 
 def control_law(model: NominalModel) -> ControlLaw:
@@ -30,19 +35,22 @@ def control_law(model: NominalModel) -> ControlLaw:
     """
     Omega, inverse = model.Omega, model.inverse
 
-    def start(measured: Measurements, params: TwistingParams) -> Array:
-        return array_namespace(measured.y).zeros_like(measured.y)
+    def engage(measured: Measurements, params: TwistingParams) -> TwistingState:
+        return TwistingState(array_namespace(measured.y).zeros_like(measured.y))
 
-    def step(state: Array, measured: Measurements, dt: Array, params: TwistingParams) -> tuple[Array, Array]:
+    def limited(
+        state: TwistingState, measured: Measurements, dt: Array, params: TwistingParams, limits: Limits
+    ) -> tuple[TwistingState, Array, Array]:
         xp = array_namespace(measured.y)
         e = measured.y - measured.y_m
         increment = -dt * params.beta * xp.sign(e)
-        z = state + increment
+        z = state.z + increment
         nu = measured.y_m_dot - params.root * xp.sign(e) * xp.sqrt(xp.abs(e)) + z
-        u, beyond = saturate(inverse @ nu, measured, dt, params.limits)
-        return conditional_integration(state, z, increment, Omega @ beyond), u
+        u_free = measured.u_trim + inverse @ nu
+        u, beyond = saturate(u_free, measured, dt, limits)
+        return TwistingState(conditional_integration(state.z, z, increment, Omega @ beyond)), u_free, u
 
-    return ControlLaw(start, step)
+    return campaign_law(TwistingState, engage, limited)
 
 
 twisting_params = params_of_gains(TwistingParams)

@@ -16,8 +16,6 @@ from pydantic import Field
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import sampled_matrices
-from control_laws import rise_di
-from control_laws.rise_di import RiseParams
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, check_together
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
@@ -25,6 +23,7 @@ from flight_campaign.statistics import Tally, score, score_units
 from flight_core.files import writing
 from flight_core.parameters import ParameterError, Parameters, require
 from flight_core.vectors import FloatArray
+from rise_di_controller.control_law import TunedLaw
 
 if TYPE_CHECKING:
     from flight_campaign.fleet import Vehicle
@@ -122,12 +121,12 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 
     definition = Definition.model_validate_json(text)
     case, chunk = job
-    scenario, course, vehicle, params = _prepare(text, case)
+    scenario, course, vehicle, law = _prepare(text, case)
     first, count, part = chunk * definition.chunk, definition.size(job), definition.uncertainty
     # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft are dropped.
     A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), part, part, definition.seed, first, definition.chunk)
     aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course)
-    result = fleet.fly(aircraft, vehicle, course, rise_di.CONTROL_LAWS[scenario.controller.law().sign], params)
+    result = fleet.fly(aircraft, vehicle, course, law.control_law, law.params)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs))}
@@ -137,12 +136,13 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 
 
 @lru_cache(maxsize=8)
-def _prepare(text: str, case: int) -> tuple[Scenario, Course, "Vehicle", RiseParams]:
+def _prepare(text: str, case: int) -> tuple[Scenario, Course, "Vehicle", TunedLaw]:
     """Data that all chunks of a case share."""
     from flight_campaign import fleet  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
-    return scenario, build_course(scenario), fleet.vehicle(scenario), rise_di.params(scenario.controller)
+    law = scenario.controller.tuned_law()
+    return scenario, build_course(scenario), fleet.vehicle(scenario), law._replace(params=fleet.shared(law.params))
 
 
 class Campaign:

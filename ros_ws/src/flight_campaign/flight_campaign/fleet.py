@@ -26,6 +26,7 @@ from flight_core.integrators import rk4
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.saturation import Limits
 
 jax.config.update("jax_enable_x64", True)  # float64 as everywhere else in the stack
 
@@ -62,6 +63,7 @@ class Vehicle(NamedTuple):
     remainder_states: Array  # (c,) indices of the states in the nonlinear remainder
     remainder: Aircraft  # reduced to the remainder: f_state of x[remainder_states] gives the rows `remainder_rows`
     actuators: Actuators  # (m, 1), airframe's order
+    limits: Limits  # (m, 1), law's order: of u, as the controller has them
     quantum: Array | None  # (m, 1), law's order
     dt: float  # s, of a step of the integration
 
@@ -77,9 +79,15 @@ def vehicle(scenario: Scenario) -> Vehicle:
         np.array([list(channels.inputs).index(name) for name in scenario.controller.inputs]),
         *_reduced(aircraft),
         Actuators(*(None if one is None else one[:, None] for one in plant.actuators)),
+        Limits(*(one[:, None] for one in scenario.controller.guard().limits)),
         None if quantum is None else quantum[:, None],
         seconds(plant.step_ns),
     )
+
+
+def shared(params: Any) -> Any:
+    """Parameters of a law for one aircraft, (m,), as those of a fleet, (m, 1); matrices stay, which all aircraft share."""
+    return jax.tree.map(lambda value: np.asarray(value)[:, None] if np.ndim(value) == 1 else np.asarray(value), params)
 
 
 class FleetResult(NamedTuple):
@@ -166,9 +174,9 @@ def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
 def fly(fleet: Fleet, vehicle: Vehicle, course: Course, control_law: ControlLaw, params: Any) -> FleetResult:
     """Fly N aircraft through the course under one law, from trim at rest.
 
-    At each tick: sensors, step of the law (or engagement, or hold, by the course's phase), actuators over the K steps to the
-    next tick, aircraft. The remainder s at the middle of a tick is extrapolated from this tick and the previous one.
-    Arguments: `params` of the law, (m, 1) or (m, N).
+    At each tick: sensors, step of the law (or engagement, or a missed sample, by the course's phase), actuators over the K
+    steps to the next tick, aircraft. The remainder s at the middle of a tick is extrapolated from this tick and the previous.
+    Arguments: `params` of the law, (m, 1) or (m, N); of one aircraft, (m,), where all fly the same, as `shared` makes them.
     """
     static = {"control_law": control_law, "blocks": fleet.blocks, "steps": course.steps, "y_late": course.late}
     arrays, segments = fleet._replace(blocks=()), jax.tree.map(jnp.asarray, course.segments)
@@ -213,19 +221,20 @@ def _fly(
         forced = _product(fleet.forced_rate[..., None], segment.forcing_now)
         moving = _product(fleet.rate, [*now.x, *now.position]) + fleet.wind * forced
         position = now.position[vehicle.inputs]
-        reference = (segment.sampled_y_m[:, None], segment.sampled_y_m_dot[:, None], segment.u_ff[:, None])
+        reference = (segment.sampled_y_m[:, None], segment.sampled_y_m_dot[:, None], segment.u_ff[:, None] + 0.0 * y)
         return Measurements(y, *reference, now.u, position, x, x - fleet.wind * segment.air[:, None], moving)
 
     # Each branch calls `measure`: the compiler then removes the measurements that its law does not use.
     def engage(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
-        started = control_law.start(measure(now, y, segment), params)
+        started = control_law.engage(measure(now, y, segment), params)
         return jax.tree.map(lambda one, like: jnp.broadcast_to(one, like.shape).astype(like.dtype), started, now.law), now.u
 
     def step(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
-        return control_law.step(now.law, measure(now, y, segment), segment.dt, params)
+        law, _, u = control_law.limited(now.law, measure(now, y, segment), segment.dt, params, vehicle.limits)
+        return law, u
 
     def hold(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
-        return now.law, now.u
+        return control_law.missed(now.law, measure(now, y, segment), params), now.u
 
     def tick(now: LoopState, segment: Segments) -> tuple[LoopState, None]:
         true = now.x[vehicle.outputs]
@@ -281,7 +290,9 @@ def _fly(
         jnp.ones(count, dtype=bool),
     )
     measured = measure(begin, none, first)
-    states = jax.eval_shape(lambda: control_law.step(control_law.start(measured, params), measured, first.dt, params)[0])
+    states = jax.eval_shape(
+        lambda: control_law.limited(control_law.engage(measured, params), measured, first.dt, params, vehicle.limits)[0]
+    )
     begin = begin._replace(law=jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), states))
     end, _ = jax.lax.scan(tick, begin, segments)
     ticks = len(segments.t)

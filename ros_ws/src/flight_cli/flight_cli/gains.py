@@ -12,12 +12,13 @@ from rich.console import Console
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from flight_analysis.design import gain_selection
-from flight_analysis.design.gain_conditions import MAX_DELAY_MARGIN, Condition, failing
+from flight_analysis.design.gain_conditions import Condition, failing
 from flight_analysis.design.gain_selection import GainAssessment, Study
 from flight_analysis.report.summary import finite_or_null
 from flight_bringup.scenarios import find_scenario
 from flight_cli.output import new_table, parse_numbers, write_text
 from flight_core.parameters import require
+from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
 
 CONDITION_FAILS = 1
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
@@ -114,7 +115,7 @@ def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) ->
     for i, (output, name) in enumerate(zip(outputs, first.controller.inputs, strict=True)):
         row = [f"{output} by {name}"]
         for answer in answers.values():
-            params = answer.controller.law()
+            params = answer.controller.law_params()
             row += [f"{params.K[i]:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i]:.4g}"]
         table.add_row(*row)
     console.print(table)

@@ -94,7 +94,7 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
         console.print(f"rejected: {sentence}", highlight=False, soft_wrap=True)
 
     answer = found.selection.engineering
-    controller, params = answer.controller, answer.controller.law()
+    controller, params = answer.controller, answer.controller.law_params()
     headings = ("channel", "bandwidth", "Lambda", "beta", "lag, s")
     table = new_table("\nGains: bandwidth and Lambda in 1/s, beta in units of y / s^2", headings, left=("channel",))
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
@@ -110,7 +110,8 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
             highlight=False,
             soft_wrap=True,
         )
-    console.print(f"coupling max abs(U - I) = {found.coupling:.2g}; {params.sign.name.lower()} sign{margin}", highlight=False)
+    sign = controller.sampled_sign()[0].name.lower()
+    console.print(f"coupling max abs(U - I) = {found.coupling:.2g}; {sign} sign{margin}", highlight=False)
     _show_flights(console, found)
 
 

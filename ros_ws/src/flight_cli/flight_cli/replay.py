@@ -21,7 +21,6 @@ from flight_core.files import parse_yaml, writing
 from flight_core.parameters import ParameterError, require
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
-from rise_di_controller.params import ControllerParameters
 
 DIFFERS = 1
 
@@ -47,7 +46,7 @@ def replay(
             raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
         parameters = recorded_parameters(recorded.scenario)
         others = vary(parameters, dict(map(_parse_setting, settings))) if settings else None
-        changes = parameter_changes(run, "controller", ControllerParameters.model_fields) if others is None else []
+        changes = parameter_changes(run, "controller", type(parameters).model_fields) if others is None else []
         result = recompute(recorded.tape, parameters, others, changes)
     require(bool(result.checked.any()), str(run), "no tick that could be checked", "a log with two successive ticks")
     if csv_file is not None:

@@ -75,6 +75,11 @@ class NodeParameters(Parameters):
 
     lockstep: bool = Field(default=False, description="run in lockstep with the other nodes, as fast as possible")
 
+    @classmethod
+    def tunable(cls) -> frozenset[str]:
+        """Names of the parameters that may change in flight; a group is named by its first part."""
+        return frozenset()
+
 
 class KeyedParameters(NodeParameters):
     """Base of the parameters of a node whose messages can carry a message authentication code."""

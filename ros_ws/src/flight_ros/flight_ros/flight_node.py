@@ -49,10 +49,10 @@ CLOCK_STEP_NS = NANOSECONDS // 20  # slewing moves a clock by less than 0.01 s i
 class FlightNode(Node, Generic[P]):
     """A node that runs at fixed ticks or in lockstep. A subclass defines its rate and the work of one tick or step."""
 
-    def __init__(self, name: str, schema: type[P], tunable: frozenset[str] = frozenset()) -> None:
+    def __init__(self, name: str, schema: type[P]) -> None:
         Node.__init__(self, name, automatically_declare_parameters_from_overrides=True)
-        self.parameters = read_parameters(self, schema, tunable)
-        if tunable:
+        self.parameters = read_parameters(self, schema)
+        if self.parameters.tunable():
             self.add_on_set_parameters_callback(self._change_parameters)
         self.peers = LivelinessMonitor(self, name) if self.parameters.lockstep else None
         # Two equal lockstep flights give equal bytes, so the process number is left out.

@@ -9,19 +9,20 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from flight_core.parameters import Parameters, flatten, nest
+from flight_core.parameters import NodeParameters, flatten, nest
 
-P = TypeVar("P", bound=Parameters)
+P = TypeVar("P", bound=NodeParameters)
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
 
-def read_parameters(node: Node, schema: type[P], tunable: frozenset[str]) -> P:
+def read_parameters(node: Node, schema: type[P]) -> P:
     """Validate the overrides of a node created with automatically_declare_parameters_from_overrides. Raises ParameterError.
 
-    Then every parameter of the set is declared with its description, read-only unless it is in `tunable`.
+    Then every parameter of the set is declared with its description, read-only unless it is tunable.
     """
     parameters = schema.validate_mapping(nest(_overrides(node)), node.get_name())
-    descriptions = {name: field.description or "" for name, field in schema.model_fields.items()}
+    tunable = parameters.tunable()
+    descriptions = {name: field.description or "" for name, field in type(parameters).model_fields.items()}
     for name, value in flatten(parameters.model_dump()):
         group = name.split(".")[0]
         # dynamic_typing: the set validates the types and accepts an integer as a float

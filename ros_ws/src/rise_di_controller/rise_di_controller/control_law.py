@@ -1,41 +1,99 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Protocol of a control law, for Monte Carlo campaigns: a function for engagement, a function for a step, and their inputs.
+"""Protocol of a control law: pure functions over a state. Controller, replay and campaigns fly every law through it.
 
-Each law of `control_laws` returns a `ControlLaw`. Every array holds N aircraft in its last axis, so that one call steps all of
-them. The functions are pure: they keep no state of their own, and work with NumPy and JAX arrays.
+A law with its validated parameters is a subclass of `params.ControllerParameters`, which the controller finds by its name under
+the entry point group `laws.GROUP`. See docs/laws.md.
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
-from flight_core.vectors import Array
+from flight_core.vectors import Array, array_namespace
+from rise_di_controller.saturation import Limits
 
 
 class Measurements(NamedTuple):
-    """Inputs of a law at a tick: SI units, deviations from trim.
+    """Inputs of a law at a tick: SI units, deviations from trim, channels in the law's order.
 
-    Channels are in the law's order, states in the airframe's order. RISE-DI uses y, y_m, u_ff and u_before only; the other
-    fields serve laws that need more sensors.
+    One aircraft has arrays of (m,). A campaign has N aircraft in the last axis, (m, N); what they share is (m, 1). The last
+    four fields are not on the topics. Campaigns alone have them, for laws that need more sensors.
     """
 
-    y: Array  # (m, N) measured outputs
-    y_m: Array  # (m, 1) reference
-    y_m_dot: Array  # (m, 1) derivative of y_m
-    u_ff: Array  # (m, 1) feedforward along the reference, 0 where it is off
-    u_before: Array  # (m, N) the last command, after saturation
-    position: Array  # (m, N) positions of the actuators
-    x: Array  # (n, N) state: measured values of the outputs, true values of the other states
-    x_air: Array  # (n, N) x with alpha and beta relative to the air
-    y_dot: Array  # (m, N) true derivative of C x, free of noise and delay
+    y: Array  # measured outputs
+    y_m: Array  # reference at the stamp of y
+    y_m_dot: Array  # slope of y_m since the previous tick
+    u_trim: Array  # the input that the law adds to: u at engagement, and the feedforward
+    u_before: Array  # the last command, after saturation
+    position: Array | None = None  # of the actuators
+    x: Array | None = None  # (n, N) state: measured values of the outputs, true values of the other states
+    x_air: Array | None = None  # (n, N) x with alpha and beta relative to the air
+    y_dot: Array | None = None  # true derivative of C x, free of noise and delay
+
+
+def _no_prediction(state: Any, measured: Measurements, params: Any) -> Any:
+    return state
 
 
 class ControlLaw(NamedTuple):
-    """A control law as two pure functions.
+    """A control law as pure functions of its state and of its parameters, with NumPy and JAX arrays.
 
-    `start` makes the state of the law at engagement. `step` takes one tick of dt seconds and returns the new state and u after
-    saturation, shape (m, N). The parameters are arrays of (m, 1), or of (m, N) where each aircraft has its own.
+    The state is a NamedTuple of arrays, (m,) or (m, N). The log holds each of its fields by name, so that replay can continue
+    from any tick. The parameters are any NamedTuple of arrays.
+
+    `engage` makes the state at engagement: u has to be u_trim then. `step` is one tick of dt seconds without limits.
+    `limited` is the same tick inside limits, with the law's anti-windup: where no limit acts, it gives the same bits as `step`.
+    `retune` makes the state for new parameters, without a jump of u. `missed` predicts the state over one period without a
+    sample, u held.
     """
 
-    start: Callable[[Measurements, Any], Any]  # (measurements, params) -> state
-    step: Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]  # (state, measurements, dt, params) -> (state, u)
+    state: type[Any]
+    engage: Callable[[Measurements, Any], Any]  # (measured, params) -> state
+    step: Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]  # (state, measured, dt, params) -> (state, u)
+    limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]]
+    """(state, measured, dt, params, limits) -> (state, u before saturation, u)"""
+    retune: Callable[[Any, Any, Any], Any]  # (state, old params, new params) -> state
+    missed: Callable[[Any, Measurements, Any], Any] = _no_prediction  # (state, measured, params) -> state
+    inner: "ControlLaw | None" = None  # the law that this one extends; its state is the field `law`
+
+
+class TunedLaw(NamedTuple):
+    """A control law with its parameters."""
+
+    control_law: ControlLaw
+    params: Any
+
+
+def without_limits(
+    limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
+) -> Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]:
+    """The function `step` of a law from its function `limited`, with infinite limits."""
+
+    def step(state: Any, measured: Measurements, dt: Array, params: Any) -> tuple[Any, Array]:
+        infinite = array_namespace(measured.y).inf + 0.0 * measured.y
+        after, u, _ = limited(state, measured, dt, params, Limits(-infinite, infinite, infinite))
+        return after, u
+
+    return step
+
+
+def fields(state: Any) -> dict[str, Array]:
+    """The arrays of a law's state by name; those of an extended law first."""
+    values: dict[str, Array] = {}
+    for name, value in state._asdict().items():
+        values |= fields(value) if hasattr(value, "_asdict") else {name: value}
+    return values
+
+
+def restored(law: ControlLaw, values: Any) -> Any:
+    """The state of a law from its arrays by name, the inverse of `fields`."""
+    of_inner = {} if law.inner is None else {"law": restored(law.inner, values)}
+    return law.state(**of_inner, **{name: values[name] for name in law.state._fields if name not in of_inner})
+
+
+@lru_cache(maxsize=64)
+def field_names(law: ControlLaw) -> tuple[str, ...]:
+    """Names of the arrays of a law's state, in the order of `fields`."""
+    of_inner = () if law.inner is None else field_names(law.inner)
+    return (*of_inner, *(name for name in law.state._fields if law.inner is None or name != "law"))

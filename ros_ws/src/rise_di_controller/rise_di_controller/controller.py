@@ -7,11 +7,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
 from rise_di_controller import guard, internals
 from rise_di_controller.guard import Mode
-from rise_di_controller.law import Sign, retune
 from rise_di_controller.params import ControllerParameters
 
 
@@ -32,9 +32,9 @@ class Controller:
     """`guard.tick` with its state and the last samples of y and y_m."""
 
     def __init__(self, parameters: ControllerParameters) -> None:
-        self._law, self._guard = parameters.law(), parameters.guard()
+        self._law, self._guard = parameters.tuned_law(), parameters.guard()
         self._state = guard.initial_state(len(parameters.inputs))
-        self.names = internals.names(parameters.outputs, parameters.inputs)
+        self.names = internals.names(parameters.logged_groups())
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
         self._digest = parameters.digest()
@@ -46,22 +46,26 @@ class Controller:
         """Mode of the guard."""
         return self._state.mode
 
-    @property
-    def sign(self) -> Sign:
-        """How the sign of e is sampled."""
-        return self._law.sign
-
     def restart(self) -> None:
         """Reset the state and keep u (bumpless transfer)."""
         self._state = guard.initial_state(len(self._state.u))._replace(u=self._state.u)
 
     def retune(self, parameters: ControllerParameters) -> None:
-        """Replace all parameters between two ticks without a jump of u (bumpless transfer). Equal parameters change nothing."""
-        law, digest = parameters.law(), parameters.digest()
+        """Replace all parameters between two ticks without a jump of u (bumpless transfer). Equal parameters change nothing.
+
+        Raises ParameterError for parameters with another state: of another law, or with an observer that was not there.
+        """
+        law, digest = parameters.tuned_law(), parameters.digest()
         if digest == self._digest:
             return
-        if self._state.law is not None:
-            self._state = self._state._replace(law=retune(self._state.law, self._law, law))
+        found = internals.names(parameters.logged_groups())
+        require(
+            found == self.names,
+            "controller.law",
+            parameters.law,
+            "the law and the observer that fly: these change at a restart",
+        )
+        self._state = guard.retune(self._state, self._law, law)
         self._law, self._guard, self._digest = law, parameters.guard(), digest
 
     def take_y(self, sample: StampedVector, now_ns: int) -> None:

@@ -1,27 +1,27 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guard of the control law: saturation, anti-windup, engagement and failsafe. Pure, like the law.
+"""Guard of the control law: saturation, engagement, retuning and failsafe. Pure, like the law; it guards every control law.
 
-- Saturation: magnitude and rate limits of u (`saturate`).
-- Anti-windup: conditional integration of both integrals (`step_with_anti_windup`).
+- Saturation: magnitude and rate limits of u (`saturation.saturate`). The law has its own anti-windup (`ControlLaw.limited`).
 - Watchdog: an input older than `max_age` is stale (`tick`).
 - Failsafe for stale inputs: hold u, then ramp it to trim (modes HOLD, RAMP, TRIM).
-- Bumpless transfer: engagement and re-engagement start from the present u, with both integrals at 0.
+- Bumpless transfer: engagement and re-engagement start from the present u, with the law's state as at the first one.
 """
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from flight_core.failsafe import failsafe_scale
 from flight_core.rates import seconds
-from flight_core.vectors import Array, FloatArray, StampedVector, array_namespace
-from rise_di_controller import feedforward
-from rise_di_controller import law as rise
+from flight_core.vectors import FloatArray, StampedVector
+from rise_di_controller import feedforward, observer
+from rise_di_controller.control_law import Measurements, TunedLaw
 from rise_di_controller.feedforward import FeedforwardState, Nominal
-from rise_di_controller.law import LawParams, LawState
+from rise_di_controller.observer import ObserverParams, ObserverState
+from rise_di_controller.saturation import Limits, saturate
 
 
 class Mode(IntEnum):
@@ -33,14 +33,6 @@ class Mode(IntEnum):
     RAMP = 3  # failsafe: stale for longer than the hold time, u ramps to trim
     TRIM = 4  # failsafe: u is at trim
     INACTIVE = 5  # deactivated: u is held or ramps to trim
-
-
-class Limits(NamedTuple):
-    """Saturation limits, as deviations from trim in units of u; infinite where there is no limit."""
-
-    lower: Array  # (m,)
-    upper: Array  # (m,)
-    rate: Array  # (m,) per s
 
 
 # Least distance of two samples from which a slope is taken, as a fraction of the extrapolation. Closer samples are noisier:
@@ -73,7 +65,7 @@ class ControllerState(NamedTuple):
     """State of the controller between two ticks."""
 
     mode: Mode
-    law: LawState | None  # None until engaged
+    law: Any  # state of the control law; None until engaged
     y: StampedVector | None  # of the last step
     y_m: FloatArray | None  # the reference at the stamp of y
     u: FloatArray  # commanded, after saturation
@@ -129,64 +121,20 @@ def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> Flo
     return before.value + fraction * (after.value - before.value)
 
 
-def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
-    """Saturation of u, shape (m,): clipped to [lower, upper] and to u_before +- rate dt. Inside, u returns to the last bit."""
-    xp = array_namespace(u)
-    reach = limits.rate * dt
-    low = xp.minimum(xp.maximum(limits.lower, u_before - reach), limits.upper)
-    high = xp.maximum(xp.minimum(limits.upper, u_before + reach), limits.lower)
-    return xp.minimum(xp.maximum(u, low), high)
-
-
-def step_with_anti_windup(
-    state: LawState, y: Array, y_m: Array, dt: Array, u_trim: Array, u_before: Array, law: LawParams, limits: Limits
-) -> tuple[LawState, Array, Array]:
-    """One step of the law with anti-windup: (law state, u before saturation, u commanded), u of shape (m,).
-
-    Conditional integration. Where u_trim + u exceeds a magnitude or rate limit, an increment of integral_e or of Pi that
-    moves u further outwards is reduced; an increment that moves u inwards stays. The increment of integral_e is dropped.
-    The increment of Pi, the faster integral, is scaled so that u ends at the limit:
-
-        excess = max(abs(u_trim + u - saturated) - abs(change of u by the increment of integral_e), 0)
-        change = abs(change of u by the increment of Pi)
-        Pi+    = Pi + max(change - excess, 0) / change times its increment
-
-    Without saturation every bit is that of the law alone. Theorem 1 does not cover saturation.
-    """
-    xp = array_namespace(y)
-    after, u = rise.step(state, y, y_m, dt, law)
-    total = u_trim + u
-    beyond = total - saturate(total, u_before, dt, limits)
-    increment, increment_Pi = after.integral_e - state.integral_e, after.Pi - state.Pi
-    change = -law.input_scale * law.D * law.K * law.Lambda * increment
-    change_Pi = -law.input_scale * law.D * increment_Pi
-    outward, outward_Pi = change * beyond > 0, change_Pi * beyond > 0
-    zero = xp.zeros_like(total)
-    excess = xp.maximum(xp.abs(beyond) - xp.where(outward, xp.abs(change), zero), zero)
-    size_Pi = xp.where(outward_Pi, xp.abs(change_Pi), zero)
-    kept = xp.maximum(size_Pi - excess, zero) / xp.where(size_Pi > 0, size_Pi, zero + 1.0)
-    after = after._replace(
-        integral_e=xp.where(outward, state.integral_e, after.integral_e),
-        Pi=xp.where(outward_Pi, state.Pi + kept * increment_Pi, after.Pi),
-    )
-    u_free = u_trim + rise.control(state, after, law)
-    return after, u_free, saturate(u_free, u_before, dt, limits)
-
-
 def tick(
     state: ControllerState,
     now_ns: int,
     y: StampedVector | None,
     y_m: Sequence[StampedVector],
     guard: GuardParams,
-    law: LawParams,
+    law: TunedLaw,
     active: bool = True,
 ) -> tuple[ControllerState, TickInputs | None]:
     """One tick of the controller: (state, now, y, y_m) -> (state, inputs of the tick), u in state.u.
 
-    Fresh inputs engage or re-engage the law with e_0 = e, both integrals 0 and u_trim = u (bumpless transfer). Each new y is
-    one step of the law with the measured dt, clipped to DT_RANGE periods. The law adds to u_trim, or to u_trim + u_ff with a
-    feedforward. Without a new y nothing changes.
+    Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). Each new y is one step of the law with the
+    measured dt, clipped to DT_RANGE periods. A law that predicts does so for each whole period without a y before that. The law
+    adds to u_trim, or to u_trim + u_ff with a feedforward. Without a new y nothing changes.
     Stale inputs start the failsafe: HOLD (nothing is integrated), then RAMP to trim, then TRIM. Where `active` is false the
     mode is INACTIVE, and u is held or ramps to trim. Returns None for the inputs where nothing is to be published.
 
@@ -198,15 +146,17 @@ def tick(
     if not active or y is None or reference is None:
         return _failsafe(state, now_ns, guard, active)
     offset = seconds(y_m[-1].stamp_ns - y.stamp_ns)
-    if state.law is None or state.y is None or state.mode is not Mode.ENGAGED:
+    control_law, params = law
+    if state.law is None or state.y is None or state.y_m is None or state.mode is not Mode.ENGAGED:
+        zero = np.zeros_like(state.u)
         engaged = state._replace(
             mode=Mode.ENGAGED,
-            law=rise.engage(y.value, reference),
+            law=control_law.engage(Measurements(y.value, reference, np.zeros_like(reference), state.u, state.u), params),
             y=y,
             y_m=reference,
             u_trim=state.u,
             u_free=state.u,
-            u_ff=np.zeros_like(state.u),
+            u_ff=zero,
             feedforward=None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal),
         )
         return engaged, TickInputs(y.stamp_ns, y.value, reference, offset, 0.0)
@@ -214,17 +164,41 @@ def tick(
         return state, None
     nominal = seconds(guard.period_ns)
     dt = min(max(seconds(y.stamp_ns - state.y.stamp_ns), DT_RANGE[0] * nominal), DT_RANGE[1] * nominal)
-    u_trim, u_ff, ff_state = state.u_trim, state.u_ff, state.feedforward
+    law_state, u_trim, u_ff, ff_state = state.law, state.u_trim, state.u_ff, state.feedforward
+    if (missed := round(dt / nominal) - 1) > 0:
+        held = Measurements(state.y.value, state.y_m, np.zeros_like(reference), u_trim + u_ff, state.u)
+        for _ in range(missed):
+            law_state = control_law.missed(law_state, held, params)
     if guard.nominal is not None and ff_state is not None:
         ff_state, u_ff = feedforward.step(ff_state, reference, dt, guard.nominal)
         u_trim = u_trim + u_ff
-    law_state, u = rise.step(state.law, y.value, reference, dt, law)
-    u_free = u_trim + u
+    measured = Measurements(y.value, reference, (reference - state.y_m) / dt, u_trim, state.u)
+    after, u_free = control_law.step(law_state, measured, dt, params)
     u = saturate(u_free, state.u, dt, guard.limits)
     if not np.array_equal(u, u_free):  # otherwise it gives the same and takes three times as long
-        law_state, u_free, u = step_with_anti_windup(state.law, y.value, reference, dt, u_trim, state.u, law, guard.limits)
-    state = state._replace(law=law_state, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state)
+        after, u_free, u = control_law.limited(law_state, measured, dt, params, guard.limits)
+    state = state._replace(law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state)
     return state, TickInputs(y.stamp_ns, y.value, reference, offset, dt)
+
+
+def retune(state: ControllerState, old: TunedLaw, new: TunedLaw) -> ControllerState:
+    """State for new parameters of the law, without a jump of u (bumpless transfer).
+
+    An observer with the same matrices continues. One with other matrices starts again from the present error: its u_o becomes
+    part of u_trim, and then fades in from 0.
+    """
+    if state.law is None or state.y is None or state.y_m is None:
+        return state
+    law = new.control_law.retune(state.law, old.params, new.params)
+    if isinstance(law, ObserverState) and not _same_model(old.params, new.params):
+        z = observer.initial_estimates(state.y.value - state.y_m, new.params)
+        state = state._replace(u_trim=state.u_trim + law.u_o)
+        law = law._replace(z=z, u_o=np.zeros_like(law.u_o), sigma=np.zeros_like(law.sigma))
+    return state._replace(law=law)
+
+
+def _same_model(old: ObserverParams, new: ObserverParams) -> bool:
+    return all(np.array_equal(getattr(old, name), getattr(new, name)) for name in ("Phi", "Gamma", "H", "L", "F"))
 
 
 def _failsafe(

@@ -2,17 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller's log: one named vector a tick. With the parameters it is enough to recompute u."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
 
 import numpy as np
 
 from flight_core.vectors import FloatArray
-from rise_di_controller.guard import ControllerState, Limits, TickInputs
+from rise_di_controller.control_law import ControlLaw, field_names, fields
+from rise_di_controller.guard import ControllerState, TickInputs
+from rise_di_controller.saturation import Limits
 
 SCALARS = ("mode", "dt", "y_m_offset", "late", "age", "number", "parameters")
-OUTPUT_GROUPS = ("y", "y_m", "e", "e_0", "integral_e", "Pi")
+OUTPUT_GROUPS = ("y", "y_m", "e")
 INPUT_GROUPS = ("u_free", "u", "u_trim", "limited", "u_ff")
+OBSERVER_GROUPS = ("z", "u_o", "sigma")
 
 
 class Saturation(IntEnum):
@@ -23,17 +26,28 @@ class Saturation(IntEnum):
     RATE = 2
 
 
-def names(outputs: Sequence[str], inputs: Sequence[str]) -> tuple[str, ...]:
-    """Channel names of `internals`: the scalars, then "group.output" and "group.input".
+def groups(
+    law: ControlLaw, outputs: Sequence[str], inputs: Sequence[str], estimates: Sequence[str]
+) -> dict[str, tuple[str, ...]]:
+    """Groups of channels of `internals` and the names in each, in the order of the log.
+
+    By output: y, y_m, e = y - y_m, then the state of the law, for RISE-DI e_0 (e at engagement), integral_e (units of y times
+    s) and Pi (scaled input). By input: u before (u_free) and after saturation (u), u_trim, limited (Saturation), u_ff
+    (feedforward). Of an observer: its estimates z, by input u_o, and sigma, the fade-in.
+    """
+    of_law = [name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS)]
+    grouped = {group: tuple(outputs) for group in (*OUTPUT_GROUPS, *of_law)}
+    grouped |= {group: tuple(inputs) for group in INPUT_GROUPS}
+    return grouped if law.inner is None else grouped | {"z": tuple(estimates), "u_o": tuple(inputs), "sigma": ("observer",)}
+
+
+def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """Channel names of `internals`: the scalars, then "group.name".
 
     Scalars: mode (guard.Mode), dt (s), y_m_offset (s), late (s, delay of the tick after its deadline), age (s, of y at the
     tick), number (counts the samples from 1 since the start: a gap is a lost sample), parameters (ControllerParameters.digest).
-    By output: y, y_m, e = y - y_m, e_0 (e at engagement), integral_e (units of y times s), Pi (scaled input).
-    By input: u before (u_free) and after saturation (u), u_trim, limited (Saturation), u_ff (feedforward).
     """
-    by_output = (f"{group}.{name}" for group in OUTPUT_GROUPS for name in outputs)
-    by_input = (f"{group}.{name}" for group in INPUT_GROUPS for name in inputs)
-    return (*SCALARS, *by_output, *by_input)
+    return (*SCALARS, *(f"{group}.{name}" for group, members in grouped.items() for name in members))
 
 
 def values(
@@ -45,5 +59,8 @@ def values(
     scalars = np.array([float(state.mode), inputs.dt, inputs.y_m_offset, late, age, float(number), float(parameters)])
     inside = (state.u_free >= limits.lower) & (state.u_free <= limits.upper)
     limited = np.where(state.u == state.u_free, Saturation.NO, np.where(inside, Saturation.RATE, Saturation.MAGNITUDE))
-    by_output = (inputs.y, inputs.y_m, state.law.e, state.law.e_0, state.law.integral_e, state.law.Pi)
-    return np.concatenate([scalars, *by_output, state.u_free, state.u, state.u_trim, limited, state.u_ff])
+    of_law = fields(state.law)
+    of_law.pop("e", None)
+    of_observer = [of_law.pop(group) for group in OBSERVER_GROUPS if group in of_law]
+    by_output = (inputs.y, inputs.y_m, inputs.y - inputs.y_m, *of_law.values())
+    return np.concatenate([scalars, *by_output, state.u_free, state.u, state.u_trim, limited, state.u_ff, *of_observer])

@@ -1,11 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control law, equations (20)-(22), as one pure step: from y and y_m only, without A, B, f or any acceleration."""
+"""The control law, equations (20)-(22), as one pure step: from y and y_m only, without A, B, f or any acceleration.
+
+`CONTROL_LAWS` has it in the protocol of `control_law`, with its anti-windup and retuning.
+"""
 
 from enum import IntEnum
 from typing import NamedTuple
 
 from flight_core.vectors import Array, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw
+from rise_di_controller.saturation import Limits, saturate
 
 
 class Sign(IntEnum):
@@ -30,7 +35,7 @@ class LawParams(NamedTuple):
     input_scale: Array  # (m,) u per scaled input: units of u s / units of y
     omega: Array  # (m,) abs(Omega_ii) in scaled inputs, or an over-estimate; for Sign.IMPLICIT only
     eps: Array  # (m,) half-width of the softened sign, units of y, > 0; for Sign.SOFT only
-    sign: Sign
+    sign: Sign | None  # None in the parameters of many aircraft: the control law has the sign then
 
 
 class LawState(NamedTuple):
@@ -109,6 +114,41 @@ def control(before: LawState, after: LawState, params: LawParams) -> Array:
     return params.input_scale * (-params.D * (params.K * (after.e - after.e_0 + params.Lambda * after.integral_e) + Pi))
 
 
+def step_with_anti_windup(
+    state: LawState, y: Array, y_m: Array, dt: Array, u_trim: Array, u_before: Array, params: LawParams, limits: Limits
+) -> tuple[LawState, Array, Array]:
+    """One step of the law with anti-windup: (law state, u before saturation, u commanded), u of shape (m,).
+
+    Conditional integration. Where u_trim + u exceeds a magnitude or rate limit, an increment of integral_e or of Pi that
+    moves u further outwards is reduced; an increment that moves u inwards stays. The increment of integral_e is dropped.
+    The increment of Pi, the faster integral, is scaled so that u ends at the limit:
+
+        excess = max(abs(u_trim + u - saturated) - abs(change of u by the increment of integral_e), 0)
+        change = abs(change of u by the increment of Pi)
+        Pi+    = Pi + max(change - excess, 0) / change times its increment
+
+    Without saturation every bit is that of the law alone. Theorem 1 does not cover saturation.
+    """
+    xp = array_namespace(y)
+    after, u = step(state, y, y_m, dt, params)
+    total = u_trim + u
+    beyond = total - saturate(total, u_before, dt, limits)
+    increment, increment_Pi = after.integral_e - state.integral_e, after.Pi - state.Pi
+    change = -params.input_scale * params.D * params.K * params.Lambda * increment
+    change_Pi = -params.input_scale * params.D * increment_Pi
+    outward, outward_Pi = change * beyond > 0, change_Pi * beyond > 0
+    zero = xp.zeros_like(total)
+    excess = xp.maximum(xp.abs(beyond) - xp.where(outward, xp.abs(change), zero), zero)
+    size_Pi = xp.where(outward_Pi, xp.abs(change_Pi), zero)
+    kept = xp.maximum(size_Pi - excess, zero) / xp.where(size_Pi > 0, size_Pi, zero + 1.0)
+    after = after._replace(
+        integral_e=xp.where(outward, state.integral_e, after.integral_e),
+        Pi=xp.where(outward_Pi, state.Pi + kept * increment_Pi, after.Pi),
+    )
+    u_free = u_trim + control(state, after, params)
+    return after, u_free, saturate(u_free, u_before, dt, limits)
+
+
 def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
     """State for new parameters, without a jump of u (bumpless transfer): Pi absorbs the change of the linear term.
 
@@ -118,3 +158,32 @@ def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
     u = control(state, state, old)
     Pi = -new.D * u / new.input_scale - new.K * (state.e - state.e_0 + new.Lambda * state.integral_e)
     return state._replace(Pi=Pi)
+
+
+def _control_law(sign: Sign) -> ControlLaw:
+    def with_sign(params: LawParams) -> LawParams:
+        return params if params.sign is sign else params._replace(sign=sign)
+
+    def start(measured: Measurements, params: LawParams) -> LawState:
+        return engage(measured.y, measured.y_m)
+
+    def tick(state: LawState, measured: Measurements, dt: Array, params: LawParams) -> tuple[LawState, Array]:
+        after, u = step(state, measured.y, measured.y_m, dt, with_sign(params))
+        return after, measured.u_trim + u
+
+    def limited(
+        state: LawState, measured: Measurements, dt: Array, params: LawParams, limits: Limits
+    ) -> tuple[LawState, Array, Array]:
+        y, y_m, u_trim, u_before = measured.y, measured.y_m, measured.u_trim, measured.u_before
+        return step_with_anti_windup(state, y, y_m, dt, u_trim, u_before, with_sign(params), limits)
+
+    return ControlLaw(LawState, start, tick, limited, retune)
+
+
+CONTROL_LAWS = {sign: _control_law(sign) for sign in Sign}
+"""RISE-DI as a control law, by the sampling of its sign."""
+
+
+def tuned(params: LawParams) -> TunedLaw:
+    """RISE-DI with its parameters."""
+    return TunedLaw(CONTROL_LAWS[Sign.SOFT if params.sign is None else params.sign], params)

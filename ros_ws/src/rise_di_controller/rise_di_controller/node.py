@@ -23,11 +23,6 @@ from rise_di_controller.controller import Controller
 from rise_di_controller.guard import Mode
 from rise_di_controller.params import ControllerParameters
 
-# Parameters that may change in flight: gains and guard. Those that decide the sign or meaning of a channel may not.
-TUNABLE = frozenset({"k_g", "k_d", "Lambda", "beta", "omega", "sign", "lag", "delay", "softening"}) | frozenset(
-    {"max_age", "hold", "ramp", "lower", "upper", "slew"}
-)
-
 
 class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
     """At each tick it takes the received y and y_m, steps the law and publishes u with the stamp of y.
@@ -37,7 +32,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
     """
 
     def __init__(self) -> None:
-        FlightNode.__init__(self, "controller", ControllerParameters, TUNABLE)
+        FlightNode.__init__(self, "controller", ControllerParameters)
         LifecycleNodeMixin.__init__(self)
         self._active = False
         self._controller = Controller(self.parameters)
@@ -64,7 +59,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Reset the law. The parameters were validated when they were set."""
         self._controller.restart()  # keeps u, so that a node that is configured again transfers without a bump
-        self.get_logger().info(self.parameters.sampled_sign()[1])
+        self.get_logger().info(self.parameters.summary())
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -201,4 +196,4 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         ages = {}
         if not self.parameters.lockstep:
             ages = {f"age of {name} (s)": f"{age:.4f}" for name, age in self._controller.ages(self.now_ns()).items()}
-        return level, mode.name, {"mode": mode.name, "sign": self._controller.sign.name, **ages}
+        return level, mode.name, {"mode": mode.name, "law": self.parameters.summary(), **ages}

@@ -1,14 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the controller: validation, and conversion to the arrays of law, guard and feedforward."""
+"""Parameters of the controller under any control law: validation, and conversion to the arrays of guard, feedforward, observer.
+
+The parameters of a law are a subclass; `ControllerParameters.validate_mapping` finds it by the name of the law.
+"""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from hashlib import blake2b
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from flight_core.parameters import (
     KeyedParameters,
@@ -20,16 +23,22 @@ from flight_core.parameters import (
     Positive,
     Positives,
     Signs,
-    as_tuple,
     flatten,
     require,
     require_length,
 )
 from flight_core.rates import divide, nanoseconds, period_ns
+from flight_core.vectors import FloatArray
+from rise_di_controller import internals
+from rise_di_controller.control_law import ControlLaw, TunedLaw
 from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART, Nominal, zero_dynamics
-from rise_di_controller.guard import DT_RANGE, GuardParams, Limits
-from rise_di_controller.law import LawParams, Sign, gain, total_lag
+from rise_di_controller.guard import DT_RANGE, GuardParams
+from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law, spectral_radius
+from rise_di_controller.observer import ObserverParams, with_observer
+from rise_di_controller.saturation import Limits
+
+MARGIN_PARTS = (0.0, 0.5, 1.0)  # of the delay margin, where the nominal loop with an observer has to be stable
 
 MAX_STABLE_STEP = 2.5
 """Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78; dt is the longest that the law takes."""
@@ -65,30 +74,55 @@ class FeedforwardParameters(Parameters):
         return Nominal(A, B, C, gravity, np.linalg.inv(C @ B), np.array(self.lead))
 
 
+class ObserverParameters(Parameters):
+    """An observer of the nominal model, an extension of the paper, with its matrices as designed; SI, row by row."""
+
+    states: Names = Field(description="names of the estimates: those of the feedforward's states first, as x.alpha")
+    Phi: Numbers = Field(description="estimates one period later without input, a row an estimate")
+    Gamma: Numbers = Field(description="effect of u, held over the period, a row an estimate, the columns as controller.inputs")
+    L: Numbers = Field(description="correction by the errors of the outputs, a row an estimate")
+    F: Numbers = Field(description="u_o = -F z, a row an input, a column an estimate")
+    part: Annotated[float, Field(gt=0, le=1)] = Field(default=0.6, description="bound of u_o as a part of the limits of u")
+    within: Positive = Field(default=0.1, description="least time in which u_o goes from 0 to its bound, s")
+    fade: Annotated[float, Field(ge=0, le=1e6)] = Field(
+        default=1.0, description="time in which u_o fades in after engagement, s"
+    )
+    margin: Annotated[float, Field(ge=0, le=0.5)] = Field(
+        default=0.03, description="the least delay margin of the nominal linear loop with which the controller loads, s"
+    )
+
+    def matrices(self, nominal: Nominal) -> tuple[FloatArray, ...]:
+        """Phi, Gamma, H, L and F. Raises ParameterError for sizes that do not match."""
+        s, (n, m) = len(self.states), nominal.B.shape
+        for key, rows, columns in (("Phi", s, s), ("Gamma", s, m), ("L", s, m), ("F", m, s)):
+            found = len(getattr(self, key))
+            require(
+                found == rows * columns, f"observer.{key}", f"{found} values", f"{rows * columns}: {rows} rows of {columns}"
+            )
+        H = np.hstack([nominal.C, np.zeros((m, s - n))])
+        Phi, Gamma, L = (np.reshape(values, (s, -1)) for values in (self.Phi, self.Gamma, self.L))
+        return Phi, Gamma, H, L, np.reshape(self.F, (m, s))
+
+
 class ControllerParameters(KeyedParameters):
-    """All parameters of the controller node."""
+    """Parameters of the controller node that every control law has. A subclass has those of one law, as fields."""
+
+    needs: ClassVar[str] = ""
+    """What the law needs beside y and y_m, as words; the controller refuses a law that needs anything."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of the law, Hz")
     y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(
         default=0.0, description="in lockstep: the rate of y, Hz; the node derives the time from the number of samples"
     )
-    outputs: Names = Field(description="the channels of y in the order of the law; the last one has the smallest gain (22)")
-    inputs: Names = Field(description="the channels of u, paired with the outputs")
-    k_g: Positive = Field(description="k_g of equation (22), 1/s")
-    k_d: Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(as_tuple)] = Field(
-        description="k_d of equation (22), one per channel except the last, 1/s"
+    law: str = Field(default="rise_di", description="the control law, by the name under which a package registers it")
+    outputs: Names = Field(
+        description="the channels of y in the order of the law; in RISE-DI the last has the smallest gain (22)"
     )
-    Lambda: Positives = Field(description="the diagonal of Lambda (4), 1/s")
-    beta: Positives = Field(description="the diagonal of beta (21) in scaled inputs, units of y / s^2")
+    inputs: Names = Field(description="the channels of u, paired with the outputs")
     D: Signs = Field(description="the diagonal of D (11), +1 or -1")
     input_scale: Positives = Field(description="the change of u that changes y_dot by one, diagonal: 1 / abs(Omega_ii)")
-    omega: Positives = Field(description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign)")
-    sign: Literal["auto", "literal", "implicit", "soft"] = Field(
-        description="how the sign of (21) is sampled; auto: implicit where lag and delay are below half a period, else soft"
-    )
     lag: NonNegatives = Field(description="time constants of the actuators, s, one per channel; 0 for an actuator without lag")
     delay: Annotated[float, Field(ge=0)] = Field(description="pure delay from y to the actuators in addition to sampling, s")
-    softening: Positive = Field(description="width of the softened sign in total lags; stable above 1, 3 is usual")
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(description="the age above which y or y_m is stale, s")
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u is held when y or y_m is stale, s")
     ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u then takes to ramp to trim, s")
@@ -100,6 +134,35 @@ class ControllerParameters(KeyedParameters):
     feedforward: FeedforwardParameters | None = Field(
         default=None, description="an extension of the paper: adds the input of a nominal model along y_m; off where absent"
     )
+    observer: ObserverParameters | None = Field(
+        default=None,
+        description="an extension of the paper: corrects the trim by estimates of wind and model error; off where absent",
+    )
+
+    @classmethod
+    def validate_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
+        """Build the set of the law that the mapping names, RISE-DI by default. Raises ParameterError."""
+        from rise_di_controller import laws  # noqa: PLC0415 - it has the laws, which import this module
+
+        name = values.get("law", laws.DEFAULT)
+        try:
+            schema = laws.schema(name)
+        except ParameterError as error:
+            raise ParameterError(f"{where}.{error}") from None
+        others = {} if name == laws.DEFAULT else laws.schema(laws.DEFAULT).model_fields
+        own = [key for key in schema.model_fields if key not in ControllerParameters.model_fields]
+        for key in values:
+            foreign = key in others and key not in schema.model_fields
+            expected = f"those of {name}: {', '.join(own) or 'none'}"
+            require(not foreign, f"{where}.{key}", f"a parameter of {laws.DEFAULT}", expected)
+        found: Self = super(ControllerParameters, schema).validate_mapping(values, where)  # type: ignore[assignment]
+        return found
+
+    @classmethod
+    def tunable(cls) -> frozenset[str]:
+        """Parameters that may change in flight: those of the law and the guard. Those that name channels or signs may not."""
+        common = {"lag", "delay", "max_age", "hold", "ramp", "lower", "upper", "slew"}
+        return frozenset(common | (set(cls.model_fields) - set(ControllerParameters.model_fields)))
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -108,8 +171,7 @@ class ControllerParameters(KeyedParameters):
             require(self.y_rate > 0, "y_rate", "0 Hz", "the rate of y in lockstep")
             divide(period, period_ns(self.y_rate, "y_rate"), "y_rate", "1 / rate")
         require_length("inputs", self.inputs, self.outputs)
-        require_length("k_d", self.k_d, self.outputs[:-1])
-        for key in ("Lambda", "beta", "D", "input_scale", "omega", "lag"):
+        for key in ("D", "input_scale", "lag"):
             require_length(key, getattr(self, key), self.outputs)
         for key in ("lower", "upper", "slew"):
             require_length(key, getattr(self, key) or self.inputs, self.inputs)
@@ -121,9 +183,14 @@ class ControllerParameters(KeyedParameters):
             require(high >= 0, f"upper[{i}]", high, "at least 0, so that trim is inside the limits")
         for i, sign in enumerate(self.D):
             require(sign in (-1, 1), f"D[{i}]", sign, "+1 or -1")
+        self.check_law()
         nominal = self.nominal()
         if nominal is not None:
             self._check_nominal(nominal)
+        if self.observer is not None:
+            if nominal is None:
+                raise ParameterError("observer: found no feedforward beside it, expected that section too: it has the model")
+            self._check_observer(self.observer, nominal)
         return self
 
     def _check_nominal(self, nominal: Nominal) -> None:
@@ -136,6 +203,61 @@ class ControllerParameters(KeyedParameters):
         slow = f"at most {limit:.3g} 1/s, which ticks of {self.rate:g} Hz can follow"
         require(fastest <= limit, "feedforward.A", f"zero dynamics as fast as {fastest:.3g} 1/s", slow)
 
+    def _check_observer(self, observer: ObserverParameters, nominal: Nominal) -> None:
+        """Sizes, stable filter and feedback, and the delay margin of the nominal loop, which certifies what flies."""
+        expected = tuple(f"x.{name}" for name in self.feedforward.states) if self.feedforward else ()
+        require(
+            observer.states[: len(expected)] == expected,
+            "observer.states",
+            ", ".join(observer.states[: len(expected)]),
+            f"first the states of the feedforward: {', '.join(expected)}",
+        )
+        Phi, Gamma, H, L, F = observer.matrices(nominal)
+        for key, matrix in (("L", Phi @ (np.eye(len(Phi)) - L @ H)), ("F", Phi - Gamma @ F)):
+            radius = spectral_radius(matrix)
+            require(radius < 1.0, f"observer.{key}", f"a spectral radius of {radius:.6g}", "less than 1: it is unstable")
+        plant = LinearPlant(nominal.A + nominal.gravity, nominal.B, nominal.C)
+        period, m = 1.0 / self.rate, len(self.inputs)
+        loop, law = Loop(np.array(self.lag), self.delay, period), linear_law(self.tuned_law(), m, period)
+        for part in MARGIN_PARTS:
+            late = part * observer.margin
+            stable = is_stable(plant, law, loop, np.full(m, late))
+            found = f"a nominal loop that is unstable with u {1e3 * late:g} ms late"
+            expected_margin = f"a delay margin of at least {1e3 * observer.margin:g} ms: a smaller F or K"
+            require(stable, "observer.margin", found, expected_margin)
+
+    def check_law(self) -> None:
+        """Checks of the law's own parameters against each other and the channels. Raises ParameterError."""
+
+    def control_law(self) -> ControlLaw:
+        """The law."""
+        raise NotImplementedError
+
+    def law_params(self) -> Any:
+        """The law's parameters as arrays."""
+        raise NotImplementedError
+
+    def summary(self) -> str:
+        """What flies, as a sentence for the log."""
+        return f"law {self.law}"
+
+    def tuned_law(self) -> TunedLaw:
+        """The law with its parameters, extended by the observer where there is one."""
+        law, params, nominal = self.control_law(), self.law_params(), self.nominal()
+        if self.observer is None or nominal is None:
+            return TunedLaw(law, params)
+        bound, part = self.guard().limits, self.observer.part
+        rate = part / self.observer.within * (bound.upper - bound.lower) / 2.0
+        limits = Limits(part * bound.lower, part * bound.upper, rate)
+        fade_rate = 1.0 / self.observer.fade if self.observer.fade else np.inf
+        Phi, Gamma, H, L, F = self.observer.matrices(nominal)
+        return TunedLaw(with_observer(law), ObserverParams(params, Phi, Gamma, H, L, F, limits, np.float64(fade_rate)))
+
+    def logged_groups(self) -> dict[str, tuple[str, ...]]:
+        """Groups of channels of `internals` and the names in each."""
+        estimates = () if self.observer is None else self.observer.states
+        return internals.groups(self.tuned_law().control_law, self.outputs, self.inputs, estimates)
+
     def nominal(self) -> Nominal | None:
         """The arrays of the feedforward, None where there is none."""
         return None if self.feedforward is None else self.feedforward.nominal(self.outputs, self.inputs, self.D)
@@ -146,30 +268,9 @@ class ControllerParameters(KeyedParameters):
         BLAKE2b of names and values. It changes with any bit of any gain. Parameters that concern only the node are left out.
         """
         content = self.model_dump(exclude={"lockstep", "y_rate", "autostart", "key_file"})
+        if content["law"] == "rise_di":  # logs of versions that had no other law have no name either
+            del content["law"]
         return int.from_bytes(blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big")
-
-    def law(self) -> LawParams:
-        """The arrays of the law."""
-        K = gain(np.array(self.k_g), np.array(self.k_d, dtype=np.float64))
-        return LawParams(
-            K=K,
-            Lambda=np.array(self.Lambda),
-            beta=np.array(self.beta),
-            D=np.array(self.D, dtype=np.float64),
-            input_scale=np.array(self.input_scale),
-            omega=np.array(self.omega),
-            eps=np.array(self.beta) / K * self.softening * total_lag(np.array(self.lag), self.delay, 1.0 / self.rate),
-            sign=self.sampled_sign()[0],
-        )
-
-    def sampled_sign(self) -> tuple[Sign, str]:
-        """How the sign is sampled, and the reason as a sentence."""
-        if self.sign != "auto":
-            return Sign[self.sign.upper()], f"{self.sign} sign, as configured"
-        lag, half = max(self.lag) + self.delay, 0.5 / self.rate
-        if lag < half:
-            return Sign.IMPLICIT, f"implicit sign, because lag and delay of {lag:g} s are below half a period ({half:g} s)"
-        return Sign.SOFT, f"softened sign, because lag and delay of {lag:g} s reach half a period ({half:g} s)"
 
     def guard(self) -> GuardParams:
         """Times, limits and nominal model of the guard."""

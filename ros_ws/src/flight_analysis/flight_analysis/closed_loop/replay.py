@@ -18,8 +18,8 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
 from flight_log.tape_reader import StoredFile
 from rise_di_controller import feedforward, guard, internals
+from rise_di_controller.control_law import TunedLaw, restored
 from rise_di_controller.guard import ControllerState, GuardParams, Mode
-from rise_di_controller.law import LawParams, LawState, retune
 from rise_di_controller.params import ControllerParameters
 
 COPIED_CHANNELS = ("y_m_offset", "number", "parameters")
@@ -139,14 +139,14 @@ def replay(
             if not ticks.flies[k]:
                 state = None
                 continue
-            state = ticks.state(k, in_force.limits)
+            state = ticks.state(k, in_force.limits, in_force.law)
             if others is None:
                 continue
             state = guard.initial_state(ticks.m)._replace(u=state.u)
         state, computed[k] = ticks.tick(k, state, in_force.limits, in_force.law)
         checked[k] = True
         if others is None and computed[k].tobytes() != ticks.values[k].tobytes():
-            state = ticks.state(k, in_force.limits, state)
+            state = ticks.state(k, in_force.limits, in_force.law, state)
     notes = (() if others is None else (OPEN_LOOP,)) + tuple(in_force.notes) + tuple(_coverage_notes(ticks, checked))
     return ReplayResult(ticks.names, ticks.number, ticks.t, ticks.values, computed, checked, other_parameters, notes)
 
@@ -166,7 +166,7 @@ class _ParametersInForce:
 
     def _apply(self, parameters: ControllerParameters) -> None:
         self._parameters, self.digest = parameters, parameters.digest()
-        self.law, self.limits = parameters.law(), parameters.guard()
+        self.law, self.limits = parameters.tuned_law(), parameters.guard()
 
     def change(self, digest: int, number: int, state: ControllerState | None) -> ControllerState | None:
         """Apply the changes that lead to the parameters with a digest, if any do. Returns the state after them."""
@@ -190,8 +190,8 @@ class _ParametersInForce:
                 continue
             before = self.law
             self._apply(step)
-            if state is not None and state.law is not None:
-                state = state._replace(law=retune(state.law, before, self.law))
+            if state is not None:
+                state = guard.retune(state, before, self.law)
         return state
 
 
@@ -201,7 +201,8 @@ class _Ticks:
     def __init__(self, tape: Tape, parameters: ControllerParameters) -> None:
         require("internals" in tape, "the log", "no sample of internals", "a flight with a controller that engaged")
         signal = tape["internals"]
-        names = internals.names(parameters.outputs, parameters.inputs)
+        groups = parameters.logged_groups()
+        names = internals.names(groups)
         missing = [f"no {name}" for name in names if name not in signal.names]
         found = ", ".join(missing + [f"also {name}" for name in signal.names if name not in names])
         require(not found, "internals", found, "the channels of the scenario in the log, as this version records them")
@@ -223,27 +224,27 @@ class _Ticks:
         self._active = signal["mode"] != Mode.INACTIVE
         self._engages = self.flies & (signal["dt"] == 0.0)
         self._offset_ns = np.round(signal["y_m_offset"] * NANOSECONDS).astype(np.int64)
-        self._groups = {name: signal.group(name).values for name in (*internals.OUTPUT_GROUPS, *internals.INPUT_GROUPS)}
+        self._groups = {name: signal.group(name).values for name in groups}
         self._y, self.y_found = _as_published(tape, "y", parameters.outputs, self.stamp_ns, self._groups["y"])
         u, _ = _as_published(tape, "u", parameters.inputs, self.stamp_ns, self._groups["u"])
         self.values = np.column_stack([signal.values, u])
         self.names = (*names, *(f"published.{name}" for name in parameters.inputs))
         self._copied = [names.index(name) for name in COPIED_CHANNELS]
 
-    def state(self, k: int, limits: GuardParams, computed: ControllerState | None = None) -> ControllerState:
+    def state(self, k: int, limits: GuardParams, law: TunedLaw, computed: ControllerState | None = None) -> ControllerState:
         """The recorded state after a tick. What the log does not hold comes from the computed state, if there is one."""
         row = {name: values[k] for name, values in self._groups.items()}
-        law = LawState(row["e_0"], row["e"], row["integral_e"], row["Pi"])
+        of_law = restored(law.control_law, row)
         mode, u, y_m = Mode(int(self._signal["mode"][k])), row["u"], row["y_m"]
         if computed is not None and not self.flies[k]:
-            return computed._replace(mode=mode, law=law, u=u, u_free=row["u_free"])
+            return computed._replace(mode=mode, law=of_law, u=u, u_free=row["u_free"])
         feedforward_state = None if computed is None else computed.feedforward
         if limits.nominal is not None and self._engages[k]:
             feedforward_state = feedforward.initial_state(y_m, limits.nominal)
         y = StampedVector(int(self.stamp_ns[k]), row["y"])
-        return ControllerState(mode, law, y, y_m, u, row["u_free"], row["u_trim"], 0, u, row["u_ff"], feedforward_state)
+        return ControllerState(mode, of_law, y, y_m, u, row["u_free"], row["u_trim"], 0, u, row["u_ff"], feedforward_state)
 
-    def tick(self, k: int, state: ControllerState, limits: GuardParams, law: LawParams) -> tuple[ControllerState, FloatArray]:
+    def tick(self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw) -> tuple[ControllerState, FloatArray]:
         """One tick: (state after it, its row of `internals`); the row is NaN where the tick publishes nothing."""
         stamp_ns = int(self.stamp_ns[k])
         y, y_m = None, []

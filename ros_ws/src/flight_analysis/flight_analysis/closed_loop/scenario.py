@@ -11,12 +11,13 @@ import yaml
 from pydantic import Field
 
 from aircraft_sim.params import AircraftParameters
-from flight_core.parameters import Parameters, require
+from flight_core.parameters import ParameterError, Parameters, require
 from flight_core.rates import period_ns
 from flight_core.scenario import read_sections
 from flight_recorder.params import RecorderParameters
 from reference_model.params import ReferenceModelParameters
 from rise_di_controller.params import ControllerParameters
+from rise_di_controller.rise_di import RiseDiParameters
 
 ParameterOverrides = dict[str, str | float | bool | list[str]]
 """Parameters of one node by name that replace those of its section in the scenario."""
@@ -53,6 +54,13 @@ class Scenario:
         varied = replace(self, **changed)
         check_together(varied)
         return varied
+
+    def rise_di(self) -> RiseDiParameters:
+        """The parameters of a controller that flies RISE-DI. Raises ParameterError for another law."""
+        if not isinstance(self.controller, RiseDiParameters):
+            expected = "rise_di, which has the gains of (20) to (22)"
+            raise ParameterError(f"{self.name}: found the law {self.controller.law}, expected {expected}")
+        return self.controller
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
         """Start and stop of each gust, s: entry and entry + 2 H / V0."""

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: N802 - K, U, Phi and N_d are the paper's names
-"""Gains of the law: Theorem 1 as a procedure, the engineering procedure, and the stability margins of the linear loop.
+"""Gains of the law: Theorem 1 as a procedure, the engineering procedure, and the conditions on both.
 
 The theorem's conditions are sufficient, not necessary, and they contain no actuator. `theorem_gains` meets them all; behind
 servos its result is unstable. `engineering_gains` starts from the lag of the loop. `check` evaluates the theorem's conditions
-on a gain set, `check_loop` those of the loop. `delay_margin` is the delay that the sampled linear loop tolerates.
+on a gain set, `check_loop` those of the loop. `rise_di_controller.linear_loop` has the linear loop and its delay margin.
 
 The crossover lag product of a channel is its bandwidth times the lag of its loop, in rad. It is the phase that the lag costs
 at the crossover: 57.3 degrees times the product. A loop that integrates then has a phase margin of 90 degrees minus that.
@@ -19,13 +19,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import cont2discrete
 
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller import law
 from rise_di_controller.decomposition import decompose
-from rise_di_controller.law import LawParams, LawState, Sign, total_lag
+from rise_di_controller.law import LawParams, Sign
+from rise_di_controller.linear_loop import Loop
 
 MIN_K = 1.5
 """1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller input scale: the same loop."""
@@ -43,13 +43,6 @@ MAX_LAMBDA_TO_BANDWIDTH = 0.5
 
 MAX_BETA_TO_RATE_LIMIT = 0.7
 """Upper bound of beta_i / rate limit of the actuator. At 1 the `osprey`'s yaw rate had a limit cycle, at 2/3 it had none."""
-
-SPECTRAL_RADIUS_TOLERANCE = 1e-6
-"""A spectral radius above 1 by more than this is unstable. Angles that integrate the outputs give a double eigenvalue 1, which
-rounding splits by the root of its size, 1e-8."""
-
-MAX_DELAY_MARGIN = 0.5
-"""s, upper end of the search for a delay margin. A loop that tolerates more is slower than any that this stack flies."""
 
 BOUND_TOLERANCE = 1e-5  # relative tolerance of a bound, since files hold gains with six digits
 
@@ -213,19 +206,6 @@ def check(gains: GainSet, bounds: Bounds) -> tuple[Condition, ...]:
 # The engineering procedure
 
 
-class Loop(NamedTuple):
-    """Actuators, delay and sampling between y and the response of the aircraft, over m channels."""
-
-    lag: FloatArray  # (m,) time constants of the actuators, s; 0 without one
-    delay: float  # pure delay beyond sampling, s
-    period: float  # of the law, s
-
-    @property
-    def total(self) -> FloatArray:
-        """Lag of the loop, shape (m,), s."""
-        return np.asarray(total_lag(self.lag, self.delay, self.period))
-
-
 def bandwidths(loop: Loop, crossover_lag_product: FloatArray) -> FloatArray:
     """Bandwidth of each channel, crossover_lag_product_i / (lag_i + 1.5 period + delay), shape (m,), rad/s.
 
@@ -312,99 +292,3 @@ def check_loop(
         add("implicit: lag", loop.lag + loop.delay, np.full(len(total), loop.period / 2.0), at_least=False)
         add("implicit: omega", params.omega, largest, at_least=True)
     return tuple(conditions)
-
-
-# The linear loop
-
-
-class LinearPlant(NamedTuple):
-    """x_dot = A x + B u_a, y = C x with one actuator an input, lag_i u_a,i_dot = u_i - u_a,i; the law's order, SI."""
-
-    A: FloatArray  # (n, n)
-    B: FloatArray  # (n, m)
-    C: FloatArray  # (m, n)
-
-
-def law_matrix(params: LawParams, period: float) -> FloatArray:
-    """The law's step near e = 0 as a matrix, shape (4 m, 4 m): (e_p, integral_e, Pi, y) -> (e, integral_e, Pi, u), y_m = 0.
-
-    The columns are `law.step` of unit vectors: the step is linear inside the width of its sign. beta and eps are multiplied by
-    1e12, which widens the sign and changes nothing inside it. Raises ParameterError for the literal sign, which has no width.
-    """
-    require(params.sign is not Sign.LITERAL, "sign", "literal", "soft or implicit, which are linear near e = 0")
-    m = len(params.K)
-    wide = params._replace(beta=1e12 * params.beta, eps=1e12 * params.eps)
-    columns = []
-    for unit in np.eye(4 * m):
-        e, integral_e, Pi, y = unit.reshape(4, m)
-        state, u = law.step(LawState(np.zeros(m), e, integral_e, Pi), y, np.zeros(m), np.array(period), wide)
-        columns.append(np.concatenate([state.e, state.integral_e, state.Pi, u]))
-    return np.array(columns).T
-
-
-def closed_loop(plant: LinearPlant, params: LawParams, loop: Loop, extra: FloatArray) -> FloatArray:
-    """One period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the unit circle.
-
-    u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,). The state is x, the
-    actuators, (e, integral_e, Pi) of the law, and the delayed inputs. Source: K. J. Astrom, B. Wittenmark,
-    "Computer-Controlled Systems", section 2.3, for the sampling of a plant with delay.
-    """
-    n, m = plant.B.shape
-    has_lag = loop.lag > 0.0
-    rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)  # without an actuator: any, it drives nothing
-    motion = np.block([[plant.A, plant.B * has_lag], [np.zeros((m, n)), -np.diag(rate)]])
-    drive = np.vstack([plant.B * ~has_lag, np.diag(rate * has_lag)])
-    whole = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
-    part = np.maximum(loop.delay + extra - whole * loop.period, 0.0)
-    held = int(whole.max()) + 1  # delayed inputs, the newest first
-
-    free, _ = _sampled(motion, drive, loop.period)
-    size = n + m + 3 * m + held * m
-    law_, delayed = slice(n + m, n + 4 * m), slice(n + 4 * m, size)
-    step = law_matrix(params, loop.period)
-    output = np.zeros((m, size))
-    output[:, :n] = plant.C
-    after = step @ np.vstack([np.eye(size)[law_], output])
-    inputs = np.vstack([after[3 * m :], np.eye(size)[delayed]])  # of this tick, then of earlier ones
-
-    matrix = np.zeros((size, size))
-    matrix[: n + m, : n + m] = free
-    for i in range(m):
-        rest, new = _sampled(motion, drive[:, [i]], loop.period - part[i])
-        _, old = _sampled(motion, drive[:, [i]], part[i])
-        matrix[: n + m] += np.outer(new, inputs[whole[i] * m + i]) + np.outer(rest @ old, inputs[(whole[i] + 1) * m + i])
-    matrix[law_] = after[: 3 * m]
-    matrix[delayed] = inputs[: held * m]
-    return matrix
-
-
-def is_stable(plant: LinearPlant, params: LawParams, loop: Loop, extra: FloatArray) -> bool:
-    """Whether no eigenvalue of `closed_loop` lies outside the unit circle, up to rounding."""
-    radius = np.max(np.abs(np.linalg.eigvals(closed_loop(plant, params, loop, extra))))
-    return bool(radius <= 1.0 + SPECTRAL_RADIUS_TOLERANCE)
-
-
-def delay_margin(plant: LinearPlant, params: LawParams, loop: Loop, channel: int | None = None) -> float:
-    """Delay margin: pure delay beyond loop.delay, s, at which the linear loop turns unstable, in all channels or in one.
-
-    0 if the loop is unstable without it, infinite if the loop tolerates half a second. The search takes steps of half a period,
-    then bisects down to 0.1 ms. Raises ParameterError for the literal sign.
-    """
-    delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
-    if not is_stable(plant, params, loop, 0.0 * delayed):
-        return 0.0
-    lower, stride = 0.0, loop.period / 2.0
-    while is_stable(plant, params, loop, (lower + stride) * delayed):
-        lower += stride
-        if lower > MAX_DELAY_MARGIN:
-            return math.inf
-    while stride > 1e-4:
-        stride /= 2.0
-        lower += stride * is_stable(plant, params, loop, (lower + stride) * delayed)
-    return lower
-
-
-def _sampled(motion: FloatArray, drive: FloatArray, duration: float) -> tuple[FloatArray, FloatArray]:
-    """Zero-order hold over T: exp(motion T) and integral_0^T exp(motion s) ds drive."""
-    state, held, *_ = cont2discrete((motion, drive, np.eye(len(motion)), np.zeros_like(drive)), duration)
-    return np.asarray(state), np.asarray(held)

@@ -9,7 +9,7 @@ scenario: conditions, stability and delay margin. `as_yaml` writes a gain set as
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined, Template
@@ -24,7 +24,7 @@ from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design import gain_conditions
 from flight_analysis.design.airframe_properties import invariant_zeros
-from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet, LinearPlant, Loop
+from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet
 from flight_analysis.design.lyapunov import KnownPlant, decay_matrix
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError, require
@@ -35,7 +35,9 @@ from reference_model.params import ReferenceModelParameters
 from rise_di_controller.decomposition import DecompositionError, coupling, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
 from rise_di_controller.law import Sign
+from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, is_stable, linear_law
 from rise_di_controller.params import ControllerParameters, FeedforwardParameters
+from rise_di_controller.rise_di import RiseDiParameters
 
 CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
 """Bandwidth of a channel times the lag of its loop, rad, by output. 0.63, 0.32 and 0.23 cost 36, 18 and 13 degrees of phase at
@@ -57,6 +59,9 @@ STEP = 0.01
 INPUT_LIMITS = ("lower", "upper", "slew")  # limits of the controller, one an input. They are reordered with the inputs.
 
 
+Controller = TypeVar("Controller", bound=ControllerParameters)
+
+
 class Manoeuvre(NamedTuple):
     """The commands and gusts that the gains are selected for."""
 
@@ -75,7 +80,7 @@ class ChannelPairing(NamedTuple):
 class LoopSetting(NamedTuple):
     """The loop that the gains are selected for, and the settings of the selection."""
 
-    base: ControllerParameters  # source of all parameters that are not selected: softening, max_age, limits
+    base: RiseDiParameters  # source of all parameters that are not selected: softening, max_age, limits
     rate: float  # Hz
     lag: Mapping[str, float]  # s, by input; 0 for an input without lag
     delay: float  # s
@@ -110,7 +115,7 @@ class Study(NamedTuple):
 class GainAssessment(NamedTuple):
     """A gain set, every condition on it, and its delay margins."""
 
-    controller: ControllerParameters
+    controller: RiseDiParameters
     theorem: tuple[Condition, ...]
     loop: tuple[Condition, ...]
     bounds: Bounds
@@ -332,7 +337,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     selected = gain_conditions.engineering_gains(bandwidth[places], slew[places] / unit, setting.factor, rate_limit / unit)
     spread = np.abs(np.einsum("Nii->Ni", (study.C @ study.B)[:, places][..., columns])).max(axis=0)
 
-    def controller(gains: GainSet, response: FloatArray) -> ControllerParameters:
+    def controller(gains: GainSet, response: FloatArray) -> RiseDiParameters:
         scale, base_inputs = unit * response, setting.base.inputs
         has_limits = set(channels.inputs) <= set(base_inputs)
         limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if has_limits else {}
@@ -351,9 +356,10 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
             "lag": _by_name(setting.lag, channels.inputs, 0.0).tolist(),
             "delay": setting.delay,
             "feedforward": None,
+            "observer": None,
         }
         values |= {key: [row[base_inputs.index(name)] for name in channels.inputs] for key, row in limits.items() if row}
-        chosen = ControllerParameters.validate_mapping(values, "controller")
+        chosen = RiseDiParameters.validate_mapping(values, "controller")
         return with_feedforward(chosen, airframe) if setting.feedforward else chosen
 
     ones = np.ones(len(places))
@@ -363,7 +369,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     return Selection(study, setting, *(assess_gains(study, one, setting) for one in (literal, engineering)))
 
 
-def with_feedforward(controller: ControllerParameters, airframe: Airframe) -> ControllerParameters:
+def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
     """The same controller with the airframe as the nominal model of its feedforward, an extension of the paper.
 
     lead = lag + delay + half a period, of the controller. Raises ParameterError for an airframe that cannot be the
@@ -378,7 +384,7 @@ def with_feedforward(controller: ControllerParameters, airframe: Airframe) -> Co
         gravity=tuple(gravity.ravel().tolist()) if gravity.any() else None,
         lead=tuple(lag + controller.delay + 0.5 / controller.rate for lag in controller.lag),
     )
-    return ControllerParameters.validate_mapping(controller.model_dump() | {"feedforward": model.model_dump()}, "controller")
+    return type(controller).validate_mapping(controller.model_dump() | {"feedforward": model.model_dump()}, "controller")
 
 
 def check_gains(scenario: Scenario, study: Study, gamma_2: float = 0.0) -> GainAssessment:
@@ -386,12 +392,12 @@ def check_gains(scenario: Scenario, study: Study, gamma_2: float = 0.0) -> GainA
 
     Raises ParameterError if D or the pairing contradict the airframe.
     """
-    return assess_gains(study, scenario.controller, loop_setting(scenario, gamma_2))
+    return assess_gains(study, scenario.rise_di(), loop_setting(scenario, gamma_2))
 
 
 def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     """The loop of a scenario: its controller, and the rate limits of controller and actuators."""
-    controller, rates = scenario.controller, scenario.aircraft.actuators.rate
+    controller, rates = scenario.rise_di(), scenario.aircraft.actuators.rate
     airframe, _ = scenario.aircraft.load()
     own = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
     limits = dict(zip(airframe.inputs, rates, strict=bool(rates)))
@@ -405,7 +411,7 @@ def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     )
 
 
-def assess_gains(study: Study, controller: ControllerParameters, setting: LoopSetting) -> GainAssessment:
+def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSetting) -> GainAssessment:
     """Every condition on a gain set. Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
 
     Theorem: "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of (29), (30), steps 2 and
@@ -418,7 +424,7 @@ def assess_gains(study: Study, controller: ControllerParameters, setting: LoopSe
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
     D = require_channels(study.Omega[np.ix_(rows, columns)], channels, controller.D)
-    params = controller.law()
+    params = controller.law_params()
     loop = Loop(params.K * 0.0 + controller.lag, controller.delay, 1.0 / controller.rate)
     bounds, holds, counts = _bounds(study, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2)
     gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
@@ -442,9 +448,10 @@ def assess_gains(study: Study, controller: ControllerParameters, setting: LoopSe
         return GainAssessment(controller, theorem, conditions, bounds, None, ())
     plants = [LinearPlant(A + study.gravity, B, C) for A, B in zip(study.A, Bs, strict=True)]
     no_delay = np.zeros(len(rows))
-    stable = float(np.mean([gain_conditions.is_stable(plant, params, loop, no_delay) for plant in plants]))
-    margin = gain_conditions.delay_margin(plants[0], params, loop)
-    each = tuple(gain_conditions.delay_margin(plants[0], params, loop, channel) for channel in range(len(rows)))
+    linear = linear_law(controller.tuned_law(), len(rows), loop.period)
+    stable = float(np.mean([is_stable(plant, linear, loop, no_delay) for plant in plants]))
+    margin = delay_margin(plants[0], linear, loop)
+    each = tuple(delay_margin(plants[0], linear, loop, channel) for channel in range(len(rows)))
     conditions += (Condition("linear stability", None, stable, 1.0),)
     if params.sign is Sign.SOFT:
         conditions += (Condition("delay margin", None, margin, loop.period),)
@@ -534,7 +541,7 @@ CONTROLLER_YAML = yaml_template("""\
 def as_yaml(selection: Selection) -> str:
     """The engineering gain set as the section `/**/controller` of a scenario file, with units and reasons in comments."""
     controller, study = selection.engineering.controller, selection.study
-    params = controller.law()
+    params = controller.law_params()
     rows, columns = law_order(study.airframe, controller)
     response = np.abs(study.Omega[rows, columns]) * controller.input_scale  # abs(Omega_ii) in the inputs of the controller
     K, bandwidth, slew = (
@@ -552,13 +559,13 @@ def as_yaml(selection: Selection) -> str:
         "D": "signs of the leading minors of C B",
         "input_scale": "units of u s / units of y: 1 / abs(Omega_ii), Omega = C B",
         "omega": f"abs(Omega_ii) in scaled inputs, the largest within +-{100 * study.uncertainty:g} %",
-        "sign": params.sign.name.lower() + " with this lag and delay",
+        "sign": controller.sampled_sign()[0].name.lower() + " with this lag and delay",
         "lag": "s, actuators",
         "delay": "s, beyond sampling",
         "softening": "1, width of the softened sign in total lags",
     }
     parameters = [
-        (key, value, comments.get(key, ControllerParameters.model_fields[key].description))
+        (key, value, comments.get(key, type(controller).model_fields[key].description))
         for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward"}).items()
     ]
     return CONTROLLER_YAML.render(

@@ -35,7 +35,7 @@ from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelParameters
 from rise_di_controller.decomposition import coupling
 from rise_di_controller.law import total_lag
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.rise_di import RiseDiParameters
 
 # The step tests
 
@@ -300,7 +300,7 @@ def manoeuvre_result(tape: Tape) -> ManoeuvreResult:
 
 def without_beta(scenario: Scenario) -> Scenario:
     """The same scenario with a negligible beta: a PI controller with the same K and Lambda."""
-    return scenario.vary(controller={"beta": [1e-9] * len(scenario.controller.beta)})
+    return scenario.vary(controller={"beta": [1e-9] * len(scenario.controller.outputs)})
 
 
 def _vehicle(condition: FlightCondition) -> JsbsimModel:
@@ -331,7 +331,7 @@ def _setting(trim: Trim, lag: FloatArray) -> LoopSetting:
     """The loop that the gains are selected for. The parameters to be selected are 1."""
     inputs = list(INPUTS)
     ones = [1.0] * len(inputs)
-    base = ControllerParameters.validate_mapping(
+    base = RiseDiParameters.validate_mapping(
         dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
         | {"rate": CONTROL_RATE, "outputs": list(OUTPUTS), "inputs": inputs, "k_g": 1.0, "k_d": ones[1:]}
         | {"D": [1] * len(inputs), "sign": "auto", "lag": lag.tolist(), "delay": DELAY, "softening": SOFTENING}

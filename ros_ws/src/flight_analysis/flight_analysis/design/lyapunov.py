@@ -72,7 +72,7 @@ def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples
             raise ValueError(f"{name}: samples at {len(indices)} of {len(stamps)} ticks of the law")
     plant = KnownPlant(
         aircraft.A,
-        aircraft.B[:, inputs] * controller.law().input_scale,
+        aircraft.B[:, inputs] * controller.law_params().input_scale,
         aircraft.C[outputs],
         lambda t, x: np.asarray(dynamics.f(t, x, aircraft)),
     )

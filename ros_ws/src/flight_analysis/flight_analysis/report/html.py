@@ -103,7 +103,7 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
 
 def _description(flight: RecordedFlight) -> str:
     controller = flight.scenario.controller
-    return f"{flight.summary['duration']:.1f} s flown at {controller.rate:g} Hz with the {controller.sampled_sign()[1]}"
+    return f"{flight.summary['duration']:.1f} s flown at {controller.rate:g} Hz with the {controller.summary()}"
 
 
 def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Section]:

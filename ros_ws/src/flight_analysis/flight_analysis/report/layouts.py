@@ -40,7 +40,7 @@ def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
         "y": tuple(scenario.aircraft.channels().outputs),
         "y_m": scenario.reference_model.outputs,
         "u": controller.inputs,
-        "internals": internals.names(controller.outputs, controller.inputs),
+        "internals": internals.names(controller.logged_groups()),
         "truth": tuple(Simulator(scenario.aircraft).truth_names),
     }
 

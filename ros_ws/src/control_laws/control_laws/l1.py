@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""L1 adaptive output control from y, y_m and the nominal Omega."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from control_laws.nominal_model import NominalModel, filter_gain, saturate
+from flight_core.parameters import Numbers, ParameterError, Positives, require, require_length
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.decomposition import DecompositionError, signs
+from rise_di_controller.params import ControllerParameters
+from rise_di_controller.saturation import Limits
+
+ADAPTATION_POLE = 1.0
+"""1/s, of the predictor. It scales the estimate by a dt / (exp(a dt) - 1), 0.995 at 100 Hz; K corrects the rest."""
+
+
+class L1Params(NamedTuple):
+    """Gains over m channels, (m,), and the nominal Omega."""
+
+    K: Array  # 1/s
+    bandwidth: Array  # of the low-pass filter C(s), rad/s
+    Omega: Array  # (m, m)
+    inverse: Array  # (m, m), of Omega
+
+
+class L1State(NamedTuple):
+    """State of L1 between two ticks, (m,)."""
+
+    e: Array
+    y_hat: Array  # predicted for the next tick
+    sigma_hat: Array  # estimate of y_dot - Omega u
+    sigma_f: Array  # filtered
+
+
+def _control_law(*, feedforward: bool) -> ControlLaw:
+    """L1 with piecewise-constant adaptation.
+
+        sigma_hat = -Phi^-1 exp(-a dt) (y_hat - y),  Phi = (1 - exp(-a dt)) / a          a = ADAPTATION_POLE
+        sigma_f  += (1 - exp(-bandwidth dt)) (sigma_hat - sigma_r - sigma_f)
+        u         = u_r - Omega^-1 (K e + sigma_f),  sigma_r = y_m_dot - Omega u_r
+        y_hat     = y + exp(-a dt) (y_hat - y) + dt Omega u + Phi sigma_hat                for the next tick
+
+    the exact step of y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat. Reference input: u_r = u_trim + Omega^-1 y_m_dot; with
+    `feedforward` u_r = u_trim, which holds it. sigma_r is the part of sigma that u_r cancels already. At engagement
+    sigma_f = -K e, so that u = u_r (bumpless transfer); retuning changes sigma_f likewise. Anti-windup: the predictor takes u
+    after saturation. Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
+    """
+
+    def engage(measured: Measurements, params: L1Params) -> L1State:
+        e = measured.y - measured.y_m
+        return L1State(e, measured.y, array_namespace(e).zeros_like(e), -params.K * e)
+
+    def limited(
+        state: L1State, measured: Measurements, dt: Array, params: L1Params, limits: Limits
+    ) -> tuple[L1State, Array, Array]:
+        xp = array_namespace(measured.y)
+        e, error = measured.y - measured.y_m, state.y_hat - measured.y
+        a = ADAPTATION_POLE + xp.zeros_like(params.K)
+        Phi, left = filter_gain(a, dt) / a, xp.exp(-a * dt)
+        sigma_hat = -left / Phi * error
+        u_r = measured.u_trim if feedforward else measured.u_trim + params.inverse @ measured.y_m_dot
+        sigma_r = measured.y_m_dot - params.Omega @ u_r
+        sigma_f = state.sigma_f + filter_gain(params.bandwidth, dt) * (sigma_hat - sigma_r - state.sigma_f)
+        u_free = u_r - params.inverse @ (params.K * e + sigma_f)
+        u, _ = saturate(u_free, measured, dt, limits)
+        y_hat = measured.y + left * error + dt * (params.Omega @ u) + Phi * sigma_hat
+        return L1State(e, y_hat, sigma_hat, sigma_f), u_free, u
+
+    def retune(state: L1State, old: L1Params, new: L1Params) -> L1State:
+        nu = old.inverse @ (old.K * state.e + state.sigma_f)
+        return state._replace(sigma_f=new.Omega @ nu - new.K * state.e)
+
+    return ControlLaw(L1State, engage, without_limits(limited), limited, retune)
+
+
+CONTROL_LAWS = {feedforward: _control_law(feedforward=feedforward) for feedforward in (False, True)}
+"""L1 without and with a feedforward in u_trim."""
+
+
+def params_of(gains: dict[str, FloatArray], model: NominalModel) -> L1Params:
+    """Parameters from gains K and bandwidth, shapes (m, N)."""
+    return L1Params(gains["K"], gains["bandwidth"], model.Omega, model.inverse)
+
+
+class L1Parameters(ControllerParameters):
+    """The controller under L1 adaptive output control."""
+
+    K: Positives = Field(description="proportional gain, 1/s")
+    bandwidth: Positives = Field(description="bandwidths of the low-pass filter of the estimate, rad/s")
+    Omega: Numbers = Field(description="nominal Omega = C B, a row an output, the columns in the order of inputs")
+
+    def check_law(self) -> None:
+        """One value for each channel, and an Omega with the controller's D."""
+        for key in ("K", "bandwidth"):
+            require_length(key, getattr(self, key), self.outputs)
+        m = len(self.outputs)
+        require(len(self.Omega) == m * m, "Omega", f"{len(self.Omega)} values", f"{m * m}: {m} rows of {m}")
+        try:
+            D = [int(sign) for sign in signs(np.reshape(self.Omega, (m, m)))]
+        except DecompositionError as error:
+            raise ParameterError(f"Omega: found a matrix without a D ({error}), expected D = {list(self.D)}") from None
+        require(list(self.D) == D, "Omega", f"a matrix with D = {D}", f"D = {list(self.D)}, that of the controller")
+
+    def control_law(self) -> ControlLaw:
+        """L1, with the feedforward where there is one."""
+        return CONTROL_LAWS[self.feedforward is not None]
+
+    def law_params(self) -> Any:
+        """The arrays of the law."""
+        m = len(self.outputs)
+        Omega = np.reshape(self.Omega, (m, m))
+        return L1Params(np.array(self.K), np.array(self.bandwidth), Omega, np.linalg.inv(Omega))

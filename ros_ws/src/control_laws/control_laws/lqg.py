@@ -1,0 +1,58 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Linear-quadratic Gaussian control (LQG): the trim that the observer corrects, and no other feedback."""
+
+from typing import Any, NamedTuple
+
+from control_laws.nominal_model import NominalModel, saturate
+from flight_core.parameters import require
+from flight_core.vectors import Array, FloatArray
+from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.params import ControllerParameters
+from rise_di_controller.saturation import Limits
+
+
+class LqgParams(NamedTuple):
+    """The law has no parameters beside the observer's."""
+
+
+class LqgState(NamedTuple):
+    """The law has no state beside the observer's."""
+
+
+def _limited(
+    state: LqgState, measured: Measurements, dt: Array, params: LqgParams, limits: Limits
+) -> tuple[LqgState, Array, Array]:
+    """U = u_trim, with u_o of the observer in it."""
+    u, _ = saturate(measured.u_trim, measured, dt, limits)
+    return state, measured.u_trim, u
+
+
+CONTROL_LAW = ControlLaw(
+    LqgState,
+    lambda measured, params: LqgState(),
+    without_limits(_limited),
+    _limited,
+    lambda state, old, new: state,
+)
+
+
+def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LqgParams:
+    """The law has no gains beside the observer's."""
+    return LqgParams()
+
+
+class LqgParameters(ControllerParameters):
+    """The controller under LQG."""
+
+    def check_law(self) -> None:
+        """The observer is the law."""
+        require(self.observer is not None, "observer", "none", "a section: it is the feedback of lqg")
+
+    def control_law(self) -> ControlLaw:
+        """The law that the observer extends."""
+        return CONTROL_LAW
+
+    def law_params(self) -> Any:
+        """The law has none."""
+        return LqgParams()

@@ -1,0 +1,55 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Observers over any law, for many sets of weights at once: their parameters from the gains of a search."""
+
+from typing import Any
+
+import numpy as np
+
+from control_laws.nominal_model import NominalModel
+from control_laws.observer_design import (
+    ExtendedStateWeights,
+    Names,
+    ObserverDesign,
+    Weights,
+    aircraft_observer,
+    extended_state_observer,
+)
+from flight_core.vectors import FloatArray
+from rise_di_controller.observer import ObserverParams
+from rise_di_controller.saturation import Limits
+
+PART, WITHIN, FADE = 0.6, 0.1, 1.0
+"""Bound of u_o as a part of the limits of u, the time from 0 to it, s, and the time in which it fades in, s: the defaults of
+`ObserverParameters`."""
+
+
+def of_design(design: ObserverDesign, of_law: Any, model: NominalModel, part: float = PART) -> ObserverParams:
+    """Parameters of an observer over a law with the parameters `of_law`, from N designs; u_o within `part` of the limits."""
+
+    def last(matrices: FloatArray) -> FloatArray:
+        return np.moveaxis(matrices, 0, -1) if matrices.ndim > 2 else matrices
+
+    lower, upper = part * model.lower[:, None], part * model.upper[:, None]
+    limits = Limits(lower, upper, (upper - lower) / 2.0 / WITHIN)
+    Phi, Gamma, H, L, F = (last(one) for one in (design.Phi, design.Gamma, design.H, design.L, design.F))
+    return ObserverParams(of_law, Phi, Gamma, H, L, F, limits, np.array(1.0 / FADE))
+
+
+def aircraft_design(gains: dict[str, FloatArray], model: NominalModel) -> ObserverDesign:
+    """Designs with the aircraft's model from effort, drift (m, N), gust, wind_time (G, N) and loose (1, N) or (n, N)."""
+    weights = Weights(*(gains[name].T for name in Weights._fields))
+    return aircraft_observer(model, unnamed(model), weights)
+
+
+def extended_state_design(gains: dict[str, FloatArray], model: NominalModel) -> ObserverDesign:
+    """Designs from Omega and lags alone: effort, drift, rate_drift and decay, (m, N) each."""
+    return extended_state_observer(
+        model, unnamed(model), ExtendedStateWeights(*(gains[name].T for name in ExtendedStateWeights._fields))
+    )
+
+
+def unnamed(model: NominalModel) -> Names:
+    """Numbers as names, for designs that are not written to a file."""
+    (n, m), G = model.B.shape[-2:], model.wind.shape[-1]
+    return Names(*(tuple(str(k) for k in range(count)) for count in (n, m, m, G)))

@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""PI control of each output: RISE-DI without its sign term."""
+
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from control_laws.nominal_model import NominalModel, conditional_integration, saturate
+from flight_core.parameters import NonNegatives, Positives, require_length
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.params import ControllerParameters
+from rise_di_controller.saturation import Limits
+
+
+class PiParams(NamedTuple):
+    """Parameters over m channels, (m,)."""
+
+    K: Array  # 1/s
+    Lambda: Array  # 1/s
+    D: Array  # +1 or -1
+    input_scale: Array  # u per scaled input
+
+
+class PiState(NamedTuple):
+    """State of the law between two ticks, (m,)."""
+
+    e_0: Array  # e at engagement, changed by a retuning
+    e: Array
+    integral_e: Array
+
+
+def _u(state: PiState, params: PiParams) -> Array:
+    """U from trim, shape (m,): -input_scale D K (e - e_0 + Lambda integral of e)."""
+    return -params.input_scale * params.D * params.K * (state.e - state.e_0 + params.Lambda * state.integral_e)
+
+
+def _engage(measured: Measurements, params: PiParams) -> PiState:
+    e = measured.y - measured.y_m
+    return PiState(e, e, array_namespace(e).zeros_like(e))
+
+
+def _limited(
+    state: PiState, measured: Measurements, dt: Array, params: PiParams, limits: Limits
+) -> tuple[PiState, Array, Array]:
+    """U = u_trim - input_scale D K (e - e_0 + Lambda integral of e), a trapezoid with conditional integration (anti-windup)."""
+    e = measured.y - measured.y_m
+    after = PiState(state.e_0, e, state.integral_e + dt * (e + state.e) / 2.0)
+    _, beyond = saturate(measured.u_trim + _u(after, params), measured, dt, limits)
+    effect = -params.D * params.K * params.Lambda * (after.integral_e - state.integral_e)
+    after = after._replace(integral_e=conditional_integration(state.integral_e, after.integral_e, effect, beyond))
+    u_free = measured.u_trim + _u(after, params)
+    u, _ = saturate(u_free, measured, dt, limits)
+    return after, u_free, u
+
+
+def _retune(state: PiState, old: PiParams, new: PiParams) -> PiState:
+    """The same u with new parameters (bumpless transfer): e_0 takes the difference, so that Lambda may be 0."""
+    asked = -new.D * _u(state, old) / (new.input_scale * new.K)
+    return state._replace(e_0=state.e + new.Lambda * state.integral_e - asked)
+
+
+CONTROL_LAW = ControlLaw(PiState, _engage, without_limits(_limited), _limited, _retune)
+
+
+def params_of(gains: dict[str, FloatArray], model: NominalModel) -> PiParams:
+    """Parameters from gains K and Lambda, shapes (m, N)."""
+    return PiParams(gains["K"], gains["Lambda"], model.D[:, None], model.input_scale[:, None])
+
+
+class PiParameters(ControllerParameters):
+    """The controller under PI control."""
+
+    K: Positives = Field(description="proportional gains in scaled inputs, 1/s")
+    Lambda: NonNegatives = Field(description="integral gains over proportional ones, 1/s")
+
+    def check_law(self) -> None:
+        """One value for each channel."""
+        for key in ("K", "Lambda"):
+            require_length(key, getattr(self, key), self.outputs)
+
+    def control_law(self) -> ControlLaw:
+        """PI control."""
+        return CONTROL_LAW
+
+    def law_params(self) -> PiParams:
+        """The arrays of the law."""
+        return PiParams(np.array(self.K), np.array(self.Lambda), np.array(self.D, dtype=float), np.array(self.input_scale))

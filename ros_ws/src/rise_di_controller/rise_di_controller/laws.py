@@ -1,0 +1,47 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The control laws that the controller can fly, by name: RISE-DI, and every law that an installed package registers.
+
+A package registers a law by an entry point in its setup.py; see docs/laws.md:
+
+    entry_points={"rise_di_controller.laws": ["pi = control_laws.pi:PiParameters"]}
+"""
+
+from functools import cache
+from importlib.metadata import EntryPoints, entry_points
+
+from flight_core.parameters import ParameterError
+from rise_di_controller.params import ControllerParameters
+from rise_di_controller.rise_di import RiseDiParameters
+
+GROUP = "rise_di_controller.laws"
+DEFAULT = "rise_di"
+
+
+@cache
+def _registered() -> EntryPoints:
+    return entry_points(group=GROUP)
+
+
+def names() -> tuple[str, ...]:
+    """Names of all laws, sorted."""
+    return tuple(sorted({DEFAULT, *_registered().names}))
+
+
+def schema(name: object) -> type[ControllerParameters]:
+    """The parameters of a law. Raises ParameterError for a law that is not registered or that cannot be loaded."""
+    if name == DEFAULT:
+        return RiseDiParameters
+    if name not in names():
+        raise ParameterError(f"law: found {name!r}, expected a registered law: {', '.join(names())}")
+    try:
+        found = _registered()[str(name)].load()
+    except (ImportError, AttributeError) as error:
+        raise ParameterError(f"law: found {name!r}, which cannot be loaded ({error}), expected an installed package") from None
+    if not (isinstance(found, type) and issubclass(found, ControllerParameters)):
+        raise ParameterError(f"law: found {name!r}, registered as {found!r}, expected a subclass of ControllerParameters")
+    if found.needs:
+        raise ParameterError(
+            f"law: found {name!r}, which needs {found.needs}, expected a law of y and y_m: the topics have no more"
+        )
+    return found

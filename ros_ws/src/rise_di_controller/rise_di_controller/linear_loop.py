@@ -1,0 +1,161 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The sampled linear loop of a control law around a model, with actuators and delay: stability and delay margin."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.parameters import require
+from flight_core.vectors import FloatArray
+from rise_di_controller.control_law import Measurements, TunedLaw, fields, restored
+from rise_di_controller.law import LawParams, Sign, total_lag
+
+SPECTRAL_RADIUS_TOLERANCE = 1e-6
+"""A spectral radius above 1 by more than this is unstable. Angles that integrate the outputs give a double eigenvalue 1, which
+rounding splits by the root of its size, 1e-8."""
+
+MAX_DELAY_MARGIN = 0.5
+"""s, upper end of the search for a delay margin. A loop that tolerates more is slower than any that this stack flies."""
+
+SMALL = 2.0**-40  # size of the steps from 0: below every limit and every width of a sign; a power of two loses no digit
+
+
+class LinearPlant(NamedTuple):
+    """x_dot = A x + B u_a, y = C x with one actuator an input, lag_i u_a,i_dot = u_i - u_a,i; the law's order, SI."""
+
+    A: FloatArray  # (n, n)
+    B: FloatArray  # (n, m)
+    C: FloatArray  # (m, n)
+
+
+class Loop(NamedTuple):
+    """Actuators, delay and sampling between y and the response of the aircraft, over m channels."""
+
+    lag: FloatArray  # (m,) time constants of the actuators, s; 0 without one
+    delay: float  # pure delay beyond sampling, s
+    period: float  # of the law, s
+
+    @property
+    def total(self) -> FloatArray:
+        """Lag of the loop, shape (m,), s."""
+        return np.asarray(total_lag(self.lag, self.delay, self.period))
+
+
+class LinearLaw(NamedTuple):
+    """A law near e = 0 with k values in its state: z+ = A z + B y, u = C z + D y, at y_m = 0."""
+
+    A: FloatArray  # (k, k)
+    B: FloatArray  # (k, m)
+    C: FloatArray  # (m, k)
+    D: FloatArray  # (m, m)
+
+
+def linear_law(law: TunedLaw, m: int, period: float) -> LinearLaw:
+    """A law's step near e = 0 over m channels: the columns are its steps by SMALL in each value of its state and of y.
+
+    An observer has faded in. Raises ParameterError for the literal sign, which is not linear anywhere.
+    """
+    control_law, params = law
+    of_law = params.law if control_law.inner is not None else params
+    literal = isinstance(of_law, LawParams) and of_law.sign is Sign.LITERAL
+    require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
+    zero = np.zeros(m)
+    at_rest = fields(control_law.engage(Measurements(zero, zero, zero, zero, zero), params))
+    if control_law.inner is not None:
+        at_rest["sigma"] = np.ones(1)
+    ends = np.cumsum([len(value) for value in at_rest.values()])
+    size = int(ends[-1]) if len(ends) else 0
+
+    def step(z: FloatArray, y: FloatArray) -> FloatArray:
+        parts = dict(zip(at_rest, np.split(z, ends[:-1]), strict=True)) if size else {}
+        state, u = control_law.step(
+            restored(control_law, parts), Measurements(y, zero, zero, zero, zero), np.float64(period), params
+        )
+        return np.concatenate([*fields(state).values(), u])
+
+    begin = np.concatenate([*at_rest.values(), zero])
+    rest = step(begin[:size], zero)
+    columns = [(step((begin + one)[:size], (begin + one)[size:]) - rest) / SMALL for one in SMALL * np.eye(size + m)]
+    matrix = np.array(columns).T
+    return LinearLaw(matrix[:size, :size], matrix[:size, size:], matrix[size:, :size], matrix[size:, size:])
+
+
+def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
+    """exp(A period) and integral_0^period exp(A s) ds B: the input held over a period; leading axes are batches.
+
+    Source: C. Van Loan, IEEE TAC 23(3), 1978.
+    """
+    from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
+
+    n, m = B.shape[-2:]
+    whole = np.zeros((*np.broadcast_shapes(A.shape[:-2], B.shape[:-2]), n + m, n + m))
+    whole[..., :n, :n], whole[..., :n, n:] = A, B
+    exponential = np.asarray(expm(whole * period), dtype=np.float64)
+    return exponential[..., :n, :n], exponential[..., :n, n:]
+
+
+def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:
+    """One period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the unit circle.
+
+    u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,). The state is x, the
+    actuators, the law's state, and the delayed inputs. Source: K. J. Astrom, B. Wittenmark, "Computer-Controlled Systems",
+    section 2.3, for the sampling of a plant with delay.
+    """
+    (n, m), k = plant.B.shape, len(law.A)
+    has_lag = loop.lag > 0.0
+    rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)  # without an actuator: any, it drives nothing
+    motion = np.block([[plant.A, plant.B * has_lag], [np.zeros((m, n)), -np.diag(rate)]])
+    drive = np.vstack([plant.B * ~has_lag, np.diag(rate * has_lag)])
+    whole = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
+    part = np.maximum(loop.delay + extra - whole * loop.period, 0.0)
+    held = int(whole.max()) + 1  # delayed inputs, the newest first
+
+    free, _ = zero_order_hold(motion, drive, loop.period)
+    size = n + m + k + held * m
+    of_law, delayed = slice(n + m, n + m + k), slice(n + m + k, size)
+    eye, output = np.eye(size), np.zeros((m, size))
+    output[:, :n] = plant.C
+    u = law.C @ eye[of_law] + law.D @ output
+    inputs = np.vstack([u, eye[delayed]])  # of this tick, then of earlier ones
+
+    matrix = np.zeros((size, size))
+    matrix[: n + m, : n + m] = free
+    for i in range(m):
+        rest, new = zero_order_hold(motion, drive[:, [i]], loop.period - part[i])
+        _, old = zero_order_hold(motion, drive[:, [i]], part[i])
+        matrix[: n + m] += np.outer(new, inputs[whole[i] * m + i]) + np.outer(rest @ old, inputs[(whole[i] + 1) * m + i])
+    matrix[of_law] = law.A @ eye[of_law] + law.B @ output
+    matrix[delayed] = inputs[: held * m]
+    return matrix
+
+
+def spectral_radius(matrix: FloatArray) -> float:
+    """Largest magnitude of an eigenvalue."""
+    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+
+
+def is_stable(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> bool:
+    """Whether no eigenvalue of `closed_loop` lies outside the unit circle, up to rounding."""
+    return spectral_radius(closed_loop(plant, law, loop, extra)) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE
+
+
+def delay_margin(plant: LinearPlant, law: LinearLaw, loop: Loop, channel: int | None = None) -> float:
+    """Delay margin: pure delay beyond loop.delay, s, at which the linear loop turns unstable, in all channels or in one.
+
+    0 if the loop is unstable without it, infinite if the loop tolerates half a second. The search takes steps of half a period,
+    then bisects down to 0.1 ms.
+    """
+    delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
+    if not is_stable(plant, law, loop, 0.0 * delayed):
+        return 0.0
+    lower, stride = 0.0, loop.period / 2.0
+    while is_stable(plant, law, loop, (lower + stride) * delayed):
+        lower += stride
+        if lower > MAX_DELAY_MARGIN:
+            return math.inf
+    while stride > 1e-4:
+        stride /= 2.0
+        lower += stride * is_stable(plant, law, loop, (lower + stride) * delayed)
+    return lower

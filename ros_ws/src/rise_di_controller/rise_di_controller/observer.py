@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Observer, an extension of the paper, off by default: estimates of states, wind and disturbances correct the trim of a law.
+
+It extends any control law: the law's own equations do not change. Its matrices are parameters, so nothing is solved here. See
+docs/theory.md.
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from flight_core.vectors import Array, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.saturation import Limits, saturate
+
+
+class ObserverParams(NamedTuple):
+    """Parameters of the extended law and of the observer, s estimates; a matrix may have the N aircraft as its last axis.
+
+    The model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u - u_trim), e = H z.
+    """
+
+    law: Any  # parameters of the extended law
+    Phi: Array  # (s, s)
+    Gamma: Array  # (s, m)
+    H: Array  # (m, s)
+    L: Array  # (s, m) correction of the estimates by the innovation
+    F: Array  # (m, s) u per estimate
+    limits: Limits  # of u_o
+    fade_rate: Array  # () 1/s, inverse of the time in which u_o fades in after engagement
+
+
+class ObserverState(NamedTuple):
+    """State of the extended law and of the observer between two ticks."""
+
+    law: Any
+    z: Array  # (s,) estimates, predicted for the next tick
+    u_o: Array  # (m,) the observer's contribution to the trim
+    sigma: Array  # (1,) fade-in after engagement, 0 to 1
+
+
+def product(matrix: Array, vector: Array) -> Array:
+    """The product of a matrix (k, s) with a vector (s,) or (s, N); of N matrices (k, s, N) with N vectors (s, N): (k, N)."""
+    if matrix.ndim == 2:
+        return matrix @ vector
+    total = matrix[:, 0] * vector[0]
+    for j in range(1, matrix.shape[1]):
+        total = total + matrix[:, j] * vector[j]
+    return total
+
+
+def predict(z: Array, u: Array, params: ObserverParams) -> Array:
+    """Estimates one period later: Phi z + Gamma u, with u the deviation from u_trim."""
+    return product(params.Phi, z) + product(params.Gamma, u)
+
+
+def initial_estimates(e: Array, params: ObserverParams) -> Array:
+    """Estimates at engagement: H'e, the outputs at their errors and all else 0."""
+    return product(params.H.T, e)
+
+
+def correct(state: ObserverState, e: Array, dt: Array, params: ObserverParams) -> ObserverState:
+    """Correction by the measured error, and the contribution to the trim.
+
+        z     = z + L (e - H z)
+        sigma = min(1, sigma + dt fade_rate)
+        u_o   = -sigma F z, inside its limits of magnitude and rate
+
+    The limits bound u_o and u_o_dot for any measurement. The fade-in makes the engagement bumpless.
+    """
+    xp = array_namespace(e)
+    z = state.z + product(params.L, e - product(params.H, state.z))
+    sigma = xp.minimum(state.sigma + dt * params.fade_rate, xp.ones_like(state.sigma))
+    u_o = saturate(-sigma * product(params.F, z), state.u_o, dt, params.limits)
+    return ObserverState(state.law, z, u_o, sigma)
+
+
+@lru_cache(maxsize=64)
+def with_observer(law: ControlLaw) -> ControlLaw:
+    """A control law from the trim u_trim + u_o; the observer takes u after saturation (anti-windup).
+
+        u_o as `correct` computes it
+        u   = law(y, y_m) from the trim u_trim + u_o
+        z  += Phi z + Gamma (u - u_trim)        for the next tick, and again for each missed one
+
+    The law takes the measured e, not the estimate.
+    """
+
+    def corrected(
+        state: ObserverState, measured: Measurements, dt: Array, params: ObserverParams
+    ) -> tuple[ObserverState, Measurements]:
+        state = correct(state, measured.y - measured.y_m, dt, params)
+        return state, measured._replace(u_trim=measured.u_trim + state.u_o)
+
+    def predicted(state: ObserverState, of_law: Any, u: Array, measured: Measurements, params: ObserverParams) -> ObserverState:
+        return ObserverState(of_law, predict(state.z, u - measured.u_trim, params), state.u_o, state.sigma)
+
+    def engage(measured: Measurements, params: ObserverParams) -> ObserverState:
+        xp = array_namespace(measured.y)
+        e = measured.y - measured.y_m
+        zero = xp.zeros_like(e)
+        return ObserverState(law.engage(measured, params.law), initial_estimates(e, params), zero, zero[:1])
+
+    def step(state: ObserverState, measured: Measurements, dt: Array, params: ObserverParams) -> tuple[ObserverState, Array]:
+        state, inner = corrected(state, measured, dt, params)
+        of_law, u = law.step(state.law, inner, dt, params.law)
+        return predicted(state, of_law, u, measured, params), u
+
+    def limited(
+        state: ObserverState, measured: Measurements, dt: Array, params: ObserverParams, limits: Limits
+    ) -> tuple[ObserverState, Array, Array]:
+        state, inner = corrected(state, measured, dt, params)
+        of_law, u_free, u = law.limited(state.law, inner, dt, params.law, limits)
+        return predicted(state, of_law, u, measured, params), u_free, u
+
+    def retune(state: ObserverState, old: ObserverParams, new: ObserverParams) -> ObserverState:
+        return state._replace(law=law.retune(state.law, old.law, new.law))
+
+    def missed(state: ObserverState, measured: Measurements, params: ObserverParams) -> ObserverState:
+        of_law = law.missed(state.law, measured, params.law)
+        return predicted(state, of_law, measured.u_before, measured, params)
+
+    return ControlLaw(ObserverState, engage, step, limited, retune, missed, inner=law)

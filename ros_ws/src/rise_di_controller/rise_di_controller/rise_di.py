@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of RISE-DI: validation, and conversion to the arrays of the law."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+
+from flight_core.parameters import Positive, Positives, as_tuple, require_length
+from rise_di_controller.control_law import ControlLaw
+from rise_di_controller.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
+from rise_di_controller.params import ControllerParameters
+
+
+class RiseDiParameters(ControllerParameters):
+    """The controller under RISE dynamic inversion, the paper's law."""
+
+    k_g: Positive = Field(description="k_g of equation (22), 1/s")
+    k_d: Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(as_tuple)] = Field(
+        description="k_d of equation (22), one per channel except the last, 1/s"
+    )
+    Lambda: Positives = Field(description="the diagonal of Lambda (4), 1/s")
+    beta: Positives = Field(description="the diagonal of beta (21) in scaled inputs, units of y / s^2")
+    omega: Positives = Field(description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign)")
+    sign: Literal["auto", "literal", "implicit", "soft"] = Field(
+        description="how the sign of (21) is sampled; auto: implicit where lag and delay are below half a period, else soft"
+    )
+    softening: Positive | Positives = Field(
+        description="width of the softened sign in total lags, one or one per channel; stable above 1, 3 is usual"
+    )
+
+    def check_law(self) -> None:
+        """One value for each channel; k_d has none for the last."""
+        require_length("k_d", self.k_d, self.outputs[:-1])
+        for key in ("Lambda", "beta", "omega"):
+            require_length(key, getattr(self, key), self.outputs)
+        if isinstance(self.softening, tuple):
+            require_length("softening", self.softening, self.outputs)
+
+    def control_law(self) -> ControlLaw:
+        """RISE-DI with its sampled sign."""
+        return CONTROL_LAWS[self.sampled_sign()[0]]
+
+    def law_params(self) -> LawParams:
+        """The arrays of the law."""
+        K = gain(np.array(self.k_g), np.array(self.k_d, dtype=np.float64))
+        return LawParams(
+            K=K,
+            Lambda=np.array(self.Lambda),
+            beta=np.array(self.beta),
+            D=np.array(self.D, dtype=np.float64),
+            input_scale=np.array(self.input_scale),
+            omega=np.array(self.omega),
+            eps=np.array(self.beta) / K * self.softening * total_lag(np.array(self.lag), self.delay, 1.0 / self.rate),
+            sign=self.sampled_sign()[0],
+        )
+
+    def summary(self) -> str:
+        """How the sign is sampled, and the reason as a sentence."""
+        return self.sampled_sign()[1]
+
+    def sampled_sign(self) -> tuple[Sign, str]:
+        """How the sign is sampled, and the reason as a sentence."""
+        if self.sign != "auto":
+            return Sign[self.sign.upper()], f"{self.sign} sign, as configured"
+        lag, half = max(self.lag) + self.delay, 0.5 / self.rate
+        if lag < half:
+            return Sign.IMPLICIT, f"implicit sign, because lag and delay of {lag:g} s are below half a period ({half:g} s)"
+        return Sign.SOFT, f"softened sign, because lag and delay of {lag:g} s reach half a period ({half:g} s)"
