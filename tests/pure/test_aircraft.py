@@ -142,10 +142,9 @@ def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() ->
     x, position, z = state
     for k, normal in enumerate(turbulence.normals(7 * T, T, filters.seed)):
         t = 0.28 + 0.002 * k
-        moved = actuators.step(position, u, 0.002, params.actuators)
-        position = actuators.apply_faults(t, position, moved, params.actuators)
+        position, mean = actuators.move(t, position, u, 0.002, params.actuators)
         x_dot = partial(dynamics.x_dot, turbulence=turbulence.wind(z, filters))
-        x = rk4(x_dot, t, x, position, params.aircraft, 0.002)
+        x = rk4(x_dot, t, x, mean, params.aircraft, 0.002)
         z = turbulence.step(z, normal, filters)
     assert end.x == pytest.approx(x, rel=1e-13, abs=1e-15)
     assert (end.position == position).all()

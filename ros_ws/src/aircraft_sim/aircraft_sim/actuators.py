@@ -36,9 +36,7 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     Source: the lag is the zero-order-hold equivalent of 1 / (lag s + 1); Franklin, Powell, Workman, Digital Control, 4.3.
     """
     xp = array_namespace(position)
-    new = command
-    if params.dead_zone is not None:
-        new = new - xp.minimum(xp.maximum(new, -params.dead_zone), params.dead_zone)
+    new = _beyond_dead_zone(command, params)
     if params.lag is not None:
         new = new - (new - position) * xp.exp(-dt / xp.maximum(params.lag, MIN_LAG))
     if params.rate is not None:
@@ -49,14 +47,53 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     return new if params.upper is None else xp.minimum(new, params.upper)
 
 
+def mean_position(position: Array, command: Array, new: Array, dt: Any, params: Actuators) -> Array:
+    """Mean of the actuator positions over a step from `position` to `new`, shape (m,): the input of the aircraft in this step.
+
+        input   = command - clip(command, -dead_zone, dead_zone)                  as in `step`
+        lagged  = input - (input - position) lag / dt (1 - exp(-dt / lag))        exact mean of lag p_dot = input - p
+        limited = clip(lagged, position - rate dt / 2, position + rate dt / 2)    exact mean of a motion at the rate limit
+        mean    = clip(limited, min(position, new), max(position, new))           the motion is monotonic and has end stops
+
+    The one step in which a limit begins or ceases to act has an approximate mean, between both ends. An ideal actuator has
+    mean = new, to the last bit.
+
+    Shapes and units as in `step`; `new` is its result.
+    """
+    if params.lag is None and params.rate is None:
+        return new
+    xp = array_namespace(position)
+    mean = _beyond_dead_zone(command, params)
+    if params.lag is not None:
+        mean = mean + (mean - position) * (params.lag / dt * xp.expm1(-dt / xp.maximum(params.lag, MIN_LAG)))
+    if params.rate is not None:
+        largest = params.rate * (0.5 * dt)
+        mean = xp.minimum(xp.maximum(mean, position - largest), position + largest)
+    return xp.minimum(xp.maximum(mean, xp.minimum(position, new)), xp.maximum(position, new))
+
+
+def move(t: Any, position: Array, command: Array, dt: Any, params: Actuators) -> tuple[Array, Array]:
+    """Positions at the end of a step that begins at t, and mean positions over the step, with faults, each of shape (m,)."""
+    new = step(position, command, dt, params)
+    mean = mean_position(position, command, new, dt, params)
+    return apply_faults(t, position, new, params), apply_faults(t, position, mean, params)
+
+
+def _beyond_dead_zone(command: Array, params: Actuators) -> Array:
+    if params.dead_zone is None:
+        return command
+    xp = array_namespace(command)
+    return command - xp.minimum(xp.maximum(command, -params.dead_zone), params.dead_zone)
+
+
 def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:
-    """Actuator positions at the end of a step that begins at t, with faults applied, shape (m,).
+    """Actuator positions at the end of a step that begins at t, or means over it, with faults applied, shape (m,).
 
         t >= stuck_at    position    the actuator keeps its position
         t >= lost_at     0           the surface is free: it goes to trim at once and stays there, also if stuck before
         else             new
 
-    Arguments: `position` at t, `new` at the end of the step without faults. A fault within a step acts from the next one on.
+    Arguments: `position` at t, `new` without faults. A fault within a step acts from the next one on.
     """
     xp = array_namespace(position)
     if params.stuck_at is not None:

@@ -27,7 +27,10 @@ class JsbsimModel:
         commands  = trim + position+, then JSBSim runs
 
     JSBSim integrates the forces of the step before, then computes those of the new commands and the new wind: both act one step
-    later. Raises FlightEnded where the aircraft does not trim, crashes or hangs. Each is tried in an isolated process first.
+    later. JSBSim computes forces at an instant, t_k + dt, so the position at this instant is the right one: the mean over the
+    past step would be half a step older.
+
+    Raises FlightEnded where the aircraft does not trim, crashes or hangs. Each is tried in an isolated process first.
     """
 
     def __init__(self, condition: FlightCondition, actuator_model: Actuators, wind_model: WindModel) -> None:

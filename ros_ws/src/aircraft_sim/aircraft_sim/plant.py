@@ -28,7 +28,7 @@ class AircraftState(NamedTuple):
     """State of the plant, deviations from trim, SI."""
 
     x: Array  # (n,)
-    position: Array  # (m,) of the actuators: the input of equation (1)
+    position: Array  # (m,) of the actuators
     turbulence: Array | None = None  # (5,) of the turbulence filters; None without turbulence
 
 
@@ -58,16 +58,17 @@ def advance(
 
     Each step dt, from t_k on, is
 
-        position+ = actuators.apply_faults(t_k, position, actuators.step(position, u, dt))
-        x+        = Runge-Kutta step of equation (1) with the input position+ and the turbulence at t_k
-        z+        = turbulence.step(z, n_k)
+        position+, mean = actuators.move(t_k, position, u, dt)
+        x+              = Runge-Kutta step of equation (1) with the input `mean` and the turbulence at t_k
+        z+              = turbulence.step(z, n_k)
 
-    The position at the end of the step acts during the whole step. An ideal actuator then passes u on without delay, to the
-    last bit, and a real one leads its continuous model by dt / 2. The turbulence at the beginning of the step acts during the
-    whole step: sampled at the steps it has its spectrum exactly, in between it is held. Time is counted in ns, so that steps
-    add up exactly. `forced` is the `forcing` of these steps, if the caller has it. `normals` are the numbers n_k, shape
-    (steps, 5); by default they follow from the seed, which takes NumPy. Raises ParameterError where the step does not divide
-    the duration.
+    The mean position over the step acts during the whole step: its error against the continuous actuator is of second order
+    in dt, and an ideal actuator passes u on without delay, to the last bit. The turbulence at the beginning of the step acts
+    during the whole step: sampled at the steps it has its spectrum exactly, in between it is held. Time is counted in ns, so
+    that steps add up exactly.
+
+    `forced` is the `forcing` of these steps, if the caller has it. `normals` are the numbers n_k, shape (steps, 5); by default
+    they follow from the seed, which takes NumPy. Raises ParameterError where the step does not divide the duration.
     """
     x, position, z = state
     aircraft, filters = plant.aircraft, plant.turbulence
@@ -80,9 +81,8 @@ def advance(
 
     rate = (forcing(t_ns, steps, plant) if forced is None else forced).rate
     for k in range(steps):
-        new = actuators.step(position, u, dt, plant.actuators)
-        position = actuators.apply_faults(seconds(t_ns + k * plant.step_ns), position, new, plant.actuators)
-        held = aircraft.B @ position
+        position, mean = actuators.move(seconds(t_ns + k * plant.step_ns), position, u, dt, plant.actuators)
+        held = aircraft.B @ mean
         if filters is not None:
             held = held + aircraft.gust_direction @ turbulence.wind(z, filters)
             z = turbulence.step(z, normals[k], filters)

@@ -14,7 +14,7 @@ def names(airframe: Airframe) -> tuple[str, ...]:
     """Channels of `truth`, group by group.
 
     "x.state", "f.state" (f of equation (1), with all disturbances), "gust.axis" (the wind along each axis of the airframe's
-    gusts, 1-cosine gust plus turbulence, m/s), "actuator.input" (the position that has acted up to now).
+    gusts, 1-cosine gust plus turbulence, m/s), "actuator.input" (the position now).
     """
     groups = (("x", airframe.states), ("f", airframe.states), ("gust", airframe.gusts), ("actuator", airframe.inputs))
     return tuple(f"{group}.{name}" for group, members in groups for name in members)

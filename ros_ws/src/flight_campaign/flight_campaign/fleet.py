@@ -41,7 +41,7 @@ class StateBlock(NamedTuple):
 class Fleet(NamedTuple):
     """N aircraft over one tick of the controller, in K steps of the integration; q rows of the remainder, r of the forcing.
 
-    With p_k the actuators' positions at the end of step k, the remainder s and the course's forcing w_k in step k, one tick is
+    With p_k the actuators' mean positions over step k, the remainder s and the course's forcing w_k in step k, one tick is
 
         x+ = tick @ [x, p_1, ..., p_K, s] + wind forced @ [w_1, ..., w_K]
     """
@@ -107,8 +107,8 @@ def assemble(A: FloatArray, B: FloatArray, plant: PlantParams, course: Course, w
         tick = [Phi^K, Phi^(K-1) Gamma B, ..., Gamma B, (Phi^(K-1) + ... + 1) Gamma remainder]
         forced = [Phi^(K-1) Gamma basis, ..., Gamma basis]
 
-    The steps, and the actuators' positions in them, are those of `plant.advance`. The remainder is held over a tick, and the
-    forcing over a step. `wind` and `late` are those of Fleet, one value for all or one each.
+    The steps, and the actuators' mean positions in them, are those of `plant.advance`. The remainder is held over a tick, and
+    the forcing over a step. `wind` and `late` are those of Fleet, one value for all or one each.
     """
     dt, aircraft = seconds(plant.step_ns), plant.aircraft
     K, count = course.steps, len(A)
@@ -249,9 +249,8 @@ def _fly(
         acting = u if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
         command, position, positions = acting[jnp.argsort(vehicle.inputs)], now.position, []
         for k in range(steps):
-            moved = actuators.step(position, command, vehicle.dt, vehicle.actuators)
-            position = actuators.apply_faults(segment.t + k * vehicle.dt, position, moved, vehicle.actuators)
-            positions.extend(position)
+            position, mean = actuators.move(segment.t + k * vehicle.dt, position, command, vehicle.dt, vehicle.actuators)
+            positions.extend(mean)
         remainder = remainder_of(now.x[vehicle.remainder_states], vehicle.remainder)
         moves = [*now.x, *positions, *(1.5 * remainder - 0.5 * now.remainder)]
         parts = [_product(part, [moves[j] for j in block.columns]) for part, block in zip(fleet.tick, blocks, strict=True)]
