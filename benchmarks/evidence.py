@@ -54,7 +54,7 @@ QUICK_CAMPAIGN = (*CAMPAIGN, "--aircraft", "2000", "--chunk", "200", "--exact", 
 SECURITY = (*PYTEST, "tests/ros/test_security.py")
 READERS = "readers of files and messages, coverage-guided fuzzing"
 FLEET = ("rise-di", "campaign", "osprey_servo", "--uncertainty", "0.3", "--seed", "7", "--json", "--aircraft")
-COMPARE = ("rise-di", "compare", "osprey_servo", "--tuning", "nominal,uncertain,late", "--json", FILE, "--aircraft")
+COMPARE = ("rise-di", "compare", "osprey_servo", "--tuning", "gust,gust_turbulence,delay", "--json", FILE, "--aircraft")
 
 MEASUREMENTS = (
     *(_speed(group) for group in SPEED),

@@ -142,19 +142,23 @@ def _outcome(cases: Sequence[str]) -> str:
     return ("skipped" if "skipped" in cases else "passed") + (f" ({len(cases)} cases)" if len(cases) > 1 else "")
 
 
-def scores(law: Mapping[str, Any]) -> list[float | None]:
+def scores(law: Mapping[str, Any], wind: str) -> list[float | None]:
     """Score on the nominal aircraft, then mean and worst at each level; None where it diverged."""
-    return [law["score"], *(level[key] for level in law["levels"] for key in ("mean", "worst"))]
+    return [law["score"][wind], *(level[wind][key] for level in law["levels"] for key in ("mean", "worst"))]
 
 
 def marked_scores(law: Mapping[str, Any], laws: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The scores as cells, the lowest of each column among laws with the same measurements in bold."""
-    peers = [[math.inf if value is None else value for value in scores(one)] for one in laws if one["sees"] == law["sees"]]
-    cells = []
-    for value, column in zip(scores(law), zip(*peers, strict=True), strict=True):
-        text = "diverged" if value is None else f"{value:.2f}"
-        cells.append(f"**{text}**" if value is not None and value <= min(column) else text)
-    return [cells[0], *(f"{mean} ({worst})" for mean, worst in zip(cells[1::2], cells[2::2], strict=True))]
+    """The scores of each wind as cells, the lowest of a column among laws with the same measurements and knowledge in bold."""
+    peers = [one for one in laws if (one["sees"], one["knows"]) == (law["sees"], law["knows"])]
+    row = []
+    for wind in law["score"]:
+        of_peers = [[math.inf if value is None else value for value in scores(one, wind)] for one in peers]
+        cells = []
+        for value, column in zip(scores(law, wind), zip(*of_peers, strict=True), strict=True):
+            text = "diverged" if value is None else f"{value:.2f}"
+            cells.append(f"**{text}**" if value is not None and value <= min(column) else text)
+        row += [cells[0], *(f"{mean} ({worst})" for mean, worst in zip(cells[1::2], cells[2::2], strict=True))]
+    return row
 
 
 TEMPLATES = Environment(

@@ -1,24 +1,24 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of control laws: cost and score, repeatable tuning, the shipped gains, the command."""
+"""Comparison of control laws: cost and score, repeatable tuning, delayed inputs, the shipped gains, the command."""
 
 import json
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from tests.closed_loop import error
 from typer.testing import CliRunner
 
-from control_laws.catalogue import LAWS, initial_gains
+from control_laws.catalogue import LAWS, Gains, initial_gains
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet, law_comparison, tuning
 from flight_campaign.fleet import FleetResult
-from flight_campaign.tuning import Benchmark, TuningResult
+from flight_campaign.tuning import GUST, OBJECTIVES, TURBULENCE, Benchmark, TuningResult
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 
@@ -29,8 +29,23 @@ SHIPPED = ("osprey_servo", "osprey_gust")
 @pytest.fixture(scope="module")
 def short() -> Benchmark:
     """The first 4 s of osprey_servo, with its vertical gust brought forward into them."""
+    return tuning.build_benchmark(brief(find_scenario("osprey_servo")))
+
+
+def brief(scenario: Scenario) -> Scenario:
+    """The first 4 s of a scenario, with a vertical gust in them."""
     gust = {"vertical": {"start": 2.0, "speed": 10.12, "length": 15.24}}
-    return tuning.build_benchmark(find_scenario("osprey_servo").vary(flight={"duration": 4.0}, aircraft={"gusts": gust}))
+    return scenario.vary(flight={"duration": 4.0}, aircraft={"gusts": gust})
+
+
+def as_tuned(gains: Gains, **changes: Any) -> TuningResult:
+    """A tuning result with these gains."""
+    return TuningResult({name: value[:, 0].tolist() for name, value in gains.items()}, 1.0, 1, [1.0], 0)._replace(**changes)
+
+
+def initial(name: str, benchmark: Benchmark, **changes: Any) -> TuningResult:
+    """A tuning result with the initial gains of a law."""
+    return as_tuned(initial_gains(LAWS[name], benchmark.model), **changes)
 
 
 def test_a_score_counts_each_channel_in_its_unit_and_a_cost_adds_activity(short: Benchmark) -> None:
@@ -46,92 +61,133 @@ def test_a_score_counts_each_channel_in_its_unit_and_a_cost_adds_activity(short:
     assert tuning.cost(result._replace(rms=np.nan * rms), short) == [tuning.MAX_COST]
 
 
-@pytest.mark.parametrize(("objective", "flights"), [("nominal", 3), ("uncertain", 15), ("late", 21)])
-def test_an_evaluation_gives_equal_weights_to_aircraft_and_to_calm_air_gusts_and_delay(
-    objective: str, flights: int, short: Benchmark
-) -> None:
-    evaluation = tuning.evaluation(objective, short)
-    wind, late = np.asarray(evaluation.fleet.wind), np.asarray(evaluation.fleet.late)
-    assert len(wind) == flights
-    assert evaluation.weight.sum() == pytest.approx(3.0)
-    for part in (wind == 0.0, (wind == 1.0) & (late == 0), late == tuning.EXTRA_DELAY_TICKS):
-        assert evaluation.weight[part].sum() == pytest.approx(1.0)
+@pytest.mark.parametrize("name", list(OBJECTIVES))
+def test_a_cost_is_the_mean_of_the_aircraft_in_each_wind_and_that_of_the_late_ones(name: str, short: Benchmark) -> None:
+    objective = OBJECTIVES[name]
+    aircraft = 1 + tuning.UNCERTAIN_AIRCRAFT
+    found = tuning.evaluations(objective, short)
+    assert {part.wind: part.weight.sum() / 2.0 for part in found} == pytest.approx(objective.weights)
+    for part in found:
+        late, weight = np.asarray(part.fleet.late), part.weight / objective.weights[part.wind]
+        assert weight[late == 0].tolist() == [1.0 / aircraft] * aircraft
+        delayed = aircraft if objective.all_late else 1
+        assert weight[late == objective.delay * tuning.DELAY_TICKS].tolist() == [1.0 / delayed] * delayed
+        # the first late one is the nominal aircraft, number 0
+        np.testing.assert_array_equal(part.fleet.rate[..., aircraft], part.fleet.rate[..., 0])
+
+
+def test_the_turbulence_replaces_the_gusts_and_depends_on_its_seed(short: Benchmark) -> None:
+    other = tuning.build_benchmark(short.scenario, law_comparison.TURBULENCE_SEED)
+    forcing = {
+        seed: {wind: course[False].segments.forcing @ np.kron(np.eye(course[False].steps), course[False].basis.T)
+               for wind, course in one.courses.items()}
+        for seed, one in (("tuning", short), ("comparison", other))
+    }  # fmt: skip
+    begin = slice(0, 150)  # 1.5 s, before the gust
+    assert not forcing["tuning"][GUST][begin].any()
+    assert forcing["tuning"][TURBULENCE][begin].any(axis=1).all()
+    np.testing.assert_array_equal(forcing["tuning"][GUST], forcing["comparison"][GUST])
+    assert not np.array_equal(forcing["tuning"][TURBULENCE], forcing["comparison"][TURBULENCE])
 
 
 def test_a_search_is_repeatable_and_lowers_the_cost_of_its_initial_gains(short: Benchmark) -> None:
-    law, begin = LAWS["pi"], initial_gains(LAWS["pi"], short.model)
-    found = [tuning.tune(law, tuning.NOMINAL, short, (3, 4), generations=6) for _ in range(2)]
+    law, begin, objective = LAWS["pi"], initial_gains(LAWS["pi"], short.model), OBJECTIVES["gust_turbulence"]
+    found = [tuning.tune(law, objective, short, (3, 4), generations=6) for _ in range(2)]
     assert found[0] == found[1]
     assert found[0].cost == min(found[0].costs)
     assert found[0].evaluations == 6 * tuning.POPULATION
-    flights, weight = tuning.evaluation(tuning.NOMINAL, short)
-    fly = partial(fleet.fly, flights, short.vehicle, short.courses[False], law.control_law(short.model))
-    params = (law.params(one, short.model) for one in (begin, tuning.as_gains(found[0])))
-    costs = [float(tuning.cost(fly(one), short) @ weight) for one in params]
-    assert costs[1] == pytest.approx(found[0].cost, rel=1e-3)  # gains are written with five digits
-    assert costs[1] < 0.95 * costs[0]
+    control_law = law.control_law(short.model)
+
+    def cost(gains: Gains) -> float:
+        params = law.params(gains, short.model)
+        return sum(
+            float(tuning.cost(fleet.fly(part.fleet, short.vehicle, short.courses[part.wind][False], control_law, params), short)
+            @ part.weight)
+            for part in tuning.evaluations(objective, short)
+        )  # fmt: skip
+
+    after = cost(tuning.as_gains(found[0]))
+    assert after == pytest.approx(found[0].cost, rel=1e-3)  # gains are written with five digits
+    assert after < 0.95 * cost(begin)
 
 
-def test_the_score_of_a_campaign_is_that_of_the_single_process_simulation(short: Benchmark) -> None:
+@pytest.mark.parametrize("wind", [GUST, TURBULENCE])
+def test_the_score_of_a_campaign_is_that_of_the_single_process_simulation(wind: str, short: Benchmark) -> None:
     controller = short.scenario.controller
-    gains = {key: list(getattr(controller, key)) for key in ("Lambda", "beta")}
-    gains |= {"K": controller.law_params().K.tolist(), "softening": [short.scenario.rise_di().softening]}
-    (found,) = law_comparison.compare(short, {"rise": {"nominal": TuningResult(gains, 0.0, 0, [], 0)}}, 1, [0.3], 1)
-    true = error(simulate(short.scenario))
+    gains = {key: np.array([getattr(controller, key)]).T for key in ("Lambda", "beta")}
+    gains |= {"K": np.array([controller.law_params().K]).T, "softening": np.array([[short.scenario.rise_di().softening]])}
+    (found,) = law_comparison.compare(short, {"rise": {"gust": as_tuned(gains)}}, 1, [0.3], 1)
+    turbulence = tuning.DRYDEN | {"seed": tuning.TUNING_TURBULENCE_SEED}
+    flown = short.scenario if wind == GUST else short.scenario.vary(aircraft={"gusts": {}, "turbulence": turbulence})
+    true = error(simulate(flown))
     rms = np.array([error_metrics(true[name]).rms for name in controller.outputs])
     # the campaign holds the nonlinear remainder over a tick, the simulation does not: far below the 1 % that a score needs
-    np.testing.assert_allclose(found.rms, rms, rtol=2e-3)
-    assert found.score == pytest.approx(float(np.sum(rms / short.unit)), rel=2e-3)
+    assert found.scores[wind] == pytest.approx(float(np.sum(rms / short.unit)), rel=2e-3)
+    if wind == GUST:
+        np.testing.assert_allclose(found.rms, rms, rtol=2e-3)
 
 
 def test_more_aircraft_do_not_change_the_results_of_the_first_ones(short: Benchmark) -> None:
-    gains = tuning.load(tuning.TUNED / "osprey_servo.yaml")
-    one = {"pi": {"nominal": gains["pi"]["nominal"]}}
+    one = {"pi": {"gust": initial("pi", short)}}
     few, more = (next(iter(law_comparison.compare(short, one, count, [0.3, 0.5], 7))) for count in (2, 3))
-    assert few.score == more.score
+    assert few.scores == more.scores
     for level, wider in zip(few.levels, more.levels, strict=True):
-        assert level.worst <= wider.worst
-        assert level.diverged == wider.diverged == 0.0
+        for wind in (GUST, TURBULENCE):
+            assert level.scores[wind].worst <= wider.scores[wind].worst
+
+
+def test_the_share_of_lost_aircraft_is_that_of_the_first_level_by_the_delay_of_u(short: Benchmark) -> None:
+    # K of 40 1/s and the 35 ms of the loop of q are 1.4 rad at the crossover: stable below pi/2; with 60 ms more it is unstable
+    fast = as_tuned({"K": np.full((4, 1), 40.0), "Lambda": np.ones((4, 1))})
+    (found,) = law_comparison.compare(short, {"pi": {"gust": fast}}, 3, [0.3, 0.5], 1, delays=(0, 6))
+    assert found.lost_late == {0.0: 0.0, 0.06: 1.0}
+    assert found.levels[0].scores[GUST].lost == 0.0
+
+
+@pytest.mark.xfail(strict=True, reason="the gains are not tuned yet on the costs of gusts and turbulence")
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_law_ships_with_gains_for_gusts_and_turbulence(name: str) -> None:
+    shipped = tuning.load(tuning.TUNED / f"{name}.yaml")
+    assert set(shipped) == set(LAWS)
+    assert all("gust_turbulence" in by_aim for by_aim in shipped.values())
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_every_law_ships_with_gains_for_the_nominal_and_the_uncertain_objective(name: str) -> None:
-    shipped = tuning.load(tuning.TUNED / f"{name}.yaml")
-    assert set(shipped) == set(LAWS)
+def test_shipped_gains_are_those_of_the_catalogue(name: str) -> None:
     benchmark = tuning.build_benchmark(find_scenario(name).vary(flight={"duration": 0.1}))
-    for law, by_aim in shipped.items():
-        assert {"nominal", "uncertain"} <= set(by_aim), law
+    for law, by_aim in tuning.load(tuning.TUNED / f"{name}.yaml").items():
         for found in by_aim.values():
             assert found.cost == min(found.costs) < tuning.MAX_COST
+            assert len(found.costs) >= 3  # seeds, so that the spread of the search is known
             expected = {key: len(gain) for key, gain in initial_gains(LAWS[law], benchmark.model).items()}
             assert {key: len(values) for key, values in found.gains.items()} == expected
             assert all(value > 0.0 for values in found.gains.values() for value in values)
 
 
-def test_gains_read_back_as_they_were_written(tmp_path: Path) -> None:
-    pi = TuningResult({"K": [9.0, 0.1 + 0.2], "Lambda": [2e-07, 1e22]}, 4.5, 2, [4.75, 4.5], 32)
-    tuned = {"pi": {"nominal": pi, "late": pi._replace(cost=1 / 3)}, "l1": {"nominal": pi}}
-    path = tmp_path / "made" / "gains.yaml"
-    tuning.save(path, tuned, "a command")
-    assert tuning.load(path) == tuned
-    assert "# Made by: a command" in path.read_text(encoding="utf-8")
-    assert repr(tuning.load(path)) == repr(tuned)  # to the last bit
-    assert tuning.load(tmp_path / "none.yaml") == {}
-    path.write_text("laws: {pi: {nominal: {gains: {}}}}", encoding="utf-8")
-    with pytest.raises(ParameterError, match=r"gains\.yaml"):
-        tuning.load(path)
-
-
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_gains_are_in_the_form_that_save_writes(name: str, tmp_path: Path) -> None:
-    text = (tuning.TUNED / f"{name}.yaml").read_text(encoding="utf-8")
-    (command,) = [line.removeprefix("# Made by: ") for line in text.splitlines() if line.startswith("# Made by: ")]
-    tuned = tuning.load(tuning.TUNED / f"{name}.yaml")
-    tuning.save(tmp_path / "again.yaml", tuned, command)
-    assert (tmp_path / "again.yaml").read_text(encoding="utf-8") == text
+    path = tuning.TUNED / f"{name}.yaml"
+    text, tuned = path.read_text(encoding="utf-8"), tuning.load(path)
+    tuning.save(tmp_path / path.name, tuned, f"rise-di compare {name} --tune")
+    assert (tmp_path / path.name).read_text(encoding="utf-8") == text
     assert max(len(line) for line in text.splitlines()) <= 200
     assert len(text.splitlines()) <= 6 + sum(1 + 2 * len(sets) for sets in tuned.values())  # a gain set in one or two lines
-    assert list(yaml.safe_load(text)["laws"]["rise"]) == [key for key in tuning.OBJECTIVES if key in tuned["rise"]]
+
+
+def test_gains_read_back_as_they_were_written_in_the_order_of_the_catalogue(tmp_path: Path) -> None:
+    pi = TuningResult({"K": [9.0, 0.1 + 0.2], "Lambda": [2e-07, 1e22]}, 4.5, 2, [4.75, 4.5], 32)
+    tuned = {"l1": {"gust": pi}, "pi": {"delay": pi._replace(cost=1 / 3), "gust": pi}}
+    path = tmp_path / "made" / "gains.yaml"
+    tuning.save(path, tuned, "a command")
+    found = tuning.load(path)
+    assert found == tuned
+    assert [list(found), list(found["pi"])] == [["pi", "l1"], ["gust", "delay"]]
+    assert "# Made by: a command --tuning gust,delay\n" in path.read_text(encoding="utf-8")
+    assert repr(found["pi"]["delay"]) == repr(tuned["pi"]["delay"])  # to the last bit
+    assert tuning.load(tmp_path / "none.yaml") == {}
+    path.write_text("laws: {pi: {gust: {gains: {}}}}", encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"gains\.yaml"):
+        tuning.load(path)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +196,8 @@ def test_shipped_gains_are_in_the_form_that_save_writes(name: str, tmp_path: Pat
         (["--laws", "rise,magic"], "'magic'"),
         (["--uncertainty", "0.3,1"], "0 and below 1"),
         (["--uncertainty", "much"], "'much'"),
-        (["--tuning", "best"], "nominal, uncertain, late"),
+        (["--tuning", "best"], ", ".join(OBJECTIVES)),
+        (["--turbulence-seed", str(tuning.TUNING_TURBULENCE_SEED)], "another seed"),
         (["--gains", "nowhere.yaml", "--laws", "pi"], "--tune"),
     ],
 )
@@ -150,15 +207,56 @@ def test_bad_input_is_one_sentence(arguments: list[str], words: str) -> None:
     assert words in str(result.exception)
 
 
-def test_the_command_writes_what_it_shows(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def gains_file(short: Benchmark, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file with gains of three laws."""
+    path = tmp_path_factory.mktemp("gains") / "gains.yaml"
+    tuned = {name: {"gust": initial(name, short, cost=7.25, costs=[7.375, 7.25])} for name in ("rise", "l1", "indi")}
+    tuning.save(path, tuned, "a test")
+    return path
+
+
+def test_the_command_writes_what_it_shows(gains_file: Path, tmp_path: Path) -> None:
     path = tmp_path / "compared.json"
-    arguments = ["--laws", "rise,l1", "--aircraft", "2", "--uncertainty", "0.3", "--tuning", "nominal", "--json", str(path)]
-    result = CliRunner().invoke(app, ["compare", "osprey_servo", *arguments])
+    arguments = ["--laws", "rise,l1", "--aircraft", "2", "--uncertainty", "0.3", "--tuning", "gust", "--gains", str(gains_file)]
+    result = CliRunner().invoke(app, ["compare", "osprey_servo", *arguments, "--json", str(path)])
     assert result.exit_code == 0, result.output
     found = json.loads(path.read_text(encoding="utf-8"))
     assert [row["law"] for row in found["laws"]] == ["rise", "l1"]
+    assert [row["knows"] for row in found["laws"]] == [LAWS[name].model_data for name in ("rise", "l1")]
     for row in found["laws"]:
-        assert f"{row['score']:.2f}" in result.stdout
         (level,) = row["levels"]
-        assert f"{level['mean']:.2f} ({level['worst']:.2f})" in result.stdout
+        for wind in (GUST, TURBULENCE):
+            assert f"{row['score'][wind]:.2f}" in result.stdout
+            assert f"{level[wind]['mean']:.2f} ({level[wind]['worst']:.2f})" in result.stdout
+        late = [level[GUST]["lost"], *(one["lost"] for one in row["late"])]
+        assert "/".join(f"{100.0 * share:.3g}" for share in late) in result.stdout
+        assert [one["delay"] for one in row["late"]] == pytest.approx([0.01, 0.02, 0.03, 0.04, 0.06])
+        assert (row["cost"], row["spread"]) == (7.25, 0.125)
+        assert "7.25 +0.12" in result.stdout
         assert set(row["slew"]) == {"elevator", "thrust", "aileron", "rudder"}
+
+
+def test_an_interrupted_tuning_resumes_with_the_missing_laws(
+    short: Benchmark, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, tuned = tmp_path / "gains.yaml", list[str]()
+    names = {law.title: name for name, law in LAWS.items()}
+
+    def tune(law: Any, objective: Any, benchmark: Any, seeds: Any, progress: Any) -> TuningResult:
+        tuned.append(names[law.title])
+        if tuned == ["rise", "pi"]:
+            raise KeyboardInterrupt
+        return initial(names[law.title], short)
+
+    monkeypatch.setattr(tuning, "tune", tune)
+    scenario = tmp_path / "brief.yaml"
+    text = find_scenario("osprey_servo").path.read_text(encoding="utf-8")
+    scenario.write_text(text.replace("duration: 60.0 ", "duration: 4.0 "), encoding="utf-8")
+    arguments = ["compare", str(scenario), "--laws", "rise,pi,l1", "--aircraft", "1", "--tune", "--gains", str(path)]
+    CliRunner().invoke(app, arguments)
+    assert list(tuning.load(path)) == ["rise"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert list(tuning.load(path)) == ["rise", "pi", "l1"]
+    assert tuned == ["rise", "pi", "pi", "l1"]

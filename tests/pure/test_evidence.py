@@ -40,9 +40,13 @@ FAULT = {
     "ready_to_caught_up": {"median": 0.4, "worst": 0.62},
     "longest_pause": None,
 }
-LEVEL = {"uncertainty": 0.3, "mean": 1.75, "worst": 2.48, "diverged": 0.0, "lost": 0.0}
-LAW: dict[str, Any] = {"law": "rise", "sees": "y", "tuned_on": "nominal", "score": 1.61, "delay": 0.02}
-LAW |= {"levels": [LEVEL], "slew": {"elevator": 0.077}}
+UNCERTAIN = {"mean": 1.75, "worst": 2.48, "worst_number": 3, "lost": 0.0}
+LEVEL = {"uncertainty": 0.3, "gust": UNCERTAIN, "turbulence": UNCERTAIN | {"mean": 2.75, "worst": 3.48}}
+LAW: dict[str, Any] = {"law": "rise", "sees": "y", "knows": "Omega", "tuned_on": "gust"}
+LAW |= {"score": {"gust": 1.61, "turbulence": 2.61}}
+LAW |= {"levels": [LEVEL], "late": [{"delay": 0.02, "lost": 0.26}], "slew": {"elevator": 0.077}, "cost": 7.25, "spread": 0.5}
+COMPARED = {"aircraft": 200, "seed": 1, "turbulence_seed": 3}
+PI = LAW | {"law": "pi", "score": {"gust": 1.72, "turbulence": 2.51}}
 FIGURE = {"mean": 1.31, "q50": 1.21, "q95": 2.31, "q99": 2.71, "worst": 3.01, "deviation": 0.1}
 COVERAGE = {"status": 0, "covered": 1234, "number_of_executed_units": 98765, "peak_rss_mb": 321}
 CAMPAIGN: dict[str, Any] = {"whole": 120_000.0, "flown": 150_000.0, "memory_early": 900.0, "memory": 905.0, "aircraft": 10_000}
@@ -56,7 +60,7 @@ RESULTS = {
     "fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE}),
     "campaign": result("campaign", CAMPAIGN),
     "campaign-fleet": result("campaign-fleet", {"cases": [FLEET]}),
-    "compare": result("compare", {"aircraft": 200, "seed": 1, "laws": [LAW, LAW | {"law": "pi", "score": 1.72}]}),
+    "compare": result("compare", COMPARED | {"laws": [LAW, PI]}),
     "replay": result("replay", {"osprey_gust": {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": True}}),
 }
 
@@ -114,10 +118,10 @@ def test_the_controller_is_also_compared_with_the_fastest_echo() -> None:
 
 def test_the_page_depends_on_every_figure_of_every_result() -> None:
     """Except those that the page omits."""
-    before, hidden = page(), {"seconds", "deviation", "status", "quiet"}
+    before, hidden = page(), {"seconds", "deviation", "status", "quiet", "worst_number"}
     for name, whole in RESULTS.items():
         for path in leaves(whole["result"]):
-            if path[-1] in hidden or (name == "compare" and path[-1] == "diverged"):
+            if path[-1] in hidden or path[-2:] == ("turbulence", "lost"):
                 continue
             changed = deepcopy(whole)
             inside = changed["result"]
@@ -178,15 +182,22 @@ def test_a_scenario_that_replays_differently_is_bold() -> None:
     assert "**no flight**" in page(replay=result("replay", {"osprey_gust": {"outcome": ["error: no aircraft"]}}))
 
 
-def test_the_lowest_score_among_laws_with_the_same_measurements_is_bold() -> None:
-    assert "| rise | y | **1.61** |" in page()
-    assert "| pi | y | 1.72 |" in page()
+def test_the_lowest_score_among_laws_with_the_same_measurements_and_knowledge_is_bold() -> None:
+    assert "| rise | y | Omega | **1.61** | **1.75** (**2.48**) | 2.61 |" in page()
+    assert "| pi | y | Omega | 1.72 | **1.75** (**2.48**) | **2.51** |" in page()
+    model = LAW | {"law": "lqg", "knows": "A, B", "score": {"gust": 9.0, "turbulence": 9.0}}
+    assert "| lqg | y | A, B | **9.00** |" in page(compare=result("compare", COMPARED | {"laws": [LAW, model]}))
+
+
+def test_the_share_of_lost_aircraft_is_shown_by_the_delay_of_u_and_the_cost_with_its_spread() -> None:
+    assert "lost at +-30 %, %, u late by 0 / 20 ms |" in page()
+    assert "| 0 / 26 | 0.077 | 7.25 +0.50 |" in page()
 
 
 def test_the_score_of_a_diverged_law_is_a_word() -> None:
-    lost = LAW | {"law": "di", "levels": [LEVEL | {"mean": None, "worst": None}]}
-    compared = result("compare", {"aircraft": 200, "seed": 1, "laws": [LAW, lost]})
-    assert "| di | y | **1.61** | diverged (diverged) |" in page(compare=compared)
+    lost = LAW | {"law": "di", "levels": [LEVEL | {"gust": UNCERTAIN | {"mean": None, "worst": None}}]}
+    compared = result("compare", COMPARED | {"laws": [LAW, lost]})
+    assert "| di | y | Omega | **1.61** | diverged (diverged) |" in page(compare=compared)
 
 
 def test_each_table_has_as_many_cells_as_headings() -> None:

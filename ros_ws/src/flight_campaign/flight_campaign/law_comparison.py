@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of tuned laws on the same aircraft, course, noise and limits: nominal, uncertain, and with delayed inputs."""
+"""Comparison of tuned laws on the same aircraft, winds, noise and limits: nominal, uncertain, and with delayed inputs."""
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -11,22 +13,27 @@ from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.catalogue import LAWS
 from flight_campaign import fleet
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
-from flight_campaign.tuning import Benchmark, TuningResult, as_gains, benchmark_fleet, score
+from flight_campaign.tuning import GUST, TURBULENCE, Benchmark, TuningResult, as_gains, benchmark_fleet, score
 from flight_core.vectors import FloatArray
 
-MAX_SCORE_RATIO = 3.0  # a delay is tolerated if the score is below this factor times the score without delay
-MAX_DELAY_TICKS = 12  # largest delay of the search: 120 ms at 100 Hz
+DELAY_TICKS = (1, 2, 3, 4, 6)  # delays of u: 10 to 60 ms at 100 Hz
+TURBULENCE_SEED = 3  # of a comparison, unlike that of the tuning
+
+
+class Scores(NamedTuple):
+    """Scores of the uncertain aircraft of one level in one wind."""
+
+    mean: float  # infinite if one diverged
+    worst: float
+    worst_number: int  # index of that aircraft, from 0
+    lost: float  # fraction with loss of track, a score above LOSS_OF_TRACK_SCORE; includes diverged ones
 
 
 class Level(NamedTuple):
-    """Results of a law on the uncertain aircraft of one level."""
+    """Results of a law on the uncertain aircraft of one level, u in time."""
 
     uncertainty: float
-    mean: float  # score; infinite if one diverged
-    worst: float
-    worst_number: int  # index of that aircraft, from 0
-    diverged: float  # fraction of the aircraft
-    lost: float  # fraction with loss of track, a score above LOSS_OF_TRACK_SCORE; includes diverged ones
+    scores: dict[str, Scores]  # by wind
 
 
 class LawResult(NamedTuple):
@@ -34,54 +41,86 @@ class LawResult(NamedTuple):
 
     law: str
     objective: str  # what it was tuned on
-    score: float  # on the nominal aircraft
+    costs: list[float]  # of the seeds of its tuning
+    scores: dict[str, float]  # on the nominal aircraft, by wind
     levels: tuple[Level, ...]
-    rms: FloatArray  # (m,) of the true error, nominal aircraft
-    slew: FloatArray  # (m,) mean abs(u_dot), nominal aircraft
-    delay: float  # s, largest tolerated delay of u in whole ticks: the score is below MAX_SCORE_RATIO times that without
+    lost_late: dict[float, float]  # by delay of u in s: fraction of the aircraft of the first level that lose track in gusts
+    rms: FloatArray  # (m,) of the true error, nominal aircraft in gusts
+    slew: FloatArray  # (m,) mean abs(u_dot), nominal aircraft in gusts
 
 
 def compare(
-    benchmark: Benchmark, tuned: Mapping[str, Mapping[str, TuningResult]], aircraft: int, levels: Sequence[float], seed: int
+    benchmark: Benchmark,
+    tuned: Mapping[str, Mapping[str, TuningResult]],
+    aircraft: int,
+    levels: Sequence[float],
+    seed: int,
+    delays: Sequence[int] = DELAY_TICKS,
 ) -> Iterator[LawResult]:
-    """Simulate each law with each of its gain sets on the same flights, all of one gain set at once.
+    """Simulate each law with each of its gain sets on the same flights; a thread flies one law.
 
-    The flights: the nominal aircraft with u delayed by 0 to MAX_DELAY_TICKS ticks, and `aircraft` uncertain ones of `seed` at
-    each level. Raises ParameterError for an uncertainty outside [0, 1).
+    The flights, in each wind: the nominal aircraft and `aircraft` uncertain ones of `seed` at each level. In gusts also the
+    aircraft of the first level with u late by each of `delays`, ticks. Raises ParameterError for an uncertainty outside [0, 1).
     """
     airframe, _ = benchmark.scenario.aircraft.load()
     sampled = [nominal_and_sampled(airframe, level, aircraft, seed) for level in levels]
-    nominal = [np.repeat(matrix[None], MAX_DELAY_TICKS + 1, axis=0) for matrix in (airframe.matrix_a(), airframe.matrix_b())]
-    A = np.concatenate([nominal[0], *(one[0][1:] for one in sampled)])
-    B = np.concatenate([nominal[1], *(one[1][1:] for one in sampled)])
-    late = np.concatenate([np.arange(MAX_DELAY_TICKS + 1), np.zeros(aircraft * len(levels), dtype=int)])
-    flights = benchmark_fleet(A, B, np.ones(len(A)), late, benchmark)
-    parts = np.split(np.arange(MAX_DELAY_TICKS + 1, len(A)), len(levels))
-    for name, by_aim in tuned.items():
+    A, B = (np.concatenate([sampled[0][k], *(level[k][1:] for level in sampled[1:])]) for k in range(2))
+    in_time = np.arange(len(A))
+    parts, first = np.split(in_time[1:], len(levels)), in_time[1 : 1 + aircraft]
+    of = np.concatenate([in_time, np.tile(first, len(delays))])
+    late = np.concatenate([0 * in_time, np.repeat(np.array(delays, dtype=int), aircraft)])
+    flights = {
+        GUST: benchmark_fleet(A[of], B[of], late, GUST, benchmark),
+        TURBULENCE: benchmark_fleet(A, B, 0 * in_time, TURBULENCE, benchmark),
+    }
+
+    def results(name: str) -> list[LawResult]:
         law = LAWS[name]
         control_law = law.control_law(benchmark.model)  # one for all gain sets: it is compiled once
-        for objective, gains in by_aim.items():
+        found = []
+        for objective, gains in tuned[name].items():
             params = law.params(as_gains(gains), benchmark.model)
-            result = fleet.fly(flights, benchmark.vehicle, benchmark.courses[law.feedforward], control_law, params)
-            scores, diverged = score(result, benchmark.unit), np.asarray(result.diverged)
-            yield LawResult(
-                name,
-                objective,
-                float(scores[0]),
-                tuple(_level(level, scores[part], diverged[part]) for level, part in zip(levels, parts, strict=True)),
-                np.asarray(result.rms)[:, 0],
-                np.asarray(result.slew)[:, 0],
-                _tolerated_delay(scores[: MAX_DELAY_TICKS + 1]) * benchmark.model.period,
+            flown = {
+                wind: fleet.fly(one, benchmark.vehicle, benchmark.courses[wind][law.feedforward], control_law, params)
+                for wind, one in flights.items()
+            }
+            scores = {wind: score(one, benchmark.unit) for wind, one in flown.items()}
+            delayed = scores[GUST][len(in_time) :].reshape(len(delays), aircraft)
+            found.append(
+                LawResult(
+                    name,
+                    objective,
+                    gains.costs,
+                    {wind: float(one[0]) for wind, one in scores.items()},
+                    tuple(
+                        Level(level, {wind: _scores(one[part]) for wind, one in scores.items()})
+                        for level, part in zip(levels, parts, strict=True)
+                    ),
+                    {ticks * benchmark.model.period: _lost(one) for ticks, one in zip(delays, delayed, strict=True)},
+                    np.asarray(flown[GUST].rms)[:, 0],
+                    np.asarray(flown[GUST].slew)[:, 0],
+                )
             )
+        return found
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for found in pool.map(results, tuned):
+            yield from found
 
 
-def _level(uncertainty: float, scores: FloatArray, diverged: FloatArray) -> Level:
+def score_cells(result: LawResult) -> list[str]:
+    """The scores of a law as cells of a table: in each wind that of the nominal aircraft, then mean (worst) at each level."""
+    cells = []
+    for wind, nominal in result.scores.items():
+        uncertain = (level.scores[wind] for level in result.levels)
+        cells += [f"{nominal:.2f}", *(f"{one.mean:.2f} ({one.worst:.2f})" for one in uncertain)]
+    return cells
+
+
+def _scores(scores: FloatArray) -> Scores:
     worst = int(np.argmax(scores))
-    track_lost = float(np.mean(scores > LOSS_OF_TRACK_SCORE))
-    return Level(uncertainty, float(np.mean(scores)), float(scores[worst]), worst, float(np.mean(diverged)), track_lost)
+    return Scores(float(np.mean(scores)), float(scores[worst]), worst, _lost(scores))
 
 
-def _tolerated_delay(scores: FloatArray) -> int:
-    """Ticks of delay before the first one with a score above MAX_SCORE_RATIO times that without delay."""
-    beyond = np.flatnonzero(~(scores <= MAX_SCORE_RATIO * scores[0]))
-    return int(beyond[0]) - 1 if len(beyond) else len(scores) - 1
+def _lost(scores: FloatArray) -> float:
+    return float(np.mean(scores > LOSS_OF_TRACK_SCORE))

@@ -1,8 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""One tuning procedure for every law: CMA-ES over the logarithms of its gains, on the nominal aircraft or around it."""
+"""One tuning procedure for every law: CMA-ES over the logarithms of its gains, on the nominal aircraft and around it."""
 
+import os
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,38 +25,54 @@ from flight_campaign.fleet import Fleet, FleetResult, Vehicle
 from flight_campaign.statistics import score_units
 from flight_core.files import read_yaml
 from flight_core.parameters import ParameterError, require
-from flight_core.vectors import FloatArray
+from flight_core.vectors import Array, FloatArray
 
 TUNED = Path(__file__).parent / "tuned"  # folder of the tuned gains, one file a scenario
 
 ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
 """rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error. 60 deg/s and 600 %/s."""
 
-NOMINAL, UNCERTAIN, LATE = "nominal", "uncertain", "late"
+GUST, TURBULENCE = "gust", "turbulence"
+"""The winds of a benchmark: that of its scenario, and turbulence in its place."""
 
+DRYDEN = {"altitude": 100.0, "wind": 15.4}  # m; m/s at 20 ft, moderate turbulence by MIL-F-8785C, 3.7.3.4
+TUNING_TURBULENCE_SEED = 40  # of the turbulence in a cost; a comparison flies another one
+
+
+class Objective(NamedTuple):
+    """The flights of a cost: every aircraft with u in time, and some with u late."""
+
+    title: str
+    weights: dict[str, float]  # by wind
+    delay: int  # of the late u, in multiples of `Benchmark.delay`
+    all_late: bool  # u is late on all aircraft, not on the nominal one alone
+
+
+# Turbulence has half the weight, since scores in it are about twice those in the gusts.
 OBJECTIVES = {
-    NOMINAL: "the nominal aircraft",
-    UNCERTAIN: "the nominal and 6 uncertain aircraft at +-40 %, with late inputs on the nominal one",
-    LATE: "the nominal and 6 uncertain aircraft at +-40 %, with late inputs on all of them",
+    "gust": Objective("gusts", {GUST: 1.0}, 1, all_late=False),
+    "gust_turbulence": Objective("gusts and turbulence", {GUST: 1.0, TURBULENCE: 0.5}, 1, all_late=False),
+    "delay": Objective("gusts and turbulence with a large delay", {GUST: 1.0, TURBULENCE: 0.5}, 2, all_late=True),
 }
-"""The flights in each cost, in words."""
 
-UNCERTAIN_AIRCRAFT, UNCERTAINTY, UNCERTAINTY_SEED = 6, 0.4, 40
+UNCERTAIN_AIRCRAFT, UNCERTAINTY, UNCERTAINTY_SEED = 12, 0.4, 40
 """Number, +-fraction and seed of the uncertain aircraft. Campaigns and comparisons use other seeds by default."""
 
-EXTRA_DELAY_TICKS = 2
-"""Delay of u in the delayed flights of a cost: 20 ms at 100 Hz. Without actuators it is one tick: the loop's lag is 15 ms."""
+DELAY_TICKS = 2
+"""Delay of u in the late flights of a cost: 20 ms at 100 Hz. Without actuators it is one tick: the loop's lag is 15 ms."""
 
 POPULATION, GENERATIONS, GENERATIONS_PER_GAIN, INITIAL_SIGMA = 16, 88, 6, 0.4
 """A search has GENERATIONS, or GENERATIONS_PER_GAIN times its gains if that is more: from 15 gains on. INITIAL_SIGMA is the
 first standard deviation of log(gain)."""
+
+PARTS = 2  # of the candidates of a generation, flown side by side; a flight in a smaller part takes more processor time
 
 MAX_COST = 1000.0  # cost of a flight that diverged, and upper bound of every other cost
 STEP = 0.005  # s. Step of the integration, or one tick if that is shorter. The scores are within 1 % of those of a finer step.
 
 
 class Benchmark(NamedTuple):
-    """The setting in which laws are tuned and compared: one scenario with its gusts, channels in the law's order."""
+    """The setting in which laws are tuned and compared: one scenario in two winds, channels in the law's order."""
 
     scenario: Scenario
     model: NominalModel
@@ -61,14 +80,15 @@ class Benchmark(NamedTuple):
     activity_unit: FloatArray  # (m,) of the mean abs(u_dot) in a cost
     plant: PlantParams
     vehicle: Vehicle
-    courses: dict[bool, Course]  # without and with the feedforward
-    extra_delay: int  # ticks, delay of u in the delayed flights of a cost
+    courses: dict[str, dict[bool, Course]]  # by wind, without and with the feedforward
+    delay: int  # ticks, delay of u in the late flights of a cost
 
 
-def build_benchmark(scenario: Scenario) -> Benchmark:
-    """The benchmark of a scenario: its manoeuvre, gusts, actuators and noise; y, y_m and law at one rate, topics without delay.
+def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE_SEED) -> Benchmark:
+    """The benchmark of a scenario: its manoeuvre, actuators and noise; y, y_m and law at one rate, topics without delay.
 
-    Raises ParameterError for a scenario that a campaign cannot fly, and for outputs whose unit has no score.
+    Its winds are those of the scenario, and DRYDEN of `turbulence_seed` alone. Raises ParameterError for a scenario that a
+    campaign cannot fly, and for outputs whose unit has no score.
     """
     scenario = scenario.vary(
         aircraft={"rate": scenario.controller.rate, "step": min(STEP, 1.0 / scenario.controller.rate)},
@@ -78,6 +98,7 @@ def build_benchmark(scenario: Scenario) -> Benchmark:
     airframe, _ = scenario.aircraft.load()
     controller = scenario.controller
     with_model = scenario.vary(controller=with_feedforward(controller, airframe).model_dump())
+    turbulent = with_model.vary(aircraft={"gusts": {}, "turbulence": DRYDEN | {"seed": turbulence_seed}})
     rows, columns = law_order(airframe, controller)
     actuators, m = scenario.aircraft.actuators, len(controller.inputs)
 
@@ -111,9 +132,16 @@ def build_benchmark(scenario: Scenario) -> Benchmark:
         np.array([ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]),
         scenario.aircraft.plant(),
         fleet.vehicle(scenario),
-        {False: build_course(scenario), True: build_course(with_model)},
-        EXTRA_DELAY_TICKS if any(controller.lag) else 1,
+        {GUST: _courses(with_model), TURBULENCE: _courses(turbulent)},
+        DELAY_TICKS if any(controller.lag) else 1,
     )
+
+
+def _courses(scenario: Scenario) -> dict[bool, Course]:
+    """The course of a scenario with feedforward, and the same course without it."""
+    course = build_course(scenario)
+    without = course.segments._replace(u_ff=np.zeros_like(course.segments.u_ff))
+    return {False: course._replace(segments=without), True: course}
 
 
 def score(result: FleetResult, unit: FloatArray) -> FloatArray:
@@ -129,33 +157,37 @@ def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
     return np.where(np.isfinite(total), np.minimum(total, MAX_COST), MAX_COST)
 
 
-def benchmark_fleet(A: FloatArray, B: FloatArray, wind: FloatArray, late: FloatArray, benchmark: Benchmark) -> Fleet:
-    """Aircraft in the benchmark, shapes as in `fleet.assemble`."""
-    return fleet.assemble(A, B, benchmark.plant, benchmark.courses[False], wind, late)
+def benchmark_fleet(A: FloatArray, B: FloatArray, late: Array, wind: str, benchmark: Benchmark) -> Fleet:
+    """Aircraft in a wind of the benchmark, u late by whole ticks; shapes as in `fleet.assemble`."""
+    return fleet.assemble(A, B, benchmark.plant, benchmark.courses[wind][False], late=late)
 
 
 class Evaluation(NamedTuple):
-    """The flights of one evaluation of the cost, and their weights."""
+    """The flights of a cost in one wind, and their weights."""
 
+    wind: str
     fleet: Fleet
     weight: FloatArray  # (F,) of their costs in the sum
 
 
-def evaluation(objective: str, benchmark: Benchmark) -> Evaluation:
-    """Flights of one evaluation: every aircraft in calm air and in gusts, some in gusts with u delayed by `extra_delay` ticks.
+def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
+    """Flights of one evaluation of the cost, by wind: all aircraft with u in time, and the late ones.
 
-    The cost is the mean over the aircraft in calm air + the mean in gusts + the mean of the delayed flights.
+        cost = sum over the winds of weight (mean over the aircraft with u in time + mean over the late ones)
+
+    No flight is in calm air: in the flights with gusts the manoeuvre comes first, in calm air.
     """
     airframe, _ = benchmark.scenario.aircraft.load()
-    A, B = nominal_and_sampled(airframe, UNCERTAINTY, 0 if objective == NOMINAL else UNCERTAIN_AIRCRAFT, UNCERTAINTY_SEED)
+    A, B = nominal_and_sampled(airframe, UNCERTAINTY, UNCERTAIN_AIRCRAFT, UNCERTAINTY_SEED)
     aircraft = np.arange(len(A))
-    delayed = aircraft if objective == LATE else aircraft[:1]
-    of = np.concatenate([aircraft, aircraft, delayed])
-    counts = [len(A), len(A), len(delayed)]
-    wind = np.repeat([0.0, 1.0, 1.0], counts)
-    late = np.repeat([0, 0, benchmark.extra_delay], counts)
-    weight = np.repeat([1.0 / count for count in counts], counts)
-    return Evaluation(benchmark_fleet(A[of], B[of], wind, late, benchmark), weight)
+    delayed = aircraft if objective.all_late else aircraft[:1]
+    of, counts = np.concatenate([aircraft, delayed]), [len(A), len(delayed)]
+    late = np.repeat([0, objective.delay * benchmark.delay], counts)
+    share = np.repeat([1.0 / count for count in counts], counts)
+    return [
+        Evaluation(wind, benchmark_fleet(A[of], B[of], late, wind, benchmark), weight * share)
+        for wind, weight in objective.weights.items()
+    ]
 
 
 def repeat_flights(flights: Fleet, times: int) -> Fleet:
@@ -164,13 +196,16 @@ def repeat_flights(flights: Fleet, times: int) -> Fleet:
     return tiled._replace(blocks=flights.blocks, forced_rate=flights.forced_rate)
 
 
-def spread_over(params: Any, flights: int, candidates: int) -> Any:
-    """Parameters of several candidates, each for all of its flights: (.., candidates) -> (.., candidates flights)."""
+def spread_over(params: Any, of_one: Any, flights: int) -> Any:
+    """Parameters of several candidates, each for all of its flights: (.., candidates) -> (.., candidates flights).
 
-    def spread(leaf: FloatArray) -> FloatArray:
-        return np.repeat(leaf, flights, axis=-1) if leaf.shape[-1] == candidates else leaf
+    `of_one` are the parameters of one candidate. What has the same shape in both is common to all candidates, and stays.
+    """
 
-    return jax.tree.map(spread, params)
+    def spread(leaf: FloatArray, one: FloatArray) -> FloatArray:
+        return leaf if leaf.shape == one.shape else np.repeat(leaf, flights, axis=-1)
+
+    return jax.tree.map(spread, params, of_one)
 
 
 class TuningResult(NamedTuple):
@@ -190,7 +225,7 @@ def generation_count(law: Law, benchmark: Benchmark) -> int:
 
 def tune(
     law: Law,
-    objective: str,
+    objective: Objective,
     benchmark: Benchmark,
     seeds: tuple[int, ...],
     generations: int | None = None,
@@ -198,8 +233,9 @@ def tune(
 ) -> TuningResult:
     """Gains of the smallest cost that CMA-ES finds from the initial ones, the best of several seeds; all seeds run together.
 
-    The cost of a candidate is the weighted sum over the flights of `evaluation`. `progress` receives the generation and the
-    smallest cost so far. Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package `cma`.
+    The cost of a candidate is the weighted sum over the flights of `evaluations`. Threads fly a part of the candidates in one
+    wind each. `progress` receives the generation and the smallest cost so far.
+    Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package `cma`.
     """
     import cma  # noqa: PLC0415 - it imports matplotlib, which nothing here uses
 
@@ -210,26 +246,35 @@ def tune(
         """Gains by name, shape (size, N), of logarithms (N, d)."""
         return dict(zip(begin, np.split(np.exp(vectors.T), ends), strict=True))
 
-    flights, weight = evaluation(objective, benchmark)
-    each, candidates = len(weight), POPULATION * len(seeds)
-    repeated, control_law = repeat_flights(flights, candidates), law.control_law(benchmark.model)
-    course = benchmark.courses[law.feedforward]
+    together = POPULATION * len(seeds) // PARTS
+    flights = [one._replace(fleet=repeat_flights(one.fleet, together)) for one in evaluations(objective, benchmark)]
+    each, control_law, of_one = len(flights[0].weight), law.control_law(benchmark.model), law.params(begin, benchmark.model)
+
+    def costs(job: tuple[Any, Evaluation]) -> FloatArray:
+        """Costs of a part of the candidates in one wind, (together,)."""
+        params, flown = job
+        course = benchmark.courses[flown.wind][law.feedforward]
+        result = fleet.fly(flown.fleet, benchmark.vehicle, course, control_law, params)
+        return cost(result, benchmark).reshape(together, each) @ flown.weight
+
     options = {"popsize": POPULATION, "verbose": -9}
     searches = [cma.CMAEvolutionStrategy(origin, INITIAL_SIGMA, options | {"seed": seed}) for seed in seeds]
     best: list[tuple[float, FloatArray]] = [(np.inf, origin)] * len(seeds)
     generations = generation_count(law, benchmark) if generations is None else generations
-    for generation in range(generations):
-        asked = [np.array(search.ask()) for search in searches]
-        params = spread_over(law.params(gains_of(np.concatenate(asked)), benchmark.model), each, candidates)
-        costs = cost(fleet.fly(repeated, benchmark.vehicle, course, control_law, params), benchmark)
-        of_each = costs.reshape(candidates, each) @ weight
-        for k, (search, values) in enumerate(zip(searches, np.split(of_each, len(seeds)), strict=True)):
-            search.tell(list(asked[k]), list(values))
-            least = int(np.argmin(values))
-            if values[least] < best[k][0]:
-                best[k] = (float(values[least]), asked[k][least])
-        if progress is not None:
-            progress(generation + 1, min(value for value, _ in best))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for generation in range(generations):
+            asked = [np.array(search.ask()) for search in searches]
+            parts = np.split(np.concatenate(asked), PARTS)
+            params = [spread_over(law.params(gains_of(part), benchmark.model), of_one, each) for part in parts]
+            found = np.array(list(pool.map(costs, product(params, flights)))).reshape(PARTS, len(flights), together)
+            of_search = found.sum(axis=1).reshape(len(seeds), POPULATION)
+            for k, (search, values) in enumerate(zip(searches, of_search, strict=True)):
+                search.tell(list(asked[k]), list(values))
+                least = int(np.argmin(values))
+                if values[least] < best[k][0]:
+                    best[k] = (float(values[least]), asked[k][least])
+            if progress is not None:
+                progress(generation + 1, min(value for value, _ in best))
     winner = int(np.argmin([value for value, _ in best]))
     gains = {name: [float(f"{v:.5g}") for v in gain[:, 0]] for name, gain in gains_of(best[winner][1][None]).items()}
     lowest = [round(value, 4) for value, _ in best]
@@ -266,14 +311,15 @@ def load(path: Path) -> dict[str, dict[str, TuningResult]]:
 
 
 def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], command: str) -> None:
-    """Write tuned gains, their costs and the command that finds them."""
+    """Write tuned gains, their costs and the command that finds them; laws and objectives in the order of their catalogues."""
     path.parent.mkdir(exist_ok=True)
+    objectives = [name for name in OBJECTIVES if any(name in sets for sets in tuned.values())]
     head = (
         "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
         "# Gains found by CMA-ES, in the law's order of channels and its scaled inputs; cost, seed, evaluations of a search.\n"
-        f"# Made by: {command}\n"
+        f"# Made by: {command} --tuning {','.join(objectives)}\n"
     )
-    laws = {law: dict(sets) for law, sets in tuned.items()}
+    laws = {law: {name: tuned[law][name] for name in objectives if name in tuned[law]} for law in LAWS if law in tuned}
     text = yaml.dump({"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160)
     path.write_text(head + text, encoding="utf-8")
 

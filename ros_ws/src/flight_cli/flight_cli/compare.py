@@ -3,12 +3,13 @@
 """`rise-di compare`: RISE-DI and other control laws on the same aircraft, each tuned by the same procedure."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 from control_laws.catalogue import LAWS
@@ -18,6 +19,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_campaign import law_comparison
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.law_comparison import LawResult
+from flight_campaign.tuning import Benchmark
 from flight_cli.output import COUNT_COLUMNS, new_table, parse_numbers, progress_bar, write_text
 from flight_core.parameters import require
 
@@ -26,13 +28,17 @@ NOTES = """
 {titles}
 sees: measurements beside y_m. y alone is gyros and airspeed; a full state is y and the other states without error;
   vanes give alpha and beta relative to the air without error. No real sensor is as good
-score: sum of rms of the true error over {unit}; mean (worst) of {aircraft} aircraft a level,
-  every entry of A and B off by up to the level, rows of angles known, seed {seed}; a few % are noise of the tuning
-lost: loss of track, a score above 10, in % at each level; a diverged aircraft is lost and makes the mean infinite
-rms, slew: of the true error and mean abs(u_dot), nominal aircraft, in the units of the airframe and mrad/s
-delay: the largest delay of u in whole ticks at which the score stays below three times that without delay
+knows: data of the nominal aircraft beside D; Omega_ii alone as the scale of the inputs
+gust: the wind of the scenario. turbulence: Dryden at {altitude:g} m, {wind:g} m/s of wind at 20 ft
+score: sum of rms of the true error over {unit}; mean (worst) of the aircraft of a level, every entry of A and B off by up to
+  the level, rows of angles known; a few % are noise of the tuning
+lost: share of the aircraft that lose track in gusts, a score above 10; a diverged aircraft is lost and makes the mean infinite
+slew: mean abs(u_dot) in gusts, nominal aircraft, in the units of the airframe
+cost: the least of {seeds} seeds of the tuning, and the difference to the largest. It is the mean of score + slew over
+  {slew}, of the nominal and {uncertain} uncertain aircraft at +-{level:g} %, once with u in time and once late:
+{costs}
 """
-WIDTH = 160  # characters, the least width of the table
+WIDTH = 200  # characters, the least width of the table
 
 
 def compare(
@@ -43,15 +49,18 @@ def compare(
     laws: Annotated[str | None, typer.Option(help="Laws to compare, by name: rise,pi,l1; all by default.")] = None,
     tuning: Annotated[
         str,
-        typer.Option(help="What the gains were tuned on: nominal, uncertain, late (uncertain, inputs late on all of them)."),
-    ] = "nominal,uncertain",
+        typer.Option(help=f"What the gains were tuned on: {', '.join(gain_tuning.OBJECTIVES)}."),
+    ] = "gust_turbulence",
     tune: Annotated[
         bool, typer.Option("--tune", help="First tune the laws that have no gains for this scenario: minutes a law.")
     ] = False,
+    turbulence_seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the turbulence, unlike that of the tuning.")
+    ] = law_comparison.TURBULENCE_SEED,
     gains: Annotated[Path | None, typer.Option(help="File of tuned gains; by default the one of the stack.")] = None,
     to_json: Annotated[Path | None, typer.Option("--json", help="File to write the figures to, SI.")] = None,
 ) -> None:
-    """Fly RISE-DI and other laws side by side: same aircraft, reference, gusts, noise, limits, uncertainty, tuning procedure.
+    """Fly RISE-DI and other laws side by side: same aircraft, reference, winds, noise, limits, uncertainty, tuning.
 
     Exit status: 0, or 2 bad input.
     """
@@ -63,74 +72,118 @@ def compare(
     levels = parse_numbers(uncertainty)
     fits = bool(levels) and all(0.0 <= level < 1.0 for level in levels)
     require(fits, "--uncertainty", repr(uncertainty), "parts of each entry, each at least 0 and below 1: 0.3,0.5")
+    tuning_seed = gain_tuning.TUNING_TURBULENCE_SEED
+    require(turbulence_seed != tuning_seed, "--turbulence-seed", turbulence_seed, "another seed than that of the tuning")
     chosen = find_scenario(scenario)
-    benchmark, path = gain_tuning.build_benchmark(chosen), gains or gain_tuning.tuned_file(chosen)
-    known = gain_tuning.load(path)
+    path = gains or gain_tuning.tuned_file(chosen)
+    wanted = [(name, aim) for name in names for aim in aims if aim not in gain_tuning.load(path).get(name, {})]
     results = []
     with progress_bar(*COUNT_COLUMNS) as bar:
-        wanted = [(name, aim) for name in names for aim in aims if aim not in known.get(name, {})]
-        for name, aim in wanted if tune else ():
-            task = bar.add_task("", total=gain_tuning.generation_count(LAWS[name], benchmark))
-
-            def show_cost(generation: int, least: float, task: Any = task, shown: str = f"tuning {name}, {aim}") -> None:
-                bar.update(task, completed=generation, description=f"{shown}: cost {least:.3f}")
-
-            known.setdefault(name, {})[aim] = gain_tuning.tune(LAWS[name], aim, benchmark, SEEDS, progress=show_cost)
-            gain_tuning.save(path, known, f"rise-di compare {scenario} --tune --tuning {tuning}")
+        if tune:
+            _tune(wanted, chosen, path, scenario, bar)
+        known = gain_tuning.load(path)
         tuned = {name: {aim: known[name][aim] for aim in aims if aim in known[name]} for name in names if name in known}
         require(any(tuned.values()), "--laws", "tuned gains for none of them", f"gains in {path}, or --tune, which finds them")
+        benchmark = gain_tuning.build_benchmark(chosen, turbulence_seed)
         task = bar.add_task("comparing", total=sum(len(by_aim) for by_aim in tuned.values()))
         for one in law_comparison.compare(benchmark, tuned, aircraft, levels, seed):
             results.append(one)
             bar.advance(task)
-    console, units = Console(), display_units(chosen)
+    console = Console()
     console.width = max(console.width, WIDTH)
     for aim in aims:
-        console.print(_table(gain_tuning.OBJECTIVES[aim], [one for one in results if one.objective == aim], chosen))
-    titles = "\n".join(f"{name}: {LAWS[name].title}; knows {LAWS[name].model_data or 'no model'}" for name in tuned)
-    counted = zip(chosen.controller.outputs, benchmark.unit, strict=True)
-    unit = ", ".join(f"{one * units[name].factor:g} {units[name].unit} of {name}" for name, one in counted)
-    console.print(NOTES.strip().format(titles=titles, unit=unit, aircraft=aircraft, seed=seed), style="dim", highlight=False)
+        if found := [one for one in results if one.objective == aim]:
+            console.print(_table(gain_tuning.OBJECTIVES[aim].title, found, chosen))
+    notes = _notes(chosen, benchmark, tuned, aims)
+    flown = f"{aircraft} aircraft a level, seed {seed}; turbulence seed {turbulence_seed}, that of the tuning {tuning_seed}"
+    console.print(f"{notes}\n{flown}", style="dim", highlight=False)
     if wanted and not tune:
         missing = ", ".join(f"{name} ({aim})" for name, aim in wanted)
         console.print(f"without tuned gains (--tune finds them): {missing}")
     if to_json is not None:
         rows = [_as_json(one, chosen) for one in results]
-        figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "laws": rows}
-        write_text("--json", to_json, json.dumps(figures, indent=1) + "\n")
+        figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "turbulence_seed": turbulence_seed}
+        write_text("--json", to_json, json.dumps(figures | {"laws": rows}, indent=1) + "\n")
+
+
+def _tune(wanted: Iterable[tuple[str, str]], chosen: Scenario, path: Path, scenario: str, bar: Progress) -> None:
+    """Tune laws, each for an objective. The file is written after each of them, with what it then holds."""
+    benchmark = gain_tuning.build_benchmark(chosen)
+    for name, aim in wanted:
+        task = bar.add_task("", total=gain_tuning.generation_count(LAWS[name], benchmark))
+
+        def show_cost(generation: int, least: float, task: Any = task, shown: str = f"tuning {name}, {aim}") -> None:
+            bar.update(task, completed=generation, description=f"{shown}: cost {least:.3f}")
+
+        result = gain_tuning.tune(LAWS[name], gain_tuning.OBJECTIVES[aim], benchmark, SEEDS, progress=show_cost)
+        known = gain_tuning.load(path)
+        known.setdefault(name, {})[aim] = result
+        gain_tuning.save(path, known, f"rise-di compare {scenario} --tune")
 
 
 def _table(tuned_on: str, found: Sequence[LawResult], scenario: Scenario) -> Table:
-    units, channels, of = display_units(scenario), scenario.aircraft.channels(), " / ".join
-    levels = [f"+-{100.0 * level.uncertainty:g} %" for level in found[0].levels] if found else []
-    inputs = "slew\n" + of(name[:4] for name in channels.inputs)
-    heads = ("law", "sees", "nominal", *levels, "lost\n%", f"rms\n{of(channels.outputs)}", inputs, "delay\nms")
-    table = new_table(f"{scenario.name}, each law tuned on {tuned_on}", heads, left=("law", "sees"))
+    units, of = display_units(scenario), " / ".join
+    levels = ("nominal", *(f"+-{100.0 * level.uncertainty:g} %" for level in found[0].levels))
+    delays = "/".join(f"{1e3 * delay:g}" for delay in (0.0, *found[0].lost_late))
+    heads = (
+        *("law", "sees", "knows"),
+        *(f"{wind}\n{level}" for wind in found[0].scores for level in levels),
+        f"lost, %, at {levels[1]},\nu late by, ms:\n{delays}",
+        "slew\n" + of(name[:4] for name in scenario.controller.inputs),
+        "cost",
+    )
+    table = new_table(f"{scenario.name}, each law tuned on {tuned_on}", heads, left=("law", "sees", "knows"))
     for one in found:
-        rms, slew = _by_name(one, scenario)
+        lost = (one.levels[0].scores[gain_tuning.GUST].lost, *one.lost_late.values())
+        slew = zip(scenario.controller.inputs, one.slew.tolist(), strict=True)
         table.add_row(
-            one.law,
-            LAWS[one.law].measurements,
-            f"{one.score:.2f}",
-            *(f"{level.mean:.2f} ({level.worst:.2f})" for level in one.levels),
-            of(f"{100.0 * level.lost:g}" for level in one.levels),
-            of(f"{rms[name] * units[name].factor:.2g}" for name in channels.outputs),
-            of(f"{slew[name] * units[name].factor:.0f}" for name in channels.inputs),
-            f"{1e3 * one.delay:.0f}",
+            *(one.law, LAWS[one.law].measurements, LAWS[one.law].model_data),
+            *law_comparison.score_cells(one),
+            "/".join(f"{100.0 * share:.3g}" for share in lost),
+            of(f"{value * units[name].factor:.0f}" for name, value in slew),
+            f"{min(one.costs):.2f} +{max(one.costs) - min(one.costs):.2f}",
         )
     return table
 
 
-def _by_name(one: LawResult, scenario: Scenario) -> tuple[dict[str, float], dict[str, float]]:
-    """Errors by output and slew by input, SI."""
-    controller = scenario.controller
-    rms = dict(zip(controller.outputs, one.rms.tolist(), strict=True))
-    return rms, dict(zip(controller.inputs, one.slew.tolist(), strict=True))
+def _notes(scenario: Scenario, benchmark: Benchmark, laws: Iterable[str], aims: Iterable[str]) -> str:
+    """What the words of the table mean."""
+    units, controller = display_units(scenario), scenario.controller
+    errors = zip(controller.outputs, benchmark.unit.tolist(), strict=True)
+    slews = zip(controller.inputs, benchmark.activity_unit.tolist(), strict=True)
+    delay = 1e3 * benchmark.model.period * benchmark.delay
+    costs = []
+    for aim in aims:
+        objective = gain_tuning.OBJECTIVES[aim]
+        winds = " + ".join(f"{weight:g} x {wind}" for wind, weight in objective.weights.items())
+        whose = "all of them" if objective.all_late else "the nominal one"
+        costs.append(f"{aim}: {winds}; u late by {objective.delay * delay:g} ms on {whose}")
+    return NOTES.strip().format(
+        titles="\n".join(f"{name}: {LAWS[name].title}" for name in laws),
+        unit=", ".join(f"{one * units[name].factor:g} {units[name].unit} of {name}" for name, one in errors),
+        slew=", ".join(f"{one * units[name].factor:g} {units[name].unit}/s of {name}" for name, one in slews),
+        costs="\n".join(f"  {one}" for one in costs),
+        uncertain=gain_tuning.UNCERTAIN_AIRCRAFT,
+        level=100.0 * gain_tuning.UNCERTAINTY,
+        seeds=len(SEEDS),
+        **gain_tuning.DRYDEN,
+    )
 
 
 def _as_json(one: LawResult, scenario: Scenario) -> dict[str, Any]:
     """Figures of a law for JSON: SI, null for an infinite figure."""
-    rms, slew = _by_name(one, scenario)
-    sees, levels = LAWS[one.law].measurements, [level._asdict() for level in one.levels]
-    row = {"law": one.law, "sees": sees, "tuned_on": one.objective, "score": one.score, "levels": levels}
-    return {**finite_or_null(row), "rms": rms, "slew": slew, "delay": one.delay}
+    controller, law = scenario.controller, LAWS[one.law]
+    levels = [
+        {"uncertainty": level.uncertainty} | {wind: scores._asdict() for wind, scores in level.scores.items()}
+        for level in one.levels
+    ]
+    row = {"law": one.law, "sees": law.measurements, "knows": law.model_data, "tuned_on": one.objective}
+    return row | {
+        "cost": min(one.costs),
+        "spread": max(one.costs) - min(one.costs),
+        "score": finite_or_null(one.scores),
+        "levels": finite_or_null(levels),
+        "late": [{"delay": delay, "lost": lost} for delay, lost in one.lost_late.items()],
+        "rms": dict(zip(controller.outputs, one.rms.tolist(), strict=True)),
+        "slew": dict(zip(controller.inputs, one.slew.tolist(), strict=True)),
+    }
