@@ -25,19 +25,18 @@ from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import feedforward, guard
 from rise_di_controller import law as rise
-from rise_di_controller.feedforward import Nominal
+from rise_di_controller.feedforward import Nominal, nominal_model
 from rise_di_controller.guard import ControllerState
 from rise_di_controller.params import ControllerParameters
 
 app = application([*COMMANDS])
 MS = 1_000_000
 SERVO = find_scenario("osprey_servo")
-BY_HAND = Nominal(
+BY_HAND = nominal_model(
     A=np.array([[-1.0, 2.0], [4.0, -3.0]]),
     B=np.array([[2.0], [0.0]]),
     C=np.array([[1.0, 0.0]]),
     gravity=np.zeros((2, 2)),
-    inverse=np.array([[0.5]]),
     lead=np.zeros(1),
 )
 

@@ -24,7 +24,17 @@ class Nominal(NamedTuple):
     C: Array  # (m, n), selects the outputs
     gravity: Array  # (n, n), f(x) = gravity @ sin(x)
     inverse: Array  # (m, m), inverse of Omega = C B
+    path: Array  # (n, n), I - B Omega^-1 C: what the ideal input leaves of a drift
+    path_A: Array  # (n, n), path A
+    path_gravity: Array  # (n, n), path gravity
     lead: Array  # (m,) time from a tick until its input acts: half a period of hold, delay, actuator lag; s
+
+
+def nominal_model(A: Array, B: Array, C: Array, gravity: Array, lead: Array) -> Nominal:
+    """The nominal model with the products that each tick uses. Omega = C B is regular."""
+    inverse = np.linalg.inv(C @ B)
+    path = np.eye(len(A)) - B @ inverse @ C
+    return Nominal(A, B, C, gravity, inverse, path, path @ A, path @ gravity, lead)
 
 
 class FeedforwardState(NamedTuple):
@@ -46,17 +56,16 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
 
 def ideal(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
     """Input that moves the outputs of the nominal model by y_m_dot: Omega^-1 (y_m_dot - C (A x + f(x))), shape (m,)."""
-    return nominal.inverse @ (y_m_dot - nominal.C @ _drift(x, nominal))
-
-
-def x_dot(t: Array, x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
-    """Nominal model under its ideal input, shape (n,): A x + f(x) + B ideal(x, y_m_dot), so that C x_dot = y_m_dot."""
-    return _drift(x, nominal) + nominal.B @ ideal(x, y_m_dot, nominal)
-
-
-def _drift(x: Array, nominal: Nominal) -> Array:
     xp = array_namespace(x)
-    return nominal.A @ x + nominal.gravity @ xp.sin(x)
+    return nominal.inverse @ (y_m_dot - nominal.C @ (nominal.A @ x + nominal.gravity @ xp.sin(x)))
+
+
+def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
+    """Nominal model under its ideal input, shape (n,): A x + f(x) + B ideal(x, y_m_dot), so that C x_dot = y_m_dot.
+
+    As (I - B Omega^-1 C) (A x + f(x)) + forced, with forced = B Omega^-1 y_m_dot.
+    """
+    return nominal.path_A @ x + nominal.path_gravity @ array_namespace(x).sin(x) + forced
 
 
 def step(state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal) -> tuple[FeedforwardState, Array]:
@@ -79,7 +88,7 @@ def step(state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal) -> tu
     """
     xp = array_namespace(y_m)
     y_m_dot = (y_m - nominal.C @ state.x) / dt
-    x = rk4(x_dot, 0.0, state.x, y_m_dot, nominal, dt)
+    x = rk4(x_dot, 0.0, state.x, nominal.B @ (nominal.inverse @ y_m_dot), nominal, dt)
     u = ideal((x + state.x) / 2.0, y_m_dot, nominal)
     u_ff = u + (dt + 2.0 * nominal.lead) * (u - state.u) / (dt + state.dt)
     u_0 = xp.where(state.ticks < 2.0, u_ff, state.u_0)
@@ -93,6 +102,5 @@ def zero_dynamics(nominal: Nominal) -> NDArray[np.complex128]:
     linearised to x. NumPy arrays only.
     """
     hidden = ~np.asarray(nominal.C).any(axis=0)
-    linear = nominal.A + nominal.gravity
-    matrix = linear - nominal.B @ nominal.inverse @ nominal.C @ linear
+    matrix = nominal.path @ (nominal.A + nominal.gravity)
     return np.linalg.eigvals(matrix[np.ix_(hidden, hidden)]).astype(np.complex128)

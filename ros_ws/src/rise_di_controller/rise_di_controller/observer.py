@@ -68,9 +68,8 @@ def correct(state: ObserverState, e: Array, dt: Array, params: ObserverParams) -
 
     The limits bound u_o and u_o_dot for any measurement. The fade-in makes the engagement bumpless.
     """
-    xp = array_namespace(e)
     z = state.z + product(params.L, e - product(params.H, state.z))
-    sigma = xp.minimum(state.sigma + dt * params.fade_rate, xp.ones_like(state.sigma))
+    sigma = array_namespace(e).minimum(state.sigma + dt * params.fade_rate, 1.0 + 0.0 * state.sigma)
     u_o = saturate(-sigma * product(params.F, z), state.u_o, dt, params.limits)
     return ObserverState(state.law, z, u_o, sigma)
 

@@ -32,7 +32,7 @@ from flight_core.vectors import FloatArray
 from rise_di_controller import internals
 from rise_di_controller.control_law import ControlLaw, TunedLaw
 from rise_di_controller.decomposition import DecompositionError, signs
-from rise_di_controller.feedforward import ZERO_REAL_PART, Nominal, zero_dynamics
+from rise_di_controller.feedforward import ZERO_REAL_PART, Nominal, nominal_model, zero_dynamics
 from rise_di_controller.guard import DT_RANGE, GuardParams
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law, spectral_radius
 from rise_di_controller.observer import ObserverParams, with_observer
@@ -71,7 +71,7 @@ class FeedforwardParameters(Parameters):
         except DecompositionError as error:
             raise ParameterError(f"feedforward.B: found a C B without a D ({error}), expected D = {list(D)}") from None
         require(nominal_D == list(D), "feedforward.B", f"a C B with D = {nominal_D}", f"D = {list(D)}, that of the controller")
-        return Nominal(A, B, C, gravity, np.linalg.inv(C @ B), np.array(self.lead))
+        return nominal_model(A, B, C, gravity, np.array(self.lead))
 
 
 class ObserverParameters(Parameters):
