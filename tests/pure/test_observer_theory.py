@@ -484,17 +484,51 @@ def course() -> tuning.Benchmark:
     return tuning.build_benchmark(find_scenario("osprey_servo"))
 
 
+def gain_set(
+    K: str, Lambda: str, beta: str, softening: float, observer: dict[str, list[float]] | None = None
+) -> tuning.TuningResult:
+    """Gains of q, p, r, V as a result of a search."""
+    of_law = {name: [float(one) for one in text.split()] for name, text in (("K", K), ("Lambda", Lambda), ("beta", beta))}
+    return tuning.TuningResult(of_law | {"softening": [softening]} | (observer or {}), 1.0, 1, [1.0], 0)
+
+
+GAINS = {
+    "rise": {
+        "nominal": gain_set("22.8 23.6 9.11 3.19", "4.80 8.75 0.957 0.212", "30.7 13.8 7.95 1.22", 1.32),
+        "uncertain": gain_set("21.4 23.4 10.8 3.86", "12.5 15.1 5.82 0.240", "21.0 45.0 12.5 16.1", 1.92),
+        "late": gain_set("18.0 20.7 10.1 3.41", "4.46 3.69 2.97 0.401", "46.6 21.6 13.4 1.39", 1.44),
+    },
+    "rise_observer": {
+        "uncertain": gain_set(
+            "3.69 1.96 0.230 0.0556", "3.91 1.62 876 0.303", "31.6 181 7.69 0.169", 0.232,
+            {
+                "effort": [0.0217, 0.0658, 0.0565, 0.119], "gust": [0.00941, 0.129, 0.735], "wind_time": [0.6, 0.6, 0.6],
+                "drift": [1.18, 1.99, 0.130, 0.00428], "loose": [0.00199],
+            },
+        ),
+        "late": gain_set(
+            "2.30 2.75 0.997 0.219", "8.21 6.14 69.0 0.00662", "256 8.16 1240 17.9", 0.139,
+            {
+                "effort": [0.0449, 0.0132, 0.0499, 0.0982], "gust": [0.439, 0.0855, 0.888], "wind_time": [0.6, 0.6, 0.6],
+                "drift": [0.00177, 0.678, 0.00445, 0.0143], "loose": [0.00208],
+            },
+        ),
+    },
+}  # fmt: skip
+"""Gains by law and aircraft of their search: the nominal one, uncertain ones too, u late on all of them; in the gusts alone."""
+
+
 def as_pi(course: tuning.Benchmark, law: str, objective: str, channels: int) -> FloatArray:
     """Factors of the score if the softened sign is made linear in the first channels: nominal, mean of four at +-30 %."""
-    tuned = tuning.load(tuning.TUNED / "osprey_servo.yaml")[law][objective]
+    tuned = GAINS[law][objective]
     gains = {name: np.array(values) for name, values in tuned.gains.items()}
     T_eps, replaced = gains["softening"] * course.model.total_lag, np.arange(4) < channels
     Lambda = np.where(replaced, gains["Lambda"] + 1.0 / T_eps, gains["Lambda"])
     linear = tuned.gains | {"Lambda": Lambda.tolist(), "beta": np.where(replaced, 1e-9, gains["beta"]).tolist()}
     scores = []
     for one in (linear, tuned.gains):
-        (found,) = law_comparison.compare(course, {law: {objective: tuned._replace(gains=one)}}, 4, [0.3], 1)
-        scores.append([found.score, found.levels[0].mean])
+        (found,) = law_comparison.compare(course, {law: {objective: tuned._replace(gains=one)}}, 4, [0.3], 1, delays=())
+        scores.append([found.scores[tuning.GUST], found.levels[0].scores[tuning.GUST].mean])
     return np.asarray(np.array(scores[0]) / np.array(scores[1]))
 
 
@@ -515,6 +549,9 @@ def test_behind_servos_the_tuned_law_scores_as_a_PI_with_its_integral_gain(
     assert as_pi(course, law, objective, channels) == pytest.approx([1.0, 1.0], abs=0.03)
 
 
-def test_the_airspeed_saturates_its_sign_with_gains_tuned_on_the_nominal_aircraft(course: tuning.Benchmark) -> None:
-    # Its softened sign is 0.06 m/s wide. Without the limit of the sign the score is 12 % larger.
-    assert as_pi(course, "rise", "nominal", 4)[0] > 1.05
+@pytest.mark.parametrize("objective", ["nominal", "late"])
+def test_the_airspeed_saturates_its_sign_with_gains_tuned_on_the_nominal_aircraft(
+    course: tuning.Benchmark, objective: str
+) -> None:
+    # Its softened sign is 0.06 m/s wide. Without the limit of the sign the score is 12 and 9 % larger.
+    assert as_pi(course, "rise", objective, 4)[0] > 1.05
