@@ -487,10 +487,12 @@ def test_the_recorded_f_as_a_function_of_time_has_the_same_limit_under_the_sampl
     assert replayed(cycle, 1.1 * cycle.e_dot[0], acts=0.0) < 1e-9
 
 
-def test_the_same_f_lets_the_error_vanish_from_rest() -> None:
-    # beta exceeds abs(f_dot), so e = 0 solves the loop too. The theorem claims convergence from every start.
-    cycle = counterexample.limit_cycle(2.0)
+def test_the_same_f_lets_the_error_vanish_from_rest_or_at_a_longer_period() -> None:
+    # beta exceeds abs(f_dot), so e = 0 solves the loop too. The theorem claims convergence from every start. At beta = 20 the
+    # cycle attracts so weakly that the sampling of 0.2 ms takes the law off it.
+    cycle, weak = counterexample.limit_cycle(2.0), counterexample.limit_cycle(20.0)
     assert replayed(cycle, 0.0) < 1e-3 * np.max(cycle.e)
+    assert replayed(weak, weak.e_dot[0]) < 1e-3 * np.max(weak.e)
 
 
 def test_with_U_the_identity_the_classical_condition_keeps_P_positive_without_lemma_1() -> None:
