@@ -502,9 +502,7 @@ def course() -> tuning.Benchmark:
     return tuning.build_benchmark(find_scenario("osprey_servo"))
 
 
-def gain_set(
-    K: str, Lambda: str, beta: str, softening: float, observer: dict[str, list[float]] | None = None
-) -> TuningResult:
+def gain_set(K: str, Lambda: str, beta: str, softening: float, observer: dict[str, list[float]] | None = None) -> TuningResult:
     """Gains of q, p, r, V as a result of a search."""
     of_law = {name: [float(one) for one in text.split()] for name, text in (("K", K), ("Lambda", Lambda), ("beta", beta))}
     return TuningResult(of_law | {"softening": [softening]} | (observer or {}), 1.0, 1, [1.0], 0)
