@@ -18,7 +18,8 @@ from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
 from flight_campaign.law_comparison import TURBULENCE_SEED, LawResult, compare, score_cells
-from flight_campaign.tuning import Benchmark, build_benchmark, load, tuned_file
+from flight_campaign.tuned_gains import load, tuned_file
+from flight_campaign.tuning import Benchmark, build_benchmark
 
 TUNED_ON = "gust_turbulence"
 LEVELS = (0.3, 0.5)

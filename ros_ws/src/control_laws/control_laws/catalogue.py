@@ -44,6 +44,10 @@ INITIAL_WIND_GAINS = {"gust": 0.5, "wind_time": 2.0}
 4 s vertically and 10 s along the flight; a design gust of 15 m peaks after 0.6 s."""
 
 
+NONE, AIRCRAFT, INTEGRATORS = "none", "aircraft", "integrators"
+"""Models of a feedforward: none, A, B and f of the nominal aircraft, y_dot = Omega u."""
+
+
 class Law(NamedTuple):
     """One law."""
 
@@ -53,7 +57,7 @@ class Law(NamedTuple):
     control_law: Callable[[NominalModel], ControlLaw]
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of its gains
-    feedforward: bool = False  # whether it uses the feedforward
+    feedforward: str = NONE  # model of its feedforward
 
 
 def initial_gains(law: Law, model: NominalModel) -> Gains:
@@ -101,7 +105,7 @@ LAWS: dict[str, Law] = {
     "rise_implicit": Law(
         "RISE-DI, implicit sign", "y", "Omega_ii", _implicit, rise_di.params_of, ("K", "Lambda", "beta", "omega")
     ),
-    "rise_ff": Law("RISE-DI + feedforward", "y", _model, _soft, rise_di.params_of, _rise_gains, True),
+    "rise_ff": Law("RISE-DI + feedforward", "y", _model, _soft, rise_di.params_of, _rise_gains, AIRCRAFT),
     "rise_observer": Law(
         "RISE-DI + feedforward + observer",
         "y",
@@ -109,7 +113,7 @@ LAWS: dict[str, Law] = {
         _fixed(with_observer(rise.CONTROL_LAWS[Sign.SOFT])),
         _over(rise_di.params_of),
         _rise_gains + _observer_gains,
-        True,
+        AIRCRAFT,
     ),
     "pi_observer": Law(
         "PI + feedforward + observer",
@@ -118,7 +122,7 @@ LAWS: dict[str, Law] = {
         _fixed(with_observer(pi.CONTROL_LAW)),
         _over(pi.params_of),
         ("K", "Lambda", *_observer_gains),
-        True,
+        AIRCRAFT,
     ),
     "lqg": Law(
         "LQG + feedforward",
@@ -127,20 +131,21 @@ LAWS: dict[str, Law] = {
         _fixed(with_observer(lqg.CONTROL_LAW)),
         _over(lqg.params_of, 1.0),
         _observer_gains,
-        True,
+        AIRCRAFT,
     ),
     "eso": Law(
-        "PI + extended-state observer",
+        "PI + feedforward + extended-state observer",
         "y",
         "Omega, lags, noise",
         _fixed(with_observer(pi.CONTROL_LAW)),
         _extended_state,
         ("K", "Lambda", "effort", "drift", "rate_drift", "decay"),
+        INTEGRATORS,
     ),
     "pi": Law("PI", "y", "Omega_ii", _fixed(pi.CONTROL_LAW), pi.params_of, ("K", "Lambda")),
-    "pi_ff": Law("PI + feedforward", "y", _model, _fixed(pi.CONTROL_LAW), pi.params_of, ("K", "Lambda"), True),
+    "pi_ff": Law("PI + feedforward", "y", _model, _fixed(pi.CONTROL_LAW), pi.params_of, ("K", "Lambda"), AIRCRAFT),
     "l1": Law("L1", "y", "Omega", _l1, l1.params_of, ("K", "bandwidth")),
-    "l1_ff": Law("L1 + feedforward", "y", _model, _l1_ff, l1.params_of, ("K", "bandwidth"), True),
+    "l1_ff": Law("L1 + feedforward", "y", _model, _l1_ff, l1.params_of, ("K", "bandwidth"), AIRCRAFT),
     "twisting": Law(
         "super-twisting", "y", "Omega", super_twisting.control_law, super_twisting.twisting_params, ("root", "beta")
     ),

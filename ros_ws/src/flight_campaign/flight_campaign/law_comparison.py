@@ -13,7 +13,8 @@ from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.catalogue import LAWS
 from flight_campaign import fleet
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
-from flight_campaign.tuning import GUST, TURBULENCE, Benchmark, TuningResult, as_gains, benchmark_fleet, score
+from flight_campaign.tuned_gains import TuningResult
+from flight_campaign.tuning import GUST, TURBULENCE, Benchmark, as_gains, benchmark_fleet, score
 from flight_core.vectors import FloatArray
 
 DELAY_TICKS = (1, 2, 3, 4, 6)  # delays of u: 10 to 60 ms at 100 Hz

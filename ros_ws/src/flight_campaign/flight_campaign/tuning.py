@@ -3,31 +3,28 @@
 """One tuning procedure for every law: CMA-ES over the logarithms of its gains, on the nominal aircraft and around it."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import yaml
 
 from aircraft_sim.plant import PlantParams
 from aircraft_sim.uncertainty import KINEMATIC, nominal_and_sampled
-from control_laws.catalogue import LAWS, Gains, Law, initial_gains
+from control_laws.catalogue import AIRCRAFT, INTEGRATORS, LAWS, NONE, Gains, Law, initial_gains
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.gain_selection import law_order, with_feedforward
+from flight_analysis.design.observer_selection import integrator_model
 from flight_campaign import fleet, statistics
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.fleet import Fleet, FleetResult, Vehicle
 from flight_campaign.statistics import score_units
-from flight_core.files import read_yaml
-from flight_core.parameters import ParameterError, require
+from flight_campaign.tuned_gains import TuningResult
+from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray
-
-TUNED = Path(__file__).parent / "tuned"  # folder of the tuned gains, one file a scenario
 
 ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
 """rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error. 60 deg/s and 600 %/s."""
@@ -80,7 +77,7 @@ class Benchmark(NamedTuple):
     activity_unit: FloatArray  # (m,) of the mean abs(u_dot) in a cost
     plant: PlantParams
     vehicle: Vehicle
-    courses: dict[str, dict[bool, Course]]  # by wind, without and with the feedforward
+    courses: dict[str, dict[str, Course]]  # by wind and by the model of the feedforward
     delay: int  # ticks, delay of u in the late flights of a cost
 
 
@@ -93,7 +90,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
     scenario = scenario.vary(
         aircraft={"rate": scenario.controller.rate, "step": min(STEP, 1.0 / scenario.controller.rate)},
         reference_model={"rate": scenario.controller.rate},
-        controller={"delay": 0.0, "feedforward": None},
+        controller={"delay": 0.0, "feedforward": None, "observer": None},
     )
     airframe, _ = scenario.aircraft.load()
     controller = scenario.controller
@@ -137,11 +134,14 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
     )
 
 
-def _courses(scenario: Scenario) -> dict[bool, Course]:
-    """The course of a scenario with feedforward, and the same course without it."""
-    course = build_course(scenario)
-    without = course.segments._replace(u_ff=np.zeros_like(course.segments.u_ff))
-    return {False: course._replace(segments=without), True: course}
+def _courses(scenario: Scenario) -> dict[str, Course]:
+    """The course of a scenario whose controller has the aircraft as the model of its feedforward, by the model of that."""
+    course, controller, (airframe, _) = build_course(scenario), scenario.controller, scenario.aircraft.load()
+    rows, columns = law_order(airframe, controller)
+    Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
+    integrators = scenario.vary(controller={"feedforward": integrator_model(controller, Omega).model_dump()})
+    none = course.segments._replace(u_ff=np.zeros_like(course.segments.u_ff))
+    return {NONE: course._replace(segments=none), AIRCRAFT: course, INTEGRATORS: build_course(integrators)}
 
 
 def score(result: FleetResult, unit: FloatArray) -> FloatArray:
@@ -159,7 +159,7 @@ def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
 
 def benchmark_fleet(A: FloatArray, B: FloatArray, late: Array, wind: str, benchmark: Benchmark) -> Fleet:
     """Aircraft in a wind of the benchmark, u late by whole ticks; shapes as in `fleet.assemble`."""
-    return fleet.assemble(A, B, benchmark.plant, benchmark.courses[wind][False], late=late)
+    return fleet.assemble(A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late)
 
 
 class Evaluation(NamedTuple):
@@ -206,16 +206,6 @@ def spread_over(params: Any, of_one: Any, flights: int) -> Any:
         return leaf if leaf.shape == one.shape else np.repeat(leaf, flights, axis=-1)
 
     return jax.tree.map(spread, params, of_one)
-
-
-class TuningResult(NamedTuple):
-    """Result of a search."""
-
-    gains: dict[str, list[float]]
-    cost: float
-    seed: int  # of the best
-    costs: list[float]  # of all seeds
-    evaluations: int  # of each
 
 
 def generation_count(law: Law, benchmark: Benchmark) -> int:
@@ -279,49 +269,6 @@ def tune(
     gains = {name: [float(f"{v:.5g}") for v in gain[:, 0]] for name, gain in gains_of(best[winner][1][None]).items()}
     lowest = [round(value, 4) for value, _ in best]
     return TuningResult(gains, lowest[winner], seeds[winner], lowest, generations * POPULATION)
-
-
-# Files of tuned gains
-
-
-class _Dumper(yaml.SafeDumper):
-    """Writes a tuning result in flow style: one or two lines a gain set."""
-
-
-_Dumper.add_representer(
-    TuningResult, lambda dumper, result: dumper.represent_mapping("tag:yaml.org,2002:map", result._asdict(), flow_style=True)
-)
-
-
-def tuned_file(scenario: Scenario) -> Path:
-    """Path of the tuned gains of a scenario."""
-    return TUNED / f"{scenario.name}.yaml"
-
-
-def load(path: Path) -> dict[str, dict[str, TuningResult]]:
-    """Tuned gains by law and objective; empty if there is no file. Raises ParameterError for a file that cannot be read."""
-    if not path.exists():
-        return {}
-    content = read_yaml(path, path.name, "a file of tuned gains")
-    try:
-        laws = content["laws"].items()
-        return {law: {objective: TuningResult(**entry) for objective, entry in sets.items()} for law, sets in laws}
-    except (TypeError, KeyError, AttributeError) as error:
-        raise ParameterError(f"{path.name}: found {error}, expected laws, each with gains by objective") from None
-
-
-def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], command: str) -> None:
-    """Write tuned gains, their costs and the command that finds them; laws and objectives in the order of their catalogues."""
-    path.parent.mkdir(exist_ok=True)
-    objectives = [name for name in OBJECTIVES if any(name in sets for sets in tuned.values())]
-    head = (
-        "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
-        "# Gains found by CMA-ES, in the law's order of channels and its scaled inputs; cost, seed, evaluations of a search.\n"
-        f"# Made by: {command} --tuning {','.join(objectives)}\n"
-    )
-    laws = {law: {name: tuned[law][name] for name in objectives if name in tuned[law]} for law in LAWS if law in tuned}
-    text = yaml.dump({"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160)
-    path.write_text(head + text, encoding="utf-8")
 
 
 def as_gains(tuned: TuningResult) -> Gains:

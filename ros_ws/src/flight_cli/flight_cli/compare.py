@@ -16,7 +16,7 @@ from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.summary import display_units, finite_or_null
 from flight_bringup.scenarios import find_scenario
-from flight_campaign import law_comparison
+from flight_campaign import law_comparison, tuned_gains
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.law_comparison import LawResult
 from flight_campaign.tuning import Benchmark
@@ -75,13 +75,13 @@ def compare(
     tuning_seed = gain_tuning.TUNING_TURBULENCE_SEED
     require(turbulence_seed != tuning_seed, "--turbulence-seed", turbulence_seed, "another seed than that of the tuning")
     chosen = find_scenario(scenario)
-    path = gains or gain_tuning.tuned_file(chosen)
-    wanted = [(name, aim) for name in names for aim in aims if aim not in gain_tuning.load(path).get(name, {})]
+    path = gains or tuned_gains.tuned_file(chosen)
+    wanted = [(name, aim) for name in names for aim in aims if aim not in tuned_gains.load(path).get(name, {})]
     results = []
     with progress_bar(*COUNT_COLUMNS) as bar:
         if tune:
             _tune(wanted, chosen, path, scenario, bar)
-        known = gain_tuning.load(path)
+        known = tuned_gains.load(path)
         tuned = {name: {aim: known[name][aim] for aim in aims if aim in known[name]} for name in names if name in known}
         require(any(tuned.values()), "--laws", "tuned gains for none of them", f"gains in {path}, or --tune, which finds them")
         benchmark = gain_tuning.build_benchmark(chosen, turbulence_seed)
@@ -116,9 +116,9 @@ def _tune(wanted: Iterable[tuple[str, str]], chosen: Scenario, path: Path, scena
             bar.update(task, completed=generation, description=f"{shown}: cost {least:.3f}")
 
         result = gain_tuning.tune(LAWS[name], gain_tuning.OBJECTIVES[aim], benchmark, SEEDS, progress=show_cost)
-        known = gain_tuning.load(path)
+        known = tuned_gains.load(path)
         known.setdefault(name, {})[aim] = result
-        gain_tuning.save(path, known, f"rise-di compare {scenario} --tune")
+        tuned_gains.save(path, known, list(gain_tuning.OBJECTIVES), f"rise-di compare {scenario} --tune")
 
 
 def _table(tuned_on: str, found: Sequence[LawResult], scenario: Scenario) -> Table:

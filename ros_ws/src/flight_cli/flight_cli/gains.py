@@ -7,20 +7,33 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.console import Console
 
 from aircraft_sim.airframe import Airframe, load_airframe
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import Condition, failing
 from flight_analysis.design.gain_selection import GainAssessment, Study
+from flight_analysis.design.observer_selection import (
+    ANGLE_UNIT,
+    SPEED_UNIT,
+    gains_by_rule,
+    gains_of_search,
+    nominal_model,
+    with_aircraft_observer,
+)
 from flight_analysis.report.summary import finite_or_null
 from flight_bringup.scenarios import find_scenario
+from flight_campaign import tuned_gains
 from flight_cli.output import new_table, parse_numbers, write_text
 from flight_core.parameters import require
 from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
+from rise_di_controller.rise_di import RiseDiParameters
 
 CONDITION_FAILS = 1
+OBSERVER_LAW, OBJECTIVE = "rise_observer", "gust_turbulence"  # whose gains of a search are taken
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
     "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 periods, delay), rad: times 57.3"
@@ -49,6 +62,13 @@ def gains(
     feedforward: Annotated[
         bool, typer.Option("--feedforward", help="Write the airframe too, as the model of the feedforward (an extension).")
     ] = False,
+    observer: Annotated[
+        bool, typer.Option("--observer", help="Write feedforward and observer, and the gains beside them (an extension).")
+    ] = False,
+    model: Annotated[
+        str | None, typer.Option(help="Airframe that the observer takes as its model, as rise-di identify --log writes it.")
+    ] = None,
+    margin: Annotated[float, typer.Option(help="Least delay margin of the nominal loop with the observer, s.")] = 0.03,
     check: Annotated[
         bool, typer.Option("--check", help="Check the gain set of the scenario instead of selecting one.")
     ] = False,
@@ -67,19 +87,26 @@ def gains(
     paired = tuple(inputs.split(",")) if inputs else ()
     setting = gain_selection.loop_setting(chosen, gamma_2)._replace(inputs=paired, feedforward=feedforward, **loop)
     if check:
-        for option, given in (("--write", write is not None), ("--feedforward", feedforward)):
+        for option, given in (("--write", write is not None), ("--feedforward", feedforward), ("--observer", observer)):
             require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
         own_loop = not loop and inputs is None
         require(own_loop, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
         known, named = chosen.controller.outputs, f"airframe {frame.name}"
         require(sorted(known) == sorted(frame.outputs), named, ", ".join(frame.outputs), f"the outputs {', '.join(known)}")
+    require(observer or model is None, "--model", model, "--observer beside it: it is the observer's model")
+    require(0.0 <= margin <= MAX_DELAY_MARGIN, "--margin", margin, f"0 to {MAX_DELAY_MARGIN:g} s")
+    known_model = frame if model is None else load_airframe(model)
     console = Console(quiet=as_json)
+    origin = ""
     with console.status("simulating the ideal control on uncertain airframes"):
         found = gain_selection.study_airframe(frame, gain_selection.manoeuvre(chosen, frame), uncertainty, samples, seed)
         if check:
             answers, text = {"scenario": gain_selection.check_gains(chosen, found, gamma_2)}, None
         else:
             selection = gain_selection.select_gains(found, setting)
+            if observer:
+                controller, origin = observed(selection.engineering.controller, chosen, known_model, margin)
+                selection = selection._replace(engineering=gain_selection.assess_gains(found, controller, setting))
             answers = {"theorem": selection.theorem, "engineering": selection.engineering}
             text = gain_selection.as_yaml(selection)
     if write is not None and text is not None:
@@ -88,10 +115,35 @@ def gains(
         print(json.dumps(_as_json(found, answers, seed)))
     else:
         _show(console, found, answers)
+        if origin:
+            console.print(origin, highlight=False, soft_wrap=True)
         if write is not None:
             console.print(f"gains: {write}")
     if check and failing(answers["scenario"].loop):
         raise typer.Exit(CONDITION_FAILS)
+
+
+def observed(
+    controller: RiseDiParameters, scenario: Scenario, model: Airframe, margin: float
+) -> tuple[RiseDiParameters, str]:
+    """A controller with feedforward and observer of a model, and a sentence on its gains.
+
+    The gains are those that `rise-di compare --tune` found in the scenario, where its airframe has the same states; else they
+    follow from the lags by a rule.
+    """
+    noises = scenario.aircraft.sensors.noise or (0.0,) * len(controller.outputs)
+    by_name = dict(zip(scenario.aircraft.channels().outputs, noises, strict=True))
+    sizes = {name: SPEED_UNIT if unit in {"m/s", "ft/s"} else ANGLE_UNIT for name, unit in model.states.items()}
+    noise = np.array([by_name.get(name, 0.0) or sizes[name] / 100.0 for name in controller.outputs])
+    searched = tuned_gains.find(scenario, OBSERVER_LAW, OBJECTIVE)
+    if searched is not None and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
+        gains, origin = gains_of_search(searched.gains), f"gains of a search in {scenario.name}, on {OBJECTIVE}"
+    else:
+        nominal = nominal_model(model, controller, noise)
+        gains, origin = gains_by_rule(nominal, tuple(model.gusts), model.speed), "gains by a rule from the lags, a start"
+    found = with_aircraft_observer(controller, model, gains, noise, margin)
+    relaxed = f"; K / {found.relaxation:.2f}, effort x {found.relaxation:.2f} for the margin" if found.relaxation > 1.0 else ""
+    return found.controller, f"observer of {model.name}: {origin}{relaxed}; delay margin {1e3 * found.delay_margin:.0f} ms"
 
 
 def _parse_lags(text: str, airframe: Airframe) -> dict[str, float]:

@@ -36,7 +36,7 @@ from rise_di_controller.decomposition import DecompositionError, coupling, searc
 from rise_di_controller.feedforward import ZERO_REAL_PART
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, is_stable, linear_law
-from rise_di_controller.params import ControllerParameters, FeedforwardParameters
+from rise_di_controller.params import ControllerParameters, FeedforwardParameters, ObserverParameters
 from rise_di_controller.rise_di import RiseDiParameters
 
 CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
@@ -416,7 +416,7 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
 
     Theorem: "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of (29), (30), steps 2 and
     3 are the largest over the samples for which both hold. "V2_dot" is the smallest eigenvalue of Q in V2_dot = -z'Qz over
-    these samples; steps 2 and 3 are sufficient for Q > 0. Loop: `check_loop`, the fraction of the samples for which the linear
+    these samples; steps 2 and 3 are sufficient for Q > 0. Loop: `check_loop` without an observer, the fraction of the samples for which the linear
     loop is stable, and its delay margin on the nominal airframe, which should be at least one period: a missed tick. With
     the implicit sign the linear loop is the one inside the width of the sign, dt^2 omega beta. Its margin is then the delay at
     which chatter begins, and at most half a period.
@@ -443,7 +443,9 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
     responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
     rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
     limits = tuple(values / params.input_scale for values in (study.slew[columns], rate_limit))
-    conditions = gain_conditions.check_loop(params, loop, responses[0], responses.max(axis=0), *limits)
+    conditions: tuple[Condition, ...] = ()
+    if controller.observer is None:  # the engineering rules are those of a law that has no other feedback beside it
+        conditions = gain_conditions.check_loop(params, loop, responses[0], responses.max(axis=0), *limits)
     if params.sign is Sign.LITERAL:
         return GainAssessment(controller, theorem, conditions, bounds, None, ())
     plants = [LinearPlant(A + study.gravity, B, C) for A, B in zip(study.A, Bs, strict=True)]
@@ -454,7 +456,8 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
     each = tuple(delay_margin(plants[0], linear, loop, channel) for channel in range(len(rows)))
     conditions += (Condition("linear stability", None, stable, 1.0),)
     if params.sign is Sign.SOFT:
-        conditions += (Condition("delay margin", None, margin, loop.period),)
+        least = loop.period if controller.observer is None else controller.observer.margin
+        conditions += (Condition("delay margin", None, margin, least),)
     return GainAssessment(controller, theorem, conditions, bounds, margin, each)
 
 
@@ -498,16 +501,16 @@ def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) 
 # YAML
 
 
-def yaml_flow(value: Any) -> str:
+def yaml_flow(value: Any, precision: int = 6) -> str:
     """A value in YAML's flow style. Floats have six digits and always a point, which YAML 1.1 requires of a float."""
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(yaml_flow(one) for one in value)}]"
+        return f"[{', '.join(yaml_flow(one, precision) for one in value)}]"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key}: {yaml_flow(one)}" for key, one in value.items()) + "}"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
-        digits, mark, exponent = f"{value:.6g}".partition("e")
+        digits, mark, exponent = f"{value:.{precision}g}".partition("e")
         return (digits if "." in digits else digits + ".0") + mark + exponent
     return str(value)
 
@@ -529,12 +532,12 @@ CONTROLLER_YAML = yaml_template("""\
 {% for key, value, comment in parameters %}
     {{ key }}: {{ value | flow }}{{ "  # " ~ comment if comment }}
 {% endfor %}
-{% if feedforward %}
-    feedforward:  # an extension of the paper: the input of {{ airframe }} along y_m is added; SI, a line a state
-{% for key, rows in feedforward.items() %}
-      {{ key }}: [{{ rows | join(",\n" ~ " " * (9 + key | length)) }}]{{ "  # s" if key == "lead" }}
+{% for name, (comment, keys) in sections.items() %}
+    {{ name }}:  # an extension of the paper: {{ comment }}
+{% for key, rows in keys.items() %}
+      {{ key }}: {{ rows if rows is string else "[" ~ rows | join(",\n" ~ " " * (9 + key | length)) ~ "]" }}
 {% endfor %}
-{% endif %}
+{% endfor %}
 """)
 
 
@@ -566,20 +569,36 @@ def as_yaml(selection: Selection) -> str:
     }
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
-        for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward"}).items()
+        for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward", "observer"}).items()
     ]
     return CONTROLLER_YAML.render(
         airframe=study.airframe.name,
         delay_margin=selection.engineering.delay_margin,
         parameters=parameters,
-        feedforward=None if controller.feedforward is None else _feedforward_rows(controller.feedforward),
+        sections=_sections(controller, study.airframe),
     )
 
 
-def _feedforward_rows(model: FeedforwardParameters) -> dict[str, list[str]]:
-    """Entries of each parameter in flow style, in rows: a row of a matrix is a state."""
-    rows = {}
-    for key, value in model.model_dump(exclude_none=True).items():
-        columns = len(value) if key in {"states", "lead"} else len(value) // len(model.states)
-        rows[key] = [yaml_flow(value[i : i + columns])[1:-1] for i in range(0, len(value), columns)]
+def _sections(controller: RiseDiParameters, airframe: Airframe) -> dict[str, tuple[str, dict[str, str | list[str]]]]:
+    """The sections feedforward and observer where there are any: a comment, and each parameter in flow style."""
+    along = f"the input of {airframe.name} along y_m is added; SI, a line a state, lead in s"
+    corrects = "estimates correct the trim; SI, a line an estimate, of F a line an input; within, fade, margin in s"
+    comments = {"feedforward": along, "observer": corrects}
+    return {
+        name: (comment, _matrix_rows(section, len(controller.inputs)))
+        for name, comment in comments.items()
+        if (section := getattr(controller, name)) is not None
+    }
+
+
+def _matrix_rows(section: FeedforwardParameters | ObserverParameters, m: int) -> dict[str, str | list[str]]:
+    """Entries of each parameter in flow style, a matrix in rows. A matrix of the observer has ten digits."""
+    rows: dict[str, str | list[str]] = {}
+    for key, value in section.model_dump(exclude_none=True).items():
+        if not isinstance(value, tuple):
+            rows[key] = yaml_flow(value)
+            continue
+        columns = len(value) if key in {"states", "lead"} else len(value) // (m if key == "F" else len(section.states))
+        digits = 10 if isinstance(section, ObserverParameters) else 6
+        rows[key] = [yaml_flow(value[i : i + columns], digits)[1:-1] for i in range(0, len(value), columns)]
     return rows

@@ -1,0 +1,259 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Observer selection: the sections feedforward and observer of a controller, and the gains of the law beside it.
+
+`with_aircraft_observer` takes the model of an airframe, `with_extended_state_observer` Omega and the lags alone. Both give a
+controller whose nominal linear loop has a delay margin: while it has less, `effort` is raised and K is lowered.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.turbulence import dryden
+from aircraft_sim.uncertainty import KINEMATIC
+from control_laws.nominal_model import NominalModel
+from control_laws.observer_design import (
+    ExtendedStateWeights,
+    Names,
+    ObserverDesign,
+    Weights,
+    aircraft_observer,
+    extended_state_observer,
+)
+from flight_analysis.design.gain_conditions import MIN_GAIN, MIN_K
+from flight_analysis.design.gain_selection import law_order, with_feedforward
+from flight_core.parameters import ParameterError, require
+from flight_core.vectors import FloatArray
+from rise_di_controller.decomposition import DecompositionError, signs
+from rise_di_controller.law import gain
+from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law, spectral_radius
+from rise_di_controller.params import ControllerParameters, FeedforwardParameters, ObserverParameters
+from rise_di_controller.rise_di import RiseDiParameters
+
+RELAXATION = 1.15
+"""Factor by which `effort` rises, and K falls, in a step of the search for the delay margin."""
+
+MAX_STEPS = 40  # of that search: a factor of 270
+
+ALTITUDE, WIND = 100.0, 15.4  # m, m/s at 20 ft: Dryden's moderate turbulence, for which the rule's wind stands
+
+SPEED_UNIT, ANGLE_UNIT = 1.0, 0.1  # m/s, rad: the units of the states, "sizes"
+
+
+class ObserverGains(NamedTuple):
+    """Gains of the law in scaled inputs with abs(Omega_ii) of 1, and weights of the observer; the law's order."""
+
+    K: FloatArray  # (m,) 1/s
+    Lambda: FloatArray  # (m,) 1/s
+    beta: FloatArray  # (m,) units of y / s^2
+    softening: FloatArray  # (m,) total lags
+    weights: Weights
+
+
+def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> ObserverGains:
+    """Gains from the lags of the loop, as a start: they were found on the `osprey` and scale with the total lag T.
+
+        effort = 0.38 T,  drift = 0.4 0.035 s / T,  loose = 0.0036,  K = 0.026 / T,  Lambda = K / 4
+        wind: 0.12 of Dryden's noise sqrt(2 V0 / L) sigma, with 17 times its time L / V0
+        beta = K / T, and a softened sign of 3 T: eps is 3 units of y / s times T
+
+    Arguments: `axes` of the wind in the order of the model's columns; `speed` V0, m/s.
+    """
+    T = model.total_lag
+    spectrum, order = dryden(ALTITUDE, WIND, 0.0), {"longitudinal": 0, "lateral": 1, "vertical": 2}
+    places = [order[axis] for axis in axes]
+    length, sigma = spectrum.length[places], spectrum.sigma[places]
+    gust = 0.12 * sigma * np.sqrt(2.0 * speed / length)
+    weights = Weights(0.38 * T, 0.4 * 0.035 / T, gust, 17.0 * length / speed, np.array([0.0036]))
+    K = 0.026 / T
+    return ObserverGains(K, K / 4.0, K / T, np.full(len(T), 3.0), weights)
+
+
+def gains_of_search(gains: Mapping[str, list[float]]) -> ObserverGains:
+    """Gains as `rise-di compare --tune` finds them for the law rise_observer, by name."""
+    values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
+    softening = np.broadcast_to(values["softening"], values["K"].shape)
+    weights = Weights(**{name: values[name] for name in Weights._fields})
+    return ObserverGains(values["K"], values["Lambda"], values["beta"], softening, weights)
+
+
+def nominal_model(airframe: Airframe, controller: ControllerParameters, noise: FloatArray) -> NominalModel:
+    """The model of an airframe for a controller, in the law's order. `noise` of the measured outputs, (m,), rms per sample."""
+    rows, columns = law_order(airframe, controller)
+    wind = [airframe.gust_direction(axis) for axis in airframe.gusts]
+    period, lag, unlimited = 1.0 / controller.rate, np.array(controller.lag), (np.inf,) * len(columns)
+    A, B, C = airframe.matrix_a(), airframe.matrix_b()[:, columns], airframe.matrix_c()[rows]
+    return NominalModel(
+        A=A,
+        B=B,
+        C=C,
+        gravity=airframe.matrix_gravity(),
+        wind=np.reshape(wind, (len(wind), len(airframe.states))).T,
+        noise=noise,
+        kinematic=np.array([float(state in KINEMATIC) for state in airframe.states]),
+        size=np.array([SPEED_UNIT if unit in {"m/s", "ft/s"} else ANGLE_UNIT for unit in airframe.states.values()]),
+        input_scale=1.0 / np.abs(np.diag(C @ B)),
+        D=np.array(controller.D, dtype=np.float64),
+        lag=lag,
+        total_lag=lag + 1.5 * period + controller.delay,
+        period=period,
+        lower=-np.array(unlimited) if controller.lower is None else np.array(controller.lower),
+        upper=np.array(controller.upper or unlimited),
+    )
+
+
+class SelectedObserver(NamedTuple):
+    """A controller with an observer, and what it tolerates."""
+
+    controller: RiseDiParameters
+    delay_margin: float  # s, of the nominal linear loop
+    relaxation: float  # factor by which the search for the margin raised `effort` and lowered K; 1: not at all
+
+
+def with_aircraft_observer(
+    controller: RiseDiParameters,
+    airframe: Airframe,
+    gains: ObserverGains,
+    noise: FloatArray,
+    margin: float,
+) -> SelectedObserver:
+    """The controller with the feedforward and the observer of an airframe, and the gains of the law beside it.
+
+    Raises ParameterError for an airframe with another D or without a wind, one that a feedforward refuses, and for a delay
+    margin that no relaxation reaches.
+    """
+    require(bool(airframe.gusts), f"airframe {airframe.name}", "no gusts", "the effect of wind: the observer estimates it")
+    rows, columns = law_order(airframe, controller)
+    Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
+    _require_signs(Omega, controller, f"airframe {airframe.name}")
+    base = with_feedforward(controller.model_copy(update={"observer": None}), airframe)
+    model = nominal_model(airframe, controller, noise)
+    names = Names(tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts))
+
+    def design(effort: float) -> ObserverDesign:
+        return aircraft_observer(model, names, gains.weights._replace(effort=effort * gains.weights.effort))
+
+    return _within_margin(base, model, gains, design, margin)
+
+
+def extended_state_gains(model: NominalModel) -> tuple[ObserverGains, ExtendedStateWeights]:
+    """Gains with an extended-state observer from the lags of the loop: those of a search on the `osprey`, scaled with T.
+
+    The gains of that search, by output q, p, r, V with T of 35, 35, 35 and 115 ms, as products with T: effort 0.18 to 1.3 T,
+    drift 0.0077 to 0.024 / T, its rate's 0.67 to 0.18 / T, decay 0.1 to 0.67 / T. The geometric means are used.
+    """
+    T, one = model.total_lag, np.ones(len(model.total_lag))
+    weights = ExtendedStateWeights(0.6 * T, 0.013 / T, 0.5 / T, 0.2 / T)
+    K = 0.026 / T
+    unused = Weights(weights.effort, weights.drift, one, one, one)
+    return ObserverGains(K, K / 4.0, K / T, np.full(len(T), 3.0), unused), weights
+
+
+def integrator_model(controller: ControllerParameters, Omega: FloatArray) -> FeedforwardParameters:
+    """The model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order; lead = lag + delay + half a period."""
+    return FeedforwardParameters(
+        states=controller.outputs,
+        A=(0.0,) * Omega.size,
+        B=tuple(Omega.ravel().tolist()),
+        lead=tuple(lag + controller.delay + 0.5 / controller.rate for lag in controller.lag),
+    )
+
+
+def with_extended_state_observer(
+    controller: RiseDiParameters, Omega: FloatArray, noise: FloatArray, size: FloatArray, margin: float
+) -> SelectedObserver:
+    """The controller with an observer from Omega and lags alone: no A, no f, no wind.
+
+    The model of its feedforward is y_dot = Omega u. Arguments: Omega (m, m) in the law's order; `noise` of the outputs, (m,),
+    rms per sample; `size` (m,), their units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer`.
+    """
+    m = len(controller.outputs)
+    _require_signs(Omega, controller, "Omega")
+    period, lag, unlimited = 1.0 / controller.rate, np.array(controller.lag), (np.inf,) * m
+    values = controller.model_dump() | {"observer": None, "feedforward": integrator_model(controller, Omega).model_dump()}
+    base = RiseDiParameters.validate_mapping(values, "controller")
+    none, eye = np.zeros((m, m)), np.eye(m)
+    model = NominalModel(
+        A=none,
+        B=Omega,
+        C=eye,
+        gravity=none,
+        wind=np.zeros((m, 0)),
+        noise=noise,
+        kinematic=np.zeros(m),
+        size=size,
+        input_scale=1.0 / np.abs(np.diag(Omega)),
+        D=np.array(controller.D, dtype=np.float64),
+        lag=lag,
+        total_lag=lag + 1.5 * period + controller.delay,
+        period=period,
+        lower=-np.array(unlimited) if controller.lower is None else np.array(controller.lower),
+        upper=np.array(controller.upper or unlimited),
+    )
+    names = Names(controller.outputs, controller.inputs, controller.outputs, ())
+    gains, weights = extended_state_gains(model)
+
+    def design(effort: float) -> ObserverDesign:
+        return extended_state_observer(model, names, weights._replace(effort=effort * weights.effort))
+
+    return _within_margin(base, model, gains, design, margin)
+
+
+def _require_signs(Omega: FloatArray, controller: ControllerParameters, where: str) -> None:
+    try:
+        D = [int(sign) for sign in signs(Omega)]
+    except DecompositionError as error:
+        raise ParameterError(f"{where}: found a C B without a D ({error}), expected D = {list(controller.D)}") from None
+    require(D == list(controller.D), where, f"a C B with D = {D}", f"D = {list(controller.D)}, that of the controller")
+
+
+def _within_margin(
+    base: RiseDiParameters,
+    model: NominalModel,
+    gains: ObserverGains,
+    design: Callable[[float], ObserverDesign],
+    margin: float,
+) -> SelectedObserver:
+    """The first relaxation with the delay margin."""
+    loop = Loop(model.lag, base.delay, model.period)
+    plant = LinearPlant(model.A + model.gravity, model.B, model.C)
+    found = 0.0
+    for step in range(MAX_STEPS + 1):
+        relaxation = RELAXATION**step
+        controller = _parameters(base, model, gains, design(relaxation), relaxation)
+        found = delay_margin(plant, linear_law(controller.tuned_law(), len(model.lag), model.period), loop)
+        if found >= margin:
+            checked = controller.model_dump()
+            checked["observer"]["margin"] = math.floor(1e3 * min(found, margin)) / 1e3
+            return SelectedObserver(RiseDiParameters.validate_mapping(checked, "controller"), found, relaxation)
+    raise ParameterError(f"--margin: found at most {1e3 * found:.0f} ms of delay, expected less than {1e3 * margin:g} ms")
+
+
+def _parameters(
+    base: RiseDiParameters, model: NominalModel, gains: ObserverGains, design: ObserverDesign, relaxation: float
+) -> RiseDiParameters:
+    """The parameters with gains and matrices. A K below MIN_K is MIN_K with a smaller input scale: the same loop."""
+    K = gains.K / relaxation
+    whole = np.maximum(K, MIN_K + MIN_GAIN)
+    whole[-1] = MIN_K
+    share = K / whole
+    k_g = MIN_K - 1.0
+    Phi, Gamma, L, F = (tuple(one.ravel().tolist()) for one in (design.Phi, design.Gamma, design.L, design.F))
+    require(spectral_radius(design.Phi - design.Gamma @ design.F) < 1.0, "observer.F", "an unstable feedback", "a stable one")
+    observer = ObserverParameters(states=design.states, Phi=Phi, Gamma=Gamma, L=L, F=F, margin=0.0)
+    changes: dict[str, Any] = {
+        "k_g": k_g,
+        "k_d": tuple((whole[:-1] - gain(np.array(k_g), np.zeros(len(K) - 1))[:-1]).tolist()),
+        "Lambda": tuple(gains.Lambda.tolist()),
+        "beta": tuple((gains.beta / relaxation / share).tolist()),
+        "softening": tuple(gains.softening.tolist()),
+        "input_scale": tuple((model.input_scale * share).tolist()),
+        "omega": tuple(share.tolist()),
+        "sign": "soft",
+        "observer": observer,
+    }
+    return base.model_copy(update=changes)

@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Files of tuned gains: one a scenario, with the gains of each law by objective."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from control_laws.catalogue import LAWS
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.files import read_yaml
+from flight_core.parameters import ParameterError
+
+TUNED = Path(__file__).parent / "tuned"  # folder of the tuned gains, one file a scenario
+
+
+class TuningResult(NamedTuple):
+    """Result of a search."""
+
+    gains: dict[str, list[float]]
+    cost: float
+    seed: int  # of the best
+    costs: list[float]  # of all seeds
+    evaluations: int  # of each
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes a tuning result in flow style: one or two lines a gain set."""
+
+
+_Dumper.add_representer(
+    TuningResult, lambda dumper, result: dumper.represent_mapping("tag:yaml.org,2002:map", result._asdict(), flow_style=True)
+)
+
+
+def tuned_file(scenario: Scenario) -> Path:
+    """Path of the tuned gains of a scenario."""
+    return TUNED / f"{scenario.name}.yaml"
+
+
+def load(path: Path) -> dict[str, dict[str, TuningResult]]:
+    """Tuned gains by law and objective; empty if there is no file. Raises ParameterError for a file that cannot be read."""
+    if not path.exists():
+        return {}
+    content = read_yaml(path, path.name, "a file of tuned gains")
+    try:
+        laws = content["laws"].items()
+        return {law: {objective: TuningResult(**entry) for objective, entry in sets.items()} for law, sets in laws}
+    except (TypeError, KeyError, AttributeError) as error:
+        raise ParameterError(f"{path.name}: found {error}, expected laws, each with gains by objective") from None
+
+
+def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
+    """The tuned gains of a law in a scenario, None without any. Raises ParameterError for a file that cannot be read."""
+    return load(tuned_file(scenario)).get(law, {}).get(objective)
+
+
+def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Sequence[str], command: str) -> None:
+    """Write tuned gains, their costs and the command that finds them; laws as in the catalogue, objectives as given."""
+    path.parent.mkdir(exist_ok=True)
+    objectives = [name for name in order if any(name in sets for sets in tuned.values())]
+    head = (
+        "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
+        "# Gains found by CMA-ES, in the law's order of channels and its scaled inputs; cost, seed, evaluations of a search.\n"
+        f"# Made by: {command} --tuning {','.join(objectives)}\n"
+    )
+    laws = {law: {name: tuned[law][name] for name in objectives if name in tuned[law]} for law in LAWS if law in tuned}
+    text = yaml.dump({"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160)
+    path.write_text(head + text, encoding="utf-8")
