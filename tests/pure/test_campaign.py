@@ -107,6 +107,31 @@ def test_an_aircraft_of_a_campaign_has_the_same_score_in_the_single_process_simu
     assert worst.score == pytest.approx(score(rms, unit)[0], rel=1e-3)  # as of single flights: tests of fleets
 
 
+def test_a_campaign_flies_the_effect_of_wind_that_its_definition_names(tmp_path: Path) -> None:
+    gust = {"vertical": {"start": 2.0, "speed": 10.12, "length": 15.24}}
+    gusty = find_scenario("osprey_servo").vary(flight={"duration": 4.0}, aircraft={"gusts": gust})
+    published = gusty.vary(aircraft={"uncertainty": {"A": 0.9, "wind": "published"}})
+    of = {
+        "own": define(gusty, 20, 0.5, 7, 20),
+        "published": define(gusty, 20, 0.5, 7, 20, wind="published"),
+        "scenario": define(published, 20, 0.5, 7, 20),
+    }
+    tallies = {name: fly_campaign(tmp_path / name, one).tally(0) for name, one in of.items()}
+    # Half of Z_alpha with the whole force of the gust has a larger error.
+    assert tallies["own"].figures["score"].largest < 0.9 * tallies["published"].figures["score"].largest
+    assert tallies["scenario"] == tallies["published"]  # its own uncertain aircraft does not fly
+    for name, wind in (("own", "air_relative"), ("published", "published")):
+        assert of[name].aircraft_scenario(3).aircraft.uncertainty.wind == wind
+
+
+def test_a_campaign_of_a_version_without_effects_of_wind_is_not_continued(tmp_path: Path) -> None:
+    old = json.loads(definition().model_dump_json())
+    del old["wind"]
+    (tmp_path / "campaign.json").write_text(json.dumps(old), encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"found no campaign \(.*wind, Field required"):
+        Campaign.resume(tmp_path)
+
+
 def test_the_same_seed_gives_the_same_figures_in_any_order_and_engine(tmp_path: Path) -> None:
     first, second = (fly_campaign(tmp_path / name, definition()) for name in ("first", "second"))
     assert first.tally(0).model_dump_json() == second.tally(0).model_dump_json()

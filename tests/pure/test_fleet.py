@@ -9,7 +9,7 @@ import pytest
 from tests.closed_loop import error
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import sampled_matrices
+from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from control_laws.nominal_model import campaign_law
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -50,13 +50,15 @@ def fly(
     params: Any = PARAMS,
 ) -> fleet.FleetResult:
     course = build_course(scenario)
-    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, wind, late)
+    directions = gust_directions(load_airframe("osprey"), A, scenario.aircraft.uncertainty.wind)
+    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, wind, late, directions)
     return fleet.fly(aircraft, fleet.vehicle(scenario), course, control_law, params)
 
 
 def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
     """One of them in the single-process simulation, evaluated at the ticks: figures of `fleet.FleetResult`, (m,)."""
-    uncertainty = {"A": 0.3, "B": 0.3, "seed": 5, "number": number}
+    effect = scenario.aircraft.uncertainty.wind
+    uncertainty = {"A": 0.3, "B": 0.3, "wind": effect, "seed": 5, "number": number}
     tape = simulate(scenario.vary(aircraft={"uncertainty": uncertainty}))
     true, period = error(tape), round(1e9 / scenario.controller.rate)
     e = np.array([true[name][true.stamp_ns % period == 0] for name in scenario.controller.outputs])
@@ -69,6 +71,7 @@ def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
 LAG = [0.02, 0.1, 0.02, 0.02]
 VARIATIONS: dict[str, dict[str, Any]] = {
     "servos, noise, gusts": {},
+    "gusts with the published effect": {"aircraft": {"uncertainty": {"wind": "published"}}},
     "products of states": {"aircraft": {"inertial_coupling": 1.0}},
     "feedforward": {"controller": with_feedforward(SERVO.controller, load_airframe("osprey")).model_dump()},
     "turbulence": {"aircraft": {"turbulence": {"altitude": 100.0, "wind": 7.7}}, "flight": {"duration": 6.0}},
@@ -131,6 +134,20 @@ class Ticks(NamedTuple):
     """State of the pulse."""
 
     count: Array
+
+
+def test_the_wind_acts_on_x_dot_by_the_own_directions_of_each_aircraft() -> None:
+    course, plant = build_course(SERVO), SERVO.aircraft.plant()
+    A, B = sampled(0.3, 5, 2)
+    directions = gust_directions(load_airframe("osprey"), A, "air_relative")
+    assembled = fleet.assemble(A, B, plant, course, gust_directions=directions)
+    assert [list(load_airframe("osprey").gusts)[axis] for axis in course.axes] == ["vertical", "lateral"]
+    C = plant.aircraft.C[course.order]
+    for k in range(2):
+        assert np.asarray(assembled.forced_rate)[..., k] == pytest.approx(C @ directions[k][:, course.axes], rel=1e-14)
+    # Without directions the plant's own act on all.
+    shared = np.asarray(fleet.assemble(A, B, plant, course).forced_rate)
+    assert (shared == (C @ plant.aircraft.gust_direction[:, course.axes])[..., None]).all()
 
 
 def _pulse(delay: int) -> ControlLaw:

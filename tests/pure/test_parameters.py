@@ -122,7 +122,8 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
         ({"A": 1.0}, r"\.A: found 1.0, expected less than 1"),
         ({"B": -0.1}, r"\.B: found -0.1, expected greater than or equal to 0"),
         ({"seed": -1}, r"\.seed: found -1, expected greater than or equal to 0"),
-        ({"C": 0.1}, r"\.C: unknown key, expected one of A, B, number, seed"),
+        ({"C": 0.1}, r"\.C: unknown key, expected one of A, B, number, seed, wind"),
+        ({"wind": "none"}, r"\.wind: found 'none', expected"),
     ],
     "turbulence": [
         ({"altitude": 3.0, "wind": 7.7}, r"\.altitude: found 3\.0, expected greater than or equal to 3\.048"),

@@ -10,7 +10,7 @@ from scipy.stats import kstest
 from tests.builders import aircraft_parameters
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
-from aircraft_sim.uncertainty import as_yaml, nominal_and_sampled, sample_airframe
+from aircraft_sim.uncertainty import as_yaml, gust_directions, nominal_and_sampled, sample_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.vectors import FloatArray
@@ -44,7 +44,44 @@ def test_a_sampled_airframe_keeps_zeros_angles_and_everything_but_a_and_b() -> N
     rows = [OSPREY.index(state) for state in OSPREY.states if state not in {"theta", "phi"}]
     assert 0.2 < np.abs(relative_change(sampled.matrix_a()[rows], A[rows])).max() < 0.3
     assert 0.1 < np.abs(relative_change(sampled.matrix_b()[rows], B[rows])).max() < 0.2
+    assert sampled.model_dump(exclude={"A", "B", "gusts"}) == OSPREY.model_dump(exclude={"A", "B", "gusts"})
+
+
+def test_aircraft_that_drift_with_the_wind_do_not_notice_it() -> None:
+    # An aircraft with alpha = w / V0, beta = v / V0 or V = u has no velocity relative to steady air of that wind: A x and the
+    # effect of the wind cancel. The airframe file rounds its effect of wind to two or three digits: 3e-3 at most.
+    sampled = sample_airframe(OSPREY, 0.5, 0.0, seed=7)
+    A, effect = sampled.matrix_a(), sampled.matrix_gusts()
+    for axis, state, drift in (("vertical", "alpha", 1.0 / 25.0), ("lateral", "beta", 1.0 / 25.0), ("longitudinal", "V", 1.0)):
+        by_state, by_wind = A[:, OSPREY.index(state)] * drift, effect[:, list(OSPREY.gusts).index(axis)]
+        assert by_wind == pytest.approx(-by_state, rel=5e-3, abs=0.0), axis
+        published = OSPREY.matrix_gusts()[:, list(OSPREY.gusts).index(axis)]
+        assert np.abs(published + by_state).max() > 0.1 * np.abs(published).max(), axis  # what it would feel otherwise
+
+
+def test_the_published_effect_of_wind_remains_as_an_option() -> None:
+    sampled = sample_airframe(OSPREY, 0.3, 0.2, seed=7, wind="published")
     assert sampled.model_dump(exclude={"A", "B"}) == OSPREY.model_dump(exclude={"A", "B"})
+    own = sample_airframe(OSPREY, 0.3, 0.2, seed=7)
+    assert (own.A, own.B) == (sampled.A, sampled.B)
+
+
+def test_the_effect_of_wind_of_a_published_airframe_is_the_published_one_to_the_last_bit() -> None:
+    for wind in ("air_relative", "published"):
+        assert (gust_directions(OSPREY, OSPREY.matrix_a()[None], wind)[0] == OSPREY.matrix_gusts()).all()
+        assert (sample_airframe(OSPREY, 0.0, 0.3, seed=7, wind=wind).matrix_gusts() == OSPREY.matrix_gusts()).all()
+
+
+def test_the_effect_of_wind_on_a_state_without_a_published_entry_stays() -> None:
+    # The vertical wind acts on r here although A[r, alpha] is 0; an airframe without beta keeps its lateral effect.
+    gusts = {"vertical": {"alpha": 7.2, "r": 1.0}, "lateral": {"q": 2.0}}
+    states = {("sideslip" if state == "beta" else state): unit for state, unit in OSPREY.states.items()}
+    changes = {"gusts": gusts, "states": states, "gravity": [{"into": "sideslip", "angle": "phi", "gain": 0.39}]}
+    airframe = Airframe.validate_mapping(OSPREY.model_dump() | changes, "changed")
+    sampled = sample_airframe(airframe, 0.5, 0.0, seed=7)
+    assert sampled.gusts["vertical"]["r"] == 1.0
+    assert sampled.gusts["vertical"]["alpha"] != 7.2
+    assert sampled.gusts["lateral"] == gusts["lateral"]
 
 
 def test_one_uncertainty_leaves_the_other_matrix_as_published() -> None:

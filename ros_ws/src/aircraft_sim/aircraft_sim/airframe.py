@@ -123,12 +123,23 @@ class Airframe(Parameters):
         first, second = (np.array([self.index(term.product[k]) for term in terms], dtype=np.int64) for k in (0, 1))
         return gain, first, second
 
-    def with_matrices(self, A: FloatArray, B: FloatArray) -> Self:
-        """The same airframe with other A, shape (n, n), and B, shape (n, m), given in SI and stored in the file's units."""
+    def with_matrices(self, A: FloatArray, B: FloatArray, wind_factor: FloatArray) -> Self:
+        """The same airframe with other A, shape (n, n), and B, shape (n, m), given in SI and stored in the file's units.
+
+        `wind_factor`, shape (n, G), multiplies the effect of wind along each axis of `gusts`.
+        """
         state: FloatArray = np.array([SI_PER_UNIT[u] for u in self.states.values()])
         inputs: FloatArray = np.array([SI_PER_UNIT[i.unit] for i in self.inputs.values()])
         values = {"A": (A / state[:, None] * state).tolist(), "B": (B / state[:, None] * inputs).tolist()}
-        return self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
+        gusts = {
+            axis: {name: value * float(factor[self.index(name)]) for name, value in direction.items()}
+            for (axis, direction), factor in zip(self.gusts.items(), wind_factor.T, strict=True)
+        }
+        return self.validate_mapping(self.model_dump() | values | {"gusts": gusts}, f"airframe {self.name}")
+
+    def matrix_gusts(self) -> FloatArray:
+        """Change of x_dot for 1 m/s of wind along each axis of `gusts`, shape (n, G)."""
+        return np.array([self.gust_direction(axis) for axis in self.gusts]).reshape(-1, len(self.states)).T
 
     def gust_direction(self, gust: str) -> FloatArray:
         """Change of x_dot for 1 m/s of wind along an axis, shape (n,). Raises ParameterError for an axis not in the file."""

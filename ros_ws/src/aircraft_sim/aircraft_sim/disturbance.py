@@ -13,6 +13,9 @@ from flight_core.vectors import Array, array_namespace
 AXES = ("longitudinal", "lateral", "vertical")
 """Axes of the wind, FRD axes of trim. Positive: tail wind, wind to the right, wind down."""
 
+AIR_STATE = {"longitudinal": "V", "lateral": "beta", "vertical": "alpha"}
+"""State that wind w along an axis changes relative to the air: V - w, beta - w / V0, alpha - w / V0, small angles."""
+
 REFERENCE_LENGTH = 106.68  # m, 350 ft: FAR/CS 25.341(a)(4)
 
 MIN_RISE = 1e-30  # s, used for rise 0, a step: t / 1e-30 saturates for every t > 0, in float32 too, without division by 0

@@ -17,6 +17,7 @@ from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, FlightConditio
 from aircraft_sim.plant import PlantParams
 from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
+from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
 from flight_core import parameters
 from flight_core.failsafe import failsafe_scale
 from flight_core.parameters import KeyedParameters, NonNegative, ParameterError, Parameters, Positive, require
@@ -83,6 +84,11 @@ class UncertaintyParameters(Parameters):
 
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
+    wind: WindEffect = Field(
+        default=AIR_RELATIVE,
+        description="effect of wind on x_dot. air_relative: by the aircraft's own A, through alpha, beta and V relative to the"
+        " air; published: that of the airframe",
+    )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
     number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's aircraft, from 0 on")
 
@@ -249,12 +255,13 @@ class AircraftParameters(KeyedParameters):
     def sampled_airframe(self) -> Airframe:
         """The airframe in flight: the named one, or the sample of `uncertainty` around it."""
         chosen = self.uncertainty
-        return uncertainty.sample_airframe(load_airframe(self.airframe), chosen.A, chosen.B, chosen.seed, chosen.number)
+        return uncertainty.sample_airframe(
+            load_airframe(self.airframe), chosen.A, chosen.B, chosen.seed, chosen.number, chosen.wind
+        )
 
     def load(self) -> tuple[Airframe, Aircraft]:
         """The airframe in flight and the arrays of equation (1) with all disturbances, for the axes of the airframe's gusts."""
         airframe = self.sampled_airframe()
-        direction = [airframe.gust_direction(axis) for axis in airframe.gusts]
         gain, first, second = airframe.products()
         biases = {name: bias for name, bias in self.bias.items() if bias.value != 0.0}
         sines = {name: sine for name, sine in self.sines.items() if sine.amplitude != 0.0}
@@ -263,7 +270,7 @@ class AircraftParameters(KeyedParameters):
             airframe.matrix_b(),
             airframe.matrix_c(),
             airframe.matrix_gravity(),
-            np.reshape(direction, (len(direction), len(airframe.states))).T,
+            airframe.matrix_gusts(),
             self._gust_arrays(list(airframe.gusts)),
             np.array(airframe.speed),
             Coupling(self.inertial_coupling * gain, first, second) if self.inertial_coupling > 0.0 else None,

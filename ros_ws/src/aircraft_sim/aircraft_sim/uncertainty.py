@@ -2,16 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """Uncertain aircraft for Monte Carlo campaigns: A and B sampled around a published airframe, repeatable by seed."""
 
+from typing import Literal
+
 import numpy as np
 import yaml
 
 from aircraft_sim import random_streams
 from aircraft_sim.airframe import Airframe
+from aircraft_sim.disturbance import AIR_STATE
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
 KINEMATIC = ("theta", "phi", "psi")
 """States whose derivatives are known exactly: their rows stay as published in uncertain airframes."""
+
+WindEffect = Literal["air_relative", "published"]
+"""Effect of wind on the x_dot of an uncertain aircraft: by its own A, or that of the published airframe. See `wind_factors`."""
+
+AIR_RELATIVE: WindEffect = "air_relative"
 
 
 def nominal_and_sampled(airframe: Airframe, uncertainty: float, samples: int, seed: int) -> tuple[FloatArray, FloatArray]:
@@ -23,13 +31,39 @@ def nominal_and_sampled(airframe: Airframe, uncertainty: float, samples: int, se
     return np.concatenate([airframe.matrix_a()[None], A]), np.concatenate([airframe.matrix_b()[None], B])
 
 
-def sample_airframe(airframe: Airframe, of_A: float, of_B: float, seed: int, number: int = 0) -> Airframe:
+def sample_airframe(
+    airframe: Airframe, of_A: float, of_B: float, seed: int, number: int = 0, wind: WindEffect = AIR_RELATIVE
+) -> Airframe:
     """Uncertain airframe `number` of a seed, with an uncertainty of A and one of B. 0 and 0 give the published airframe.
 
-    f, with the effect of gusts, stays as published. Raises ParameterError for an uncertainty outside [0, 1).
+    The effect of wind is that of `wind_factors`; the rest of f stays as published. Raises ParameterError for an uncertainty
+    outside [0, 1).
     """
     A, B = sampled_matrices(airframe, of_A, of_B, seed, number, 1)
-    return airframe if of_A == of_B == 0.0 else airframe.with_matrices(A[0], B[0])
+    return airframe if of_A == of_B == 0.0 else airframe.with_matrices(A[0], B[0], wind_factors(airframe, A, wind)[0])
+
+
+def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
+    """Factors on the published effect of wind, shape (N, n, G), of N aircraft with the matrices A, shape (N, n, n), SI.
+
+    Wind w along an axis changes the state j of AIR_STATE relative to the air, so that it acts as minus column j of A:
+
+        air_relative    factor_i = A_ij / published A_ij    1 where the published A_ij is 0 or the airframe has no state j
+        published       factor_i = 1
+
+    A published effect that is minus the published column, per w / V0 or w, is then minus the aircraft's own column.
+    """
+    published, factors = airframe.matrix_a(), np.ones((len(A), len(airframe.states), len(airframe.gusts)))
+    for k, axis in enumerate(airframe.gusts):
+        if wind == AIR_RELATIVE and AIR_STATE[axis] in airframe.states:
+            j = airframe.index(AIR_STATE[axis])
+            np.divide(A[:, :, j], published[:, j], out=factors[:, :, k], where=published[:, j] != 0.0)
+    return factors
+
+
+def gust_directions(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
+    """Change of x_dot for 1 m/s of wind along each axis, shape (N, n, G), of N aircraft with the matrices A; `wind_factors`."""
+    return wind_factors(airframe, A, wind) * airframe.matrix_gusts()
 
 
 def sampled_matrices(

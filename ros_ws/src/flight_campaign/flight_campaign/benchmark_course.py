@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from aircraft_sim import plant as plant_model
 from aircraft_sim import sensors, turbulence
 from aircraft_sim.airframe import Airframe
+from aircraft_sim.disturbance import AIR_STATE
 from aircraft_sim.plant import PlantParams
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.parameters import require
@@ -26,9 +27,6 @@ from rise_di_controller.guard import DT_RANGE
 HOLD, ENGAGE, STEP = range(3)
 """Action of a controller at a tick: it holds u without a new y, it engages, or it takes a step of its law."""
 
-WIND_ANGLE = {"vertical": "alpha", "lateral": "beta"}
-"""Angle that a wind along an axis changes: alpha_air = alpha - w/V0, beta_air = beta - v/V0, small angles."""
-
 
 class Segments(NamedTuple):
     """The parts of a course that change from tick to tick."""
@@ -41,7 +39,7 @@ class Segments(NamedTuple):
     sampled_y_m_dot: FloatArray  # (T, m)
     u_ff: FloatArray  # (T, m) feedforward
     error: FloatArray  # (T, m) sensor error of the y of the tick
-    forcing: FloatArray  # (T, K r) mean of basis' @ f_time over each of the steps from here to the next tick
+    forcing: FloatArray  # (T, K r) mean over each of the steps from here to the next tick: wind along `axes`, basis' @ the rest
     forcing_now: FloatArray  # (T, r) at the tick
     air: FloatArray  # (T, n) wind's contribution to alpha and beta, rad
 
@@ -50,7 +48,8 @@ class Course(NamedTuple):
     """T ticks of the controller, the last at the end of the flight; channels in the law's order, states in the airframe's."""
 
     segments: Segments
-    basis: FloatArray  # (n, r) orthonormal directions of f_time in x_dot
+    axes: NDArray[np.int64]  # (g,) indices of the axes of the airframe's gusts along which there is wind
+    basis: FloatArray  # (n, r - g) orthonormal directions in x_dot of f_time without wind: biases and sines
     order: NDArray[np.int64]  # (m,) indices of the law's outputs in y
     late: int  # delay of y, ticks
     period: float  # s, of the ticks
@@ -89,9 +88,13 @@ def build_course(scenario: Scenario) -> Course:
     arrives = [sensors.arrives(k, errors) for k in range(ticks)]
     phase, dt = _phases(ticks, late, seconds(tick_ns), scenario.controller.max_age, arrives)
     used = np.maximum(np.arange(ticks) - late, 0)
-    forcing, now, air = _wind(ticks, steps, plant, airframe)
-    _, sizes, rows = np.linalg.svd(forcing, full_matrices=False)
+    wind, other = _forcing(ticks, steps, plant)
+    axes = np.flatnonzero(wind.over_step.any(axis=0))
+    _, sizes, rows = np.linalg.svd(other.over_step, full_matrices=False)
     basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
+    over_step, now = (
+        np.concatenate([blowing[:, axes], rest @ basis], axis=1) for blowing, rest in zip(wind, other, strict=True)
+    )
     segments = Segments(
         np.arange(ticks) * np.float64(seconds(tick_ns)),
         phase,
@@ -101,11 +104,11 @@ def build_course(scenario: Scenario) -> Course:
         y_m_dot[used],
         _feedforward(controller.nominal(), phase, dt, y_m[used]),
         error[:, order],
-        (forcing @ basis).reshape(ticks, -1),
-        now @ basis,
-        air,
+        over_step.reshape(ticks, -1),
+        now,
+        _air_angles(wind.at_tick, airframe),
     )
-    return Course(segments, basis, order, late, seconds(tick_ns), steps)
+    return Course(segments, axes, basis, order, late, seconds(tick_ns), steps)
 
 
 def _phases(ticks: int, late: int, period: float, max_age: float, arrives: list[bool]) -> tuple[NDArray[np.int32], FloatArray]:
@@ -139,23 +142,36 @@ def _feedforward(nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArr
     return u_ff
 
 
-def _wind(ticks: int, steps: int, plant: PlantParams, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Forcing of x_dot in time: mean over each step (T K, n), at each tick (T, n); the wind's contribution to the angles."""
-    forced = plant_model.forcing(0, ticks * steps, plant)
-    direction = np.asarray(plant.aircraft.gust_direction)
-    gusting = np.zeros((ticks * steps, direction.shape[1]))
+class _Forcing(NamedTuple):
+    """A part of the forcing in time."""
+
+    over_step: FloatArray  # (T K, ...) mean over each step of the integration
+    at_tick: FloatArray  # (T, ...)
+
+
+def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _Forcing]:
+    """The wind along the G axes, m/s, and f_time without wind, n rows of x_dot."""
+    no_effect = np.zeros_like(plant.aircraft.gust_direction)
+    forced = plant_model.forcing(0, ticks * steps, plant._replace(aircraft=plant.aircraft._replace(gust_direction=no_effect)))
+    wind, other = (
+        # Simpson's rule, as in Runge-Kutta
+        _Forcing((part[:-1:2] + 4.0 * part[1::2] + part[2::2]) / 6.0, part[: -1 : 2 * steps])
+        for part in forced
+    )
     if (air := plant.turbulence) is not None:
-        z = turbulence.initial_state(air)
+        turbulent, z = np.zeros_like(wind.over_step), turbulence.initial_state(air)
         normals = turbulence.normals(0, ticks * steps, air.seed)
         for k in range(ticks * steps):
-            gusting[k] = turbulence.wind(z, air)
+            turbulent[k] = turbulence.wind(z, air)
             z = turbulence.step(z, normals[k], air)
-    rate = forced.rate
-    over_step = (rate[:-1:2] + 4.0 * rate[1::2] + rate[2::2]) / 6.0 + gusting @ direction.T  # Simpson's rule, as in Runge-Kutta
-    wind = forced.wind[: -1 : 2 * steps] + gusting[::steps]
-    angles = np.zeros((ticks, len(airframe.states)))
+        wind = _Forcing(wind.over_step + turbulent, wind.at_tick + turbulent[::steps])
+    return wind, other
+
+
+def _air_angles(wind: FloatArray, airframe: Airframe) -> FloatArray:
+    """Contribution of the wind at the ticks, shape (T, G), to alpha and beta, rad, in the order of the states, shape (T, n)."""
+    angles = np.zeros((len(wind), len(airframe.states)))
     for place, axis in enumerate(airframe.gusts):
-        angle = WIND_ANGLE.get(axis)
-        if angle in airframe.states:
-            angles[:, airframe.index(angle)] = wind[:, place] / airframe.speed
-    return over_step, rate[: -1 : 2 * steps] + gusting[::steps] @ direction.T, angles
+        if axis != "longitudinal" and AIR_STATE[axis] in airframe.states:
+            angles[:, airframe.index(AIR_STATE[axis])] = wind[:, place] / airframe.speed
+    return angles

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import sampled_matrices
+from aircraft_sim.uncertainty import WindEffect, gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, check_together
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
@@ -47,6 +47,7 @@ class Definition(Parameters):
     sections: dict[str, dict[str, object]]  # of the scenario, every parameter
     aircraft: int = Field(ge=1, description="how many aircraft fly")
     uncertainty: float = Field(ge=0, lt=1, description="the largest part by which an entry of A and of B differs")
+    wind: WindEffect = Field(description="the effect of wind: by each aircraft's own A, or that of the airframe")
     seed: int = Field(ge=0, lt=2**63, description="the seed of the aircraft")
     chunk: int = Field(ge=1, description="how many of them fly at once")
     sweep: Sweep | None = None
@@ -64,7 +65,7 @@ class Definition(Parameters):
 
     def aircraft_scenario(self, number: int, case: int = 0) -> Scenario:
         """The scenario of one aircraft of the campaign, as `rise-di fly` flies it."""
-        uncertainty = {"A": self.uncertainty, "B": self.uncertainty, "seed": self.seed, "number": number}
+        uncertainty = {"A": self.uncertainty, "B": self.uncertainty, "wind": self.wind, "seed": self.seed, "number": number}
         return self.scenario(case).vary(aircraft={"uncertainty": uncertainty})
 
     @property
@@ -87,16 +88,34 @@ class Definition(Parameters):
 
 
 def define(
-    scenario: Scenario, aircraft: int, uncertainty: float, seed: int, chunk: int, sweep: Sweep | None = None
+    scenario: Scenario,
+    aircraft: int,
+    uncertainty: float,
+    seed: int,
+    chunk: int,
+    sweep: Sweep | None = None,
+    wind: WindEffect | None = None,
 ) -> Definition:
-    """The definition of a campaign over a scenario. Raises ParameterError if a campaign cannot fly it."""
+    """The definition of a campaign over a scenario; `wind` None: that of the scenario's `aircraft.uncertainty`.
+
+    Raises ParameterError if a campaign cannot fly it.
+    """
     if sweep is not None:
         names = ", ".join(SWEPT)
         require(sweep.parameter in SWEPT, "--sweep", sweep.parameter, f"a parameter of the controller: {names}")
         require(all(factor > 0.0 for factor in sweep.factors), "--sweep", sweep.factors, "factors above 0")
-    sections = {name: getattr(scenario, name).model_dump(mode="json") for name in SCHEMAS}
-    values = {"name": scenario.name, "sections": sections, "aircraft": aircraft, "uncertainty": uncertainty, "seed": seed}
-    definition = Definition.validate_mapping({**values, "chunk": chunk, "sweep": sweep}, "campaign")
+    published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
+    values = {
+        "name": scenario.name,
+        "sections": {name: getattr(published, name).model_dump(mode="json") for name in SCHEMAS},
+        "aircraft": aircraft,
+        "uncertainty": uncertainty,
+        "wind": scenario.aircraft.uncertainty.wind if wind is None else wind,
+        "seed": seed,
+        "chunk": chunk,
+        "sweep": sweep,
+    }
+    definition = Definition.validate_mapping(values, "campaign")
     for case in range(definition.cases):
         definition.scenario(case)
     return definition
@@ -124,8 +143,10 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     scenario, course, vehicle, law = _prepare(text, case)
     first, count, part = chunk * definition.chunk, definition.size(job), definition.uncertainty
     # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft are dropped.
-    A, B = sampled_matrices(load_airframe(scenario.aircraft.airframe), part, part, definition.seed, first, definition.chunk)
-    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course)
+    airframe = load_airframe(scenario.aircraft.airframe)
+    A, B = sampled_matrices(airframe, part, part, definition.seed, first, definition.chunk)
+    directions = gust_directions(airframe, A, definition.wind)
+    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
     result = fleet.fly(aircraft, vehicle, course, law.control_law, law.params)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
@@ -165,7 +186,7 @@ class Campaign:
         try:
             definition = Definition.model_validate_json((folder / DEFINITION).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            why = str(error).splitlines()[0]
+            why = ", ".join(line.strip() for line in str(error).splitlines()[:3])
             raise ParameterError(f"{folder}: found no campaign ({why}), expected the folder of one") from None
         (folder / CHUNKS).mkdir(exist_ok=True)
         return cls(folder, definition)

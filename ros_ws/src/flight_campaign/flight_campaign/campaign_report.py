@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
+from aircraft_sim.uncertainty import WindEffect
 from flight_analysis.report.comparison import COLOURS
 from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
 from flight_analysis.report.plotting import SampleStore, set_layout, subplot, subplot_grid
@@ -19,6 +20,7 @@ from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, F
 from flight_core.vectors import FloatArray
 
 COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, 5 % wide
+WIND_EFFECTS: dict[WindEffect, str] = {"air_relative": "by each aircraft's own A", "published": "that of the airframe"}
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 
 
@@ -29,8 +31,9 @@ def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cas
     title = f"Campaign {definition.name}"
     text = (
         f"{tallies[0].flights} aircraft, every entry of A and B within"
-        f" ±{100 * definition.uncertainty:g} % of the airframe, seed {definition.seed}; the airframe's own gusts, the"
-        f" same noise for all; true errors at the controller's ticks. Score: the sum over the channels of rms error in"
+        f" ±{100 * definition.uncertainty:g} % of the airframe, seed {definition.seed}; the same wind and noise for all, the"
+        f" effect of wind on x_dot {WIND_EFFECTS[definition.wind]}; true errors at the controller's ticks."
+        " Score: the sum over the channels of rms error in"
         f" 10 mrad/s (p: 20) and 0.1 m/s; loss of track: a score above {LOSS_OF_TRACK_SCORE:g}."
     )
     tables = [_ends(labels, cases), *(_figures(label, one, units) for label, one in zip(labels, tallies, strict=True))]

@@ -50,7 +50,7 @@ class Fleet(NamedTuple):
     tick: tuple[Array, ...]  # (n, n + K m + q, N), by blocks, without entries that are 0 in all aircraft
     forced: Array  # (n, K r, N)
     rate: Array  # (m, n + m, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, up to the remainder
-    forced_rate: Array  # (m, r)
+    forced_rate: Array  # (m, r, N)
     wind: Array  # (N,) factor of the course's gusts and turbulence
     late: Array  # (N,) delay of u, whole ticks
 
@@ -99,16 +99,25 @@ class FleetResult(NamedTuple):
     diverged: Array  # (N,) bool: the state exceeded DIVERGENCE_LIMIT, the other figures are invalid
 
 
-def assemble(A: FloatArray, B: FloatArray, plant: PlantParams, course: Course, wind: Array = 1.0, late: Array = 0) -> Fleet:
+def assemble(
+    A: FloatArray,
+    B: FloatArray,
+    plant: PlantParams,
+    course: Course,
+    wind: Array = 1.0,
+    late: Array = 0,
+    gust_directions: FloatArray | None = None,
+) -> Fleet:
     """The matrices of N aircraft, A of shape (N, n, n) and B of (N, n, m).
 
     With L = A + gravity, Phi and Gamma the matrices of one Runge-Kutta step of x_dot = L x + u with u held,
 
         tick = [Phi^K, Phi^(K-1) Gamma B, ..., Gamma B, (Phi^(K-1) + ... + 1) Gamma remainder]
-        forced = [Phi^(K-1) Gamma basis, ..., Gamma basis]
+        forced = [Phi^(K-1) Gamma F, ..., Gamma F],    F = [gust_directions[course.axes], course.basis]
 
     The steps, and the actuators' mean positions in them, are those of `plant.advance`. The remainder is held over a tick, and
-    the forcing over a step. `wind` and `late` are those of Fleet, one value for all or one each.
+    the forcing over a step. `wind` and `late` are those of Fleet, one value for all or one each. `gust_directions` of shape
+    (N, n, G) are the effects of wind on x_dot, of `uncertainty.gust_directions`; None: those of the plant, for all aircraft.
     """
     dt, aircraft = seconds(plant.step_ns), plant.aircraft
     K, count = course.steps, len(A)
@@ -121,6 +130,9 @@ def assemble(A: FloatArray, B: FloatArray, plant: PlantParams, course: Course, w
     tick = [powers[K], *(of_step @ B for of_step in held), sum(held)[..., remainder_rows(aircraft)]]
     rate = np.concatenate([L, B], axis=2)
     C = aircraft.C[course.order]
+    directions = aircraft.gust_direction if gust_directions is None else gust_directions
+    parts = (directions[..., course.axes], course.basis)
+    forcing = np.concatenate([np.broadcast_to(part, (count, *part.shape[-2:])) for part in parts], axis=2)
 
     def last(array: FloatArray) -> Array:
         return jnp.asarray(np.moveaxis(array, 0, -1))
@@ -130,9 +142,9 @@ def assemble(A: FloatArray, B: FloatArray, plant: PlantParams, course: Course, w
     return Fleet(
         blocks,
         tuple(last(whole[:, block.rows][:, :, block.columns]) for block in blocks),
-        last(np.concatenate([of_step @ course.basis for of_step in held], axis=2)),
+        last(np.concatenate([of_step @ forcing for of_step in held], axis=2)),
         last(C @ rate),
-        jnp.asarray(C @ course.basis),
+        last(C @ forcing),
         jnp.broadcast_to(jnp.asarray(wind, dtype=np.float64), (count,)),
         jnp.broadcast_to(jnp.asarray(late), (count,)),
     )
@@ -218,7 +230,7 @@ def _fly(
 
     def measure(now: LoopState, y: Array, segment: Segments) -> Measurements:
         x = now.x.at[vehicle.outputs].set(y)
-        forced = _product(fleet.forced_rate[..., None], segment.forcing_now)
+        forced = _product(fleet.forced_rate, segment.forcing_now)
         moving = _product(fleet.rate, [*now.x, *now.position]) + fleet.wind * forced
         position = now.position[vehicle.inputs]
         reference = (segment.sampled_y_m[:, None], segment.sampled_y_m_dot[:, None], segment.u_ff[:, None] + 0.0 * y)

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from aircraft_sim.plant import PlantParams
-from aircraft_sim.uncertainty import KINEMATIC, nominal_and_sampled
+from aircraft_sim.uncertainty import KINEMATIC, gust_directions, nominal_and_sampled
 from control_laws.catalogue import AIRCRAFT, INTEGRATORS, LAWS, NONE, Gains, Law, initial_gains
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.scenario import Scenario
@@ -159,7 +159,9 @@ def cost(result: FleetResult, benchmark: Benchmark) -> FloatArray:
 
 def benchmark_fleet(A: FloatArray, B: FloatArray, late: Array, wind: str, benchmark: Benchmark) -> Fleet:
     """Aircraft in a wind of the benchmark, u late by whole ticks; shapes as in `fleet.assemble`."""
-    return fleet.assemble(A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late)
+    aircraft = benchmark.scenario.aircraft
+    directions = gust_directions(aircraft.sampled_airframe(), A, aircraft.uncertainty.wind)
+    return fleet.assemble(A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late, gust_directions=directions)
 
 
 class Evaluation(NamedTuple):
@@ -193,7 +195,7 @@ def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
 def repeat_flights(flights: Fleet, times: int) -> Fleet:
     """The same flights several times, one set after the other."""
     tiled = jax.tree.map(lambda array: np.tile(np.asarray(array), times), flights._replace(blocks=()))
-    return tiled._replace(blocks=flights.blocks, forced_rate=flights.forced_rate)
+    return tiled._replace(blocks=flights.blocks)
 
 
 def spread_over(params: Any, of_one: Any, flights: int) -> Any:

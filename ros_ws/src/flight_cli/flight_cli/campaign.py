@@ -11,13 +11,14 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from aircraft_sim.uncertainty import WindEffect
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.report.run_folder import REPORT, SUMMARY, new_run
 from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import Campaign, Definition, Sweep, define
-from flight_campaign.campaign_report import write_page
+from flight_campaign.campaign_report import WIND_EFFECTS, write_page
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
 from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, SHOWN_COLUMN, display_path, new_table, parse_numbers, progress_bar
 from flight_core.parameters import require
@@ -38,6 +39,10 @@ def campaign(
     ] = None,
     aircraft: Annotated[int, typer.Option(min=1, help="How many uncertain aircraft.")] = 1000,
     uncertainty: Annotated[float, typer.Option(help="Largest relative deviation of each entry of A and B, 0 to 1.")] = 0.3,
+    wind: Annotated[
+        WindEffect | None,
+        typer.Option(help="Effect of wind: by each aircraft's own A, or that of the airframe; by default the scenario's."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the aircraft.")] = 1,
     sweep: Annotated[
         str | None, typer.Option(help="A controller parameter and factors to multiply it by, as in beta=0.5,1,2.")
@@ -63,7 +68,7 @@ def campaign(
         monte_carlo = Campaign.resume(resume)
     else:
         chosen = find_scenario(str(scenario), duration)
-        definition = define(chosen, aircraft, uncertainty, seed, chunk, None if sweep is None else _parse_sweep(sweep))
+        definition = define(chosen, aircraft, uncertainty, seed, chunk, None if sweep is None else _parse_sweep(sweep), wind)
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
     speed = _fly_missing(monte_carlo, flies, quiet=as_json)
@@ -122,6 +127,7 @@ def _write_results(monte_carlo: Campaign) -> dict[str, Any]:
         "scenario": definition.name,
         "aircraft": definition.aircraft,
         "uncertainty": definition.uncertainty,
+        "wind": definition.wind,
         "seed": definition.seed,
         "sweep": None if definition.sweep is None else definition.sweep.parameter,
         "cases": cases,
@@ -146,6 +152,7 @@ def _write_worst(monte_carlo: Campaign, case: int, tally: Tally) -> list[dict[st
 def _show(console: Console, definition: Definition, case: int, tally: Tally, figures: dict[str, Any]) -> None:
     units = display_units(definition.scenario(case))
     title = f"\n{definition.name}: {tally.flights} aircraft within +-{100 * definition.uncertainty:g} %, seed {definition.seed}"
+    title += f", effect of wind {WIND_EFFECTS[definition.wind]}"
     if definition.sweep is not None:
         title += f", {definition.sweep.parameter} times {definition.factor(case):g}"
     table = new_table(title, ("figure", "mean", "median", "95 %", "99 %", "worst"), left=("figure",))
