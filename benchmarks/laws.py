@@ -14,6 +14,7 @@ from benchmarks.sampling import SINES, new_table, wide_console
 from rich.console import Console
 from rich.progress import track
 
+from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
@@ -57,9 +58,12 @@ def main(
     aircraft: Annotated[int, typer.Option(min=1, help="Uncertain aircraft at each level.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain aircraft.")] = 1,
     tuning: Annotated[str, typer.Option(help="What the gains were tuned on.")] = TUNED_ON,
+    wind: Annotated[
+        WindEffect, typer.Option(help="Effect of wind: by each aircraft's own A, or that of the airframe.")
+    ] = AIR_RELATIVE,
 ) -> None:
     """Print scores of laws tuned on osprey_servo, on courses that were not part of the tuning."""
-    scenario = find_scenario("osprey_servo")
+    scenario = find_scenario("osprey_servo").vary(aircraft={"uncertainty": {"wind": wind}})
     tuned = {name: {tuning: sets[tuning]} for name, sets in load(tuned_file(scenario)).items() if tuning in sets}
     observers = {name: sets for name, sets in tuned.items() if "wind" in LAWS[name].model_data}
     flown = benchmarks(scenario)
@@ -69,7 +73,7 @@ def main(
     for name, benchmark, laws in track(cases, "courses", console=Console(stderr=True)):
         rows += [(name, one) for one in compare(benchmark, laws, aircraft, LEVELS, seed, delays=())]
     levels = ("nominal", *(f"+-{100.0 * level:g} %" for level in LEVELS))
-    title = f"Scores, mean (worst) of {aircraft} aircraft a level, seed {seed}, tuned on {tuning}"
+    title = f"Scores, mean (worst) of {aircraft} aircraft a level, seed {seed}, tuned on {tuning}, effect of wind: {wind}"
     heads = (f"{wind}\n{level}" for wind in flown["as tuned"].courses for level in levels)
     table = new_table(title, ("course", "law", *heads), texts=2)
     for name, one in rows:

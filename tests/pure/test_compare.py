@@ -136,6 +136,15 @@ def test_more_aircraft_do_not_change_the_results_of_the_first_ones(short: Benchm
             assert level.scores[wind].worst <= wider.scores[wind].worst
 
 
+def test_the_effect_of_wind_changes_uncertain_aircraft_and_not_the_nominal_one(short: Benchmark) -> None:
+    published = tuning.build_benchmark(short.scenario.vary(aircraft={"uncertainty": {"wind": "published"}}))
+    tuned = {"pi": {"gust": initial("pi", short)}}
+    own, other = (next(iter(law_comparison.compare(one, tuned, 2, [0.3], 1, delays=()))) for one in (short, published))
+    assert own.scores == other.scores
+    for wind in (GUST, TURBULENCE):
+        assert own.levels[0].scores[wind].mean != other.levels[0].scores[wind].mean
+
+
 def test_the_share_of_lost_aircraft_is_that_of_the_first_level_by_the_delay_of_u(short: Benchmark) -> None:
     # K of 40 1/s and the 35 ms of the loop of q are 1.4 rad at the crossover: stable below pi/2; with 60 ms more it is unstable
     fast = as_tuned({"K": np.full((4, 1), 40.0), "Lambda": np.ones((4, 1))})
@@ -219,9 +228,12 @@ def gains_file(short: Benchmark, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def test_the_command_writes_what_it_shows(gains_file: Path, tmp_path: Path) -> None:
     path = tmp_path / "compared.json"
     arguments = ["--laws", "rise,l1", "--aircraft", "2", "--uncertainty", "0.3", "--tuning", "gust", "--gains", str(gains_file)]
+    arguments += ["--wind", "published"]
     result = CliRunner().invoke(app, ["compare", "osprey_servo", *arguments, "--json", str(path)])
     assert result.exit_code == 0, result.output
     found = json.loads(path.read_text(encoding="utf-8"))
+    assert found["wind"] == "published"
+    assert "effect of wind on x_dot that of the airframe" in result.stdout
     assert [row["law"] for row in found["laws"]] == ["rise", "l1"]
     assert [row["knows"] for row in found["laws"]] == [LAWS[name].model_data for name in ("rise", "l1")]
     for row in found["laws"]:

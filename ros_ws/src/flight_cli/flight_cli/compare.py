@@ -12,12 +12,14 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from aircraft_sim.uncertainty import WindEffect
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.summary import display_units, finite_or_null
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import law_comparison, tuned_gains
 from flight_campaign import tuning as gain_tuning
+from flight_campaign.campaign_report import WIND_EFFECTS
 from flight_campaign.law_comparison import LawResult
 from flight_campaign.tuning import Benchmark
 from flight_cli.output import COUNT_COLUMNS, new_table, parse_numbers, progress_bar, write_text
@@ -46,6 +48,10 @@ def compare(
     aircraft: Annotated[int, typer.Option(min=1, help="Uncertain aircraft at each level.")] = 200,
     uncertainty: Annotated[str, typer.Option(help="Largest relative deviations of A and B, as in 0.3,0.5")] = "0.3,0.5",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain aircraft.")] = 1,
+    wind: Annotated[
+        WindEffect | None,
+        typer.Option(help="Effect of wind: by each aircraft's own A, or that of the airframe; by default the scenario's."),
+    ] = None,
     laws: Annotated[str | None, typer.Option(help="Laws to compare, by name: rise,pi,l1; all by default.")] = None,
     tuning: Annotated[
         str,
@@ -74,13 +80,17 @@ def compare(
     require(fits, "--uncertainty", repr(uncertainty), "parts of each entry, each at least 0 and below 1: 0.3,0.5")
     tuning_seed = gain_tuning.TUNING_TURBULENCE_SEED
     require(turbulence_seed != tuning_seed, "--turbulence-seed", turbulence_seed, "another seed than that of the tuning")
-    chosen = find_scenario(scenario)
+    chosen, command = find_scenario(scenario), f"rise-di compare {scenario} --tune"
+    if wind is not None:
+        chosen = chosen.vary(aircraft={"uncertainty": chosen.aircraft.uncertainty.model_dump() | {"wind": wind}})
+        command += f" --wind {wind}"
+    effect = chosen.aircraft.uncertainty.wind
     path = gains or tuned_gains.tuned_file(chosen)
     wanted = [(name, aim) for name in names for aim in aims if aim not in tuned_gains.load(path).get(name, {})]
     results = []
     with progress_bar(*COUNT_COLUMNS) as bar:
         if tune:
-            _tune(wanted, chosen, path, scenario, bar)
+            _tune(wanted, chosen, path, command, bar)
         known = tuned_gains.load(path)
         tuned = {name: {aim: known[name][aim] for aim in aims if aim in known[name]} for name in names if name in known}
         require(any(tuned.values()), "--laws", "tuned gains for none of them", f"gains in {path}, or --tune, which finds them")
@@ -95,18 +105,19 @@ def compare(
         if found := [one for one in results if one.objective == aim]:
             console.print(_table(gain_tuning.OBJECTIVES[aim].title, found, chosen))
     notes = _notes(chosen, benchmark, tuned, aims)
-    flown = f"{aircraft} aircraft a level, seed {seed}; turbulence seed {turbulence_seed}, that of the tuning {tuning_seed}"
-    console.print(f"{notes}\n{flown}", style="dim", highlight=False)
+    flown = f"{aircraft} aircraft a level, seed {seed}; effect of wind on x_dot {WIND_EFFECTS[effect]}"
+    turbulence = f"turbulence of seed {turbulence_seed}, that of the tuning {tuning_seed}"
+    console.print(f"{notes}\n{flown}; {turbulence}", style="dim", highlight=False)
     if wanted and not tune:
         missing = ", ".join(f"{name} ({aim})" for name, aim in wanted)
         console.print(f"without tuned gains (--tune finds them): {missing}")
     if to_json is not None:
         rows = [_as_json(one, chosen) for one in results]
-        figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "turbulence_seed": turbulence_seed}
-        write_text("--json", to_json, json.dumps(figures | {"laws": rows}, indent=1) + "\n")
+        figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "wind": effect}
+        write_text("--json", to_json, json.dumps(figures | {"turbulence_seed": turbulence_seed, "laws": rows}, indent=1) + "\n")
 
 
-def _tune(wanted: Iterable[tuple[str, str]], chosen: Scenario, path: Path, scenario: str, bar: Progress) -> None:
+def _tune(wanted: Iterable[tuple[str, str]], chosen: Scenario, path: Path, command: str, bar: Progress) -> None:
     """Tune laws, each for an objective. The file is written after each of them, with what it then holds."""
     benchmark = gain_tuning.build_benchmark(chosen)
     for name, aim in wanted:
@@ -118,7 +129,7 @@ def _tune(wanted: Iterable[tuple[str, str]], chosen: Scenario, path: Path, scena
         result = gain_tuning.tune(LAWS[name], gain_tuning.OBJECTIVES[aim], benchmark, SEEDS, progress=show_cost)
         known = tuned_gains.load(path)
         known.setdefault(name, {})[aim] = result
-        tuned_gains.save(path, known, list(gain_tuning.OBJECTIVES), f"rise-di compare {scenario} --tune")
+        tuned_gains.save(path, known, list(gain_tuning.OBJECTIVES), command)
 
 
 def _table(tuned_on: str, found: Sequence[LawResult], scenario: Scenario) -> Table:
