@@ -108,6 +108,8 @@ def gains(
                 controller, origin = observed(selection.engineering.controller, chosen, known_model, margin)
                 selection = selection._replace(engineering=gain_selection.assess_gains(found, controller, setting))
             answers = {"theorem": selection.theorem, "engineering": selection.engineering}
+            if observer:
+                answers = {"observer": selection.engineering}
             text = gain_selection.as_yaml(selection)
     if write is not None and text is not None:
         write_text("--write", write, HEADER + text)
@@ -123,9 +125,7 @@ def gains(
         raise typer.Exit(CONDITION_FAILS)
 
 
-def observed(
-    controller: RiseDiParameters, scenario: Scenario, model: Airframe, margin: float
-) -> tuple[RiseDiParameters, str]:
+def observed(controller: RiseDiParameters, scenario: Scenario, model: Airframe, margin: float) -> tuple[RiseDiParameters, str]:
     """A controller with feedforward and observer of a model, and a sentence on its gains.
 
     The gains are those that `rise-di compare --tune` found in the scenario, where its airframe has the same states; else they

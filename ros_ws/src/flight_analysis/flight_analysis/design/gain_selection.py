@@ -416,10 +416,10 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
 
     Theorem: "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of (29), (30), steps 2 and
     3 are the largest over the samples for which both hold. "V2_dot" is the smallest eigenvalue of Q in V2_dot = -z'Qz over
-    these samples; steps 2 and 3 are sufficient for Q > 0. Loop: `check_loop` without an observer, the fraction of the samples for which the linear
-    loop is stable, and its delay margin on the nominal airframe, which should be at least one period: a missed tick. With
-    the implicit sign the linear loop is the one inside the width of the sign, dt^2 omega beta. Its margin is then the delay at
-    which chatter begins, and at most half a period.
+    these samples; steps 2 and 3 are sufficient for Q > 0. Loop: `check_loop` without an observer, the fraction of the samples
+    for which the linear loop is stable, and its delay margin on the nominal airframe, which should be at least one period, a
+    missed tick, or the margin that an observer requires. With the implicit sign the linear loop is the one inside the width of
+    the sign, dt^2 omega beta. Its margin is then the delay at which chatter begins, and at most half a period.
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
@@ -524,7 +524,7 @@ def yaml_template(text: str) -> Template:
 
 
 CONTROLLER_YAML = yaml_template("""\
-# Gains for the airframe {{ airframe }} by the engineering procedure.
+# Gains for the airframe {{ airframe }} {{ "beside an observer" if observed else "by the engineering procedure" }}.
 {%- if delay_margin is not none %} Predicted delay margin {{ "%.0f" | format(1e3 * delay_margin) }} ms.{% endif %}
 
 /**/controller:
@@ -567,12 +567,21 @@ def as_yaml(selection: Selection) -> str:
         "delay": "s, beyond sampling",
         "softening": "1, width of the softened sign in total lags",
     }
+    if controller.observer is not None:
+        unscaled = "units of u s / units of y; for a K of (22) that is above 1"
+        comments |= {
+            "Lambda": "1/s",
+            "beta": "units of y / s^2",
+            "omega": "abs(Omega_ii) in scaled inputs",
+            "input_scale": unscaled,
+        }
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
         for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward", "observer"}).items()
     ]
     return CONTROLLER_YAML.render(
         airframe=study.airframe.name,
+        observed=controller.observer is not None,
         delay_margin=selection.engineering.delay_margin,
         parameters=parameters,
         sections=_sections(controller, study.airframe),

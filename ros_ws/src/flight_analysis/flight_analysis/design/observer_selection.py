@@ -6,7 +6,6 @@
 controller whose nominal linear loop has a delay margin: while it has less, `effort` is raised and K is lowered.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -36,6 +35,8 @@ from rise_di_controller.rise_di import RiseDiParameters
 
 RELAXATION = 1.15
 """Factor by which `effort` rises, and K falls, in a step of the search for the delay margin."""
+
+RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file change
 
 MAX_STEPS = 40  # of that search: a factor of 270
 
@@ -208,7 +209,7 @@ def _require_signs(Omega: FloatArray, controller: ControllerParameters, where: s
         D = [int(sign) for sign in signs(Omega)]
     except DecompositionError as error:
         raise ParameterError(f"{where}: found a C B without a D ({error}), expected D = {list(controller.D)}") from None
-    require(D == list(controller.D), where, f"a C B with D = {D}", f"D = {list(controller.D)}, that of the controller")
+    require(list(controller.D) == D, where, f"a C B with D = {D}", f"D = {list(controller.D)}, that of the controller")
 
 
 def _within_margin(
@@ -226,9 +227,9 @@ def _within_margin(
         relaxation = RELAXATION**step
         controller = _parameters(base, model, gains, design(relaxation), relaxation)
         found = delay_margin(plant, linear_law(controller.tuned_law(), len(model.lag), model.period), loop)
-        if found >= margin:
+        if found >= margin + RESOLUTION:
             checked = controller.model_dump()
-            checked["observer"]["margin"] = math.floor(1e3 * min(found, margin)) / 1e3
+            checked["observer"]["margin"] = margin
             return SelectedObserver(RiseDiParameters.validate_mapping(checked, "controller"), found, relaxation)
     raise ParameterError(f"--margin: found at most {1e3 * found:.0f} ms of delay, expected less than {1e3 * margin:g} ms")
 
