@@ -32,7 +32,8 @@ class L1State(NamedTuple):
     """State of L1 between two ticks, (m,)."""
 
     e: Array
-    y_hat: Array  # predicted for the next tick
+    y_before: Array  # y of this tick, from which the next one predicts
+    y_dot_u: Array  # Omega u, u after saturation
     sigma_hat: Array  # estimate of y_dot - Omega u
     sigma_f: Array  # filtered
 
@@ -40,40 +41,41 @@ class L1State(NamedTuple):
 def _control_law(*, feedforward: bool) -> ControlLaw:
     """L1 with piecewise-constant adaptation.
 
+        y_hat     = y_p + dt Omega u_p                                       u_p, y_p of the previous tick
         sigma_hat = -Phi^-1 exp(-a dt) (y_hat - y),  Phi = (1 - exp(-a dt)) / a          a = ADAPTATION_POLE
         sigma_f  += (1 - exp(-bandwidth dt)) (sigma_hat - sigma_r - sigma_f)
         u         = u_r - Omega^-1 (K e + sigma_f),  sigma_r = y_m_dot - Omega u_r
-        y_hat     = y + exp(-a dt) (y_hat - y) + dt Omega u + Phi sigma_hat                for the next tick
 
-    the exact step of y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat. Reference input: u_r = u_trim + Omega^-1 y_m_dot; with
-    `feedforward` u_r = u_trim, which holds it. sigma_r is the part of sigma that u_r cancels already. At engagement
-    sigma_f = -K e, so that u = u_r (bumpless transfer); retuning changes sigma_f likewise. Anti-windup: the predictor takes u
-    after saturation. Source: N. Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
+    y_hat is the step of y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat: this sigma_hat cancels what is left of y_hat - y in
+    one tick. Reference input: u_r = u_trim + Omega^-1 y_m_dot; with `feedforward` u_r = u_trim, which holds it. sigma_r is the
+    part of sigma that u_r cancels already. At engagement sigma_f = -K e, so that u = u_r (bumpless transfer); retuning at
+    y_m_dot = 0 changes sigma_f likewise. Anti-windup: the predictor takes u after saturation. Source: N. Hovakimyan, C. Cao,
+    "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
     """
 
     def engage(measured: Measurements, params: L1Params) -> L1State:
         e = measured.y - measured.y_m
-        return L1State(e, measured.y, array_namespace(e).zeros_like(e), -params.K * e)
+        zero = array_namespace(e).zeros_like(e)
+        return L1State(e, measured.y, params.Omega @ measured.u_before + zero, zero, -params.K * e)
 
     def limited(
         state: L1State, measured: Measurements, dt: Array, params: L1Params, limits: Limits
     ) -> tuple[L1State, Array, Array]:
         xp = array_namespace(measured.y)
-        e, error = measured.y - measured.y_m, state.y_hat - measured.y
+        e, error = measured.y - measured.y_m, state.y_before + dt * state.y_dot_u - measured.y
         a = ADAPTATION_POLE + xp.zeros_like(params.K)
-        Phi, left = filter_gain(a, dt) / a, xp.exp(-a * dt)
-        sigma_hat = -left / Phi * error
+        sigma_hat = -a * xp.exp(-a * dt) / filter_gain(a, dt) * error
         u_r = measured.u_trim if feedforward else measured.u_trim + params.inverse @ measured.y_m_dot
         sigma_r = measured.y_m_dot - params.Omega @ u_r
         sigma_f = state.sigma_f + filter_gain(params.bandwidth, dt) * (sigma_hat - sigma_r - state.sigma_f)
         u_free = u_r - params.inverse @ (params.K * e + sigma_f)
         u, _ = saturate(u_free, measured, dt, limits)
-        y_hat = measured.y + left * error + dt * (params.Omega @ u) + Phi * sigma_hat
-        return L1State(e, y_hat, sigma_hat, sigma_f), u_free, u
+        return L1State(e, measured.y, params.Omega @ u, sigma_hat, sigma_f), u_free, u
 
     def retune(state: L1State, old: L1Params, new: L1Params) -> L1State:
         nu = old.inverse @ (old.K * state.e + state.sigma_f)
-        return state._replace(sigma_f=new.Omega @ nu - new.K * state.e)
+        y_dot_u = new.Omega @ (old.inverse @ state.y_dot_u)
+        return state._replace(y_dot_u=y_dot_u, sigma_f=new.Omega @ nu - new.K * state.e)
 
     return ControlLaw(L1State, engage, without_limits(limited), limited, retune)
 
