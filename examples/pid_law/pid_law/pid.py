@@ -11,7 +11,7 @@ from flight_core.parameters import NonNegatives, Positives, require_length
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
 from rise_di_controller.params import ControllerParameters
-from rise_di_controller.saturation import Limits, saturate
+from rise_di_controller.saturation import Limits, limited_integral, saturate
 
 
 class PidParams(NamedTuple):
@@ -35,7 +35,7 @@ class PidState(NamedTuple):
 
 
 def u_from_trim(state: PidState, params: PidParams) -> Array:
-    """u from trim, shape (m,): -input_scale D K (e - e_0 + Lambda integral of e + lead e_dot)."""
+    """Deviation of u from trim, shape (m,): -input_scale D K (e - e_0 + Lambda integral of e + lead e_dot)."""
     terms = state.e - state.e_0 + params.Lambda * state.integral_e + params.lead * state.e_dot
     return -params.input_scale * params.D * params.K * terms
 
@@ -53,17 +53,16 @@ def limited(
     """One tick inside the limits: u = u_trim + u_from_trim.
 
     e_dot      += (1 - exp(-dt / filter_time)) ((e - e_p) / dt - e_dot)
-    integral_e += dt (e + e_p) / 2, unless u is saturated and it would move further outwards (anti-windup)
+    integral_e += dt (e + e_p) / 2, or less of it where u is saturated and would move further outwards (anti-windup)
     """
-    xp = array_namespace(measured.y)
     e = measured.y - measured.y_m
-    share = -xp.expm1(-dt / params.filter_time)
+    share = -array_namespace(e).expm1(-dt / params.filter_time)
     e_dot = state.e_dot + share * ((e - state.e) / dt - state.e_dot)
     after = PidState(state.e_0, e, e_dot, state.integral_e + dt * (e + state.e) / 2.0)
     u_free = measured.u_trim + u_from_trim(after, params)
     beyond = u_free - saturate(u_free, measured.u_before, dt, limits)
-    outwards = -params.D * (after.integral_e - state.integral_e) * beyond > 0.0
-    after = after._replace(integral_e=xp.where(outwards, state.integral_e, after.integral_e))
+    change = -params.input_scale * params.D * params.K * params.Lambda * (after.integral_e - state.integral_e)
+    after = after._replace(integral_e=limited_integral(state.integral_e, after.integral_e, change, beyond))
     u_free = measured.u_trim + u_from_trim(after, params)
     return after, u_free, saturate(u_free, measured.u_before, dt, limits)
 
@@ -96,5 +95,11 @@ class PidParameters(ControllerParameters):
 
     def law_params(self) -> PidParams:
         """The arrays of the law."""
-        gains = (np.array(values) for values in (self.K, self.Lambda, self.lead, self.filter_time))
-        return PidParams(*gains, np.array(self.D, dtype=np.float64), np.array(self.input_scale))
+        return PidParams(
+            K=np.array(self.K),
+            Lambda=np.array(self.Lambda),
+            lead=np.array(self.lead),
+            filter_time=np.array(self.filter_time),
+            D=np.array(self.D, dtype=np.float64),
+            input_scale=np.array(self.input_scale),
+        )

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from control_laws.nominal_model import NominalModel, conditional_integration, saturate
+from control_laws.nominal_model import NominalModel, saturate
 from flight_core.parameters import NonNegatives, Positives, require_length
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
 from rise_di_controller.params import ControllerParameters
-from rise_di_controller.saturation import Limits
+from rise_di_controller.saturation import Limits, limited_integral
 
 
 class PiParams(NamedTuple):
@@ -45,12 +45,12 @@ def _engage(measured: Measurements, params: PiParams) -> PiState:
 def _limited(
     state: PiState, measured: Measurements, dt: Array, params: PiParams, limits: Limits
 ) -> tuple[PiState, Array, Array]:
-    """U = u_trim - input_scale D K (e - e_0 + Lambda integral of e), a trapezoid with conditional integration (anti-windup)."""
+    """U = u_trim - input_scale D K (e - e_0 + Lambda integral of e), a trapezoid with anti-windup (`limited_integral`)."""
     e = measured.y - measured.y_m
     after = PiState(state.e_0, e, state.integral_e + dt * (e + state.e) / 2.0)
     _, beyond = saturate(measured.u_trim + _u(after, params), measured, dt, limits)
-    effect = -params.D * params.K * params.Lambda * (after.integral_e - state.integral_e)
-    after = after._replace(integral_e=conditional_integration(state.integral_e, after.integral_e, effect, beyond))
+    change = -params.input_scale * params.D * params.K * params.Lambda * (after.integral_e - state.integral_e)
+    after = after._replace(integral_e=limited_integral(state.integral_e, after.integral_e, change, beyond))
     u_free = measured.u_trim + _u(after, params)
     u, _ = saturate(u_free, measured, dt, limits)
     return after, u_free, u

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Saturation of u: magnitude and rate limits."""
+"""Saturation of u: magnitude and rate limits, and the anti-windup of an integral."""
 
 from typing import NamedTuple
 
@@ -22,3 +22,18 @@ def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
     low = xp.minimum(xp.maximum(limits.lower, u_before - reach), limits.upper)
     high = xp.maximum(xp.minimum(limits.upper, u_before + reach), limits.lower)
     return xp.minimum(xp.maximum(u, low), high)
+
+
+def limited_integral(before: Array, after: Array, change: Array, beyond: Array) -> Array:
+    """An integral after a tick, shape (m,): an increment that moves u further beyond a limit is reduced (anti-windup).
+
+        before + max(1 - beyond / change, 0) (after - before)    where change beyond > 0, otherwise `after`, to the last bit
+
+    So u ends at the limit, and moves at its rate where the limit is one of rate. Arguments: `change` of u by the increment;
+    `beyond`, u with the increment less u after saturation; both in the same units. Source: conditional integration,
+    K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5; the reduced increment is this project's.
+    """
+    xp = array_namespace(before)
+    outward = change * beyond > 0.0
+    kept = xp.maximum(1.0 - beyond / xp.where(outward, change, xp.ones_like(change)), xp.zeros_like(change))
+    return xp.where(outward, before + kept * (after - before), after)
