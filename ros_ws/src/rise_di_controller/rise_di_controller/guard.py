@@ -129,6 +129,7 @@ def tick(
     guard: GuardParams,
     law: TunedLaw,
     active: bool = True,
+    u_ff_recorded: FloatArray | None = None,
 ) -> tuple[ControllerState, TickInputs | None]:
     """One tick of the controller: (state, now, y, y_m) -> (state, inputs of the tick), u in state.u.
 
@@ -138,7 +139,8 @@ def tick(
     Stale inputs start the failsafe: HOLD (nothing is integrated), then RAMP to trim, then TRIM. Where `active` is false the
     mode is INACTIVE, and u is held or ramps to trim. Returns None for the inputs where nothing is to be published.
 
-    Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps; both in the law's order.
+    Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps; both in the law's order. `u_ff_recorded`
+    stands in for a feedforward whose state is not known, in replay.
     """
     reference = None
     if y is not None and y_m and max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) <= guard.max_age_ns:
@@ -171,6 +173,9 @@ def tick(
             law_state = control_law.missed(law_state, held, params)
     if guard.nominal is not None and ff_state is not None:
         ff_state, u_ff = feedforward.step(ff_state, reference, dt, guard.nominal)
+        u_trim = u_trim + u_ff
+    elif u_ff_recorded is not None:
+        u_ff = u_ff_recorded
         u_trim = u_trim + u_ff
     measured = Measurements(y.value, reference, (reference - state.y_m) / dt, u_trim, state.u)
     after, u_free = control_law.step(law_state, measured, dt, params)

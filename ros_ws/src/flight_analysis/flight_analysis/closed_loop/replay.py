@@ -257,12 +257,8 @@ class _Ticks:
             state = guard.initial_state(self.m)._replace(u=state.u)  # the controller was configured again before this tick
         # After a gap the log has the feedforward's output but not its state: only the law is computed.
         only_law = limits.nominal is not None and state.mode is Mode.ENGAGED and state.feedforward is None
-        u_trim, u_ff = state.u_trim, self._groups["u_ff"][k]
-        if only_law:
-            state = state._replace(u_trim=u_trim + u_ff)
-        after, used = guard.tick(state, int(self.now_ns[k]), y, y_m, limits, law, bool(self._active[k]))
-        if only_law:
-            after = after._replace(u_trim=u_trim, u_ff=u_ff)
+        u_ff = self._groups["u_ff"][k] if only_law else None
+        after, used = guard.tick(state, int(self.now_ns[k]), y, y_m, limits, law, bool(self._active[k]), u_ff)
         if used is None:
             return after, np.full(len(self.names), np.nan)
         late, age = float(self._signal["late"][k]), float(self._signal["age"][k])
