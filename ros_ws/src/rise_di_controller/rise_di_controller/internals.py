@@ -16,6 +16,8 @@ SCALARS = ("mode", "dt", "y_m_offset", "late", "age", "number", "parameters")
 OUTPUT_GROUPS = ("y", "y_m", "e")
 INPUT_GROUPS = ("u_free", "u", "u_trim", "limited", "u_ff")
 OBSERVER_GROUPS = ("z", "u_o", "sigma")
+RESERVED = frozenset({*SCALARS, *OUTPUT_GROUPS, *INPUT_GROUPS, *OBSERVER_GROUPS}) - {"e"}
+"""Names that the state of a law does not have: the log has them already. Its e is y - y_m."""
 
 
 class Saturation(IntEnum):

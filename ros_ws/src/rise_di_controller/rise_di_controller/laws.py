@@ -29,13 +29,16 @@ def names() -> tuple[str, ...]:
 
 
 def schema(name: object) -> type[ControllerParameters]:
-    """The parameters of a law. Raises ParameterError for a law that is not registered or that cannot be loaded."""
+    """The parameters of a law. Raises ParameterError for a law that is not registered, or twice, or that cannot be loaded."""
     if name == DEFAULT:
         return RiseDiParameters
     if name not in names():
         raise ParameterError(f"law: found {name!r}, expected a registered law: {', '.join(names())}")
+    entries = {entry.value: entry for entry in _registered().select(name=str(name))}
+    if len(entries) > 1:
+        raise ParameterError(f"law: found {name!r}, registered as {' and as '.join(sorted(entries))}, expected one of them")
     try:
-        found = _registered()[str(name)].load()
+        found = next(iter(entries.values())).load()
     except (ImportError, AttributeError) as error:
         raise ParameterError(f"law: found {name!r}, which cannot be loaded ({error}), expected an installed package") from None
     if not (isinstance(found, type) and issubclass(found, ControllerParameters)):

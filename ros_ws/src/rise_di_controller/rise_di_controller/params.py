@@ -30,7 +30,7 @@ from flight_core.parameters import (
 from flight_core.rates import divide, nanoseconds, period_ns
 from flight_core.vectors import FloatArray
 from rise_di_controller import internals
-from rise_di_controller.control_law import ControlLaw, TunedLaw
+from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, fields
 from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART, Nominal, nominal_model, zero_dynamics
 from rise_di_controller.guard import DT_RANGE, GuardParams
@@ -184,6 +184,7 @@ class ControllerParameters(KeyedParameters):
         for i, sign in enumerate(self.D):
             require(sign in (-1, 1), f"D[{i}]", sign, "+1 or -1")
         self.check_law()
+        self._check_state()
         nominal = self.nominal()
         if nominal is not None:
             self._check_nominal(nominal)
@@ -192,6 +193,15 @@ class ControllerParameters(KeyedParameters):
                 raise ParameterError("observer: found no feedforward beside it, expected that section too: it has the model")
             self._check_observer(self.observer, nominal)
         return self
+
+    def _check_state(self) -> None:
+        """The log holds each array of the law's state by output, beside groups of its own."""
+        zero = np.zeros(len(self.outputs))
+        state = self.control_law().engage(Measurements(zero, zero, zero, zero, zero), self.law_params())
+        for name, value in fields(state).items():
+            require(name not in internals.RESERVED, "law", f"a state with {name}", "another name, which the log does not have")
+            shape = np.shape(value)
+            require(shape == zero.shape, "law", f"a state with {name} of shape {shape}", f"{zero.shape}, one value an output")
 
     def _check_nominal(self, nominal: Nominal) -> None:
         zeros = zero_dynamics(nominal)
