@@ -56,7 +56,7 @@ def predict(z: Array, u: Array, params: ObserverParams) -> Array:
 
 def initial_estimates(e: Array, params: ObserverParams) -> Array:
     """Estimates at engagement: H'e, the outputs at their errors and all else 0."""
-    return product(params.H.T, e)
+    return product(params.H.swapaxes(0, 1), e)
 
 
 def correct(state: ObserverState, e: Array, dt: Array, params: ObserverParams) -> ObserverState:
