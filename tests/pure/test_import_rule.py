@@ -32,8 +32,8 @@ IMPORTS: dict[str, set[str]] = {
     },
     "flight_analysis.metrics": {"flight_core", "rise_di_controller"},
     "flight_analysis.design": {
-        "aircraft_sim", "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core",
-        "flight_log", "reference_model", "rise_di_controller",
+        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop", "flight_analysis.metrics",
+        "flight_core", "flight_log", "reference_model", "rise_di_controller",
     },
     "flight_analysis.report": {
         "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core", "flight_log",
