@@ -49,6 +49,9 @@ def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
     """The tabs: y over y_m and e by output, u with u_free, integral_e and Pi, state and timing of the controller, the wind."""
     outputs, inputs, wind = channels["y_m"], channels["u"], [name for name in channels["truth"] if name.startswith("gust.")]
 
+    integrals = [f"{group}.{name}" for name in outputs for group in ("integral_e", "Pi")]
+    integrals = [name for name in integrals if name in channels["internals"]]  # another law may have neither
+
     def log(title: str, *names: str) -> Plot:
         return Plot(title, tuple(("internals", name) for name in names))
 
@@ -56,9 +59,7 @@ def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
         Tab("tracking", tuple(Plot(f"{name}: y, y_m", (("y", name), ("y_m", name))) for name in outputs)),
         Tab("error", tuple(log(f"e {name}", f"e.{name}") for name in outputs)),
         Tab("input", tuple(log(f"u {name}: u_free, u", f"u_free.{name}", f"u.{name}") for name in inputs)),
-        Tab(
-            "integrals", tuple(log(f"{group} {name}", f"{group}.{name}") for name in outputs for group in ("integral_e", "Pi"))
-        ),
+        Tab("integrals", tuple(log(name.replace(".", " "), name) for name in integrals)),
         Tab(
             "controller",
             (
