@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-TOP = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docker/README.md")
+TOP = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docker/README.md", "examples/pid_law/README.md")
 PAGES = [*(REPOSITORY / name for name in TOP), *sorted((REPOSITORY / "docs").glob("*.md"))]
 MAX_LINE = 200
 TEXTS = {".py", ".md", ".yaml", ".xml", ".jinja", ".js", ".sh", ".c"}
-FOLDERS = ("ros_ws/src", "tests", "benchmarks", "docs", "docker")
+FOLDERS = ("ros_ws/src", "examples", "tests", "benchmarks", "docs", "docker")
 REPLACED = {
     "anew": "again",
     "crowd": "peers",
@@ -76,7 +76,7 @@ def test_every_relative_link_and_anchor_exists(page: Path) -> None:
     assert broken == []
 
 
-@pytest.mark.parametrize("page", ["architecture", "glossary", "theory", "symbols", "interfaces", "experiments", "evidence"])
+@pytest.mark.parametrize("page", ["architecture", "glossary", "theory", "symbols", "interfaces", "laws", "experiments", "evidence"])
 def test_the_readme_links_the_page(page: str) -> None:
     assert f"docs/{page}.md" in links(REPOSITORY / "README.md")
 

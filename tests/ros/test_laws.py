@@ -1,0 +1,120 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Other control laws over real DDS: lockstep equal to the loop in one process and replayed, and a law that is not installed."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from tests.other_laws import EXAMPLE, SECTIONS
+from tests.ros.conftest import Start
+from tests.ros.peer import Peer
+from tests.ros.test_controller import channel, engage, set_parameters
+from tests.ros.test_lockstep import TOPICS, payloads
+from typer.testing import CliRunner
+
+from flight_analysis.closed_loop.scenario import load_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_bringup.scenarios import find_scenario
+from flight_cli.cli import COMMANDS, application
+from flight_log.tape_reader import read_run
+from rise_di_controller import laws
+
+PEER_TOPICS = ("u", "internals")
+OPTIONS = ["--lockstep", "--one-process"]
+PULSES = {"q": {"start": [0.2], "stop": [1.0], "value": [0.1]}, "p": {"start": [0.4], "stop": [1.4], "value": [0.4]}}
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder into which pip installs a copy of the example; pip leaves build artefacts beside the source."""
+    copy, target = tmp_path_factory.mktemp("source") / "pid_law", tmp_path_factory.mktemp("installed")
+    shutil.copytree(EXAMPLE, copy, ignore=shutil.ignore_patterns("build", "*.egg-info", "__pycache__"))
+    options = ("--quiet", "--no-index", "--no-deps", "--no-build-isolation", "--target", str(target))
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(copy)], check=True, timeout=120.0)
+    return target
+
+
+@pytest.fixture
+def _example(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The installed example in this process and in those that it starts."""
+    path = os.environ.get("PYTHONPATH")
+    monkeypatch.setenv("PYTHONPATH", f"{installed}{os.pathsep}{path}" if path else str(installed))
+    monkeypatch.syspath_prepend(str(installed))
+    laws._registered.cache_clear()
+    yield
+    laws._registered.cache_clear()
+
+
+def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
+    """Two seconds of osprey_servo with commands and lost samples under another controller."""
+    tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text(encoding="utf-8"))
+    sections = {name.removeprefix("/**/"): section["ros__parameters"] for name, section in tree.items()}
+    sections["flight"]["duration"] = 2.0
+    sections["reference_model"]["pulses"] = PULSES
+    sections["aircraft"]["sensors"]["dropout"] = 0.2
+    tree["/**/controller"]["ros__parameters"] = controller
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    return path
+
+
+@pytest.mark.usefixtures("_example")
+@pytest.mark.parametrize(("law", "options"), [("pi", ["--lockstep"]), ("l1", ["--one-process"]), ("pid", OPTIONS)])
+def test_a_law_flies_in_lockstep_as_without_ros_and_is_replayed(
+    law: str, options: list[str], start: Start, tmp_path: Path
+) -> None:
+    scenario = scenario_file(tmp_path / f"{law}.yaml", SECTIONS[law])
+    runs = []
+    for option in options:
+        start("flight_cli.cli", "fly", str(scenario), option, "--runs", option.strip("-")).succeed(120.0)
+        runs.append(tmp_path / option.strip("-") / "latest")
+    first, last = (payloads(run) for run in (runs[0], runs[-1]))
+    for topic in TOPICS:
+        assert first[topic] == last[topic], topic
+    tape, recorded = simulate(load_scenario(scenario)), read_run(runs[0]).tape
+    assert tape["u"].values.any(axis=0).all()
+    for name, signal in tape.signals.items():
+        assert signal.names == recorded[name].names
+        assert signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
+        assert signal.values.tobytes() == recorded[name].values.tobytes(), name
+    replay = CliRunner().invoke(application([*COMMANDS]), ["replay", str(runs[0])])
+    assert (replay.exit_code, replay.stdout) == (0, "201 ticks, every bit equal\n")
+
+
+@pytest.mark.parametrize(
+    ("law", "sentence"),
+    [
+        ("pid", "found 'pid', expected a registered law: indi, l1, lqg, lqi, pi, rise_di"),
+        (
+            "lqi",
+            "found 'lqi', which needs the full state, expected a law of y and y_m: the topics have no more",
+        ),
+    ],
+)
+def test_a_controller_under_a_law_that_it_cannot_fly_ends_with_one_sentence(
+    law: str, sentence: str, start: Start, tmp_path: Path
+) -> None:
+    scenario = scenario_file(tmp_path / "other.yaml", SECTIONS["pid"] | {"law": law})
+    node = start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario))
+    assert node.end() == 2
+    assert node.lines == [f"error: controller.law: {sentence}"]
+
+
+@pytest.mark.usefixtures("_example")
+def test_the_node_names_its_law_and_takes_new_gains_of_it_in_flight(start: Start, peer_node: Peer, tmp_path: Path) -> None:
+    scenario = scenario_file(tmp_path / "pid.yaml", SECTIONS["pid"])
+    node = start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario), "-p", "max_age:=5.0")
+    engage(peer_node)
+    assert "law pid" in node.output
+    internals, before = peer_node.received["internals"], len(peer_node.received["internals"])
+    assert set_parameters(peer_node, lead=[0.0, 0.0, 0.0, 0.0]) == (True, "")
+    peer_node.until(lambda: len(internals) > before + 20, each=lambda: peer_node.send(0.01))
+    assert channel(internals[-1], "parameters") != channel(internals[0], "parameters")
+    assert channel(internals[-1], "integral_e.q") > channel(internals[0], "integral_e.q") >= 0.0  # the law's own state
+    assert not set_parameters(peer_node, law="pi")[0]  # at a restart only
