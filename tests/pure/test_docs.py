@@ -76,7 +76,9 @@ def test_every_relative_link_and_anchor_exists(page: Path) -> None:
     assert broken == []
 
 
-@pytest.mark.parametrize("page", ["architecture", "glossary", "theory", "symbols", "interfaces", "laws", "experiments", "evidence"])
+@pytest.mark.parametrize(
+    "page", ["architecture", "glossary", "theory", "symbols", "interfaces", "laws", "experiments", "evidence"]
+)
 def test_the_readme_links_the_page(page: str) -> None:
     assert f"docs/{page}.md" in links(REPOSITORY / "README.md")
 
