@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fault campaign of tests/ros/faults, several times in a row, as a table.
 
-    .venv/bin/python -m benchmarks.faults [--times 10] [--json FILE] [--only "killed or stopped"]
+    .venv/bin/python -m benchmarks.faults [--times 10] [--scenario osprey_observer] [--json FILE] [--only "killed or stopped"]
 
 Reaction: from the fault to its first detection by a node. Recovery: from the end of the fault (of a killed node: from ready)
 until the law flies again. An instant is the reception time of the message that shows the event. Where the host delayed a
@@ -32,11 +32,12 @@ MAX_HOST_DELAY = 0.02  # s
 Row = dict[str, Any]
 
 
-def fly(times: int, seed: int, only: str) -> list[Row]:
+def fly(times: int, seed: int, only: str, scenario: str) -> list[Row]:
     """Inject every case `times` times in a row; one row for each injection."""
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "rows.jsonl"
-        options = [f"--faults-table={table}", f"--faults-times={times}", f"--faults-seed={seed}", f"--timeout={120 * times}"]
+        options = [f"--faults-table={table}", f"--faults-times={times}", f"--faults-seed={seed}"]
+        options += [f"--faults-scenario={scenario}", f"--timeout={120 * times}"]
         command = [sys.executable, "-m", "pytest", "-q", str(CAMPAIGN), *options, *(["-k", only] if only else [])]
         subprocess.run(command, cwd=REPOSITORY, check=False, stdout=sys.stderr)  # noqa: S603 - our own interpreter
         if not table.exists():
@@ -82,11 +83,12 @@ def to_table(summaries: Sequence[Row]) -> Table:
 def main(
     times: Annotated[int, typer.Option(min=1, help="Number of injections of each fault.")] = 10,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first injection; the others count up.")] = 1,
+    scenario: Annotated[str, typer.Option(help="Scenario of the flight.")] = "osprey_gust",
     only: Annotated[str, typer.Option(help="Cases by parts of their names, as pytest's -k takes them.")] = "",
     file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
 ) -> None:
     """Run the fault campaign and print its table; exit status 1 if a case did not pass each time."""
-    summaries = summarise(fly(times, seed, only))
+    summaries = summarise(fly(times, seed, only, scenario))
     if file is not None:
         file.write_text(json.dumps(summaries, indent=2) + "\n", encoding="utf-8")
     Console(width=None if sys.stdout.isatty() else 160).print(to_table(summaries))

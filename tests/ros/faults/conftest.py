@@ -14,6 +14,7 @@ import pytest
 from tests.ros.faults.flight import Flight
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_bringup.scenarios import find_scenario
 
 Row = dict[str, str | int | float | bool | None]
 
@@ -21,6 +22,7 @@ Row = dict[str, str | int | float | bool | None]
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--faults-table", type=Path, default=None, help="append a row for each fault to this file of JSON lines")
     parser.addoption("--faults-seed", type=int, default=1, help="seed of the faults")
+    parser.addoption("--faults-scenario", default="osprey_gust", help="scenario of the flight")
     parser.addoption("--faults-times", type=int, default=1, help="how often each fault is injected in a row; seeds count up")
 
 
@@ -102,7 +104,8 @@ def _clock(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def flights(tmp_path_factory: pytest.TempPathFactory, osprey_gust: Scenario) -> Iterator[Flights]:
-    made = Flights(tmp_path_factory.mktemp("faults"), osprey_gust)
+def flights(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -> Iterator[Flights]:
+    scenario = find_scenario(str(pytestconfig.getoption("--faults-scenario", "osprey_gust")))
+    made = Flights(tmp_path_factory.mktemp("faults"), scenario)
     yield made
     made.close()

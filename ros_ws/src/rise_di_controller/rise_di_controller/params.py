@@ -88,7 +88,7 @@ class ObserverParameters(Parameters):
         default=1.0, description="time in which u_o fades in after engagement, s"
     )
     margin: Annotated[float, Field(ge=0, le=0.5)] = Field(
-        default=0.03, description="the least delay margin of the nominal linear loop with which the controller loads, s"
+        default=0.03, description="least delay margin, `delay` included, of a nominal linear loop that the controller loads, s"
     )
 
     def matrices(self, nominal: Nominal) -> tuple[FloatArray, ...]:
@@ -228,9 +228,9 @@ class ControllerParameters(KeyedParameters):
             require(radius < 1.0, f"observer.{key}", f"a spectral radius of {radius:.6g}", "less than 1: it is unstable")
         plant = LinearPlant(nominal.A + nominal.gravity, nominal.B, nominal.C)
         period, m = 1.0 / self.rate, len(self.inputs)
-        loop, law = Loop(np.array(self.lag), self.delay, period), linear_law(self.tuned_law(), m, period)
+        loop, law = Loop(np.array(self.lag), 0.0, period), linear_law(self.tuned_law(), m, period)
         for part in MARGIN_PARTS:
-            late = part * observer.margin
+            late = part * max(observer.margin, self.delay)
             stable = is_stable(plant, law, loop, np.full(m, late))
             found = f"a nominal loop that is unstable with u {1e3 * late:g} ms late"
             expected_margin = f"a delay margin of at least {1e3 * observer.margin:g} ms: a smaller F or K"

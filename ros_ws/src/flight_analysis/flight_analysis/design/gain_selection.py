@@ -418,8 +418,8 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
     3 are the largest over the samples for which both hold. "V2_dot" is the smallest eigenvalue of Q in V2_dot = -z'Qz over
     these samples; steps 2 and 3 are sufficient for Q > 0. Loop: `check_loop` without an observer, the fraction of the samples
     for which the linear loop is stable, and its delay margin on the nominal airframe, which should be at least one period, a
-    missed tick, or the margin that an observer requires. With the implicit sign the linear loop is the one inside the width of
-    the sign, dt^2 omega beta. Its margin is then the delay at which chatter begins, and at most half a period.
+    missed tick, or what an observer requires beyond the delay. With the implicit sign the linear loop is the one inside the
+    width of the sign, dt^2 omega beta. Its margin is then the delay at which chatter begins, and at most half a period.
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
@@ -456,7 +456,7 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
     each = tuple(delay_margin(plants[0], linear, loop, channel) for channel in range(len(rows)))
     conditions += (Condition("linear stability", None, stable, 1.0),)
     if params.sign is Sign.SOFT:
-        least = loop.period if controller.observer is None else controller.observer.margin
+        least = loop.period if controller.observer is None else controller.observer.margin - controller.delay
         conditions += (Condition("delay margin", None, margin, least),)
     return GainAssessment(controller, theorem, conditions, bounds, margin, each)
 

@@ -3,7 +3,8 @@
 """Observer selection: the sections feedforward and observer of a controller, and the gains of the law beside it.
 
 `with_aircraft_observer` takes the model of an airframe, `with_extended_state_observer` Omega and the lags alone. Both give a
-controller whose nominal linear loop has a delay margin: while it has less, `effort` is raised and K is lowered.
+controller whose nominal linear loop has a delay margin: while it has less, `effort` is raised and K is lowered, and the
+disturbances of the extended-state observer are taken as slower.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,12 +34,12 @@ from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, line
 from rise_di_controller.params import ControllerParameters, FeedforwardParameters, ObserverParameters
 from rise_di_controller.rise_di import RiseDiParameters
 
-RELAXATION = 1.15
+RELAXATION = 1.05
 """Factor by which `effort` rises, and K falls, in a step of the search for the delay margin."""
 
 RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file change
 
-MAX_STEPS = 40  # of that search: a factor of 270
+MAX_STEPS = 60  # of that search: a factor of 18
 
 ALTITUDE, WIND = 100.0, 15.4  # m, m/s at 20 ft: Dryden's moderate turbulence, for which the rule's wind stands
 
@@ -111,7 +112,7 @@ class SelectedObserver(NamedTuple):
     """A controller with an observer, and what it tolerates."""
 
     controller: RiseDiParameters
-    delay_margin: float  # s, of the nominal linear loop
+    delay_margin: float  # s, of the nominal linear loop, the declared delay included
     relaxation: float  # factor by which the search for the margin raised `effort` and lowered K; 1: not at all
 
 
@@ -135,23 +136,32 @@ def with_aircraft_observer(
     model = nominal_model(airframe, controller, noise)
     names = Names(tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts))
 
-    def design(effort: float) -> ObserverDesign:
-        return aircraft_observer(model, names, gains.weights._replace(effort=effort * gains.weights.effort))
+    def design(slower: float) -> ObserverDesign:
+        effort = slower * gains.weights.effort
+        return aircraft_observer(model, names, gains.weights._replace(effort=effort))
 
     return _within_margin(base, model, gains, design, margin)
 
 
-def extended_state_gains(model: NominalModel) -> tuple[ObserverGains, ExtendedStateWeights]:
-    """Gains with an extended-state observer from the lags of the loop: those of a search on the `osprey`, scaled with T.
+EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
+    "q": (0.161, 0.0131, 0.183, 0.0077, 0.665, 0.256),
+    "p": (0.033, 0.231, 0.603, 0.0102, 1.02, 0.098),
+    "r": (0.0146, 0.0026, 0.714, 0.0242, 0.098, 0.161),
+    "V": (0.0075, 4.03, 1.31, 0.0242, 0.184, 0.667),
+}
+"""K T, Lambda T, effort / T, drift T, rate_drift T and decay T with the total lag T, by output. They are those of a search on
+the `osprey`, T = 0.035 s and 0.115 s in V, with the cost of gusts and turbulence together: no other aircraft was in it."""
 
-    The gains of that search, by output q, p, r, V with T of 35, 35, 35 and 115 ms, as products with T: effort 0.18 to 1.3 T,
-    drift 0.0077 to 0.024 / T, its rate's 0.67 to 0.18 / T, decay 0.1 to 0.67 / T. The geometric means are used.
-    """
-    T, one = model.total_lag, np.ones(len(model.total_lag))
-    weights = ExtendedStateWeights(0.6 * T, 0.013 / T, 0.5 / T, 0.2 / T)
-    K = 0.026 / T
-    unused = Weights(weights.effort, weights.drift, one, one, one)
-    return ObserverGains(K, K / 4.0, K / T, np.full(len(T), 3.0), unused), weights
+DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS["p"]  # for an output that is not in EXTENDED_STATE_PRODUCTS
+
+
+def extended_state_gains(controller: ControllerParameters, T: FloatArray) -> tuple[ObserverGains, ExtendedStateWeights]:
+    """Gains with an extended-state observer from the total lags of the loop, (m,), s, by EXTENDED_STATE_PRODUCTS."""
+    products = np.array([EXTENDED_STATE_PRODUCTS.get(name, DEFAULT_PRODUCTS) for name in controller.outputs]).T
+    K, Lambda, effort, drift, rate_drift, decay = products[0] / T, products[1] / T, products[2] * T, *(products[3:] / T)
+    unused = Weights(effort, drift, np.zeros(0), np.zeros(0), np.zeros(1))
+    gains = ObserverGains(K, Lambda, K / T, np.full(len(T), 30.0), unused)
+    return gains, ExtendedStateWeights(effort, drift, rate_drift, decay)
 
 
 def integrator_model(controller: ControllerParameters, Omega: FloatArray) -> FeedforwardParameters:
@@ -196,10 +206,12 @@ def with_extended_state_observer(
         upper=np.array(controller.upper or unlimited),
     )
     names = Names(controller.outputs, controller.inputs, controller.outputs, ())
-    gains, weights = extended_state_gains(model)
+    gains, weights = extended_state_gains(controller, model.total_lag)
 
-    def design(effort: float) -> ObserverDesign:
-        return extended_state_observer(model, names, weights._replace(effort=effort * weights.effort))
+    def design(slower: float) -> ObserverDesign:
+        drift, rate_drift = weights.drift / slower, weights.rate_drift / slower**2
+        changed = weights._replace(effort=slower * weights.effort, drift=drift, rate_drift=rate_drift)
+        return extended_state_observer(model, names, changed)
 
     return _within_margin(base, model, gains, design, margin)
 
@@ -220,7 +232,7 @@ def _within_margin(
     margin: float,
 ) -> SelectedObserver:
     """The first relaxation with the delay margin."""
-    loop = Loop(model.lag, base.delay, model.period)
+    loop = Loop(model.lag, 0.0, model.period)  # the margin counts the declared delay too
     plant = LinearPlant(model.A + model.gravity, model.B, model.C)
     found = 0.0
     for step in range(MAX_STEPS + 1):

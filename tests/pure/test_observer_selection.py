@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Selection of an observer: shipped scenarios, delay margin, models that are refused, the one without A, the command."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from tests.builders import rms
+from typer.testing import CliRunner
+
+from aircraft_sim.airframe import load_airframe
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design import observer_selection
+from flight_analysis.design.observer_selection import (
+    gains_by_rule,
+    nominal_model,
+    with_aircraft_observer,
+    with_extended_state_observer,
+)
+from flight_bringup.scenarios import find_scenario
+from flight_cli.cli import application
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
+from rise_di_controller.rise_di import RiseDiParameters
+
+OSPREY = load_airframe("osprey")
+SERVO = find_scenario("osprey_servo")
+NOISE = np.array([0.0017, 0.0017, 0.0017, 0.03])  # of osprey_servo in the law's order q, p, r, V
+SIZE = np.array([0.1, 0.1, 0.1, 1.0])
+SHIPPED = ("osprey_observer", "osprey_turbulence")
+
+
+def with_observer(controller: RiseDiParameters) -> Scenario:
+    """osprey_servo under another controller."""
+    return SERVO.vary(controller=controller.model_dump())
+
+
+def by_rule(margin: float = 0.03) -> observer_selection.SelectedObserver:
+    model = nominal_model(OSPREY, SERVO.controller, NOISE)
+    gains = gains_by_rule(model, tuple(OSPREY.gusts), OSPREY.speed)
+    return with_aircraft_observer(SERVO.rise_di(), OSPREY, gains, NOISE, margin)
+
+
+def Omega() -> FloatArray:  # noqa: N802 - the paper's name
+    model = nominal_model(OSPREY, SERVO.controller, NOISE)
+    return model.Omega
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_scenario_has_the_observer_that_the_command_writes(name: str, tmp_path: Path) -> None:
+    written = tmp_path / "gains.yaml"
+    result = CliRunner().invoke(application(["gains"]), ["gains", "osprey", "--observer", "--write", str(written)])
+    assert result.exit_code == 0, result.output
+    assert "gains of a search in osprey_servo" in result.output
+    section = yaml.safe_load(written.read_text(encoding="utf-8"))["/**/controller"]["ros__parameters"]
+    shipped = find_scenario(name).controller
+    again = RiseDiParameters.validate_mapping(section, "controller")
+    assert shipped.feedforward == again.feedforward
+    assert shipped.observer is not None
+    assert again.observer is not None
+    for key in ("Phi", "Gamma", "L", "F"):
+        # another LAPACK may differ in the last of the ten digits, amplified by the Riccati equations
+        np.testing.assert_allclose(getattr(shipped.observer, key), getattr(again.observer, key), rtol=1e-6, atol=1e-9)
+
+
+def test_the_margin_of_a_selected_observer_holds_and_is_the_one_that_was_asked_for() -> None:
+    for margin in (0.03, 0.045):
+        selected = by_rule(margin)
+        controller = selected.controller
+        plant = LinearPlant(*_plant(controller))
+        loop = Loop(np.array(controller.lag), 0.0, 0.01)
+        law = linear_law(controller.tuned_law(), 4, 0.01)
+        assert selected.delay_margin >= margin
+        assert is_stable(plant, law, loop, np.full(4, margin))
+        assert not is_stable(plant, law, loop, np.full(4, selected.delay_margin + 0.001))  # the search ends within 0.1 ms
+    assert by_rule(0.045).relaxation > by_rule(0.03).relaxation
+
+
+def _plant(controller: RiseDiParameters) -> tuple[FloatArray, FloatArray, FloatArray]:
+    nominal = controller.nominal()
+    assert nominal is not None
+    return nominal.A + nominal.gravity, nominal.B, nominal.C
+
+
+def test_a_delay_beyond_the_margin_makes_the_flight_oscillate_and_one_within_it_does_not() -> None:
+    # y delayed by whole samples: 20 ms is within the margin of 30 ms, 80 ms is far beyond it
+    controller = by_rule().controller
+    calm = with_observer(controller).vary(flight={"duration": 12.0}, aircraft={"gusts": {}})
+    within, beyond = (
+        rms(simulate(calm.vary(aircraft={"sensors": calm.aircraft.sensors.model_dump() | {"delay": delay}})))
+        for delay in (0.02, 0.08)
+    )
+    assert within[0] < 5.0  # mrad/s in q
+    assert beyond[0] > 5.0 * within[0]
+
+
+def test_the_observer_by_rule_flies_with_half_of_the_error_of_the_law_alone() -> None:
+    # gusts; the rule is a start, and the gains of a search are better still
+    alone, observed = rms(simulate(SERVO)), rms(simulate(with_observer(by_rule().controller)))
+    assert (observed < 0.75 * alone).all()
+
+
+def test_an_extended_state_observer_needs_no_model_and_halves_the_error_of_speed_and_roll() -> None:
+    selected = with_extended_state_observer(SERVO.rise_di(), Omega(), NOISE, SIZE, 0.03)
+    assert selected.delay_margin >= 0.03
+    controller = selected.controller
+    assert controller.feedforward is not None
+    assert not any(controller.feedforward.A)
+    alone, observed = rms(simulate(SERVO)), rms(simulate(with_observer(controller)))
+    assert (observed[[1, 2]] < 0.5 * alone[[1, 2]]).all()
+    assert (observed < 1.1 * alone).all()
+
+
+def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    flipped = OSPREY.with_matrices(OSPREY.matrix_a(), -OSPREY.matrix_b(), np.ones((8, 3)))
+    gains = gains_by_rule(nominal_model(OSPREY, SERVO.controller, NOISE), tuple(OSPREY.gusts), OSPREY.speed)
+    with pytest.raises(ParameterError, match=r"found a C B with D = \[-1, -1, -1, -1\], expected D = \[1, 1, 1, 1\]"):
+        with_aircraft_observer(SERVO.rise_di(), flipped, gains, NOISE, 0.03)
+    with pytest.raises(ParameterError, match=r"^--margin: found at most .* expected less than 500 ms$"):
+        with_aircraft_observer(SERVO.rise_di(), OSPREY, gains, NOISE, 0.5)
+    with pytest.raises(ParameterError, match=r"^Omega: found a C B with D"):
+        with_extended_state_observer(SERVO.rise_di(), -Omega(), NOISE, SIZE, 0.03)
+    calm = OSPREY.model_copy(update={"gusts": {}})
+    with pytest.raises(ParameterError, match=r"^airframe osprey: found no gusts, expected the effect of wind"):
+        with_aircraft_observer(SERVO.rise_di(), calm, gains, NOISE, 0.03)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--model", "osprey"], "error: --model: found osprey, expected --observer beside it"),
+        (["--observer", "--check"], "error: --observer: found it beside --check"),
+        (["--observer", "--margin", "0.9"], "error: --margin: found 0.9, expected 0 to 0.5 s"),
+    ],
+)
+def test_the_command_refuses_options_that_contradict_each_other(arguments: list[str], sentence: str) -> None:
+    with pytest.raises(ParameterError) as refused:
+        CliRunner().invoke(application(["gains"]), ["gains", "osprey", *arguments], catch_exceptions=False)
+    assert f"error: {refused.value}".startswith(sentence)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_scenario_loads_by_its_path_too(name: str) -> None:
+    assert load_scenario(find_scenario(name).path).controller.observer is not None
