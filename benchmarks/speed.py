@@ -52,6 +52,11 @@ EXECUTORS = ("single", "multi", "events")
 PRIORITY = 50  # SCHED_FIFO, as that of ros2_control
 FLOOR_SECONDS = 15.0  # longest measurement of a baseline
 NODE_RATE = 500.0  # Hz, at which callbacks are timed
+OBSERVER_RATE = 100.0  # Hz, of the matrices of the shipped observer
+OBSERVED = {
+    "osprey_servo": "controller, whole tick, 100 Hz, RISE-DI",
+    "osprey_observer": "controller, whole tick, 100 Hz, RISE-DI with feedforward and observer",
+}
 WARM_UP = 1.0  # s, excluded from the measurement of a process
 MATCHED_WITHIN = 20.0  # s
 OWN_MISSES = "missed excluding host delays"  # a column
@@ -149,11 +154,13 @@ class Driven:
 
 
 @contextlib.contextmanager
-def controller_at(hz: float, folder: Path, role: str = "controller") -> Iterator[Child]:
-    """The process of the controller at a rate."""
+def controller_at(hz: float, folder: Path, role: str = "controller", scenario_name: str = SCENARIO) -> Iterator[Child]:
+    """The process of the controller of a scenario at a rate."""
     others = {"rate": max(hz, 500.0)}  # at least as fast as the controller, as a scenario demands; they do not run here
     rates = {"aircraft": others | {"step": 0.001}, "reference_model": others, "controller": {"rate": hz}}
-    scenario = lockstep.write_scenario(find_scenario(SCENARIO).vary(**rates), folder / f"at_{hz:g}_hz.yaml")
+    scenario = lockstep.write_scenario(
+        find_scenario(scenario_name).vary(**rates), folder / f"{scenario_name}_at_{hz:g}_hz.yaml"
+    )
     with Child(role, "--ros-args", "--params-file", str(scenario.path)) as child:
         yield child
 
@@ -179,12 +186,23 @@ def node_rows(seconds: float, folder: Path) -> Iterator[Row]:
                 peer.drive(NODE_RATE, length, child)
                 figures = child.stop()
             took.setdefault("controller, until u is published", []).append(figures)
-            whole = {name: figures[f"whole {name}"] for name in ("p50", "p99")}
-            took.setdefault("controller, whole tick with internals", []).append(whole)
+            took.setdefault("controller, whole tick with internals", []).append(_whole(figures))
+            for scenario, name in OBSERVED.items():
+                with controller_at(OBSERVER_RATE, folder, scenario_name=scenario) as child:
+                    peer.drive(OBSERVER_RATE, length, child)
+                    took.setdefault(name, []).append(_whole(child.stop()))
+    without, observed = OBSERVED.values()
     for name, runs in took.items():
         figures = {f"{column} (us)": float(np.median([run[column] for run in runs])) for column in ("p50", "p99")}
         goals = () if name.startswith("bare") else (Goal("p50 (us)", 2.0, of_floor=True),)
-        yield Row(name, figures, "bare echo, single", goals)
+        if name in {without, observed}:
+            yield Row(name, figures, without, (Goal("p50 (us)", 1.5, of_floor=True),) if name == observed else ())
+        else:
+            yield Row(name, figures, "bare echo, single", goals)
+
+
+def _whole(figures: dict[str, float]) -> dict[str, float]:
+    return {name: figures[f"whole {name}"] for name in ("p50", "p99")}
 
 
 def latency_rows(seconds: float, folder: Path) -> Iterator[Row]:

@@ -52,24 +52,36 @@ def _example(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     laws._registered.cache_clear()
 
 
-def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
-    """Two seconds of osprey_servo with commands and lost samples under another controller."""
-    tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text(encoding="utf-8"))
+def scenario_file(path: Path, controller: dict[str, Any] | None, name: str = "osprey_servo") -> Path:
+    """Two seconds of a scenario with commands and lost samples, under another controller if there is one."""
+    tree = yaml.safe_load(find_scenario(name).path.read_text(encoding="utf-8"))
     sections = {name.removeprefix("/**/"): section["ros__parameters"] for name, section in tree.items()}
     sections["flight"]["duration"] = 2.0
     sections["reference_model"]["pulses"] = PULSES
     sections["aircraft"]["sensors"]["dropout"] = 0.2
-    tree["/**/controller"]["ros__parameters"] = controller
+    if controller is not None:
+        sections["controller"].clear()
+        sections["controller"].update(controller)
     path.write_text(yaml.safe_dump(tree), encoding="utf-8")
     return path
 
 
 @pytest.mark.usefixtures("_example")
-@pytest.mark.parametrize(("law", "options"), [("pi", ["--lockstep"]), ("l1", ["--one-process"]), ("pid", OPTIONS)])
+@pytest.mark.parametrize(
+    ("law", "options"),
+    [
+        ("pi", ["--lockstep"]),
+        ("l1", ["--one-process"]),
+        ("pid", OPTIONS),
+        ("osprey_observer", OPTIONS),
+        ("osprey_turbulence", ["--lockstep"]),
+    ],
+)
 def test_a_law_flies_in_lockstep_as_without_ros_and_is_replayed(
     law: str, options: list[str], start: Start, tmp_path: Path
 ) -> None:
-    scenario = scenario_file(tmp_path / f"{law}.yaml", SECTIONS[law])
+    name = "osprey_servo" if law in SECTIONS else law
+    scenario = scenario_file(tmp_path / f"{law}.yaml", SECTIONS.get(law), name)
     runs = []
     for option in options:
         start("flight_cli.cli", "fly", str(scenario), option, "--runs", option.strip("-")).succeed(120.0)

@@ -191,9 +191,9 @@ def steady_scenario(source: Path, folder: Path) -> Path:
     """A scenario in a steady flight 0.1 m/s above trim, without an end: u is not 0, so that a change of it shows."""
     tree = yaml.safe_load(source.read_text(encoding="utf-8"))
     sections = {key.removeprefix("/**/"): content["ros__parameters"] for key, content in tree.items()}
-    for wind in ("gusts", "turbulence"):
-        sections["aircraft"].pop(wind, None)
-    sections["aircraft"].pop("sensors", None)  # noise would hide a change of u
+    # Noise would hide a change of u, and a probe finds u in the positions of ideal actuators.
+    for disturbance in ("gusts", "turbulence", "sensors", "actuators"):
+        sections["aircraft"].pop(disturbance, None)
     del sections["reference_model"]["coordinated_turn"]
     sections["aircraft"] |= {"rate": 200.0, "step": 0.005}  # a lower load, for busy hosts
     sections["reference_model"]["rate"] = 200.0

@@ -77,6 +77,7 @@ class FeedforwardParameters(Parameters):
 class ObserverParameters(Parameters):
     """An observer of the nominal model, an extension of the paper, with its matrices as designed; SI, row by row."""
 
+    rate: Positive = Field(description="the rate of the law for which the matrices hold, Hz")
     states: Names = Field(description="names of the estimates: those of the feedforward's states first, as x.alpha")
     Phi: Numbers = Field(description="estimates one period later without input, a row an estimate")
     Gamma: Numbers = Field(description="effect of u, held over the period, a row an estimate, the columns as controller.inputs")
@@ -222,6 +223,7 @@ class ControllerParameters(KeyedParameters):
             ", ".join(observer.states[: len(expected)]),
             f"first the states of the feedforward: {', '.join(expected)}",
         )
+        require(observer.rate == self.rate, "observer.rate", f"{observer.rate:g} Hz", f"controller.rate, {self.rate:g} Hz")
         Phi, Gamma, H, L, F = observer.matrices(nominal)
         for key, matrix in (("L", Phi @ (np.eye(len(Phi)) - L @ H)), ("F", Phi - Gamma @ F)):
             radius = spectral_radius(matrix)

@@ -257,7 +257,7 @@ def _parameters(
     k_g = MIN_K - 1.0
     Phi, Gamma, L, F = (tuple(one.ravel().tolist()) for one in (design.Phi, design.Gamma, design.L, design.F))
     require(spectral_radius(design.Phi - design.Gamma @ design.F) < 1.0, "observer.F", "an unstable feedback", "a stable one")
-    observer = ObserverParameters(states=design.states, Phi=Phi, Gamma=Gamma, L=L, F=F, margin=0.0)
+    observer = ObserverParameters(rate=base.rate, states=design.states, Phi=Phi, Gamma=Gamma, L=L, F=F, margin=0.0)
     changes: dict[str, Any] = {
         "k_g": k_g,
         "k_d": tuple((whole[:-1] - gain(np.array(k_g), np.zeros(len(K) - 1))[:-1]).tolist()),
