@@ -26,6 +26,7 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre, Selection, Study
+from flight_analysis.design.observer_selection import ANGLE_UNIT, SPEED_UNIT, with_extended_state_observer
 from flight_analysis.metrics import best_error, error_metrics
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.rates import divide, nanoseconds
@@ -52,6 +53,8 @@ RATE, CONTROL_RATE, STEP = 200.0, 100.0, 0.005  # Hz, Hz, s: of y, of the law, o
 SOFTENING = 2.75  # 1, width of the softened sign in total lags, that of osprey_servo
 SAMPLES = 5  # uncertain aircraft around the identified one: only the largest response of them is used
 DELAY = 0.006  # s, topics: y is at most 5 ms old at a tick, u waits at most 5 ms; half of both, and 1 ms of transport
+
+NOISE_SHARE = 100.0  # of the unit of an output to the noise that an observer expects: 1 mrad/s, 0.01 m/s
 
 Fly = Callable[[FloatArray, float], FloatArray]
 """(constant u from trim, shape (m,); duration in s) -> y every `dt` from t = 0, shape (N + 1, m), deviations from trim."""
@@ -234,13 +237,20 @@ class IdentifiedAircraft(NamedTuple):
         return f"calm: the error of {', '.join(too_large)} is larger than the command" if too_large else ""
 
 
-def identify(name: str, speed: float, altitude: float, progress: Callable[[str], None] = lambda _: None) -> IdentifiedAircraft:
+def identify(
+    name: str,
+    speed: float,
+    altitude: float,
+    progress: Callable[[str], None] = lambda _: None,
+    observer_margin: float | None = None,
+) -> IdentifiedAircraft:
     """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s, altitude in m.
 
     1. Trim, first in another process. 2. Step tests: `step_responses`. 3. The pairing, with outputs in units of the manoeuvre,
     and D from the minors. 4. Gains by the engineering procedure for y_dot = Omega u behind the lags; all other terms count as
     f. 5. A simulation in moderate turbulence with K and Lambda alone: the slew of its u replaces that of the ideal control,
-    and gives beta. 6. Simulations of the result: in calm air, with a gust, in turbulence.
+    and gives beta. With `observer_margin`, the delay margin in s of the loop on y_dot = Omega u, an extended-state observer and
+    the gains beside it replace them. 6. Simulations of the result: in calm air, with a gust, in turbulence.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its outputs and inputs cannot be
     paired.
@@ -275,9 +285,21 @@ def identify(name: str, speed: float, altitude: float, progress: Callable[[str],
     turbulent = _load(scenario_text(first)).vary(aircraft={"turbulence": moderate_turbulence(altitude)})
     tape = simulate(without_beta(turbulent))
     chosen = gain_selection.select_gains(studied._replace(slew=_slew(tape, measured.lag)), setting)
+    if observer_margin is not None:
+        chosen = _with_observer(chosen, measured.Omega, observer_margin)
     text = scenario_text(chosen)
     flights = fly_all(_load(text), progress)
     return IdentifiedAircraft(condition, trim, measured, coupling(scaled), chosen, text, sideslip_zero(condition), flights)
+
+
+def _with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
+    """The selection with an extended-state observer in its engineering gains; Omega in the aircraft's order."""
+    controller = selection.engineering.controller
+    rows = [list(OUTPUTS).index(name) for name in controller.outputs]
+    columns = [list(INPUTS).index(name) for name in controller.inputs]
+    size = np.array([SPEED_UNIT if OUTPUTS[name] == "m/s" else ANGLE_UNIT for name in controller.outputs])
+    observed = with_extended_state_observer(controller, Omega[np.ix_(rows, columns)], size / NOISE_SHARE, size, margin)
+    return selection._replace(engineering=gain_selection.assess_gains(selection.study, observed.controller, selection.setting))
 
 
 def fly_all(scenario: Scenario, progress: Callable[[str], None] = lambda _: None) -> dict[str, ManoeuvreResult]:
