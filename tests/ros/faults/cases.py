@@ -35,6 +35,7 @@ from tests.ros.faults.flight import INPUTS, MAX_AGE, OUTPUTS, OWN_SESSION, PUBLI
 from tests.ros.peer import peer
 from tests.small_disk import fill, small_disk
 
+from flight_analysis.closed_loop.scenario import load_scenario
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from flight_log.scan import Scan
@@ -439,7 +440,8 @@ def parameters(flight: Flight, random: Generator) -> None:
             return client.call_async(SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()]))
 
         peer_node.until(client.service_is_ready)
-        first = request("k_g", 1.0)
+        k_g = load_scenario(flight.scenario).rise_di().k_g
+        first = request("k_g", k_g)
         peer_node.until(first.done)  # both ends of the service have discovered each other
         flight.begin_fault()
         futures: list[Any] = []
@@ -450,8 +452,8 @@ def parameters(flight: Flight, random: Generator) -> None:
             while done < len(futures) and futures[done].done():
                 done += 1
             while len(futures) < CHANGES and len(futures) - done < IN_FLIGHT:
-                within_a_tenth = ("k_g", float(random.uniform(0.9, 1.1)))
-                futures.append(request(*(within_a_tenth if valid[len(futures)] else invalid_change(random))))
+                lower = ("k_g", k_g * float(random.uniform(0.8, 1.0)))  # a larger one may cost an observer's loop its margin
+                futures.append(request(*(lower if valid[len(futures)] else invalid_change(random))))
 
         feed()
         peer_node.until(lambda: done == CHANGES, 100.0, each=feed)
@@ -459,7 +461,7 @@ def parameters(flight: Flight, random: Generator) -> None:
         flight.measured["changes_per_second"] = CHANGES / (flight.end - flight.begin)
         accepted = [future.result().results[0].successful for future in futures]
         assert accepted == valid.tolist()
-        peer_node.until(request("k_g", 1.0).done)
+        peer_node.until(request("k_g", k_g).done)
 
 
 def invalid_change(random: Generator) -> tuple[str, object]:

@@ -3,6 +3,7 @@
 """The sampled linear loop of a control law around a model, with actuators and delay: stability and delay margin."""
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -87,13 +88,21 @@ def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatA
 
     Source: C. Van Loan, IEEE TAC 23(3), 1978.
     """
-    from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
-
     n, m = B.shape[-2:]
     whole = np.zeros((*np.broadcast_shapes(A.shape[:-2], B.shape[:-2]), n + m, n + m))
     whole[..., :n, :n], whole[..., :n, n:] = A, B
-    exponential = np.asarray(expm(whole * period), dtype=np.float64)
+    exponential = _exponential((whole * period).tobytes(), whole.shape)
     return exponential[..., :n, :n], exponential[..., :n, n:]
+
+
+@lru_cache(maxsize=64)
+def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
+    """Exp of matrices. Cached, since new gains in flight are checked with the same plant."""
+    from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
+
+    exponential = np.asarray(expm(np.frombuffer(matrices).reshape(shape)), dtype=np.float64)
+    exponential.flags.writeable = False  # the cache returns it again
+    return exponential
 
 
 def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:
@@ -123,9 +132,10 @@ def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArra
     matrix = np.zeros((size, size))
     matrix[: n + m, : n + m] = free
     for i in range(m):
-        rest, new = zero_order_hold(motion, drive[:, [i]], loop.period - part[i])
-        _, old = zero_order_hold(motion, drive[:, [i]], part[i])
-        matrix[: n + m] += np.outer(new, inputs[whole[i] * m + i]) + np.outer(rest @ old, inputs[(whole[i] + 1) * m + i])
+        rest, new = zero_order_hold(motion, drive, loop.period - part[i])
+        _, old = zero_order_hold(motion, drive, part[i])
+        matrix[: n + m] += np.outer(new[:, i], inputs[whole[i] * m + i])
+        matrix[: n + m] += np.outer(rest @ old[:, i], inputs[(whole[i] + 1) * m + i])
     matrix[of_law] = law.A @ eye[of_law] + law.B @ output
     matrix[delayed] = inputs[: held * m]
     return matrix
