@@ -1,0 +1,228 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Identification from a log: flights of aircraft whose A and B are known, and systems whose innovations are known."""
+
+import re
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aircraft_sim.airframe import Airframe, load_airframe
+from control_laws.nominal_model import NominalModel
+from control_laws.observer_design import Names
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design import innovation_filters, model_identification
+from flight_analysis.design.gain_selection import ChannelPairing
+from flight_analysis.design.innovation_filters import Actuation, Recording
+from flight_analysis.design.model_identification import Entry, Identification, identify, whiteness
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
+
+OSPREY = load_airframe("osprey")
+ACTUATORS = Actuation(np.array([0.02, 0.1, 0.02, 0.02]), 0.0)  # those of osprey_servo; a flight in one process has no delay
+DURATION = 36.0  # s: the commands of osprey_servo end at 33 s
+AIR: dict[str, dict[str, Any]] = {
+    "calm": {"gusts": {}},
+    "gust": {
+        "gusts": {
+            "vertical": {"start": 15.0, "speed": 10.12, "length": 15.24},
+            "lateral": {"start": 27.0, "speed": 4.0, "length": 15.24},
+        }
+    },
+    "turbulence": {"gusts": {}, "turbulence": {"altitude": 100.0, "wind": 15.4}},
+}
+"""The air of a flight: none, the gusts of osprey_servo within the commands, moderate turbulence."""
+
+
+def servo(air: str, uncertainty: float, duration: float = DURATION, **reference: Any) -> Scenario:
+    """osprey_servo at 100 Hz, with an uncertain aircraft."""
+    sampled = {"A": uncertainty, "B": uncertainty, "seed": 7, "number": 2}
+    return find_scenario("osprey_servo").vary(
+        flight={"duration": duration},
+        aircraft={"rate": 100.0, "step": 0.005, "uncertainty": sampled} | AIR[air],
+        reference_model={"rate": 100.0} | reference,
+    )
+
+
+@cache
+def flight(air: str, uncertainty: float) -> Tape:
+    return simulate(servo(air, uncertainty))
+
+
+@cache
+def identified(air: str, uncertainty: float) -> Identification:
+    return identify(innovation_filters.recording(flight(air, uncertainty), OSPREY), OSPREY, ACTUATORS)
+
+
+def true_errors(aircraft: Airframe, entries: tuple[Entry, ...]) -> dict[str, float]:
+    """Relative errors of the nominal entries."""
+    A, B, inputs = aircraft.matrix_a(), aircraft.matrix_b(), list(aircraft.inputs)
+    values = {}
+    for one in entries:
+        row = aircraft.index(one.row)
+        value = A[row, aircraft.index(one.column)] if one.matrix == "A" else B[row, inputs.index(one.column)]
+        values[one.name] = float(value / one.nominal - 1.0)
+    return values
+
+
+FLIGHTS = [("calm", 0.5), ("gust", 0.5), ("turbulence", 0.3)]
+MATTER = ("B[V, thrust]", "B[q, elevator]", "A[p, p]", "B[p, aileron]", "A[beta, r]", "A[p, r]", "B[r, rudder]")
+"""What moves the outputs: the effect of each input, roll damping, and the coupling of yaw."""
+
+
+@pytest.mark.parametrize(("air", "uncertainty"), FLIGHTS)
+def test_entries_that_matter_are_found_within_their_deviations(air: str, uncertainty: float) -> None:
+    found = identified(air, uncertainty)
+    true = true_errors(servo(air, uncertainty).aircraft.sampled_airframe(), found.entries)
+    by_name = {one.name: one for one in found.entries}
+    for name in MATTER:
+        assert abs(by_name[name].error - true[name]) < 3.0 * by_name[name].deviation, name
+    # turbulence hides what the inputs do: their effects are known less well
+    largest = {"B[V, thrust]": 0.01, "B[q, elevator]": 0.1, "B[p, aileron]": 0.01, "B[r, rudder]": 0.05}
+    if air == "turbulence":
+        largest = {"B[V, thrust]": 0.06, "B[q, elevator]": 0.12, "B[p, aileron]": 0.02, "B[r, rudder]": 0.12}
+    for name, bound in largest.items():
+        assert abs((1.0 + by_name[name].error) / (1.0 + true[name]) - 1.0) < bound, name
+
+
+@pytest.mark.parametrize(("air", "uncertainty"), FLIGHTS)
+def test_innovations_of_the_held_out_samples_are_smaller_and_whiter(air: str, uncertainty: float) -> None:
+    found = identified(air, uncertainty)
+    assert found.refusal == ""
+    assert found.after.log_likelihood > found.before.log_likelihood + 0.1
+    assert np.sum(found.after.whiteness) < 0.5 * np.sum(found.before.whiteness)
+    assert (found.after.rms <= 1.001 * found.before.rms).all()
+    # nothing of the fit is in the held-out samples, of which there are one in three
+    assert found.held_out.mean() == pytest.approx(1.0 / 3.0, abs=0.02)
+
+
+@pytest.mark.parametrize("air", ["calm", "gust"])
+def test_the_deviations_are_those_of_the_errors(air: str) -> None:
+    found = identified(air, 0.5)
+    true = true_errors(servo(air, 0.5).aircraft.sampled_airframe(), found.entries)
+    scaled = np.array([(one.error - true[one.name]) / one.deviation for one in found.entries])
+    # of 26 normal numbers the mean square is below 2 with a probability of 0.998
+    assert np.mean(scaled**2) < 2.0
+
+
+def test_the_true_model_is_left_alone() -> None:
+    found = identified("calm", 0.0)
+    for one in found.entries:
+        assert abs(one.error) < 3.0 * one.deviation, one.name
+    assert abs(found.after.log_likelihood - found.before.log_likelihood) < 0.02
+
+
+def test_a_flight_without_excitation_is_refused_with_the_channel_and_the_factor() -> None:
+    scenario = servo("calm", 0.3, duration=20.0, pulses={}, coordinated_turn=None)
+    found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS)
+    pattern = r"excitation of \w: found B\[\w, \w+\] known to [\d.]+ %, expected 5.8 %: \w needs [\d.]+ times the amplitude"
+    assert re.match(pattern, found.refusal)
+
+
+def test_a_log_of_another_airframe_is_refused() -> None:
+    tape = flight("calm", 0.5)
+    with pytest.raises(ParameterError, match=r"topic y: found q, V, p, r, expected the channels of the airframe f16"):
+        innovation_filters.recording(tape, load_airframe("f16_longitudinal"))
+    A, B = OSPREY.matrix_a(), OSPREY.matrix_b()
+    other = OSPREY.with_matrices(A, 3.0 * B, np.ones((8, 3)))
+    found = identify(innovation_filters.recording(tape, other), other, ACTUATORS)
+    pattern = r"airframe osprey: found .*B\[p, aileron\].* at the bound of \+-60 %, expected a log of this airframe"
+    assert re.match(pattern, found.refusal)
+
+
+def test_other_signs_are_refused() -> None:
+    A, B = OSPREY.matrix_a(), OSPREY.matrix_b()
+    channels = ChannelPairing(OSPREY.outputs, tuple(OSPREY.inputs))
+    mirrored = OSPREY.with_matrices(A, B * np.array([1.0, 1.0, -1.0, 1.0]), np.ones((8, 3)))
+    assert model_identification.other_signs(OSPREY, OSPREY, channels) == ""
+    assert "expected the same D" in model_identification.other_signs(OSPREY, mirrored, channels)
+
+
+def test_lost_samples_are_predicted_over() -> None:
+    tape = flight("calm", 0.5)
+    y = tape["y"]
+    kept = np.random.default_rng(1).random(len(y.stamp_ns)) > 0.2
+    lossy = replace(tape, signals={**tape.signals, "y": Signal(y.stamp_ns[kept], y.names, y.values[kept])})
+    recorded = innovation_filters.recording(lossy, OSPREY)
+    assert np.isnan(recorded.y[:, 0]).mean() == pytest.approx(0.2, abs=0.02)
+    found = identify(recorded, OSPREY, ACTUATORS)
+    true = true_errors(servo("calm", 0.5).aircraft.sampled_airframe(), found.entries)
+    assert found.refusal == ""
+    assert all(abs(one.error - true[one.name]) < 3.0 * one.deviation for one in found.entries if one.name in MATTER)
+
+
+# Parts with a known result
+
+
+def test_y_is_taken_at_the_stamps_of_u() -> None:
+    tape = flight("calm", 0.5)
+    y, u = tape["y"], tape["u"]
+    fast = np.repeat(y.values, 5, axis=0) + np.tile([[0.0], [9.0], [9.0], [9.0], [9.0]], (len(y.values), 1))
+    stamps = np.arange(len(fast)) * 2_000_000
+    recorded = innovation_filters.recording(replace(tape, signals={"y": Signal(stamps, y.names, fast), "u": u}), OSPREY)
+    order = [y.names.index(name) for name in OSPREY.outputs]
+    np.testing.assert_array_equal(recorded.y, y.values[: len(recorded.y), order])
+    assert recorded.period == 0.01
+
+
+def test_a_late_input_is_the_mean_that_acts_in_a_period() -> None:
+    u = np.array([[0.0], [1.0], [3.0], [3.0]])
+    np.testing.assert_allclose(innovation_filters.delayed(u, 0.25), [[0.0], [0.75], [2.5], [3.0]])
+    np.testing.assert_allclose(innovation_filters.delayed(u, 1.0), [[0.0], [0.0], [1.0], [3.0]])
+
+
+def test_the_noise_of_a_moving_output_is_measured() -> None:
+    t = 0.01 * np.arange(6000)
+    y = np.stack([0.4 * np.sin(2.0 * t), 2.0 * np.cos(0.5 * t)], axis=1)
+    y += np.array([0.0017, 0.03]) * np.random.default_rng(1).standard_normal(y.shape)
+    np.testing.assert_allclose(innovation_filters.measured_noise(y, np.array([0.1, 1.0])), [0.0017, 0.03], rtol=0.05)
+
+
+def osprey_model(noise: Any = (0.0017, 0.03, 0.0017, 0.0017)) -> NominalModel:
+    none = Recording(0.01, np.zeros(10), np.zeros((10, 4)), np.zeros((10, 4)))
+    return innovation_filters.nominal_model(OSPREY, ACTUATORS, none)._replace(noise=np.array(noise))
+
+
+def test_the_osprey_has_two_blocks() -> None:
+    names = [{np.array(list(OSPREY.states))[k] for k in block.states} for block in innovation_filters.blocks(osprey_model())]
+    assert names == [{"V", "alpha", "q", "theta"}, {"beta", "p", "r", "phi"}]
+
+
+def test_innovations_of_the_right_model_are_white_and_of_unit_covariance() -> None:
+    block = innovation_filters.blocks(osprey_model())[0]
+    model = block.of(osprey_model())
+    model = model._replace(A=model.A[None], B=model.B[None], wind=model.wind[None], gravity=0.0 * model.gravity)
+    names = Names(("V", "alpha", "q", "theta"), ("elevator", "thrust"), ("q", "V"), ("vertical", "longitudinal"))
+    bank = innovation_filters.filter_bank(model, names, 25.0, np.ones((1, 2)))
+    level = np.array([4])
+    # simulate the filter's own model with the noise for which it is designed
+    generator, Phi, H = np.random.default_rng(1), bank.sampled.Phi[0, 0], bank.sampled.H
+    wind = [bank.sampled.states.index("wind.vertical"), bank.sampled.states.index("wind.longitudinal")]
+    _, gust = innovation_filters.wind_model(names.winds, 25.0)
+    z, y = np.zeros(len(Phi)), np.zeros((20_000, 2))
+    for k in range(len(y)):
+        y[k] = H @ z + model.noise * generator.standard_normal(2)
+        z = Phi @ z
+        z[wind] += gust * 0.1 * generator.standard_normal(2)  # root of the period, s
+    r, _ = bank.advance(np.zeros((1, len(Phi))), y, np.zeros((len(y), 2)), np.zeros(1, dtype=np.int64), level)
+    e = np.asarray(np.linalg.solve(np.linalg.cholesky(bank.covariance[0, 4]), r[1000:, 0].T).T, dtype=np.float64)
+    # 19000 samples: the standard deviation of a variance is 1 %; states and disturbances have almost no noise here
+    np.testing.assert_allclose(np.cov(e.T), np.eye(2), atol=0.04)
+    assert whiteness(e, np.ones(len(e), dtype=bool)).max() < 2.0
+
+
+def test_whiteness_is_one_for_white_noise_and_that_of_its_autocorrelation_for_coloured_noise() -> None:
+    generator, held_out = np.random.default_rng(1), np.arange(60_000) % 300 >= 200
+    white = generator.standard_normal((60_000, 50))
+    # n (1 + 0.8 rho_1^2 ..): the mean of 50 figures has a standard deviation of 0.32 / sqrt(50)
+    assert whiteness(white, held_out).mean() == pytest.approx(1.0, abs=0.2)
+    coloured: FloatArray = white[1:] + 0.5 * white[:-1]
+    # a moving average has rho_1 = 0.5 / 1.25 alone, and 99 of 100 pairs of a span
+    expected = 20_000 * 0.99 * (0.5 / 1.25) ** 2 / 20
+    assert whiteness(coloured, held_out[1:]).mean() == pytest.approx(expected, rel=0.03)
