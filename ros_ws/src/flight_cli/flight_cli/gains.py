@@ -33,7 +33,8 @@ from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
 from rise_di_controller.rise_di import RiseDiParameters
 
 CONDITION_FAILS = 1
-OBSERVER_LAW, OBJECTIVE = "rise_observer", "gust_turbulence"  # whose gains of a search are taken
+OBSERVER_LAWS, OBJECTIVE = ("rise_observer", "pi_observer"), "gust_turbulence"
+"""Laws and cost of a search whose gains are taken: those of the least cost. PI is RISE-DI with a sign that is an integral."""
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
     "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 periods, delay), rad: times 57.3"
@@ -135,11 +136,14 @@ def observed(controller: RiseDiParameters, scenario: Scenario, model: Airframe, 
     by_name = dict(zip(scenario.aircraft.channels().outputs, noises, strict=True))
     sizes = {name: SPEED_UNIT if unit in {"m/s", "ft/s"} else ANGLE_UNIT for name, unit in model.states.items()}
     noise = np.array([by_name.get(name, 0.0) or sizes[name] / 100.0 for name in controller.outputs])
-    searched = tuned_gains.find(scenario, OBSERVER_LAW, OBJECTIVE)
-    if searched is not None and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
-        gains, origin = gains_of_search(searched.gains), f"gains of a search in {scenario.name}, on {OBJECTIVE}"
+    nominal = nominal_model(model, controller, noise)
+    results = {law: tuned_gains.find(scenario, law, OBJECTIVE) for law in OBSERVER_LAWS}
+    found_gains = {law: result for law, result in results.items() if result is not None}
+    if found_gains and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
+        law = min(found_gains, key=lambda name: found_gains[name].cost)
+        gains = gains_of_search(found_gains[law].gains, nominal.total_lag)
+        origin = f"gains of a search in {scenario.name}, law {law} on {OBJECTIVE}"
     else:
-        nominal = nominal_model(model, controller, noise)
         gains, origin = gains_by_rule(nominal, tuple(model.gusts), model.speed), "gains by a rule from the lags, a start"
     found = with_aircraft_observer(controller, model, gains, noise, margin)
     relaxed = f"; K / {found.relaxation:.2f}, effort x {found.relaxation:.2f} for the margin" if found.relaxation > 1.0 else ""

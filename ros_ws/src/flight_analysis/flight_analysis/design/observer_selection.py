@@ -43,6 +43,8 @@ MAX_STEPS = 60  # of that search: a factor of 18
 
 ALTITUDE, WIND = 100.0, 15.4  # m, m/s at 20 ft: Dryden's moderate turbulence, for which the rule's wind stands
 
+SHARE = 0.9  # of the integral gain of PI that is Lambda; the rest is the slope of the softened sign
+
 SPEED_UNIT, ANGLE_UNIT = 1.0, 0.1  # m/s, rad: the units of the states, "sizes"
 
 
@@ -75,12 +77,17 @@ def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> O
     return ObserverGains(K, K / 4.0, K / T, np.full(len(T), 3.0), weights)
 
 
-def gains_of_search(gains: Mapping[str, list[float]]) -> ObserverGains:
-    """Gains as `rise-di compare --tune` finds them for the law rise_observer, by name."""
+def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
+    """Gains as `rise-di compare --tune` finds them for rise_observer or pi_observer, by name; T the total lag, (m,), s.
+
+    PI with K and Lambda is RISE-DI inside its softened sign with the same K, SHARE Lambda, and 1 / (softening T) of the rest.
+    """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
-    softening = np.broadcast_to(values["softening"], values["K"].shape)
     weights = Weights(**{name: values[name] for name in Weights._fields})
-    return ObserverGains(values["K"], values["Lambda"], values["beta"], softening, weights)
+    K, Lambda = values["K"], values["Lambda"]
+    if "beta" in values:
+        return ObserverGains(K, Lambda, values["beta"], np.broadcast_to(values["softening"], K.shape), weights)
+    return ObserverGains(K, SHARE * Lambda, K / T, 1.0 / ((1.0 - SHARE) * Lambda * T), weights)
 
 
 def nominal_model(airframe: Airframe, controller: ControllerParameters, noise: FloatArray) -> NominalModel:
