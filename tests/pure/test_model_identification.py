@@ -2,27 +2,33 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification from a log: flights of aircraft whose A and B are known, and systems whose innovations are known."""
 
+import json
 import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import innovation_filters, model_identification
 from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.innovation_filters import Actuation, Recording
 from flight_analysis.design.model_identification import Entry, Identification, identify, whiteness
 from flight_bringup.scenarios import find_scenario
+from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_log.bag import LogAttachments
+from flight_log.tape_writer import write_run
 
 OSPREY = load_airframe("osprey")
 ACTUATORS = Actuation(np.array([0.02, 0.1, 0.02, 0.02]), 0.0)  # those of osprey_servo; a flight in one process has no delay
@@ -226,3 +232,58 @@ def test_whiteness_is_one_for_white_noise_and_that_of_its_autocorrelation_for_co
     # a moving average has rho_1 = 0.5 / 1.25 alone, and 99 of 100 pairs of a span
     expected = 20_000 * 0.99 * (0.5 / 1.25) ** 2 / 20
     assert whiteness(coloured, held_out[1:]).mean() == pytest.approx(expected, rel=0.03)
+
+
+# The command
+
+
+def run_folder(folder: Path) -> Path:
+    """A run with a turbulent flight."""
+    run = folder / "run"
+    run.mkdir()
+    scenario, notes = run / "turbulent.yaml", run / "provenance.yaml"
+    scenario.write_text(scenario_yaml(servo("turbulence", 0.3)), encoding="utf-8")
+    notes.write_text("host: {name: test}\n", encoding="utf-8")
+    write_run(flight("turbulence", 0.3), run, LogAttachments(scenario, (), notes))
+    return run
+
+
+def command(*arguments: Any) -> Any:
+    return CliRunner().invoke(application(["identify"]), ["identify", *map(str, arguments)])
+
+
+def test_the_command_writes_an_airframe_and_a_page_of_its_innovations(tmp_path: Path) -> None:
+    model = tmp_path / "model.yaml"
+    result = command("--log", run_folder(tmp_path), "--airframe", "osprey", "--delay", 0, "--write", model, "--json")
+    assert result.exit_code == 0
+    found = identified("turbulence", 0.3)
+    entries = json.loads(result.stdout)["entries"]
+    assert entries == {
+        one.name: {"nominal": one.nominal, "change": one.error, "deviation": one.deviation} for one in found.entries
+    }
+    written = load_airframe(str(model))
+    np.testing.assert_array_equal(written.matrix_b(), found.airframe.matrix_b())
+    np.testing.assert_array_equal(written.matrix_gusts(), found.airframe.matrix_gusts())
+    header = [line for line in model.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
+    assert any("B[q, elevator]" in line for line in header)
+    assert {"nominal", "identified", "held out"} <= set(re.findall(r'"name":"([^"]+)"', model.with_suffix(".html").read_text()))
+
+
+def test_misuse_of_the_command_is_one_sentence(tmp_path: Path) -> None:
+    run = run_folder(tmp_path)
+    of_log = ("--log", run, "--airframe", "osprey")
+    for arguments, sentence in (
+        ((*of_log, "--write", tmp_path / "m.txt"), "--write: found .*m.txt, expected a name that ends in .yaml"),
+        ((*of_log, "--write", tmp_path / "no" / "m.yaml"), "--write: found .*, expected a file in a folder that exists"),
+        ((*of_log, "--speed", 25), "--speed: found 25.0, expected none beside --log"),
+        (("jsbsim:T37", "--write", tmp_path / "m.yaml"), "--write: found .*, expected --log with it"),
+        (("--log", run), "--airframe: found none, expected the nominal airframe"),
+        (("--log", tmp_path, "--airframe", "osprey"), "no .mcap file|expected the folder of a run"),
+        ((*of_log, "--delay", -1), "--delay: found -1.0, expected 0 s or more"),
+        (("--log", run, "--airframe", "f16_lateral"), "controller.outputs: found q, p, r, V, expected the channels"),
+        ((), "identify: found too few arguments"),
+    ):
+        result = command(*arguments)
+        assert isinstance(result.exception, ParameterError), arguments
+        assert re.search(sentence, str(result.exception)), str(result.exception)
+    assert not list(tmp_path.glob("*.html"))

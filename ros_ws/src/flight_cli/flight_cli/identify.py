@@ -1,24 +1,41 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di identify`: trim an aircraft of JSBSim, identify it by step tests, select gains, fly it, write its scenario."""
+"""`rise-di identify`: an aircraft of JSBSim by step tests, with its scenario, or A and B of an airframe from a flight's log."""
 
 import json
 import math
 import sys
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 
+from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, RESIDUALS, STATES, require_aircraft
+from flight_analysis.closed_loop.replay import recorded_parameters
+from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.identification import IdentifiedAircraft
 from flight_analysis.design.identification import identify as identify_aircraft
-from flight_cli.output import new_table, write_text
+from flight_analysis.design.innovation_filters import Actuation, recording
+from flight_analysis.design.model_identification import Identification, model_yaml
+from flight_analysis.design.model_identification import identify as identify_model
+from flight_analysis.report.figures import ERROR, GUST, PLANT
+from flight_analysis.report.html import Line, Page, Section, page_html
+from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, mask_spans, time_series_figure
+from flight_analysis.report.summary import DisplayUnit
+from flight_bringup.scenarios import find_scenario
+from flight_cli.output import COUNT_COLUMNS, new_table, progress_bar, write_text
 from flight_core.outcome import FlightEnded
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal, Tape
 from flight_core.units import SI_PER_UNIT
+from flight_log.tape_reader import read_run
+from rise_di_controller.params import ControllerParameters
 
 CANNOT_FLY = 3
 LINEAR = 0.8  # the ratio of smallest to largest slope below which an input is reported as not linear
@@ -27,18 +44,46 @@ DISPLAY_UNITS = {"rad/s": ("mrad/s", MILLI), "m/s": ("m/s", 1.0)}
 
 
 def identify(
-    airframe: Annotated[str, typer.Argument(help="jsbsim:NAME, an aircraft of JSBSim.")],
-    speed: Annotated[float, typer.Option(help="True airspeed to trim and fly at, m/s.")],
-    altitude: Annotated[float, typer.Option(help="Altitude above sea level to trim and fly at, m.")],
+    aircraft: Annotated[str | None, typer.Argument(help="jsbsim:NAME, an aircraft of JSBSim, without --log.")] = None,
+    speed: Annotated[float | None, typer.Option(help="True airspeed to trim and fly at, m/s.")] = None,
+    altitude: Annotated[float | None, typer.Option(help="Altitude above sea level to trim and fly at, m.")] = None,
     output: Annotated[
         Path | None, typer.Option(help="Scenario file to write; by default jsbsim_NAME.yaml, which must not exist.")
     ] = None,
+    log: Annotated[Path | None, typer.Option(help="Log of a flight: the folder of a run, or an MCAP file.")] = None,
+    airframe: Annotated[str | None, typer.Option(help="With --log: the nominal airframe, a name or a file (.yaml).")] = None,
+    write: Annotated[Path | None, typer.Option(help="With --log: airframe file for the model, with a page.")] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="With --log: scenario with lags and delay of the controller; by default that in the log.")
+    ] = None,
+    delay: Annotated[
+        float | None, typer.Option(help="With --log: delay of u, s; by default that of the scenario. One process has none.")
+    ] = None,
+    namespace: Annotated[str | None, typer.Option(help="With --log: namespace of the aircraft, if it holds several.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
-    """Identify an aircraft of JSBSim by step tests, select its gains, fly it and write a scenario for `rise-di fly`.
+    """Identify an aircraft of JSBSim by step tests, or with --log A and B of an airframe from a recorded flight.
 
-    Exit status: 0, 2 bad input, 3 the aircraft does not trim or does not fly.
+    The step tests also select gains, fly the aircraft and write a scenario for `rise-di fly`. A model from a log is accepted if
+    it predicts the part of the flight that it was not fitted to better than the nominal airframe.
+
+    Exit status: 0, 2 bad input or a model that is refused, 3 the aircraft does not trim or does not fly.
     """
+    of_tests = {"aircraft": aircraft, "--speed": speed, "--altitude": altitude, "--output": output}
+    of_log = {"--airframe": airframe, "--write": write, "--scenario": scenario, "--delay": delay, "--namespace": namespace}
+    for name, value in (of_log if log is None else of_tests).items():
+        require(value is None, name, f"{value}", "--log with it" if log is None else "none beside --log")
+    if log is not None:
+        require(airframe is not None, "--airframe", "none", "the nominal airframe of the log, a name or a file (.yaml)")
+        nominal = load_airframe(airframe or "")
+        _identify_log(_Source(log, scenario, delay, namespace), nominal, write, as_json)
+    elif aircraft is None or speed is None or altitude is None:
+        raise ParameterError("identify: found too few arguments, expected --log, or an aircraft with --speed and --altitude")
+    else:
+        _identify_by_steps(aircraft, speed, altitude, output, as_json)
+
+
+def _identify_by_steps(airframe: str, speed: float, altitude: float, output: Path | None, as_json: bool) -> None:
     require(airframe.startswith(PREFIX), "airframe", f"{airframe!r}", f"an aircraft of JSBSim, {PREFIX}NAME")
     name = require_aircraft(airframe)
     require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
@@ -63,6 +108,113 @@ def identify(
     if found.failure:
         print(f"error: {found.condition.title} does not fly: {found.failure}", file=sys.stderr)
         raise typer.Exit(CANNOT_FLY)
+
+
+class _Source(NamedTuple):
+    """The log, and what else tells of its flight."""
+
+    log: Path
+    scenario: str | None
+    delay: float | None
+    namespace: str | None
+
+
+def _identify_log(source: _Source, nominal: Airframe, write: Path | None, as_json: bool) -> None:
+    """Identify a model from a log, show it and write it. Raises ParameterError for a model that is refused."""
+    if write is not None:
+        require(write.suffix == ".yaml", "--write", write, "a name that ends in .yaml, as airframe files do")
+        require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
+    recorded = read_run(source.log, source.namespace)
+    if source.scenario is not None:
+        controller: ControllerParameters = find_scenario(source.scenario).controller
+    elif recorded.scenario is not None:
+        controller = recorded_parameters(recorded.scenario)
+    else:
+        raise ParameterError(f"{source.log}: found a log without its scenario, expected --scenario with the controller's lags")
+    actuation = _actuation(controller, nominal, controller.delay if source.delay is None else source.delay)
+    samples, console = recording(recorded.tape, nominal), Console(quiet=as_json)
+    with progress_bar(*COUNT_COLUMNS, quiet=as_json) as bar:
+        task = bar.add_task("search")
+        show = partial(bar.update, task)
+        found = identify_model(samples, nominal, actuation, ChannelPairing(controller.outputs, controller.inputs), show)
+        show(completed=1, total=1)
+    _show_model(console, found)
+    if found.refusal:
+        raise ParameterError(f"{source.log}: {found.refusal}")
+    if write is not None:
+        write_text("--write", write, model_yaml(found, str(source.log)))
+        page = write.with_suffix(".html")
+        write_text("--write", page, page_html(_innovation_page(found, source.log.name)))
+        console.print(f"model: {write}, innovations: {page}", highlight=False)
+    if as_json:
+        print(json.dumps(_model_as_json(found, write)))
+
+
+def _actuation(controller: ControllerParameters, nominal: Airframe, delay: float) -> Actuation:
+    """Lags and delay of a controller's loop, in the airframe's order."""
+    require(0.0 <= delay < math.inf, "--delay", delay, "0 s or more")
+    for key, found, expected in (
+        ("controller.outputs", controller.outputs, nominal.outputs),
+        ("controller.inputs", controller.inputs, tuple(nominal.inputs)),
+    ):
+        of = f"the channels of the airframe {nominal.name}: {', '.join(expected)}"
+        require(sorted(found) == sorted(expected), key, ", ".join(found), of)
+    lag = dict(zip(controller.inputs, controller.lag, strict=True))
+    return Actuation(np.array([lag[name] for name in nominal.inputs]), delay)
+
+
+def _show_model(console: Console, found: Identification) -> None:
+    headings = ("entry", "nominal", "identified", "change %", "deviation %")
+    table = new_table(f"A and B of {found.airframe.name}, SI; deviation: of the change, standard", headings, left=("entry",))
+    for one in found.entries:
+        values = f"{one.nominal:.4g}", f"{one.nominal * (1.0 + one.error):.4g}"
+        table.add_row(escape(one.name), *values, f"{100 * one.error:+.1f}", f"{100 * one.deviation:.1f}")
+    console.print(table)
+    headings = ("output", "nominal\nrms", "\nwhiteness", "identified\nrms", "\nwhiteness")
+    table = new_table("\nInnovations of the held-out samples, one of three seconds", headings, left=("output",))
+    for i, (name, unit) in enumerate(_units(found).items()):
+        figures = [(one.rms[i] * unit.factor, one.whiteness[i]) for one in (found.before, found.after)]
+        table.add_row(f"{name} ({unit.unit})", *(f"{figure:.3g}" for pair in figures for figure in pair))
+    console.print(table)
+    gain = found.after.log_likelihood - found.before.log_likelihood
+    console.print(f"whiteness: 1 for white noise; change of the log-likelihood of a sample: {gain:+.3g}", highlight=False)
+
+
+def _units(found: Identification) -> dict[str, DisplayUnit]:
+    units = {name: found.airframe.states[name] for name in found.airframe.outputs}
+    return {name: DisplayUnit(*DISPLAY_UNITS.get(unit, (unit, 1.0 / SI_PER_UNIT[unit]))) for name, unit in units.items()}
+
+
+def _innovation_page(found: Identification, name: str) -> Page:
+    """Innovations of the nominal and of the identified model over the flight, the held-out seconds shaded."""
+    t = found.recorded.t - found.recorded.t[0]
+    before, after = (Signal(np.round(t * NANOSECONDS).astype(np.int64), found.airframe.outputs, r) for r in found.innovations)
+    held_out = [Interval("held out", start, stop, GUST, False) for start, stop in mask_spans(t, found.held_out)]
+    context = PlotContext(Tape({}), _units(found), held_out, float(t[-1]), SampleStore())
+    figure = time_series_figure(context, {"nominal": Curve(before, ERROR), "identified": Curve(after, PLANT)})
+    section = Section("Innovations", "y less its prediction from the samples before; shaded: not in the fit", figure)
+    likelihoods = f"{found.before.log_likelihood:.4g} nominal, {found.after.log_likelihood:.4g} identified"
+    line = Line(f"log-likelihood of a held-out sample: {likelihoods}")
+    return Page(f"Model of {found.airframe.name} from {name}", [line], [], [section], context.samples)
+
+
+def _model_as_json(found: Identification, path: Path | None) -> dict[str, Any]:
+    outputs = found.airframe.outputs
+    return {
+        "airframe": found.airframe.name,
+        "entries": {
+            one.name: {"nominal": one.nominal, "change": one.error, "deviation": one.deviation} for one in found.entries
+        },
+        "held_out": {
+            model: {
+                "rms": dict(zip(outputs, one.rms.tolist(), strict=True)),
+                "whiteness": dict(zip(outputs, one.whiteness.tolist(), strict=True)),
+                "log_likelihood": one.log_likelihood,
+            }
+            for model, one in (("nominal", found.before), ("identified", found.after))
+        },
+        "model": None if path is None else str(path),
+    }
 
 
 def _show(console: Console, found: IdentifiedAircraft) -> None:

@@ -280,12 +280,12 @@ def identify(
     airframe: Airframe,
     actuation: Actuation,
     channels: ChannelPairing | None = None,
-    progress: Callable[[int, int], None] = lambda done, most: None,
+    progress: Callable[..., None] = lambda **_: None,
 ) -> Identification:
     """The model of a flight, with the reason why it must not be used if there is one.
 
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to keep, by default the
-    airframe's order; `progress` is called with the steps of the search that are done, and with their largest number.
+    airframe's order; `progress` is called with the steps `completed` of the search, and their largest number `total`.
     """
     recorded = recorded._replace(u=delayed(recorded.u, actuation.delay / recorded.period))
     model = nominal_model(airframe, actuation, recorded)
@@ -295,7 +295,7 @@ def identify(
     entries, before, after = [], [], []
     for block in parts:
         search = Search(recorded, model, block, airframe)
-        fit = search.fit(known & ~held_out, lambda: progress(next(done), len(parts) * (MAX_ITERATIONS + 1)))
+        fit = search.fit(known & ~held_out, lambda: progress(completed=next(done), total=len(parts) * (MAX_ITERATIONS + 1)))
         entries += search.entries(fit)
         before.append(fit.before)
         after.append(fit.after)
