@@ -5,6 +5,7 @@
 import json
 import math
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -16,9 +17,11 @@ from rich.markup import escape
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, RESIDUALS, STATES, require_aircraft
-from flight_analysis.closed_loop.replay import recorded_parameters
+from flight_analysis.closed_loop.replay import recorded_parameters, recorded_scenario
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.gain_selection import ChannelPairing
-from flight_analysis.design.identification import IdentifiedAircraft
+from flight_analysis.design.identification import IdentifiedAircraft, manoeuvre_result
 from flight_analysis.design.identification import identify as identify_aircraft
 from flight_analysis.design.innovation_filters import Actuation, recording
 from flight_analysis.design.model_identification import Identification, model_yaml
@@ -28,6 +31,7 @@ from flight_analysis.report.html import Line, Page, Section, page_html
 from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, mask_spans, time_series_figure
 from flight_analysis.report.summary import DisplayUnit
 from flight_bringup.scenarios import find_scenario
+from flight_cli.gains import observed
 from flight_cli.output import COUNT_COLUMNS, new_table, progress_bar, write_text
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require
@@ -38,6 +42,7 @@ from flight_log.tape_reader import read_run
 from rise_di_controller.params import ControllerParameters
 
 CANNOT_FLY = 3
+REFLY_MARGIN, STEP_MARGIN = 0.03, 0.012  # s. Without A the model of the loop has no damping, and less margin than the aircraft.
 LINEAR = 0.8  # the ratio of smallest to largest slope below which an input is reported as not linear
 MILLI = 1e3
 DISPLAY_UNITS = {"rad/s": ("mrad/s", MILLI), "m/s": ("m/s", 1.0)}
@@ -60,6 +65,16 @@ def identify(
         float | None, typer.Option(help="With --log: delay of u, s; by default that of the scenario. One process has none.")
     ] = None,
     namespace: Annotated[str | None, typer.Option(help="With --log: namespace of the aircraft, if it holds several.")] = None,
+    refly: Annotated[
+        bool,
+        typer.Option("--refly", help="With --log: fly its scenario with feedforward and observer of the model, in process."),
+    ] = False,
+    observer: Annotated[
+        bool, typer.Option("--observer", help="Without --log: add an extended-state observer from Omega and lags.")
+    ] = False,
+    margin: Annotated[
+        float | None, typer.Option(help="Least delay margin of the loop with an observer, s: 0.03, or 0.012 from step tests.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
     """Identify an aircraft of JSBSim by step tests, or with --log A and B of an airframe from a recorded flight.
@@ -69,21 +84,33 @@ def identify(
 
     Exit status: 0, 2 bad input or a model that is refused, 3 the aircraft does not trim or does not fly.
     """
-    of_tests = {"aircraft": aircraft, "--speed": speed, "--altitude": altitude, "--output": output}
+    of_tests = {
+        "aircraft": aircraft,
+        "--speed": speed,
+        "--altitude": altitude,
+        "--output": output,
+        "--observer": observer or None,
+    }
     of_log = {"--airframe": airframe, "--write": write, "--scenario": scenario, "--delay": delay, "--namespace": namespace}
+    of_log |= {"--refly": refly or None}
+    require(margin is None or refly or observer, "--margin", margin, "--refly or --observer beside it")
     for name, value in (of_log if log is None else of_tests).items():
         require(value is None, name, f"{value}", "--log with it" if log is None else "none beside --log")
     if log is not None:
         require(airframe is not None, "--airframe", "none", "the nominal airframe of the log, a name or a file (.yaml)")
         nominal = load_airframe(airframe or "")
-        _identify_log(_Source(log, scenario, delay, namespace), nominal, write, as_json)
+        refly_margin = (REFLY_MARGIN if margin is None else margin) if refly else None
+        _identify_log(_Source(log, scenario, delay, namespace), nominal, write, refly_margin, as_json)
     elif aircraft is None or speed is None or altitude is None:
         raise ParameterError("identify: found too few arguments, expected --log, or an aircraft with --speed and --altitude")
     else:
-        _identify_by_steps(aircraft, speed, altitude, output, as_json)
+        observer_margin = (STEP_MARGIN if margin is None else margin) if observer else None
+        _identify_by_steps(aircraft, speed, altitude, output, observer_margin, as_json)
 
 
-def _identify_by_steps(airframe: str, speed: float, altitude: float, output: Path | None, as_json: bool) -> None:
+def _identify_by_steps(
+    airframe: str, speed: float, altitude: float, output: Path | None, observer_margin: float | None, as_json: bool
+) -> None:
     require(airframe.startswith(PREFIX), "airframe", f"{airframe!r}", f"an aircraft of JSBSim, {PREFIX}NAME")
     name = require_aircraft(airframe)
     require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
@@ -95,7 +122,7 @@ def _identify_by_steps(airframe: str, speed: float, altitude: float, output: Pat
     console = Console(quiet=as_json)
     try:
         with console.status("trim") as status:
-            found = identify_aircraft(name, speed, altitude, status.update)
+            found = identify_aircraft(name, speed, altitude, status.update, observer_margin)
     except FlightEnded as error:
         print(f"error: {error}", file=sys.stderr)
         raise typer.Exit(CANNOT_FLY) from None
@@ -119,7 +146,7 @@ class _Source(NamedTuple):
     namespace: str | None
 
 
-def _identify_log(source: _Source, nominal: Airframe, write: Path | None, as_json: bool) -> None:
+def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_margin: float | None, as_json: bool) -> None:
     """Identify a model from a log, show it and write it. Raises ParameterError for a model that is refused."""
     if write is not None:
         require(write.suffix == ".yaml", "--write", write, "a name that ends in .yaml, as airframe files do")
@@ -146,8 +173,40 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, as_jso
         page = write.with_suffix(".html")
         write_text("--write", page, page_html(_innovation_page(found, source.log.name)))
         console.print(f"model: {write}, innovations: {page}", highlight=False)
+    again = None
+    if refly_margin is not None:
+        if recorded.scenario is None:
+            raise ParameterError(f"{source.log}: found a log without its scenario, expected one that --refly can fly")
+        with console.status("flying with the model"):
+            again = _refly(recorded_scenario(recorded.scenario), recorded.tape, found.airframe, refly_margin)
+        _show_flights_of_model(console, again, _units(found))
     if as_json:
-        print(json.dumps(_model_as_json(found, write)))
+        print(json.dumps(_model_as_json(found, write) | ({} if again is None else {"refly": again._asdict()})))
+
+
+class _Reflight(NamedTuple):
+    """Rms errors of a recorded flight and of the same one with feedforward and observer of a model, SI, by output."""
+
+    origin: str  # of the observer's gains
+    recorded: dict[str, float]
+    again: dict[str, float]
+    outcome: str
+
+
+def _refly(scenario: Scenario, tape: Tape, model: Airframe, margin: float) -> _Reflight:
+    """The scenario of a log, flown in this process under feedforward and observer of a model."""
+    controller, origin = observed(scenario.rise_di(), scenario, model, margin)
+    again = simulate(replace(scenario, controller=controller))
+    return _Reflight(origin, manoeuvre_result(tape).rms, manoeuvre_result(again).rms, again.outcome)
+
+
+def _show_flights_of_model(console: Console, again: _Reflight, units: dict[str, DisplayUnit]) -> None:
+    headings = ["flight", *(f"{name}\n{unit.unit}" for name, unit in units.items())]
+    table = new_table("\nRms of the error", headings, left=("flight",))
+    for title, rms in (("recorded", again.recorded), ("with the model", again.again)):
+        table.add_row(title, *(f"{rms[name] * unit.factor:.3g}" for name, unit in units.items()))
+    console.print(table)
+    console.print(f"{again.origin}; outcome: {again.outcome}", highlight=False, soft_wrap=True)
 
 
 def _actuation(controller: ControllerParameters, nominal: Airframe, delay: float) -> Actuation:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.closed_loop.scenario import SCHEMAS
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, load_scenario
 from flight_core.parameters import flatten, nest, require
 from flight_core.rates import NANOSECONDS
 from flight_core.scenario import read_sections
@@ -92,6 +92,14 @@ def recorded_parameters(scenario: StoredFile) -> ControllerParameters:
         path.write_bytes(scenario.content)
         sections = read_sections(path, tuple(SCHEMAS))
     return ControllerParameters.validate_mapping(sections["controller"], "controller")
+
+
+def recorded_scenario(stored: StoredFile) -> Scenario:
+    """The scenario in a log, every section validated. Raises ParameterError."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / stored.name
+        path.write_bytes(stored.content)
+        return load_scenario(path)
 
 
 def vary(parameters: ControllerParameters, changes: Mapping[str, Any]) -> ControllerParameters:
