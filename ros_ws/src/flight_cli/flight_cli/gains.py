@@ -129,25 +129,35 @@ def gains(
 def observed(controller: RiseDiParameters, scenario: Scenario, model: Airframe, margin: float) -> tuple[RiseDiParameters, str]:
     """A controller with feedforward and observer of a model, and a sentence on its gains.
 
-    The gains are those that `rise-di compare --tune` found in the scenario, where its airframe has the same states; else they
-    follow from the lags by a rule.
+    The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships with its airframe and lags,
+    where the model has the same states; else they follow from the lags by a rule. Of several gain sets it is the one that the
+    delay margin changes least, then the one of the least cost.
     """
     noises = scenario.aircraft.sensors.noise or (0.0,) * len(controller.outputs)
     by_name = dict(zip(scenario.aircraft.channels().outputs, noises, strict=True))
     sizes = {name: SPEED_UNIT if unit in {"m/s", "ft/s"} else ANGLE_UNIT for name, unit in model.states.items()}
     noise = np.array([by_name.get(name, 0.0) or sizes[name] / 100.0 for name in controller.outputs])
     nominal = nominal_model(model, controller, noise)
-    results = {law: tuned_gains.find(scenario, law, OBJECTIVE) for law in OBSERVER_LAWS}
-    found_gains = {law: result for law, result in results.items() if result is not None}
-    if found_gains and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
-        law = min(found_gains, key=lambda name: found_gains[name].cost)
-        gains = gains_of_search(found_gains[law].gains, nominal.total_lag)
-        origin = f"gains of a search in {scenario.name}, law {law} on {OBJECTIVE}"
-    else:
-        gains, origin = gains_by_rule(nominal, tuple(model.gusts), model.speed), "gains by a rule from the lags, a start"
-    found = with_aircraft_observer(controller, model, gains, noise, margin)
+    tuned = _tuned_scenario(scenario)
+    results = {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
+    searched = sorted(((one.cost, law, one) for law, one in results.items() if one is not None), key=lambda one: one[0])
+    candidates = [(gains_by_rule(nominal, tuple(model.gusts), model.speed), "gains by a rule from the lags, a start")]
+    if searched and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
+        origins = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
+        of_search = (gains_of_search(one.gains, nominal.total_lag) for _, _, one in searched)
+        candidates = list(zip(of_search, origins, strict=True))
+    selected = [(with_aircraft_observer(controller, model, gains, noise, margin), origin) for gains, origin in candidates]
+    found, origin = min(selected, key=lambda one: one[0].relaxation)  # the first, of the least cost, where several need none
     relaxed = f"; K / {found.relaxation:.2f}, effort x {found.relaxation:.2f} for the margin" if found.relaxation > 1.0 else ""
     return found.controller, f"observer of {model.name}: {origin}{relaxed}; delay margin {1e3 * found.delay_margin:.0f} ms"
+
+
+def _tuned_scenario(scenario: Scenario) -> Scenario:
+    """The scenario itself if it has tuned gains, else one that ships with the same airframe and actuators and has them."""
+    shipped = (find_scenario(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
+    own = scenario.aircraft.airframe, scenario.aircraft.actuators.lag
+    alike = (one for one in shipped if (one.aircraft.airframe, one.aircraft.actuators.lag) == own)
+    return next((one for one in (scenario, *alike) if tuned_gains.load(tuned_gains.tuned_file(one))), scenario)
 
 
 def _parse_lags(text: str, airframe: Airframe) -> dict[str, float]:
