@@ -28,7 +28,7 @@ COMMANDS = MappingProxyType(
         "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a scenario.",
         "gains": "Select gains for an airframe, and check every condition on them.",
         "airframes": "Show the airframes of the library, and what the theorem asks of each.",
-        "identify": "Identify an aircraft of JSBSim and write the scenario that flies it.",
+        "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an airframe from a log.",
         "check-signs": "Compare the signs of a channel map with the D of the controller.",
         "engage": "Engage or disengage the autopilot behind a running bridge.",
         "campaign": "Fly a Monte Carlo campaign of uncertain aircraft.",
