@@ -561,8 +561,8 @@ def as_pi(course: tuning.Benchmark, law: str, objective: str, channels: int) -> 
 def test_behind_servos_the_tuned_law_scores_as_a_PI_with_its_integral_gain(
     course: tuning.Benchmark, law: str, objective: str, channels: int
 ) -> None:
-    # Lambda + 1 / T_eps in place of Lambda, and no sign. Measured -1.4 to 1.3 %, and -4.3 % on uncertain aircraft with the first
-    # gains: their thrust saturates, and the anti-windup of PI differs from that of both integrals.
+    # Lambda + 1 / T_eps in place of Lambda, and no sign. Measured -1.4 to 1.3 %, and -4.3 % on uncertain aircraft with the
+    # first gains: their thrust saturates, and the anti-windup of PI differs from that of both integrals.
     assert as_pi(course, law, objective, channels) == pytest.approx([1.0, 1.0], abs=0.05)
 
 
