@@ -22,7 +22,7 @@ from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.gain_selection import with_feedforward
-from flight_analysis.design.observer_selection import gains_by_rule, nominal_model, with_aircraft_observer
+from flight_analysis.design.observer_selection import gains_by_rule, model_for, with_aircraft_observer
 from flight_analysis.report import layouts
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
@@ -68,7 +68,7 @@ def sections() -> dict[str, dict[str, Any]]:
     """Sections of a controller by a name; "observer" in it: the observer for osprey_servo by rule, with 20 ms of margin."""
     rise = SERVO.rise_di()
     leading = with_feedforward(rise, AIRFRAME).model_dump()
-    gains = gains_by_rule(nominal_model(AIRFRAME, rise, NOISE), tuple(AIRFRAME.gusts), speed=25.0)
+    gains = gains_by_rule(model_for(AIRFRAME, rise, NOISE), tuple(AIRFRAME.gusts), speed=25.0)
     observed = with_aircraft_observer(rise, AIRFRAME, gains, NOISE, 0.02).controller.model_dump()
     extended = {key: observed[key] for key in ("feedforward", "observer")}
     pi, l1 = SECTIONS["pi"], SECTIONS["l1"]

@@ -192,7 +192,7 @@ def test_the_noise_of_a_moving_output_is_measured() -> None:
 
 def osprey_model(noise: Any = (0.0017, 0.03, 0.0017, 0.0017)) -> NominalModel:
     none = Recording(0.01, np.zeros(10), np.zeros((10, 4)), np.zeros((10, 4)))
-    return innovation_filters.nominal_model(OSPREY, ACTUATORS, none)._replace(noise=np.array(noise))
+    return innovation_filters.filter_model(OSPREY, ACTUATORS, none)._replace(noise=np.array(noise))
 
 
 def test_the_osprey_has_two_blocks() -> None:

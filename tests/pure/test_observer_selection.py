@@ -16,7 +16,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import observer_selection
 from flight_analysis.design.observer_selection import (
     gains_by_rule,
-    nominal_model,
+    model_for,
     with_aircraft_observer,
     with_extended_state_observer,
 )
@@ -40,13 +40,13 @@ def with_observer(controller: RiseDiParameters) -> Scenario:
 
 
 def by_rule(margin: float = 0.03) -> observer_selection.SelectedObserver:
-    model = nominal_model(OSPREY, SERVO.controller, NOISE)
+    model = model_for(OSPREY, SERVO.controller, NOISE)
     gains = gains_by_rule(model, tuple(OSPREY.gusts), OSPREY.speed)
     return with_aircraft_observer(SERVO.rise_di(), OSPREY, gains, NOISE, margin)
 
 
 def Omega() -> FloatArray:  # noqa: N802 - the paper's name
-    model = nominal_model(OSPREY, SERVO.controller, NOISE)
+    model = model_for(OSPREY, SERVO.controller, NOISE)
     return model.Omega
 
 
@@ -118,7 +118,7 @@ def test_an_extended_state_observer_needs_no_model_and_lowers_every_error() -> N
 
 def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     flipped = OSPREY.with_matrices(OSPREY.matrix_a(), -OSPREY.matrix_b(), np.ones((8, 3)))
-    gains = gains_by_rule(nominal_model(OSPREY, SERVO.controller, NOISE), tuple(OSPREY.gusts), OSPREY.speed)
+    gains = gains_by_rule(model_for(OSPREY, SERVO.controller, NOISE), tuple(OSPREY.gusts), OSPREY.speed)
     with pytest.raises(ParameterError, match=r"found a C B with D = \[-1, -1, -1, -1\], expected D = \[1, 1, 1, 1\]"):
         with_aircraft_observer(SERVO.rise_di(), flipped, gains, NOISE, 0.03)
     with pytest.raises(ParameterError, match=r"^--margin: found at most .* expected less than 500 ms$"):

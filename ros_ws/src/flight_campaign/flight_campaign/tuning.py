@@ -12,11 +12,12 @@ import jax
 import numpy as np
 
 from aircraft_sim.plant import PlantParams
-from aircraft_sim.uncertainty import KINEMATIC, gust_directions, nominal_and_sampled
+from aircraft_sim.uncertainty import gust_directions, nominal_and_sampled
 from control_laws.catalogue import AIRCRAFT, INTEGRATORS, LAWS, NONE, Gains, Law, initial_gains
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.gain_selection import law_order, with_feedforward
+from flight_analysis.design.nominal import nominal_model
 from flight_analysis.design.observer_selection import integrator_model
 from flight_campaign import fleet, statistics
 from flight_campaign.benchmark_course import Course, build_course
@@ -25,6 +26,7 @@ from flight_campaign.statistics import score_units
 from flight_campaign.tuned_gains import TuningResult
 from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray
+from rise_di_controller.linear_loop import Loop
 
 ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
 """rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error. 60 deg/s and 600 %/s."""
@@ -105,20 +107,10 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
 
     unit = score_units(controller.outputs, airframe.states)
     noise = scenario.aircraft.sensor_arrays().noise[rows]
-    model = NominalModel(
-        A=airframe.matrix_a(),
-        B=airframe.matrix_b()[:, columns],
-        C=airframe.matrix_c()[rows],
-        gravity=airframe.matrix_gravity(),
-        wind=np.stack([airframe.gust_direction(axis) for axis in airframe.gusts], axis=1),
-        noise=np.where(noise > 0.0, noise, unit / 10.0),
-        kinematic=np.array([float(state in KINEMATIC) for state in airframe.states]),
-        size=np.array([1.0 if state_unit in {"m/s", "ft/s"} else 0.1 for state_unit in airframe.states.values()]),
-        input_scale=np.array(controller.input_scale),
+    loop = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate)
+    model = nominal_model(airframe, controller.outputs, controller.inputs, np.where(noise > 0.0, noise, unit / 10.0), loop)
+    model = model._replace(
         D=np.array(controller.D, dtype=np.float64),
-        lag=np.array(controller.lag),
-        total_lag=np.array(controller.lag) + 1.5 / controller.rate,
-        period=1.0 / controller.rate,
         lower=in_law_order(actuators.lower, -np.inf),
         upper=in_law_order(actuators.upper, np.inf),
     )

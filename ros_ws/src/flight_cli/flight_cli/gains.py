@@ -16,19 +16,18 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import Condition, failing
 from flight_analysis.design.gain_selection import GainAssessment, Study
+from flight_analysis.design.nominal import sizes
 from flight_analysis.design.observer_selection import (
-    ANGLE_UNIT,
-    SPEED_UNIT,
     gains_by_rule,
     gains_of_search,
-    nominal_model,
+    model_for,
     with_aircraft_observer,
 )
 from flight_analysis.report.summary import finite_or_null
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import tuned_gains
 from flight_cli.output import new_table, parse_numbers, write_text
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
 from rise_di_controller.rise_di import RiseDiParameters
 
@@ -135,9 +134,9 @@ def observed(controller: RiseDiParameters, scenario: Scenario, model: Airframe, 
     """
     noises = scenario.aircraft.sensors.noise or (0.0,) * len(controller.outputs)
     by_name = dict(zip(scenario.aircraft.channels().outputs, noises, strict=True))
-    sizes = {name: SPEED_UNIT if unit in {"m/s", "ft/s"} else ANGLE_UNIT for name, unit in model.states.items()}
-    noise = np.array([by_name.get(name, 0.0) or sizes[name] / 100.0 for name in controller.outputs])
-    nominal = nominal_model(model, controller, noise)
+    perfect = sizes(model.states[name] for name in controller.outputs) / 100.0  # noise in place of none, of a perfect sensor
+    noise = np.array([by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)])
+    nominal = model_for(model, controller, noise)
     tuned = _tuned_scenario(scenario)
     results = {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
     searched = sorted(((one.cost, law, one) for law, one in results.items() if one is not None), key=lambda one: one[0])
@@ -146,7 +145,14 @@ def observed(controller: RiseDiParameters, scenario: Scenario, model: Airframe, 
         origins = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
         of_search = (gains_of_search(one.gains, nominal.total_lag) for _, _, one in searched)
         candidates = list(zip(of_search, origins, strict=True))
-    selected = [(with_aircraft_observer(controller, model, gains, noise, margin), origin) for gains, origin in candidates]
+    selected, refusal = [], None
+    for gains, origin in candidates:
+        try:
+            selected.append((with_aircraft_observer(controller, model, gains, noise, margin), origin))
+        except ParameterError as error:  # another gain set may have the margin
+            refusal = error
+    if refusal is not None and not selected:
+        raise refusal
     found, origin = min(selected, key=lambda one: one[0].relaxation)  # the first, of the least cost, where several need none
     relaxed = f"; K / {found.relaxation:.2f}, effort x {found.relaxation:.2f} for the margin" if found.relaxation > 1.0 else ""
     return found.controller, f"observer of {model.name}: {origin}{relaxed}; delay margin {1e3 * found.delay_margin:.0f} ms"

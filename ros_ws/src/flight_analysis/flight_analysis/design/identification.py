@@ -26,7 +26,8 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre, Selection, Study
-from flight_analysis.design.observer_selection import ANGLE_UNIT, SPEED_UNIT, with_extended_state_observer
+from flight_analysis.design.nominal import sizes
+from flight_analysis.design.observer_selection import with_extended_state_observer
 from flight_analysis.metrics import best_error, error_metrics
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.rates import divide, nanoseconds
@@ -297,7 +298,7 @@ def _with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Se
     controller = selection.engineering.controller
     rows = [list(OUTPUTS).index(name) for name in controller.outputs]
     columns = [list(INPUTS).index(name) for name in controller.inputs]
-    size = np.array([SPEED_UNIT if OUTPUTS[name] == "m/s" else ANGLE_UNIT for name in controller.outputs])
+    size = sizes(OUTPUTS[name] for name in controller.outputs)
     observed = with_extended_state_observer(controller, Omega[np.ix_(rows, columns)], size / NOISE_SHARE, size, margin)
     return selection._replace(engineering=gain_selection.assess_gains(selection.study, observed.controller, selection.setting))
 

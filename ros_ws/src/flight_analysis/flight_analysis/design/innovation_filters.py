@@ -13,14 +13,15 @@ from scipy.sparse.csgraph import connected_components
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import AXES
 from aircraft_sim.turbulence import dryden
-from aircraft_sim.uncertainty import KINEMATIC
 from control_laws import observer_design
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names, ObserverModel, Weights
+from flight_analysis.design.nominal import nominal_model, sizes
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import Loop
 
 TRANSIENT = 0.5  # s at the begin of a recording whose innovations do not count: the filter starts from y alone
 DRIFT, LOOSE = 0.003, 1.5e-4  # noises of the filter beside the wind, as `observer_design.Weights` has them: small
@@ -73,31 +74,11 @@ def recording(tape: Tape, airframe: Airframe, rate: float | None = None) -> Reco
     return Recording(period_ns / NANOSECONDS, (instants - tape.start_ns) / NANOSECONDS, measured, commanded)
 
 
-def nominal_model(airframe: Airframe, actuation: Actuation, recorded: Recording) -> NominalModel:
+def filter_model(airframe: Airframe, actuation: Actuation, recorded: Recording) -> NominalModel:
     """The model of an airframe for its filter, channels in the airframe's order."""
-    C, size, one = airframe.matrix_c(), state_sizes(airframe), np.ones(len(airframe.inputs))
-    return NominalModel(
-        A=airframe.matrix_a(),
-        B=airframe.matrix_b(),
-        C=C,
-        gravity=airframe.matrix_gravity(),
-        wind=airframe.matrix_gusts(),
-        noise=measured_noise(recorded.y, C @ size),
-        kinematic=np.array([float(state in KINEMATIC) for state in airframe.states]),
-        size=size,
-        input_scale=one,
-        D=one,
-        lag=actuation.lag,
-        total_lag=actuation.lag + 1.5 * recorded.period + actuation.delay,
-        period=recorded.period,
-        lower=-np.inf * one,
-        upper=np.inf * one,
-    )
-
-
-def state_sizes(airframe: Airframe) -> FloatArray:
-    """Units of the states, (n,): 1 m/s or 0.1 rad (/s)."""
-    return np.array([1.0 if unit in {"m/s", "ft/s"} else 0.1 for unit in airframe.states.values()])
+    noise = measured_noise(recorded.y, airframe.matrix_c() @ sizes(airframe.states.values()))
+    loop = Loop(actuation.lag, actuation.delay, recorded.period)
+    return nominal_model(airframe, airframe.outputs, tuple(airframe.inputs), noise, loop)
 
 
 def delayed(u: FloatArray, periods: float) -> FloatArray:

@@ -29,7 +29,7 @@ from flight_analysis.design.innovation_filters import (
     blocks,
     delayed,
     filter_bank,
-    nominal_model,
+    filter_model,
 )
 from flight_core.vectors import FloatArray
 
@@ -288,7 +288,7 @@ def identify(
     airframe's order; `progress` is called with the steps `completed` of the search, and their largest number `total`.
     """
     recorded = recorded._replace(u=delayed(recorded.u, actuation.delay / recorded.period))
-    model = nominal_model(airframe, actuation, recorded)
+    model = filter_model(airframe, actuation, recorded)
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
     held_out = known & (np.arange(len(recorded.t)) // span_length(recorded) % HELD_OUT == HELD_OUT - 1)
     parts, done = blocks(model), count(1)

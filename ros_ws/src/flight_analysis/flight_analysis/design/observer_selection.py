@@ -14,7 +14,6 @@ import numpy as np
 
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.turbulence import dryden
-from aircraft_sim.uncertainty import KINEMATIC
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import (
     ExtendedStateWeights,
@@ -26,6 +25,7 @@ from control_laws.observer_design import (
 )
 from flight_analysis.design.gain_conditions import MIN_GAIN, MIN_K
 from flight_analysis.design.gain_selection import law_order, with_feedforward
+from flight_analysis.design.nominal import nominal_model
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import DecompositionError, signs
@@ -44,8 +44,6 @@ MAX_STEPS = 60  # of that search: a factor of 18
 ALTITUDE, WIND = 100.0, 15.4  # m, m/s at 20 ft: Dryden's moderate turbulence, for which the rule's wind stands
 
 SHARE = 0.9  # of the integral gain of PI that is Lambda; the rest is the slope of the softened sign
-
-SPEED_UNIT, ANGLE_UNIT = 1.0, 0.1  # m/s, rad: the units of the states, "sizes"
 
 
 class ObserverGains(NamedTuple):
@@ -90,29 +88,21 @@ def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> Observer
     return ObserverGains(K, SHARE * Lambda, K / T, 1.0 / ((1.0 - SHARE) * Lambda * T), weights)
 
 
-def nominal_model(airframe: Airframe, controller: ControllerParameters, noise: FloatArray) -> NominalModel:
+def loop_of(controller: ControllerParameters) -> Loop:
+    """The loop of a controller."""
+    return Loop(np.array(controller.lag), controller.delay, 1.0 / controller.rate)
+
+
+def model_for(airframe: Airframe, controller: ControllerParameters, noise: FloatArray) -> NominalModel:
     """The model of an airframe for a controller, in the law's order. `noise` of the measured outputs, (m,), rms per sample."""
-    rows, columns = law_order(airframe, controller)
-    wind = [airframe.gust_direction(axis) for axis in airframe.gusts]
-    period, lag, unlimited = 1.0 / controller.rate, np.array(controller.lag), (np.inf,) * len(columns)
-    A, B, C = airframe.matrix_a(), airframe.matrix_b()[:, columns], airframe.matrix_c()[rows]
-    return NominalModel(
-        A=A,
-        B=B,
-        C=C,
-        gravity=airframe.matrix_gravity(),
-        wind=np.reshape(wind, (len(wind), len(airframe.states))).T,
-        noise=noise,
-        kinematic=np.array([float(state in KINEMATIC) for state in airframe.states]),
-        size=np.array([SPEED_UNIT if unit in {"m/s", "ft/s"} else ANGLE_UNIT for unit in airframe.states.values()]),
-        input_scale=1.0 / np.abs(np.diag(C @ B)),
-        D=np.array(controller.D, dtype=np.float64),
-        lag=lag,
-        total_lag=lag + 1.5 * period + controller.delay,
-        period=period,
-        lower=-np.array(unlimited) if controller.lower is None else np.array(controller.lower),
-        upper=np.array(controller.upper or unlimited),
-    )
+    model = nominal_model(airframe, controller.outputs, controller.inputs, noise, loop_of(controller))
+    return _limited(model, controller)
+
+
+def _limited(model: NominalModel, controller: ControllerParameters) -> NominalModel:
+    """A model with the limits and D of a controller."""
+    limits = controller.guard().limits
+    return model._replace(D=np.array(controller.D, dtype=np.float64), lower=limits.lower, upper=limits.upper)
 
 
 class SelectedObserver(NamedTuple):
@@ -140,7 +130,7 @@ def with_aircraft_observer(
     Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
     _require_signs(Omega, controller, f"airframe {airframe.name}")
     base = with_feedforward(controller.model_copy(update={"observer": None}), airframe)
-    model = nominal_model(airframe, controller, noise)
+    model = model_for(airframe, controller, noise)
     names = Names(tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts))
 
     def design(slower: float) -> ObserverDesign:
@@ -191,10 +181,9 @@ def with_extended_state_observer(
     """
     m = len(controller.outputs)
     _require_signs(Omega, controller, "Omega")
-    period, lag, unlimited = 1.0 / controller.rate, np.array(controller.lag), (np.inf,) * m
     values = controller.model_dump() | {"observer": None, "feedforward": integrator_model(controller, Omega).model_dump()}
     base = RiseDiParameters.validate_mapping(values, "controller")
-    none, eye = np.zeros((m, m)), np.eye(m)
+    none, eye, loop, one = np.zeros((m, m)), np.eye(m), loop_of(controller), np.ones(m)
     model = NominalModel(
         A=none,
         B=Omega,
@@ -205,13 +194,14 @@ def with_extended_state_observer(
         kinematic=np.zeros(m),
         size=size,
         input_scale=1.0 / np.abs(np.diag(Omega)),
-        D=np.array(controller.D, dtype=np.float64),
-        lag=lag,
-        total_lag=lag + 1.5 * period + controller.delay,
-        period=period,
-        lower=-np.array(unlimited) if controller.lower is None else np.array(controller.lower),
-        upper=np.array(controller.upper or unlimited),
+        D=one,
+        lag=loop.lag,
+        total_lag=loop.total,
+        period=loop.period,
+        lower=-one,
+        upper=one,
     )
+    model = _limited(model, controller)
     names = Names(controller.outputs, controller.inputs, controller.outputs, ())
     gains, weights = extended_state_gains(controller, model.total_lag)
 

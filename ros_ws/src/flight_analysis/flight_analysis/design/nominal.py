@@ -1,0 +1,49 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The nominal model of an airframe, for observers, filters and model-based laws."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.uncertainty import KINEMATIC
+from control_laws.nominal_model import NominalModel
+from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import Loop
+
+SPEED_SIZE, ANGLE_SIZE = 1.0, 0.1  # m/s, rad (/s): the units of states in weights, "sizes"
+SPEED_UNITS = frozenset({"m/s", "ft/s"})
+
+
+def sizes(units: Iterable[str]) -> FloatArray:
+    """Sizes of values with these units."""
+    return np.array([SPEED_SIZE if unit in SPEED_UNITS else ANGLE_SIZE for unit in units])
+
+
+def nominal_model(
+    airframe: Airframe, outputs: Sequence[str], inputs: Sequence[str], noise: FloatArray, loop: Loop
+) -> NominalModel:
+    """The model of an airframe with its channels in this order, without limits, and with D = I until a caller sets another.
+
+    Arguments: `noise` of the outputs, (m,), rms per sample, and `loop`, both in this order.
+    """
+    rows, columns = [airframe.outputs.index(name) for name in outputs], [list(airframe.inputs).index(name) for name in inputs]
+    B, C, unlimited = airframe.matrix_b()[:, columns], airframe.matrix_c()[rows], np.full(len(columns), np.inf)
+    return NominalModel(
+        A=airframe.matrix_a(),
+        B=B,
+        C=C,
+        gravity=airframe.matrix_gravity(),
+        wind=airframe.matrix_gusts(),
+        noise=noise,
+        kinematic=np.array([float(state in KINEMATIC) for state in airframe.states]),
+        size=sizes(airframe.states.values()),
+        input_scale=1.0 / np.abs(np.diag(C @ B)),
+        D=np.ones(len(columns)),
+        lag=loop.lag,
+        total_lag=loop.total,
+        period=loop.period,
+        lower=-unlimited,
+        upper=unlimited,
+    )
