@@ -153,9 +153,12 @@ def observed(controller: RiseDiParameters, scenario: Scenario, model: Airframe, 
             refusal = error
     if refusal is not None and not selected:
         raise refusal
-    found, origin = min(selected, key=lambda one: one[0].relaxation)  # the first, of the least cost, where several need none
-    relaxed = f"; K / {found.relaxation:.2f}, effort x {found.relaxation:.2f} for the margin" if found.relaxation > 1.0 else ""
-    return found.controller, f"observer of {model.name}: {origin}{relaxed}; delay margin {1e3 * found.delay_margin:.0f} ms"
+    # the first, of the least cost, where several need none
+    found, origin = min(selected, key=lambda one: float(np.prod(one[0].relaxation)))
+    factors = zip(found.controller.outputs, found.relaxation.tolist(), strict=True)
+    relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
+    lowered = f"; for the margin K / and effort x {relaxed}" if relaxed else ""
+    return found.controller, f"observer of {model.name}: {origin}{lowered}; delay margin {1e3 * found.delay_margin:.0f} ms"
 
 
 def _tuned_scenario(scenario: Scenario) -> Scenario:
