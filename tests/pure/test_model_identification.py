@@ -127,7 +127,7 @@ def test_the_true_model_is_left_alone() -> None:
 def test_a_flight_without_excitation_is_refused_with_the_channel_and_the_factor() -> None:
     scenario = servo("calm", 0.3, duration=20.0, pulses={}, coordinated_turn=None)
     found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS)
-    pattern = r"excitation of \w: found B\[\w, \w+\] known to [\d.]+ %, expected 5.8 %: \w needs [\d.]+ times the amplitude"
+    pattern = r"excitation of \w: found B\[\w, \w+\] known to [\d.]+ %, expected 10 %: \w needs [\d.]+ times the amplitude"
     assert re.match(pattern, found.refusal)
 
 

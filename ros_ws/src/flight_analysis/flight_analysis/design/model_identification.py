@@ -48,7 +48,7 @@ CHANGE = 3.0  # of log-likelihood that a span has to gain by a stronger wind: od
 RECOVERY = 2  # spans after a gust that do not count either: the estimates recover
 SPAN = 1.0  # s, within which the level is constant
 HELD_OUT = 3  # Every third span is held out: each command and gust is then in both parts. A last third has no command.
-MAX_DEVIATION = PRIOR / 5.0  # of the best known effect of an input on each output: known five times as well as before
+MAX_DEVIATION = 0.1  # of the best known effect of an input on each output: two deviations are then a fifth of the loop gain
 LAGS = 20  # of the autocorrelation in the figure of whiteness: 0.2 s at 100 Hz
 
 
