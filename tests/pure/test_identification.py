@@ -204,6 +204,13 @@ def test_the_shipped_scenario_is_what_the_command_writes(cessna: IdentifiedAircr
             assert found == (pytest.approx(value, rel=1e-3, abs=1e-6) if numbers else value), key
 
 
+def test_an_extended_state_observer_lowers_every_error_in_turbulence(cessna: IdentifiedAircraft) -> None:
+    # measured 0.53, 0.81, 0.87, 0.56 in q, V, p, r; half of V is the wind itself
+    observed = identify("c172p", 46.3, 1219.2, observer_margin=0.015).flights["turbulence"].rms
+    for output, alone in cessna.flights["turbulence"].rms.items():
+        assert observed[output] < 0.95 * alone
+
+
 @pytest.mark.parametrize("name", PROTOTYPE)
 def test_shipped_aircraft_fly_closer_than_the_prototype_did(name: str) -> None:
     calm, gust = PROTOTYPE[name]

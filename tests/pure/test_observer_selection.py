@@ -105,15 +105,15 @@ def test_the_observer_by_rule_halves_the_error_of_speed_roll_and_yaw() -> None:
 
 
 def test_an_extended_state_observer_needs_no_model_and_lowers_every_error() -> None:
-    # The model y_dot = Omega u has none of the aircraft's damping: 14 ms there are 29 ms on the osprey.
+    # The model y_dot = Omega u has none of the aircraft's damping: 12 ms there are 26 ms on the osprey. Only K of p is lowered.
     selected = with_extended_state_observer(SERVO.rise_di(), Omega(), NOISE, SIZE, 0.012)
     assert selected.delay_margin >= 0.012
-    np.testing.assert_array_equal(selected.relaxation, 1.0)
+    np.testing.assert_array_equal(np.delete(selected.relaxation, 1), 1.0)
     controller = selected.controller
     assert controller.feedforward is not None
     assert not any(controller.feedforward.A)
     alone, observed = rms(simulate(SERVO)), rms(simulate(with_observer(controller)))
-    assert (observed < 0.6 * alone).all()  # measured 0.43, 0.37, 0.25, 0.54 in q, V, p, r
+    assert (observed < 0.6 * alone).all()  # measured 0.37, 0.33, 0.21, 0.42 in q, V, p, r
 
 
 def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ from flight_log.tape_reader import read_run
 from rise_di_controller.params import ControllerParameters
 
 CANNOT_FLY = 3
-REFLY_MARGIN, STEP_MARGIN = 0.03, 0.012  # s. Without A the model of the loop has no damping, and less margin than the aircraft.
+REFLY_MARGIN, STEP_MARGIN = 0.03, 0.015  # s. Without A the model of the loop has no damping, and less margin than the aircraft.
 LINEAR = 0.8  # the ratio of smallest to largest slope below which an input is reported as not linear
 MILLI = 1e3
 DISPLAY_UNITS = {"rad/s": ("mrad/s", MILLI), "m/s": ("m/s", 1.0)}
@@ -73,7 +73,7 @@ def identify(
         bool, typer.Option("--observer", help="Without --log: add an extended-state observer from Omega and lags.")
     ] = False,
     margin: Annotated[
-        float | None, typer.Option(help="Least delay margin of the loop with an observer, s: 0.03, or 0.012 from step tests.")
+        float | None, typer.Option(help="Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:

@@ -137,28 +137,25 @@ def with_aircraft_observer(
         effort = slower * gains.weights.effort
         return aircraft_observer(model, names, gains.weights._replace(effort=effort))
 
-    return _within_margin(base, model, gains, design, margin)
+    return _within_margin(base, model, LinearPlant(model.A + model.gravity, model.B, model.C), gains, design, margin)
 
 
 EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
-    "q": (0.161, 0.0131, 0.183, 0.0077, 0.665, 0.256),
-    "p": (0.033, 0.231, 0.603, 0.0102, 1.02, 0.098),
-    "r": (0.0146, 0.0026, 0.714, 0.0242, 0.098, 0.161),
-    "V": (0.0075, 4.03, 1.31, 0.0242, 0.184, 0.667),
+    "q": (0.183, 0.0077, 0.665, 0.256),
+    "p": (0.603, 0.0102, 1.02, 0.098),
+    "r": (0.714, 0.0242, 0.098, 0.161),
+    "V": (1.31, 0.0242, 0.184, 0.667),
 }
-"""K T, Lambda T, effort / T, drift T, rate_drift T and decay T with the total lag T, by output. They are those of a search on
-the `osprey`, T = 0.035 s and 0.115 s in V, with the cost of gusts and turbulence together: no other aircraft was in it."""
+"""effort / T, drift T, rate_drift T and decay T with the total lag T, by output. They are those of a search on the `osprey`,
+T = 0.035 s and 0.115 s in V, with the cost of gusts and turbulence together: no other aircraft was in it."""
 
 DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS["p"]  # for an output that is not in EXTENDED_STATE_PRODUCTS
 
 
-def extended_state_gains(controller: ControllerParameters, T: FloatArray) -> tuple[ObserverGains, ExtendedStateWeights]:
-    """Gains with an extended-state observer from the total lags of the loop, (m,), s, by EXTENDED_STATE_PRODUCTS."""
-    products = np.array([EXTENDED_STATE_PRODUCTS.get(name, DEFAULT_PRODUCTS) for name in controller.outputs]).T
-    K, Lambda, effort, drift, rate_drift, decay = products[0] / T, products[1] / T, products[2] * T, *(products[3:] / T)
-    unused = Weights(effort, drift, np.zeros(0), np.zeros(0), np.zeros(1))
-    gains = ObserverGains(K, Lambda, K / T, np.full(len(T), 30.0), unused)
-    return gains, ExtendedStateWeights(effort, drift, rate_drift, decay)
+def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedStateWeights:
+    """Weights of an extended-state observer from the total lags of the loop, (m,), s, by EXTENDED_STATE_PRODUCTS."""
+    products = np.array([EXTENDED_STATE_PRODUCTS.get(name, DEFAULT_PRODUCTS) for name in outputs]).T
+    return ExtendedStateWeights(products[0] * T, *(products[1:] / T))
 
 
 def integrator_model(controller: ControllerParameters, Omega: FloatArray) -> FeedforwardParameters:
@@ -174,26 +171,27 @@ def integrator_model(controller: ControllerParameters, Omega: FloatArray) -> Fee
 def with_extended_state_observer(
     controller: RiseDiParameters, Omega: FloatArray, noise: FloatArray, size: FloatArray, margin: float
 ) -> SelectedObserver:
-    """The controller with an observer from Omega and lags alone: no A, no f, no wind.
+    """The controller with an observer from Omega and lags alone: no A, no f, no wind. Its gains stay, but for the margin.
 
-    The model of its feedforward is y_dot = Omega u. Arguments: Omega (m, m) in the law's order; `noise` of the outputs, (m,),
+    The model of its feedforward is y_dot = Omega u, that of its observer y_dot = diag(Omega) u: with all of Omega the elevator
+    would correct V, and turn the aircraft for it. Arguments: Omega (m, m) in the law's order; `noise` of the outputs, (m,),
     rms per sample; `size` (m,), their units, 1 m/s or 0.1 rad/s. Raises ParameterError as `with_aircraft_observer`.
     """
     m = len(controller.outputs)
     _require_signs(Omega, controller, "Omega")
     values = controller.model_dump() | {"observer": None, "feedforward": integrator_model(controller, Omega).model_dump()}
     base = RiseDiParameters.validate_mapping(values, "controller")
-    none, eye, loop, one = np.zeros((m, m)), np.eye(m), loop_of(controller), np.ones(m)
+    none, eye, loop, one, effects = np.zeros((m, m)), np.eye(m), loop_of(controller), np.ones(m), np.diag(Omega)
     model = NominalModel(
         A=none,
-        B=Omega,
+        B=np.diag(effects),
         C=eye,
         gravity=none,
         wind=np.zeros((m, 0)),
         noise=noise,
         kinematic=np.zeros(m),
         size=size,
-        input_scale=1.0 / np.abs(np.diag(Omega)),
+        input_scale=1.0 / np.abs(effects),
         D=one,
         lag=loop.lag,
         total_lag=loop.total,
@@ -203,14 +201,18 @@ def with_extended_state_observer(
     )
     model = _limited(model, controller)
     names = Names(controller.outputs, controller.inputs, controller.outputs, ())
-    gains, weights = extended_state_gains(controller, model.total_lag)
+    law, weights = controller.law_params(), extended_state_weights(controller.outputs, model.total_lag)
+    response = np.abs(effects) * law.input_scale  # y_dot by a unit of scaled input: the gains are those for a unit response
+    unused = Weights(weights.effort, weights.drift, np.zeros(0), np.zeros(0), np.zeros(1))
+    softening = np.broadcast_to(controller.softening, (m,))
+    gains = ObserverGains(law.K * response, law.Lambda, law.beta * response, softening, unused)
 
     def design(slower: FloatArray) -> ObserverDesign:
         drift, rate_drift = weights.drift / slower, weights.rate_drift / slower**2
         changed = weights._replace(effort=slower * weights.effort, drift=drift, rate_drift=rate_drift)
         return extended_state_observer(model, names, changed)
 
-    return _within_margin(base, model, gains, design, margin)
+    return _within_margin(base, model, LinearPlant(none, Omega, eye), gains, design, margin)
 
 
 def _require_signs(Omega: FloatArray, controller: ControllerParameters, where: str) -> None:
@@ -224,13 +226,14 @@ def _require_signs(Omega: FloatArray, controller: ControllerParameters, where: s
 def _within_margin(
     base: RiseDiParameters,
     model: NominalModel,
+    plant: LinearPlant,
     gains: ObserverGains,
     design: Callable[[FloatArray], ObserverDesign],
     margin: float,
 ) -> SelectedObserver:
     """The first relaxation with the delay margin: steps in the channel that gains most, or in all where none gains."""
     loop = Loop(model.lag, 0.0, model.period)  # the margin counts the declared delay too
-    plant, m = LinearPlant(model.A + model.gravity, model.B, model.C), len(model.lag)
+    m = len(model.lag)
 
     def relaxed(relaxation: FloatArray) -> SelectedObserver:
         controller = _parameters(base, model, gains, design(relaxation), relaxation)
