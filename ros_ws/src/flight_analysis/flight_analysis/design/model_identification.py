@@ -39,7 +39,7 @@ MAX_ERROR = 0.6  # 1, bound of a relative error: two standard deviations
 
 DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
 DAMPINGS, FRACTIONS = (0.0, 0.01, 0.1, 1.0, 10.0), (0.5, 0.25)  # of the steps that are tried side by side
-MAX_ITERATIONS = 40
+MAX_ITERATIONS = 22  # of 0.45 s each on one core: an identification takes at most 10 s
 MIN_PROGRESS, MIN_PROGRESS_STRONG = 0.05, 5.0  # of the cost, a log-likelihood, in a step: the search ends, or its first part
 
 STRONG = 4  # index of the level at which the search begins
