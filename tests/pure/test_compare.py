@@ -24,7 +24,7 @@ from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 
 app = application([*COMMANDS])
-SHIPPED = ("osprey_servo", "osprey_gust")
+SHIPPED = sorted(path.stem for path in tuned_gains.TUNED.glob("*.yaml"))
 
 
 @pytest.fixture(scope="module")
