@@ -23,7 +23,12 @@ HEADER = "std_msgs/Header"
 MODES = ("position", "velocity", "acceleration", "attitude", "body_rate", "thrust_and_torque", "direct_actuator")
 
 PUBLISHED: dict[str, dict[str, str]] = {
-    "px4_msgs/msg/VehicleOdometry": {"angular_velocity": "float32[3]"},
+    "px4_msgs/msg/VehicleOdometry": {
+        "angular_velocity": "float32[3]",
+        "position": "float32[3]",
+        "velocity": "float32[3]",
+        "q": "float32[4]",
+    },
     "px4_msgs/msg/AirspeedValidated": {"true_airspeed_m_s": "float32"},
     "px4_msgs/msg/VehicleTorqueSetpoint": {"xyz": "float32[3]"},
     "px4_msgs/msg/VehicleThrustSetpoint": {"xyz": "float32[3]"},
@@ -34,7 +39,7 @@ PUBLISHED: dict[str, dict[str, str]] = {
     "mavros_msgs/msg/RCIn": {"channels": "uint16[]"},
     "rosflight_msgs/msg/Command": {"header": HEADER, "mode": "uint8", "ignore": "uint16", "u": "float32[10]"},
     "rosflight_msgs/msg/Status": {"rc_override": "uint16"},
-    "rosplane_msgs/msg/State": {"header": HEADER, "p": "float32", "q": "float32", "r": "float32", "va": "float32"},
+    "rosplane_msgs/msg/State": {"header": HEADER, **dict.fromkeys(("p", "q", "r", "va", "phi", "theta", "psi"), "float32")},
 }
 
 FOREIGN_MAPS = ("px4", "mavros", "rosflight")

@@ -197,3 +197,55 @@ def test_the_offboard_heartbeat_starts_before_engagement_and_ends_with_stale_inp
     assert not bridge.sends("torque", at(0.0))
     receive_outputs(bridge, 0.25, OUTPUTS[:3])
     assert not bridge.sends("offboard", at(0.25))
+
+
+ENVELOPE = {"phi": [-0.8, 0.8], "theta": [-0.4, 0.5], "V": [-5.0, 8.0]}
+
+
+def enveloped_bridge() -> Bridge:
+    """An engaged bridge with ENVELOPE in level flight at trim speed."""
+    bridge = new_bridge(ChannelMap.validate_mapping(CHANNEL_MAP.model_dump() | {"envelope": ENVELOPE}, "map"))
+    receive_u(bridge, 0.0)
+    receive_outputs(bridge, 0.0)
+    assert bridge.engage(at(0.0)) == "phi not received yet (/ap/pose/filtered); theta not received yet (/ap/pose/filtered)"
+    receive_outputs(bridge, 0.0, ("phi", "theta"))
+    assert bridge.engage(at(0.0)) == "V is -25, outside the envelope [-5, 8]"
+    receive_outputs(bridge, 0.01, ("V",), raw=25.0)
+    assert bridge.engage(at(0.01)) == ""
+    return bridge
+
+
+@pytest.mark.parametrize(("name", "raw", "channel"), [("phi", 0.81, 0.81), ("theta", 0.41, -0.41), ("V", 33.1, 8.1)])
+def test_leaving_the_envelope_releases_the_channels_with_a_sentence(name: str, raw: float, channel: float) -> None:
+    bridge = enveloped_bridge()
+    inside = {"phi": -0.79, "theta": -0.49, "V": 32.9}
+    receive_outputs(bridge, 0.02, (name,), inside[name])
+    assert bridge.step(at(0.02)) is Phase.ENGAGED
+    receive_outputs(bridge, 0.03, (name,), raw)
+    assert bridge.step(at(0.03)) is Phase.RELEASE
+    lower, upper = ENVELOPE[name]
+    assert bridge.reason == f"{name} is {channel:g}, outside the envelope [{lower:g}, {upper:g}]"
+
+
+def test_an_envelope_whose_channel_is_stale_releases_the_channels() -> None:
+    bridge = enveloped_bridge()
+    receive_outputs(bridge, 0.15)
+    receive_outputs(bridge, 0.16, ("V",), raw=25.0)
+    receive_u(bridge, 0.15)
+    assert bridge.step(at(0.25)) is Phase.RELEASE
+    assert bridge.reason.startswith("phi is 0.25 s old (/ap/pose/filtered)")
+
+
+def test_a_pose_has_the_fresh_channels_and_the_stamp_of_its_first_row() -> None:
+    bridge = new_bridge()
+    receive_outputs(bridge, 0.0, ("theta", "climb"), 0.1)
+    assert bridge.pose(at(0.0)) is None
+    receive_outputs(bridge, 0.01, ("phi",), 0.2)
+    names, pose = bridge.pose(at(0.02)) or ((), None)
+    assert pose is not None
+    assert dict(zip(names, pose.value.tolist(), strict=True)) == {"phi": 0.2, "theta": -0.1, "climb": 0.1}
+    assert pose.stamp_ns == at(0.01)
+    assert bridge.pose(at(0.03)) is None  # each is published once
+    receive_outputs(bridge, 0.3, ("phi",))
+    names, _ = bridge.pose(at(0.3)) or ((), None)
+    assert names == ("phi",)  # the others are 0.3 s old

@@ -16,10 +16,12 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from tests.published_messages import FOREIGN_MAPS, PUBLISHED, blank, kind
 
+from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.channel_map import STEP, Line, get_field, message_type, read_raw, set_field, to_channel, to_raw
-from autopilot_bridge.params import LIBRARY, BridgeParameters, ChannelMap, load_map
+from autopilot_bridge.params import LIBRARY, BridgeParameters, ChannelMap, MeasuredRow, OverrideRow, load_map
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
@@ -88,8 +90,10 @@ def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name
             set_field(message, input_row.field, raw)
             error = 1e-7 * abs(raw) if element == "float32" else 0.5
             assert get_field(message, input_row.field) == pytest.approx(raw, rel=0.0, abs=error, nan_ok=True)
-    readers = {"outputs." + one: row for one, row in channel_map.outputs.items()}
-    for key, reader in (readers | {"overrides." + one: row for one, row in channel_map.overrides.items()}).items():
+    readers: dict[str, MeasuredRow | OverrideRow] = {"outputs." + one: row for one, row in channel_map.outputs.items()}
+    readers |= {"pose." + one: row for one, row in channel_map.pose.items() if row.function == "value"}
+    readers |= {"overrides." + one: row for one, row in channel_map.overrides.items()}
+    for key, reader in readers.items():
         if key in messages:
             assert read_raw(messages[key], reader.field, "value") == 0.0
             needs_header = getattr(reader, "stamp", "arrival") == "header"
@@ -111,7 +115,58 @@ def test_each_map_is_a_dry_run_by_default_and_names_the_source_of_each_row(name:
 
 def test_the_map_ardupilot_needs_only_message_types_of_common_interfaces() -> None:
     types = {kind for _, _, kind in load_map("ardupilot").used_topics()}
-    assert types == {"geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Vector3Stamped", "sensor_msgs/msg/Joy"}
+    stamped = {f"geometry_msgs/msg/{kind}Stamped" for kind in ("Pose", "Twist", "Vector3")}
+    assert types == {*stamped, "sensor_msgs/msg/Joy"}
+
+
+ANGLE = st.floats(-math.pi, math.pi)
+TURN_NED_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # x east, y north, z up
+TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+
+
+@pytest.mark.parametrize("name", ["ardupilot", "mavros", "px4"])
+@given(phi=ANGLE, theta=st.floats(-1.5, 1.5), psi=ANGLE)
+def test_the_attitude_of_a_map_is_that_of_body_frd_in_ned(name: str, phi: float, theta: float, psi: float) -> None:
+    """Checked by SciPy's rotations. ArduPilot and MAVROS publish body FLU in ENU (REP 103), PX4 body FRD in NED."""
+    frd_in_ned = Rotation.from_euler("ZYX", [psi, theta, phi])
+    rows = load_map(name).pose
+    x, y, z, w = (frd_in_ned if name == "px4" else TURN_NED_ENU * frd_in_ned * TURN_FLU_FRD).as_quat().tolist()
+    quaternion = [w, x, y, z] if name == "px4" else Message(w=w, x=x, y=y, z=z)
+    bridge = Bridge(load_map(name), dry_run=True)
+    for channel in ("phi", "theta", "psi"):
+        bridge.take_output(channel, read_raw(Message(q=quaternion), "q", rows[channel].function), 1, 1)
+    names, pose = bridge.pose(1) or ((), None)
+    assert names == ("phi", "theta", "psi")
+    assert pose is not None
+    expected = np.array([phi, theta, psi])
+    error = np.array([math.remainder(one, math.tau) for one in (pose.value - expected).tolist()])
+    assert np.abs(error).max() < 2e-6  # the offset of psi in a map has seven digits
+    assert np.abs(pose.value).max() <= math.pi
+
+
+POSES = {  # 40 m north and 30 m east of the origin, 20 m above it; 4 m/s north, 3 m/s east, climbing at 2 m/s
+    "ardupilot": Message(
+        pose=Message(position=Message(x=30.0, y=40.0, z=20.0)), twist=Message(linear=Message(x=3.0, y=4.0, z=2.0))
+    ),
+    "px4": Message(position=[40.0, 30.0, -20.0], velocity=[4.0, 3.0, -2.0]),
+}
+POSES["mavros"] = POSES["ardupilot"]
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_position_and_velocity_are_north_east_and_up(name: str) -> None:
+    rows = load_map(name).pose
+    expected = {"north": 40.0, "east": 30.0, "altitude": 20.0, "v_north": 4.0, "v_east": 3.0, "climb": 2.0}
+    for channel, value in expected.items():
+        row = rows[channel]
+        assert to_channel(read_raw(POSES[name], row.field, row.function), row.line) == value
+
+
+@pytest.mark.parametrize("quaternion", [[0.0] * 4, [math.nan, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+def test_a_quaternion_without_an_attitude_is_refused(quaternion: list[float]) -> None:
+    for function in ("roll_of_quaternion", "pitch_of_quaternion", "yaw_of_quaternion"):
+        with pytest.raises(ChannelError, match="cannot convert q"):
+            read_raw(Message(q=quaternion), "q", function)
 
 
 @given(LINES, st.floats(-1e4, 1e4))
@@ -169,8 +224,9 @@ def test_a_message_that_another_version_lacks_is_one_sentence() -> None:
         message_type("ardupilot_msgs/msg/Airspeed", lambda name: Message())
 
 
+ROW = load_map("ardupilot").pose["phi"].model_dump()
 # Invalid values: (key path, value) and the sentence of the refusal.
-REFUSALS = (
+REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
     (("outputs", "q", "sign"), 2, r"map test\.outputs\.q\.sign: found 2, expected 1 or -1|-1 or 1"),
     (("outputs", "q", "scale"), 0.0, r"map test\.outputs\.q\.scale: found 0\.0"),
     (("outputs", "q", "field"), "twist..y", r"map test\.outputs\.q\.field: found 'twist\.\.y'"),
@@ -189,6 +245,11 @@ REFUSALS = (
     (("messages", "joy", "when"), "ready", r"map test\.inputs\.elevator\.message: found one sent when ready"),
     (("overrides", "gamepad", "above"), None, r"map test\.overrides\.gamepad: found above and below, or neither"),
     (("topics", "/ap/joy", "depth"), 0, r"map test\.topics\./ap/joy\.depth"),
+    (("pose", "phi", "topic"), "/other", r"map test\.pose\.phi\.topic: found /other"),
+    (("pose", "up"), ROW, r"map test\.pose\.up: found a channel, expected one of phi, .*, climb"),
+    (("envelope",), {"beta": [-0.1, 0.1]}, r"map test\.envelope\.beta: found a channel, expected one of .* phi, .*, r"),
+    (("envelope",), {"phi": [0.1, -0.1]}, r"map test\.envelope\.phi: found \[0\.1, -0\.1\]"),
+    (("outputs", "phi"), ROW | {"positive": "roll right"}, r"map test\.outputs\.phi: found a channel of the pose too"),
     (("instant",), "x", r"map test\.instant: found 'x', expected one of the outputs q, V, p, r"),
 )
 

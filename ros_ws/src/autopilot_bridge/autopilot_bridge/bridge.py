@@ -5,13 +5,14 @@
 It reads no clock: every instant is an argument, in ns of one clock. The watchdogs of y and u end an engagement.
 """
 
+import math
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from autopilot_bridge.channel_map import to_channel, to_raw
-from autopilot_bridge.params import ChannelMap
+from autopilot_bridge.params import ChannelMap, MeasuredRow
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer
 
@@ -41,8 +42,10 @@ class Bridge:
         self.outputs, self.inputs = tuple(channel_map.outputs), tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
         self.reason = "not engaged yet"  # why the bridge is not engaged
+        self._rows: dict[str, MeasuredRow] = {**channel_map.pose, **channel_map.outputs}
         self._readings: dict[str, Reading] = {}
         self._last_y_ns = -1  # stamp of the last y
+        self._last_pose_ns = -1  # stamp of the last pose
         self._u: FloatArray = np.zeros(len(self.inputs))
         self._u_sender: str | None = None
         self._u_ns = 0  # when u was received
@@ -55,12 +58,12 @@ class Bridge:
     # Inputs
 
     def take_output(self, name: str, raw: float, stamp_ns: int, now_ns: int) -> None:
-        """Take a value of a channel of y: y = sign scale raw + offset.
+        """Take a value of a channel of y or of the pose: sign scale raw + offset.
 
         Raises ChannelError: reason "stamp" where the stamp differs from now by more than the age limit, reason "order" where it
         is not later than the previous one.
         """
-        row = self.channel_map.outputs[name]
+        row = self._rows[name]
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
             hint = "" if row.stamp == "arrival" else "; set stamp: arrival in the map if the autopilot has another clock"
             raise ChannelError("stamp", f"{name} is stamped {seconds(now_ns - stamp_ns):.3f} s before now{hint}")
@@ -87,15 +90,27 @@ class Bridge:
     # State
 
     def stale(self, now_ns: int) -> dict[str, str]:
-        """The stale channels of y, each with the reason as a sentence."""
-        reasons = {}
-        for name, row in self.channel_map.outputs.items():
-            reading = self._readings.get(name)
-            if reading is None:
-                reasons[name] = f"{name} not received yet ({row.topic})"
-            elif now_ns - reading.stamp_ns > nanoseconds(row.max_age):
-                reasons[name] = f"{name} is {seconds(now_ns - reading.stamp_ns):.2f} s old ({row.topic})"
-        return reasons
+        """The stale channels of y and of the envelope, each with the reason as a sentence."""
+        watched = dict.fromkeys((*self.outputs, *self.channel_map.envelope))
+        return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
+
+    def _staleness(self, name: str, now_ns: int) -> str:
+        """Why a channel of y or of the pose is stale, as a sentence; empty where it is fresh."""
+        row, reading = self._rows[name], self._readings.get(name)
+        if reading is None:
+            return f"{name} not received yet ({row.topic})"
+        if now_ns - reading.stamp_ns > nanoseconds(row.max_age):
+            return f"{name} is {seconds(now_ns - reading.stamp_ns):.2f} s old ({row.topic})"
+        return ""
+
+    def _outside(self) -> str:
+        """The fresh channels that are outside the envelope, as a sentence; empty where none is."""
+        values = ((name, self._readings[name].value, limits) for name, limits in self.channel_map.envelope.items())
+        return "; ".join(
+            f"{name} is {value:.3g}, outside the envelope [{lower:g}, {upper:g}]"
+            for name, value, (lower, upper) in values
+            if not lower <= value <= upper
+        )
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
@@ -119,6 +134,8 @@ class Bridge:
             return f"pilot override active: {self._active_override}"
         if stale := "; ".join(filter(None, (*self.stale(now_ns).values(), self._u_timeout(now_ns)))):
             return stale
+        if outside := self._outside():
+            return outside
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
         for name, u, limit in zip(self.inputs, self._u, limits, strict=True):
             if abs(u) > limit:
@@ -146,6 +163,8 @@ class Bridge:
         if self.phase is Phase.ENGAGED:
             if stale := self.stale(now_ns):
                 self.disengage("; ".join(stale.values()), now_ns)
+            elif outside := self._outside():
+                self.disengage(outside, now_ns)
             elif timeout := self._u_timeout(now_ns):
                 self.reason = timeout
                 self._enter(Phase.NEUTRAL, now_ns)
@@ -161,10 +180,26 @@ class Bridge:
     def y(self, now_ns: int) -> StampedVector | None:
         """Sample of y at the stamp of the map's output `instant`; None where it was returned before or a channel is stale."""
         newest = self._readings.get(self.channel_map.instant)
-        if newest is None or newest.stamp_ns <= self._last_y_ns or self.stale(now_ns):
+        if newest is None or newest.stamp_ns <= self._last_y_ns or any(self._staleness(name, now_ns) for name in self.outputs):
             return None
         self._last_y_ns = newest.stamp_ns
         return StampedVector(newest.stamp_ns, np.array([self._readings[name].value for name in self.outputs]))
+
+    def pose(self, now_ns: int) -> tuple[tuple[str, ...], StampedVector] | None:
+        """Names and values of the fresh channels of the pose, at the stamp of its first row; None where that is not new.
+
+        psi is in -pi..pi. A channel that was not received or is stale is left out.
+        """
+        first = next(iter(self.channel_map.pose), None)
+        newest = None if first is None else self._readings.get(first)
+        if newest is None or newest.stamp_ns <= self._last_pose_ns:
+            return None
+        self._last_pose_ns = newest.stamp_ns
+        names = tuple(name for name in self.channel_map.pose if not self._staleness(name, now_ns))
+        values = {name: self._readings[name].value for name in names}
+        if "psi" in values:
+            values["psi"] = math.remainder(values["psi"], math.tau)
+        return names, StampedVector(newest.stamp_ns, np.array(list(values.values())))
 
     def raw_u(self) -> FloatArray:
         """Raw values of the newest u after saturation, shape (m,): raw of trim + min(max(u, lower), upper)."""

@@ -87,10 +87,48 @@ def _airspeed_of_pressure(pressure: Any) -> float:
     return math.sqrt(2.0 * max(float(pressure), 0.0) / SEA_LEVEL_DENSITY)
 
 
+def _quaternion(field: Any) -> tuple[float, float, float, float]:
+    """(w, x, y, z) of a quaternion with members w, x, y, z, or with four elements in this order, as PX4 publishes it."""
+    w, x, y, z = (field.w, field.x, field.y, field.z) if hasattr(field, "w") else field
+    quaternion = float(w), float(x), float(y), float(z)
+    if not 0.0 < math.hypot(*quaternion) < math.inf:
+        raise ValueError("a quaternion of length 0, infinity or NaN has no angles")
+    return quaternion
+
+
+def _roll(field: Any) -> float:
+    """Roll angle of a quaternion, rad: the last of the rotations about z, y, x from the world to the body."""
+    w, x, y, z = _quaternion(field)
+    return math.atan2(2.0 * (w * x + y * z), w * w - x * x - y * y + z * z)
+
+
+def _pitch(field: Any) -> float:
+    """Pitch angle of a quaternion, rad, in -pi/2..pi/2."""
+    w, x, y, z = _quaternion(field)
+    return math.asin(max(-1.0, min(1.0, 2.0 * (w * y - x * z) / (w * w + x * x + y * y + z * z))))
+
+
+def _yaw(field: Any) -> float:
+    """Yaw angle of a quaternion, rad."""
+    w, x, y, z = _quaternion(field)
+    return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
 DERIVED: Mapping[str, Callable[[Any], float]] = MappingProxyType(
-    {"value": float, "norm": _norm, "airspeed_of_pressure": _airspeed_of_pressure}
+    {
+        "value": float,
+        "norm": _norm,
+        "airspeed_of_pressure": _airspeed_of_pressure,
+        "roll_of_quaternion": _roll,
+        "pitch_of_quaternion": _pitch,
+        "yaw_of_quaternion": _yaw,
+    }
 )
-"""Functions from a field to the raw value: the number itself, the length of a vector, the airspeed of a dynamic pressure."""
+"""Functions from a field to the raw value.
+
+The number itself, the length of a vector, the airspeed of a dynamic pressure, the Euler angles (z, y, x) of a quaternion. The
+angles of body FLU in ENU are roll, -pitch and pi/2 - yaw of body FRD in NED: the row states it by its sign and offset.
+"""
 
 
 def read_raw(message: Any, path: str, function: str) -> float:

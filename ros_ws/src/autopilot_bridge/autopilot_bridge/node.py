@@ -13,20 +13,21 @@ from std_srvs.srv import SetBool
 
 from autopilot_bridge.bridge import Bridge, Phase
 from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field
-from autopilot_bridge.params import BridgeParameters, InputRow, MessageRow, OutputRow, OverrideRow, QosRow, load_map
+from autopilot_bridge.params import BridgeParameters, InputRow, MeasuredRow, MessageRow, OverrideRow, QosRow, load_map
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError
 from flight_ros.flight_node import FlightNode
+from flight_ros.messages import Encoder
 from flight_ros.rclpy_private import DeserializationError
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
-from flight_ros.topics import Topic, U, Y
+from flight_ros.topics import POSE, Topic, U, Y
 
 WOULD_SEND = Topic("bridge/would_send", JointState)
 RELEASES_AT_SHUTDOWN = 5  # messages with release values at the end of the node; a single one may be lost
 
-NamedRow = tuple[str, OutputRow | OverrideRow]
+NamedRow = tuple[str, MeasuredRow | OverrideRow]
 
 
 class BridgeNode(FlightNode[BridgeParameters]):
@@ -38,7 +39,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
         dry_run = self._map.dry_run if self.parameters.dry_run is None else self.parameters.dry_run
         self._bridge = Bridge(self._map, dry_run=dry_run)
         self._logged_phase = self._bridge.phase
-        named: list[NamedRow] = [*self._map.outputs.items(), *self._map.overrides.items()]
+        named: list[NamedRow] = [*self._map.outputs.items(), *self._map.pose.items(), *self._map.overrides.items()]
         rows_by_topic: dict[str, list[NamedRow]] = {}
         for name, row in named:
             rows_by_topic.setdefault(row.topic, []).append((name, row))
@@ -52,6 +53,8 @@ class BridgeNode(FlightNode[BridgeParameters]):
         self._u_subscription, self._decoder = self.subscribe(U), self.decoder(U, self._bridge.inputs)
         self._publish_y, self._publish_would_send = self.advertise(Y), self.advertise(WOULD_SEND)
         self._y_encoder = self.encoder(Y, self._bridge.outputs)
+        self._publish_pose = self.advertise(POSE) if self._map.pose else None
+        self._pose_encoders: dict[tuple[str, ...], Encoder] = {}  # by the names of the fresh channels
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
         self._would_send_encoder = self.encoder(WOULD_SEND, names)
         self.create_service(SetBool, "~/engage", self._engage)
@@ -87,6 +90,11 @@ class BridgeNode(FlightNode[BridgeParameters]):
         sample = self._bridge.y(now_ns)
         if sample is not None:
             self._publish_y(self._y_encoder.encode(sample.stamp_ns, sample.value))
+        if self._publish_pose is not None and (fresh := self._bridge.pose(now_ns)) is not None:
+            names, pose = fresh
+            if names not in self._pose_encoders:
+                self._pose_encoders[names] = self.encoder(POSE, names)
+            self._publish_pose(self._pose_encoders[names].encode(pose.stamp_ns, pose.value))
         if self._take_u(now_ns):
             self._publish_would_send(self._would_send_encoder.encode(now_ns, self._bridge.raw_u()))
         self._bridge.step(now_ns)
@@ -159,7 +167,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
     def _warn_stale_inputs(self, now_ns: int) -> None:
         stale = self._bridge.stale(now_ns)
         for subscription, rows in self._readers:
-            if any(name in stale for name, row in rows if isinstance(row, OutputRow)):
+            if any(name in stale for name, row in rows if isinstance(row, MeasuredRow)):
                 self.warn_no_publisher(subscription)
         if self._bridge.u_timed_out(now_ns):
             self.warn_no_publisher(self._u_subscription)
@@ -218,13 +226,13 @@ def _qos(row: QosRow) -> QoSProfile:
     )
 
 
-def _require_field(empty: Any, name: str, row: OutputRow | OverrideRow) -> None:
+def _require_field(empty: Any, name: str, row: MeasuredRow | OverrideRow) -> None:
     """Raise ParameterError for a field that is missing. One inside a sequence is checked with the first message only."""
     if "[" in row.field:
         return
     try:
         get_field(empty, row.field)
-        if isinstance(row, OutputRow) and row.stamp == "header":
+        if isinstance(row, MeasuredRow) and row.stamp == "header":
             get_field(empty, "header.stamp")
     except ChannelError as error:
         raise ParameterError(f"{name}.field: {error}, expected a field of {row.type}") from None

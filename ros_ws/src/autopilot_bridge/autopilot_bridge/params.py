@@ -36,18 +36,23 @@ MOTIONS: Mapping[str, tuple[str, int]] = MappingProxyType(
 """The output that responds to a motion, and its sign: FRD, q nose up +, p roll right +, r nose right +, V faster +."""
 
 Rate = Annotated[float, Field(ge=1, le=1000)]
+Function = Literal["value", "norm", "airspeed_of_pressure", "roll_of_quaternion", "pitch_of_quaternion", "yaw_of_quaternion"]
 MessageType = Annotated[str, Field(pattern=r"^[a-z]\w*/msg/[A-Z]\w*$")]
 TopicName = Annotated[str, Field(pattern=r"^/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")]
 Raw = Annotated[float, Field(allow_inf_nan=True)]
 Range = Annotated[tuple[Raw, Raw], BeforeValidator(as_tuple)]
+Limits = Annotated[tuple[float, float], BeforeValidator(as_tuple)]
 Value = bool | int | Raw | str | Annotated[tuple[int, ...] | tuple[Raw, ...], BeforeValidator(as_tuple)]
 
 
+POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb")
+"""Channels of a pose: attitude, rad (body FRD in NED); position, m, and velocity over ground, m/s, north, east and up."""
+
+
 class Row(Parameters):
-    """Common part of the rows of a map: y or u = sign scale raw + offset, with frame and source."""
+    """Common part of the rows of a map: channel = sign scale raw + offset, with frame and source."""
 
     field: str = Field(description="the path of the field in the message, such as twist.angular.y or axes[1]")
-    positive: Motion = Field(description="motion of the aircraft for an increasing raw value")
     frame: str = Field(description="the frame and the unit of the raw value, as a note for the reader")
     sign: Literal[-1, 1] = Field(description="+1, or -1 where the channel decreases for an increasing raw value")
     scale: Positive = Field(description="units of the channel (SI, radians) per unit of the raw value")
@@ -59,6 +64,12 @@ class Row(Parameters):
         """The conversion between the raw value and the channel."""
         return Line(self.sign, self.scale, self.offset)
 
+
+class MovingRow(Row):
+    """A row whose sign can be checked by a motion of the aircraft."""
+
+    positive: Motion = Field(description="motion of the aircraft for an increasing raw value")
+
     @property
     def motion(self) -> tuple[str, int]:
         """The output that responds to an increasing channel, and the sign of its response."""
@@ -66,19 +77,28 @@ class Row(Parameters):
         return output, sign * self.sign
 
 
-class OutputRow(Row):
-    """A channel of y, the deviation from trim: topic and field of its source."""
+class MeasuredRow(Row):
+    """A channel that the autopilot publishes: topic and field of its source."""
 
     topic: TopicName = Field(description="the autopilot's topic")
     type: MessageType = Field(description="its type, package/msg/Type")
-    function: Literal["value", "norm", "airspeed_of_pressure"] = Field(
-        default="value", description="conversion of the field to the raw value: none, vector length, airspeed of a pressure"
+    function: Function = Field(
+        default="value",
+        description="conversion of the field to the raw value: none, vector length, airspeed of a pressure, an Euler angle",
     )
     stamp: Literal["header", "arrival"] = Field(description="stamp of the sample: that of the message header, or its arrival")
     max_age: Positive = Field(description="the age above which the channel is stale, s")
 
 
-class InputRow(Row):
+class PoseRow(MeasuredRow):
+    """A channel of the pose, an absolute value. `sign` and `offset` bring it to FRD, north, east, up from the frame it has."""
+
+
+class OutputRow(MeasuredRow, MovingRow):
+    """A channel of y, the deviation from trim."""
+
+
+class InputRow(MovingRow):
     """A channel of u, the deviation from trim: message and field of its setpoint. trim + u = sign scale raw + offset."""
 
     message: str = Field(description="the message with the field, one of `messages`")
@@ -150,6 +170,12 @@ class ChannelMap(Parameters):
     )
     silence: SilenceParameters = Field(description="failsafe for a u that times out")
     outputs: Annotated[dict[str, OutputRow], Field(min_length=1)] = Field(description="the channels of y")
+    pose: dict[str, PoseRow] = Field(
+        default={}, description="the channels of the pose; the newest stamp of the first row is the stamp of the pose"
+    )
+    envelope: dict[str, Limits] = Field(
+        default={}, description="limits of channels of the pose or of y: the bridge disengages beyond them"
+    )
     inputs: Annotated[dict[str, InputRow], Field(min_length=1)] = Field(description="the channels of u")
     messages: Annotated[dict[str, MessageRow], Field(min_length=1)] = Field(description="the messages to the autopilot")
     overrides: dict[str, OverrideRow] = Field(default={}, description="the pilot overrides")
@@ -176,13 +202,21 @@ class ChannelMap(Parameters):
                 inside = low - ROUNDING <= raw <= high + ROUNDING
                 require(inside, f"{key}.{limit}", f"{row.field} = {raw:.6g}", f"one in the range [{low:g}, {high:g}]")
             require(low <= row.neutral <= high, f"{key}.neutral", row.neutral, f"one in the range [{low:g}, {high:g}]")
+        for name in self.pose:
+            require(name in POSE, f"pose.{name}", "a channel", f"one of {', '.join(POSE)}")
+        for name in self.outputs:
+            require(name not in self.pose, f"outputs.{name}", "a channel of the pose too", "a name of its own")
+        watched = [*self.pose, *self.outputs]
+        for name, (lower, upper) in self.envelope.items():
+            require(name in watched, f"envelope.{name}", "a channel", f"one of the pose or of y: {', '.join(watched)}")
+            require(lower < upper, f"envelope.{name}", [lower, upper], "the lower end before the upper one")
         for name, override in self.overrides.items():
             one_threshold = (override.above is None) != (override.below is None)
             require(one_threshold, f"overrides.{name}", "above and below, or neither", "one of the two")
         return self
 
     def _check_fields(self) -> None:
-        rows: dict[str, Mapping[str, Any]] = {"outputs": self.outputs, "inputs": self.inputs, "overrides": self.overrides}
+        rows = self._readers() | {"inputs": self.inputs}
         paths = {f"{kind}.{name}.field": row.field for kind, named in rows.items() for name, row in named.items()}
         paths |= {f"messages.{name}.values.{path}": path for name, row in self.messages.items() for path in row.values}
         for key, path in paths.items():
@@ -198,9 +232,13 @@ class ChannelMap(Parameters):
         for topic in self.topics:
             require(topic in types, f"topics.{topic}", "a topic", "one that a row uses")
 
+    def _readers(self) -> dict[str, Mapping[str, Any]]:
+        """The sections whose rows read a field of a topic."""
+        return {"outputs": self.outputs, "pose": self.pose, "overrides": self.overrides}
+
     def used_topics(self) -> list[tuple[str, str, str]]:
         """(key of the row, topic, type) of each row that names a topic."""
-        rows: dict[str, Mapping[str, Any]] = {"outputs": self.outputs, "messages": self.messages, "overrides": self.overrides}
+        rows = self._readers() | {"messages": self.messages}
         return [(f"{kind}.{name}", row.topic, row.type) for kind, named in rows.items() for name, row in named.items()]
 
 

@@ -39,7 +39,7 @@ FIRST_STAGE = (RECORDER, CONTROLLER)
 SECOND_STAGE = (AIRCRAFT, REFERENCE_MODEL)
 SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
-WOULD_SEND = "bridge/would_send"
+POSE, WOULD_SEND = "pose", "bridge/would_send"
 
 # The bridge also publishes the messages of its channel map.
 PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
@@ -47,7 +47,7 @@ PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
         AIRCRAFT: ("y", "truth"),
         REFERENCE_MODEL: ("y_m",),
         CONTROLLER: ("u", "internals"),
-        BRIDGE: ("y", WOULD_SEND),
+        BRIDGE: ("y", POSE, WOULD_SEND),
         RECORDER: ("recorded",),
     }
 )
@@ -62,8 +62,8 @@ class Autopilot(NamedTuple):
 
     @property
     def topics(self) -> list[str]:
-        """The topics to record: those of the map, and WOULD_SEND."""
-        return [*self.channel_map.topics, WOULD_SEND]
+        """The topics to record: those of the map, the pose where the map has one, and WOULD_SEND."""
+        return [*self.channel_map.topics, *([POSE] if self.channel_map.pose else []), WOULD_SEND]
 
 
 def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:

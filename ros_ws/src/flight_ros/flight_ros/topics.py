@@ -67,6 +67,7 @@ class Topic(NamedTuple):
 Y = Topic("y", JointState)
 Y_M = Topic("y_m", JointState)
 U = Topic("u", JointState)
+POSE = Topic("pose", JointState)  # phi, theta, psi, north, east, altitude, v_north, v_east, climb: those that are known
 U_M = Topic("u_m", JointState, foreign=True)
 INTERNALS = Topic("internals", JointState)
 TRUTH = Topic("truth", JointState)
