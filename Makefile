@@ -4,6 +4,7 @@
 # make fly     set up what is needed, fly the default scenario     make fly SCENARIO=... ARGS="--duration 10"
 # make test    set up what is needed, run all checks and tests
 # make evidence   measure what has not been measured yet, write docs/evidence.md     make evidence ARGS="--again speed"
+# make messages PACKAGE=... SOURCE=...   build a message package of an autopilot for the stack: docs/autopilots.md
 # make setup   what flying and its report need: .venv/, the workspace built, .venv/bin/rise-di; make setup-all: campaigns and tests too
 
 PYTHON ?= python3
@@ -18,11 +19,11 @@ PACKAGES := $(notdir $(patsubst %/package.xml,%,$(wildcard ros_ws/src/*/package.
 BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/config/*.yaml ros_ws/src/*/launch/*.py)
 
 FLY_GROUPS := --group ros --group core --group report --group build
-ALL_GROUPS := $(FLY_GROUPS) --group campaign --group dev
+ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group dev
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
 
-.PHONY: fly test check evidence setup setup-all lock clean
+.PHONY: fly test check evidence messages setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
@@ -37,6 +38,10 @@ check: setup-all
 
 evidence: setup-all
 	@$(BIN)/python -m benchmarks.evidence $(ARGS)
+
+messages: .venv/.messages
+	@$(if $(and $(PACKAGE),$(SOURCE)),,echo "error: say make messages PACKAGE=px4_msgs SOURCE=FOLDER" >&2; exit 2)
+	@$(BIN)/python -m tools.messages $(PACKAGE) $(SOURCE) $(if $(MESSAGES),--messages $(MESSAGES)) $(ARGS)
 
 setup: .venv/.workspace
 
@@ -54,9 +59,13 @@ setup-all: .venv/.all .venv/.workspace
 	$(INSTALL) $(FLY_GROUPS)
 	@touch $@
 
+.venv/.messages: requirements.lock | .venv/.fly
+	$(INSTALL) --group messages
+	@touch $@
+
 .venv/.all: requirements.lock | .venv/.uv
 	$(INSTALL) $(ALL_GROUPS)
-	@touch .venv/.fly $@
+	@touch .venv/.fly .venv/.messages $@
 
 .venv/.workspace: $(BUILD_INPUTS) | .venv/.fly
 	cd ros_ws && PATH="$(BIN):$$PATH" colcon build --symlink-install --event-handlers console_cohesion- status-

@@ -12,7 +12,7 @@ TOP = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docker/README.md", "exam
 PAGES = [*(REPOSITORY / name for name in TOP), *sorted((REPOSITORY / "docs").glob("*.md"))]
 MAX_LINE = 200
 TEXTS = {".py", ".md", ".yaml", ".xml", ".jinja", ".js", ".sh", ".c"}
-FOLDERS = ("ros_ws/src", "examples", "tests", "benchmarks", "docs", "docker")
+FOLDERS = ("ros_ws/src", "examples", "tests", "benchmarks", "tools", "docs", "docker")
 REPLACED = {
     "anew": "again",
     "crowd": "peers",

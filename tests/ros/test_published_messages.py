@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The maps of PX4, MAVROS and ROSflight with the real message packages, where these are installed.
 
-None of them is on PyPI. On a full ROS 2: apt install ros-jazzy-mavros-msgs; build px4_msgs, rosflight_msgs and rosplane_msgs
-in a workspace that is sourced. Without them tests/pure/test_channel_map.py tests each row with the published fields.
+None of them is on PyPI; `make messages` builds each from its sources (docs/autopilots.md). Without them
+tests/pure/test_channel_map.py tests each row with the published fields.
 """
 
 from importlib import import_module
@@ -31,7 +31,7 @@ def needs(*packages: str) -> None:
     """Skip where a message package is not installed."""
     for package in packages:
         if find_spec(package) is None:
-            pytest.skip(f"{package} is not installed and not on PyPI; its fields are checked as {PACKAGES[package]} has them")
+            pytest.skip(f"no {package}: make messages PACKAGE={package} SOURCE=FOLDER, the sources of {PACKAGES[package]}")
 
 
 def needs_packages_of(channel_map: ChannelMap) -> None:
