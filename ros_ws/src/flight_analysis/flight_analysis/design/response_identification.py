@@ -1,0 +1,416 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Input-output response of an aircraft from a log of y and u: Omega, lags and delays with standard errors, without a model.
+
+A predictor of every sample of y from the samples before it and from u is fitted by least squares. It is long enough that the
+disturbances are part of it. Its response to a step of one input is that of the aircraft. A second-order response with a delay
+and a lag, fitted to the begin of the step response, has Omega, the lag and the delay. Sources: L. Ljung, "System
+Identification", 1999, 7.3 and 13.4 (direct identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999;
+Y. Zhu, "Multivariable System Identification for Process Control", 2001, 6 (a high-order ARX model, then a reduced one).
+"""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from flight_core.parameters import require
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal
+from flight_core.vectors import FloatArray
+
+WINDOW = 0.02  # s, width of the windows over which u and older y are averaged: shorter than a servo's lag
+RECENT = 4  # samples of y that the predictor has one by one
+FINE_Y, FINE_U = 0.2, 0.45  # s before a sample that are covered by windows of equal width: the longest delay and a lag
+FAR = 2.0  # s before a sample that are covered by windows that double: the memory of disturbances and of a controller
+HORIZON = 0.8  # s of the step response
+MAX_DELAY = 0.3  # s
+DRAWS = 200  # of the predictor's coefficients, for the covariance of the step response
+PRIOR = 10.0  # of a coefficient: it turns a typical y or u into so many typical changes of y within a window
+MIN_ROWS_PER_COEFFICIENT = 5.0
+MIN_RATIO = 5.0  # standard errors from which on the sign of Omega is certain
+
+RANK = 1e-10  # of the largest eigenvalue of the normal equations: smaller ones are rounding
+MAX_LAG = 1.0  # s
+RESOLUTION = 0.025  # s between the points of the step response that are fitted
+FLOOR = 0.01  # of the largest value of a step response: what windows and a linear model leave out
+STARTS_DELAY, STARTS_LAG = (0.02, 0.1, 0.2), (0.03, 0.2)  # s, of the search
+# Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow part; Omega and slow part per largest value of the step response
+LOWER = np.array([0.0, 0.003, -np.inf, -2.0, -20.0, -np.inf])
+UPPER = np.array([MAX_DELAY, MAX_LAG, np.inf, 300.0, 5000.0, np.inf])
+SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])
+SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # before the fit
+ORDERS = ((1, 1, 1, 0, 0, 0), (1, 1, 1, 1, 0, 0), (1, 1, 1, 1, 1, 1))  # an integrator, first order, second order
+MIN_GAIN = 6.0  # of chi squared per parameter that a higher order has to gain
+EARLY = 0.3  # s after delay and lag in which the sign of a response shows
+COUPLING_SPAN = 0.25  # s after delay and lag in which other outputs respond by Omega
+
+Spans = Sequence[tuple[int, int]]
+
+
+class Response(NamedTuple):
+    """Response of m outputs to m inputs, output i driven by input i; SI. A refused channel has NaN in its row of the results.
+
+    y_i_dot = sum_j Omega_ij v_j + slower terms,   lag_j v_j_dot = u_j(t - delay_j) - v_j
+    """
+
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    Omega: FloatArray  # (m, m) rows as outputs, columns as inputs
+    Omega_deviation: FloatArray  # (m, m) standard errors
+    lag: FloatArray  # (m,) s, of each input
+    lag_deviation: FloatArray  # (m,)
+    delay: FloatArray  # (m,) s, from u to the stamp of y
+    delay_deviation: FloatArray  # (m,)
+    refusal: tuple[str, ...]  # (m,) why Omega_ii must not be used, one sentence; empty if it may
+    seconds: float  # of the log that were used
+    sign_ratio: FloatArray  # (m,) response i to input i in standard errors: the sign of Omega_ii is certain above MIN_RATIO
+
+
+def identify_response(
+    y: Signal,
+    u: Signal,
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    *,
+    excitation: Signal | None = None,
+    engaged: Spans | None = None,
+) -> Response:
+    """Omega, lag and delay of every channel of a log, with standard errors, or a refusal of the channel.
+
+    Arguments: `y`, `u` (after limits) at their stamps, which may be irregular, of one clock; `outputs` and `inputs` the
+    channels in pairs; `excitation` what moves u from outside in a closed loop, such as y_m, None where u itself is that, as in
+    an open-loop experiment; `engaged` the spans in ns in which u acts on the aircraft, by default all of the log.
+    Raises ParameterError where the log lacks a channel, or holds too few samples for any result.
+    """
+    for topic, signal, names in (("y", y, outputs), ("u", u, inputs)):
+        missing = [name for name in names if name not in signal.names]
+        require(not missing, f"{topic} of the log", ", ".join(signal.names), f"the channels {', '.join(names)}")
+    require(len(y.stamp_ns) > 1 and len(u.stamp_ns) > 1, "the log", f"{len(y.stamp_ns)} samples of y", "a flight")
+    layout = Layout.of(float(np.median(np.diff(y.stamp_ns))) / NANOSECONDS)
+    rows = [
+        _rows(y, u, outputs, inputs, excitation, layout, span)
+        for span in engaged or [(int(y.stamp_ns[0]), int(y.stamp_ns[-1]))]
+    ]
+    predictor = _fit(rows, layout, len(outputs))
+    return _responses(tuple(outputs), tuple(inputs), layout, predictor.step_responses(), rows)
+
+
+# The predictor
+
+
+class Layout(NamedTuple):
+    """What the predictor of y(k) has: samples of y and windows of samples before k, ends in sample periods."""
+
+    period: float  # s, of y
+    recent: int  # samples of y one by one
+    y_windows: tuple[tuple[int, int], ...]  # (a, b): the mean of y(k - a - 1) to y(k - b)
+    u_windows: tuple[tuple[int, int], ...]  # (a, b): the mean of u from t_k - b period to t_k - a period
+
+    @classmethod
+    def of(cls, period: float) -> "Layout":
+        """The layout for a period of y in s."""
+
+        def windows(first: int, fine: float) -> tuple[tuple[int, int], ...]:
+            width, ends = max(round(WINDOW / period), 1), [first]
+            while ends[-1] * period < FAR:
+                width = width if ends[-1] * period < fine else 2 * width
+                ends.append(ends[-1] + width)
+            return tuple(pairwise(ends))
+
+        return cls(period, RECENT, windows(RECENT, FINE_Y), windows(0, FINE_U))
+
+    @property
+    def past(self) -> int:
+        """Samples of y before the first one that is predicted."""
+        return self.y_windows[-1][1]
+
+
+class _Rows(NamedTuple):
+    y_before: FloatArray  # (N, m lags) regressors of y
+    u_before: FloatArray  # (N, m windows) regressors of u
+    excitation: FloatArray  # (N, k windows) the same of the excitation, k = 0 without one
+    y: FloatArray  # (N, m)
+    u: FloatArray  # (K, m) as recorded in the span
+
+
+def _window_means(t: FloatArray, values: FloatArray, held: bool, at: FloatArray, layout: Layout) -> FloatArray:
+    """Means of a signal over the windows before the instants `at`, (N, k windows); between samples it is held or linear."""
+    steps = values[:-1] if held else (values[:-1] + values[1:]) / 2.0
+    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps * np.diff(t)[:, None], axis=0)])
+
+    def until(instants: FloatArray) -> FloatArray:
+        return np.stack([np.interp(instants, t, column) for column in integral.T], axis=1)
+
+    ends = [until(at - edge * layout.period) for edge in (0, *(b for _, b in layout.u_windows))]
+    widths = [(b - a) * layout.period for a, b in layout.u_windows]
+    return np.concatenate([(new - old) / width for new, old, width in zip(ends, ends[1:], widths, strict=False)], axis=1)
+
+
+def _rows(
+    y: Signal,
+    u: Signal,
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    excitation: Signal | None,
+    layout: Layout,
+    span: tuple[int, int],
+) -> _Rows:
+    """Regressors and predicted samples of one span."""
+
+    def within(signal: Signal, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        inside = (signal.stamp_ns >= span[0]) & (signal.stamp_ns <= span[1])
+        values = np.stack([signal[name][inside] for name in names], axis=1)
+        return (signal.stamp_ns[inside] - span[0]) / NANOSECONDS, values
+
+    (t, values), (t_u, held) = within(y, outputs), within(u, inputs)
+    others = [] if excitation is None else [within(excitation, excitation.names)]
+    starts, m = [one[0] for one, _ in [(t_u, held), *others] if len(one) > 1], len(outputs)
+    k = np.arange(layout.past, len(t))
+    if len(starts) < 1 + len(others) or not len(k):
+        return _Rows(np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, m)), held)
+    ends = [one[-1] for one, _ in [(t_u, held), *others]]
+    k = k[(t[k] - layout.u_windows[-1][1] * layout.period >= max(starts)) & (t[k] <= min(ends))]
+    sums = np.concatenate([np.zeros((1, m)), np.cumsum(values, axis=0)])
+    before = [values[k - lag] for lag in range(1, layout.recent + 1)]
+    before += [(sums[k - a] - sums[k - b]) / (b - a) for a, b in layout.y_windows]
+    excited = [_window_means(one, w, False, t[k], layout) for one, w in others] or [np.zeros((len(k), 0))]
+    return _Rows(np.concatenate(before, axis=1), _window_means(t_u, held, True, t[k], layout), excited[0], values[k], held)
+
+
+class _Predictor(NamedTuple):
+    """y(k) = coefficients' regressors + e."""
+
+    layout: Layout
+    coefficients: FloatArray  # (m lags, m), rows in the order of the regressors
+    roots: FloatArray  # (m, m lags, m lags) roots of the covariance of each column
+
+    def step_responses(self) -> FloatArray:
+        """Responses of every output to a unit step of every input, (1 + DRAWS, K, m, m): the estimate, then draws of it.
+
+        At whole periods after the step, K of them up to HORIZON.
+        """
+        m, layout = self.coefficients.shape[1], self.layout
+        normal = np.random.default_rng(0).standard_normal((DRAWS, *self.coefficients.shape))
+        drawn = self.coefficients + np.einsum("ikl,dli->dki", self.roots, normal)
+        every = np.concatenate([self.coefficients[None], drawn])
+        blocks = np.swapaxes(every.reshape(len(every), -1, m, m), -1, -2)
+        windows = len(layout.y_windows)
+        steps = round(HORIZON / layout.period)
+        own = np.zeros((len(every), max(layout.past, steps), m, m))
+        own[:, : layout.recent] = blocks[:, : layout.recent]
+        for number, (first, last) in enumerate(layout.y_windows, layout.recent):
+            own[:, first:last] += blocks[:, number : number + 1] / (last - first)
+        s = np.zeros((len(every), steps + 1, m, m))
+        for k in range(1, steps + 1):
+            for number, (first, last) in enumerate(layout.u_windows, layout.recent + windows):
+                s[:, k] += min(max((k - first) / (last - first), 0.0), 1.0) * blocks[:, number]
+            s[:, k] += np.einsum("dlij,dljn->din", own[:, : k - 1], s[:, k - 1 : 0 : -1])
+        return s[:, 1:]
+
+
+def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
+    """Least squares over all spans, each with a constant of its own."""
+    used = [one for one in rows if len(one.y)]
+    samples = sum(len(one.y) for one in used)
+    coefficients = m * (layout.recent + len(layout.y_windows) + len(layout.u_windows))
+    least = MIN_ROWS_PER_COEFFICIENT * coefficients
+    found = f"{samples * layout.period:.3g} s in which u acts and {FAR:g} s before are known"
+    require(samples >= least, "the log", found, f"{least * layout.period:.3g} s or more")
+    Y, before, u, excitation = (
+        np.concatenate([getattr(one, name) - getattr(one, name).mean(axis=0) for one in used])
+        for name in ("y", "y_before", "u_before", "excitation")
+    )
+    known = np.concatenate([before, excitation], axis=1)
+    explained = known @ _solve(known, u) if excitation.size else u
+    X = np.concatenate([before, explained], axis=1)
+    moves = np.std(np.diff(Y, axis=0), axis=0) * max(WINDOW / layout.period, 1.0) ** 0.5
+    spread = np.std(u, axis=0)
+    fits, roots = [], []
+    for i in range(m):
+        per_y = np.tile(moves[i] / np.maximum(moves, np.finfo(float).tiny), before.shape[1] // m)
+        per_u = moves[i] / np.where(spread > 0.0, spread, np.inf)
+        prior = PRIOR * np.concatenate([per_y, per_u])
+        scaled = X * prior
+        normal = scaled.T @ scaled
+        variance = float(np.var(Y[:, i])) * 1e-6
+        for _ in range(3):
+            values, vectors = np.linalg.eigh(normal / variance + np.eye(len(normal)))
+            root = prior[:, None] * vectors / np.sqrt(values)
+            fit = root @ (root.T @ (X.T @ Y[:, i])) / variance
+            e = Y[:, i] - np.concatenate([before, u], axis=1) @ fit
+            variance = float(e @ e) / (len(e) - coefficients - len(used))
+        fits.append(fit)
+        roots.append(root)
+    return _Predictor(layout, np.stack(fits, axis=1), np.stack(roots))
+
+
+def _solve(X: FloatArray, Y: FloatArray) -> FloatArray:
+    size = np.linalg.norm(X, axis=0)
+    size[size == 0.0] = 1.0
+    values, vectors = np.linalg.eigh((X / size).T @ (X / size))
+    kept = values > values[-1] * RANK
+    root = vectors[:, kept] / np.sqrt(values[kept])
+    return np.asarray(root @ (root.T @ ((X / size).T @ Y)) / size[:, None])
+
+
+# The step response
+
+
+class _Column(NamedTuple):
+    Omega: FloatArray  # (m,)
+    deviation: FloatArray  # (m,)
+    lag: float
+    lag_deviation: float
+    delay: float
+    delay_deviation: float
+    sign_ratio: float
+
+
+def _responses(
+    outputs: tuple[str, ...], inputs: tuple[str, ...], layout: Layout, responses: FloatArray, rows: Sequence[_Rows]
+) -> Response:
+    every = max(round(RESOLUTION / layout.period), 1)
+    t, responses = layout.period * np.arange(every, responses.shape[1] + 1, every), responses[:, every - 1 :: every]
+    columns, refusal = [], []
+    for j in range(len(inputs)):
+        moved = max(float(np.ptp(one.u[:, j])) if len(one.u) else 0.0 for one in rows)
+        columns.append(_column(t, responses[..., j], j) if moved > 0.0 else _no_column(len(outputs)))
+        refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, moved))
+    return Response(
+        outputs,
+        inputs,
+        np.stack([one.Omega for one in columns], axis=1),
+        np.stack([one.deviation for one in columns], axis=1),
+        np.array([one.lag for one in columns]),
+        np.array([one.lag_deviation for one in columns]),
+        np.array([one.delay for one in columns]),
+        np.array([one.delay_deviation for one in columns]),
+        tuple(refusal),
+        sum(len(one.y) for one in rows) * layout.period,
+        np.array([one.sign_ratio for one in columns]),
+    )
+
+
+def _no_column(m: int) -> _Column:
+    return _Column(np.full(m, np.nan), np.full(m, np.nan), math.nan, math.nan, math.nan, math.nan, 0.0)
+
+
+def _refusal(output: str, name: str, column: _Column, j: int, moved: float) -> str:
+    if moved == 0.0:
+        return f"{output} by {name}: found a {name} that never changes, expected one that moves"
+    ratio = abs(column.Omega[j]) / column.deviation[j]
+    if ratio >= MIN_RATIO:
+        return ""
+    factor = MIN_RATIO / max(ratio, 0.1)
+    return (
+        f"{output} by {name}: found Omega within {100.0 / max(ratio, 0.1):.0f} %, expected {100.0 / MIN_RATIO:.0f} % or less:"
+        f" excite {name} {factor:.1f} times as strongly, or for {factor**2:.1f} times as long"
+    )
+
+
+def second_order(t: FloatArray, delay: float, lag: float, damping: float, stiffness: float) -> tuple[FloatArray, FloatArray]:
+    """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest, with lag v' = u(t - delay) - v; (N,) each."""
+    begin = np.maximum(t - delay, 0.0)
+    A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])  # z, z', v; y = z' or z
+    values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-6, 2e-6]))  # distinct eigenvalues
+    parts = np.linalg.solve(vectors, np.array([0.0, 0.0, 1.0 / lag]))
+    product = values[:, None] * begin
+    small = np.abs(product) < 1e-6
+    grown = np.where(small, begin, np.expm1(product) / np.where(values == 0.0, 1.0, values)[:, None])
+    z = (vectors @ (parts[:, None] * grown)).real
+    return z[1], z[0]
+
+
+def _column(t: FloatArray, responses: FloatArray, j: int) -> _Column:
+    """Delay, lag and Omega_jj of input j from output j, then Omega_ij of the other outputs with this delay and lag.
+
+    Arguments: t (N,); responses (1 + DRAWS, N, m), the estimate first.
+    """
+    step = responses[0]
+    size = max(float(np.max(np.abs(step[:, j]))), np.finfo(float).tiny)
+    whiten = _whitener(responses[:, :, j])
+    best = _search(t, whiten, step[:, j] / size, size, ORDERS[0], None)
+    for free in ORDERS[1:]:
+        tried = _search(t, whiten, step[:, j] / size, size, free, best.theta)
+        if best.chi_squared - tried.chi_squared > MIN_GAIN * (sum(free) - sum(best.free)):
+            best = tried
+    inside = (np.array(best.free) > 0) & (best.theta > LOWER + 1e-6) & (best.theta < UPPER - 1e-6)
+    misfit = max(best.chi_squared / max(len(t) - sum(best.free), 1), 1.0)  # R. T. Birge, Phys. Rev. 40, 1932
+    deviation = np.array([RESOLUTION, RESOLUTION, *np.zeros(4)])
+    J = best.jacobian[:, inside]
+    deviation[inside] = np.sqrt(misfit * np.diag(np.linalg.pinv(J.T @ J)))
+    delay, lag = float(best.theta[0]), float(best.theta[1])
+    sign = math.sqrt(_significance(t, responses[:, :, j], best.theta, size) / misfit)
+    early = (t > delay) & (t <= delay + lag + COUPLING_SPAN)
+    basis = np.stack(second_order(t[early], delay, lag, 0.0, 0.0), axis=1)
+    Omega, error = np.zeros(step.shape[1]), np.zeros(step.shape[1])
+    for i in range(step.shape[1]):
+        whiten = _whitener(responses[:, early, i])
+        solve = np.linalg.pinv(whiten @ basis)
+        Omega[i], error[i] = (solve @ (whiten @ step[early, i]))[0], np.linalg.norm(solve[0])
+    Omega[j], error[j] = best.theta[2] * size, deviation[2] * size
+    return _Column(Omega, error, lag, float(deviation[1]), delay, float(deviation[0]), sign)
+
+
+def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
+    """Chi squared of no response against the fitted one, up to EARLY after delay and lag, less its parameters."""
+    early = t <= theta[0] + theta[1] + EARLY
+    first, second = second_order(t[early], *theta[[0, 1, 3, 4]])
+    fitted = size * (theta[2] * first + theta[5] * second)
+    whiten = _whitener(responses[:, early])
+    none, left = whiten @ responses[0, early], whiten @ (responses[0, early] - fitted)
+    same_sign = float(np.sum(fitted)) * theta[2] > 0.0
+    return max(float(none @ none - left @ left) - len(theta), 0.0) if same_sign else 0.0
+
+
+def _whitener(responses: FloatArray) -> FloatArray:
+    """W with W (s - true s) of covariance I, (N, N), of responses (1 + DRAWS, N), to FLOOR of the largest value."""
+    values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(responses[1:].T)))
+    floor = (FLOOR * np.max(np.abs(responses[0]))) ** 2 + RANK * values[-1]
+    return np.asarray(vectors.T / np.sqrt(np.maximum(values, 0.0) + floor)[:, None])
+
+
+class _Curve(NamedTuple):
+    """A fitted step response: delay, lag, Omega, damping, stiffness, slow part."""
+
+    theta: FloatArray
+    free: tuple[int, ...]  # 1 where an entry is fitted
+    chi_squared: float
+    jacobian: FloatArray
+
+
+def _search(
+    t: FloatArray, whiten: FloatArray, step: FloatArray, size: float, free: tuple[int, ...], start: FloatArray | None
+) -> _Curve:
+    """Least squares over the free entries, from several delays and lags and from `start`."""
+    fitted = np.array(free, dtype=bool)
+
+    def whole(theta: FloatArray) -> FloatArray:
+        values = np.zeros(len(free))
+        values[fitted] = theta
+        return values
+
+    def residuals(theta: FloatArray) -> FloatArray:
+        delay, lag, Omega, damping, stiffness, slow = whole(theta)
+        first, second = second_order(t, delay, lag, damping, stiffness)
+        return np.concatenate([size * (whiten @ (Omega * first + slow * second - step)), theta / SPREAD[fitted]])
+
+    starts = [] if start is None else [start]
+    for delay in STARTS_DELAY:
+        for lag in STARTS_LAG:
+            first, _ = second_order(t, delay, lag, 2.0, 0.0)
+            seen = whiten @ first
+            slope = float(seen @ whiten @ step) / max(float(seen @ seen), np.finfo(float).tiny)
+            starts.append(np.array([delay, lag, slope, 2.0, 0.0, 0.0]))
+    bounds = LOWER[fitted], UPPER[fitted]
+    best: Any = min(
+        (least_squares(residuals, np.clip(one[fitted], *bounds), bounds=bounds, x_scale=SCALE[fitted]) for one in starts),
+        key=lambda one: float(one.cost),
+    )
+    jacobian = np.zeros((len(best.fun), len(free)))
+    jacobian[:, fitted] = best.jac
+    return _Curve(whole(best.x), free, 2.0 * float(best.cost), jacobian)
