@@ -16,11 +16,13 @@ PACKAGES = {
     "px4_msgs": "PX4/px4_msgs v1.16.2, 392e831c",
     "mavros_msgs": "mavlink/mavros 2.12.0, f8f462dd",
     "rosflight_msgs": "rosflight/rosflight_ros_pkgs v2.0.1, cefdb425",
-    "rosplane_msgs": "rosflight/rosplane, ba7e114a",
+    "rosplane_msgs": "rosflight/rosplane v2.0.0, 79702c09",
 }
 
 HEADER = "std_msgs/Header"
 MODES = ("position", "velocity", "acceleration", "attitude", "body_rate", "thrust_and_torque", "direct_actuator")
+
+STATE = ("p", "q", "r", "va", "phi", "theta", "psi", "p_n", "p_e", "p_d")
 
 PUBLISHED: dict[str, dict[str, str]] = {
     "px4_msgs/msg/VehicleOdometry": {
@@ -39,7 +41,7 @@ PUBLISHED: dict[str, dict[str, str]] = {
     "mavros_msgs/msg/RCIn": {"channels": "uint16[]"},
     "rosflight_msgs/msg/Command": {"header": HEADER, "mode": "uint8", "ignore": "uint16", "u": "float32[10]"},
     "rosflight_msgs/msg/Status": {"rc_override": "uint16"},
-    "rosplane_msgs/msg/State": {"header": HEADER, **dict.fromkeys(("p", "q", "r", "va", "phi", "theta", "psi"), "float32")},
+    "rosplane_msgs/msg/State": {"header": HEADER, **dict.fromkeys(STATE, "float32")},
 }
 
 FOREIGN_MAPS = ("px4", "mavros", "rosflight")

@@ -151,15 +151,25 @@ POSES = {  # 40 m north and 30 m east of the origin, 20 m above it; 4 m/s north,
     "px4": Message(position=[40.0, 30.0, -20.0], velocity=[4.0, 3.0, -2.0]),
 }
 POSES["mavros"] = POSES["ardupilot"]
+POSES["rosflight"] = Message(p_n=40.0, p_e=30.0, p_d=-20.0)
 
 
 @pytest.mark.parametrize("name", POSES)
 def test_position_and_velocity_are_north_east_and_up(name: str) -> None:
     rows = load_map(name).pose
     expected = {"north": 40.0, "east": 30.0, "altitude": 20.0, "v_north": 4.0, "v_east": 3.0, "climb": 2.0}
-    for channel, value in expected.items():
+    missing = {"v_north", "v_east", "climb"} if name == "rosflight" else set()  # it publishes the velocity in body axes
+    assert expected.keys() - rows.keys() == missing
+    for channel in expected.keys() - missing:
         row = rows[channel]
-        assert to_channel(read_raw(POSES[name], row.field, row.function), row.line) == value
+        assert to_channel(read_raw(POSES[name], row.field, row.function), row.line) == expected[channel]
+
+
+@pytest.mark.parametrize("name", ["mavros", "rosflight"])
+def test_an_override_that_is_offered_reliably_is_not_lost(name: str) -> None:
+    """Publishers of rc_io.cpp:47 and rosflight_io.cpp:534, with ROS 2's default reliability."""
+    channel_map = load_map(name)
+    assert {channel_map.topics[row.topic].reliability for row in channel_map.overrides.values()} == {"reliable"}
 
 
 @pytest.mark.parametrize("quaternion", [[0.0] * 4, [math.nan, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
@@ -214,9 +224,10 @@ def test_a_value_that_is_not_finite_is_refused(raw: float) -> None:
     assert refused.value.reason == "finite"
 
 
-def test_a_missing_message_package_is_one_sentence_that_names_the_package_to_install() -> None:
-    with pytest.raises(ParameterError, match=r"px4_msgs/msg/VehicleOdometry: .*ros-jazzy-px4-msgs"):
-        message_type("px4_msgs/msg/VehicleOdometry")
+def test_a_missing_message_package_is_one_sentence_that_tells_how_to_get_it() -> None:
+    expected = r"absent_msgs/msg/State: .*make messages PACKAGE=absent_msgs SOURCE=FOLDER .*ros-jazzy-absent-msgs"
+    with pytest.raises(ParameterError, match=expected):
+        message_type("absent_msgs/msg/State")
 
 
 def test_a_message_that_another_version_lacks_is_one_sentence() -> None:

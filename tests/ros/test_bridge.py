@@ -346,11 +346,13 @@ def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Sta
         bridge.wait_for("/ap/joy: /peer subscribes to sensor_msgs/msg/Imu, expected sensor_msgs/msg/Joy")
 
 
-def test_a_missing_message_package_ends_the_bridge_with_the_package_to_install(start: Start) -> None:
-    bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4")
+def test_a_missing_message_package_ends_the_bridge_with_the_command_that_builds_it(start: Start, tmp_path: Path) -> None:
+    absent = tmp_path / "absent.yaml"
+    absent.write_text((LIBRARY / "px4.yaml").read_text(encoding="utf-8").replace("px4_msgs/", "absent_msgs/"), encoding="utf-8")
+    bridge = start("autopilot_bridge.main", "--ros-args", "-p", f"map:={absent}")
     assert bridge.end() == 2
-    assert "error: px4_msgs/msg/VehicleOdometry: found no Python package px4_msgs" in bridge.output
-    assert "install ros-jazzy-px4-msgs" in bridge.output
+    assert "error: absent_msgs/msg/VehicleOdometry: found no Python package absent_msgs" in bridge.output
+    assert "make messages PACKAGE=absent_msgs SOURCE=FOLDER" in bridge.output
 
 
 # Rows with real messages, after serialisation and deserialisation.

@@ -149,10 +149,9 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
     try:
         module = load(f"{package}.msg")
     except ModuleNotFoundError:
-        debian = f"ros-jazzy-{package.replace('_', '-')}"
         raise ParameterError(
-            f"{name}: found no Python package {package}, expected it: install {debian}, or build {package} in a workspace and"
-            " source it"
+            f"{name}: found no Python package {package}, expected it: make messages PACKAGE={package} SOURCE=FOLDER builds it"
+            f" from its sources; on a full ROS 2 install ros-jazzy-{package.replace('_', '-')}, or source a workspace with it"
         ) from None
     message_class = getattr(module, kind, None)
     if not isinstance(message_class, type):
