@@ -578,7 +578,7 @@ def test_the_page_names_every_registered_law_and_its_parameters() -> None:
 
 
 def test_a_law_that_is_not_registered_is_refused_with_those_that_are() -> None:
-    registered = "indi, l1, lqg, lqi, pi, pid, rise_di"
+    registered = "excitation, indi, l1, lqg, lqi, pi, pid, rise_di"
     refused(f"controller.law: found 'adrc', expected a registered law: {registered}", COMMON | {"law": "adrc"})
     refused(f"controller.law: found 3, expected a registered law: {registered}", COMMON | {"law": 3})
     refused(f"controller.law: found ['pi'], expected a registered law: {registered}", COMMON | {"law": ["pi"]})

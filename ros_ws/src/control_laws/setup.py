@@ -15,6 +15,7 @@ setup(
             "lqg = control_laws.lqg:LqgParameters",
             "indi = control_laws.indi:IndiParameters",
             "lqi = control_laws.lqi:LqiParameters",
+            "excitation = control_laws.excitation:ExcitationParameters",
         ]
     },
     data_files=[

@@ -1,0 +1,143 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Excitation of one input after another, open loop: doublets and a multisine, for an identification. It controls nothing."""
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from flight_core.parameters import NonNegative, NonNegatives, Positives, require, require_length
+from flight_core.vectors import Array, FloatArray, array_namespace
+from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
+from rise_di_controller.params import ControllerParameters
+from rise_di_controller.saturation import Limits, saturate
+
+DOUBLETS = 8.0  # widths: a doublet of 2, a gap of 1, the opposite doublet of 4, a gap of 1
+
+
+class ExcitationParams(NamedTuple):
+    """Timetable over m inputs, (m,), and the harmonics of their multisines, (h, m)."""
+
+    amplitude: Array  # units of u
+    width: Array  # s
+    begin: Array  # s after engagement: of the doublets of an input
+    period: Array  # s, of the multisine; it lasts one period
+    harmonic: Array  # multiples of 1 / period
+    phase: Array  # rad
+    part: Array  # of the amplitude; 0 where an input has fewer harmonics than others
+
+
+class ExcitationState(NamedTuple):
+    """State between two ticks, (m,)."""
+
+    e: Array  # y - y_m, which this law shows and does not correct
+    elapsed: Array  # s since engagement, the same for every input
+
+
+def signal(elapsed: Array, params: ExcitationParams) -> Array:
+    """Excitation of every input in units of its amplitude, shape (m,), in [-1, 1].
+
+    With tau = elapsed - begin in widths w of an input:
+
+        +1 in [0, 1), -1 in [1, 2), -1 in [3, 5), +1 in [5, 7)                              two opposite doublets
+        sum_k part_k sin(2 pi harmonic_k (tau - 8) w / period + phase_k) in [8, 8 + period / w)       a multisine
+
+    Each doublet and the multisine have the mean 0: a rate that follows u leaves no attitude behind.
+    """
+    xp = array_namespace(params.amplitude)
+    since = elapsed - params.begin
+    tau = since / params.width
+    zero = 0.0 * tau
+    doublets = zero
+    for first, last, sign in ((0, 1, 1.0), (1, 2, -1.0), (3, 5, -1.0), (5, 7, 1.0)):
+        doublets = xp.where((tau >= first) & (tau < last), sign + zero, doublets)
+    turns = (since - DOUBLETS * params.width) / params.period
+    waves = xp.sum(params.part * xp.sin(2.0 * np.pi * params.harmonic * turns + params.phase), 0)
+    return xp.where((turns >= 0.0) & (turns < 1.0), waves, doublets)
+
+
+def multisine(period: float, lowest: float, highest: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Harmonics of 1 / period from `lowest` to `highest`, Hz, their phases and their parts of a peak of one; (h,) each.
+
+    phase_k = -pi k (k - 1) / h keeps the peak low. Source: M. R. Schroeder, IEEE Trans. Information Theory 16(1), 1970.
+    """
+    harmonic = np.arange(max(round(lowest * period), 1), max(int(highest * period), 1) + 1, dtype=np.float64)
+    k = np.arange(1, len(harmonic) + 1)
+    phase = -np.pi * k * (k - 1) / len(k)
+    turns = np.linspace(0.0, 1.0, 64 * int(harmonic[-1]), endpoint=False)
+    peak = np.max(np.abs(np.sin(2.0 * np.pi * np.outer(turns, harmonic) + phase).sum(axis=1)))
+    return harmonic, phase, np.full(len(k), 1.0 / peak)
+
+
+def _engage(measured: Measurements, params: ExcitationParams) -> ExcitationState:
+    e = measured.y - measured.y_m
+    return ExcitationState(e, 0.0 * e)
+
+
+def _limited(
+    state: ExcitationState, measured: Measurements, dt: Array, params: ExcitationParams, limits: Limits
+) -> tuple[ExcitationState, Array, Array]:
+    elapsed = state.elapsed + dt
+    u = measured.u_trim + params.amplitude * signal(elapsed, params)
+    after = ExcitationState(measured.y - measured.y_m, elapsed)
+    return after, u, saturate(u, measured.u_before, dt, limits)
+
+
+def _retune(state: ExcitationState, old: ExcitationParams, new: ExcitationParams) -> ExcitationState:
+    return state
+
+
+EXCITATION = ControlLaw(ExcitationState, _engage, without_limits(_limited), _limited, _retune)
+
+
+class ExcitationParameters(ControllerParameters):
+    """A controller that excites its inputs, one after another in the order of `inputs`, and controls nothing."""
+
+    amplitude: NonNegatives = Field(description="largest deviation of each input from trim, units of u; 0 for none")
+    width: Positives = Field(description="half the first doublet of each input, s")
+    period: Positives = Field(description="period of the multisine of each input, which lasts for one, s")
+    lowest: Positives = Field(description="lowest frequency of each multisine, Hz")
+    highest: Positives = Field(description="highest frequency of each multisine, Hz")
+    pause: NonNegative = Field(description="time before each input's excitation, and after the last one, s")
+
+    @classmethod
+    def tunable(cls) -> frozenset[str]:
+        """No parameter: the timetable holds for a whole flight."""
+        return frozenset()
+
+    def check_law(self) -> None:
+        """One value for each input, inside the limits of u."""
+        for key in ("amplitude", "width", "period", "lowest", "highest"):
+            require_length(key, getattr(self, key), self.inputs)
+        nyquist = self.rate / 2.0
+        for i, name in enumerate(self.inputs):
+            low, high = ((limit or (np.inf,) * len(self.inputs))[i] for limit in (self.lower, self.upper))
+            room, slowest, fastest = min(abs(low), abs(high)), self.lowest[i], self.highest[i]
+            require(self.amplitude[i] <= room, f"amplitude[{i}]", self.amplitude[i], f"at most {room:g}, the limits of {name}")
+            require(slowest <= fastest, f"lowest[{i}]", slowest, f"at most highest[{i}] = {fastest:g} Hz")
+            require(fastest < nyquist, f"highest[{i}]", fastest, f"below half the rate of the law, {nyquist:g} Hz")
+
+    @property
+    def duration(self) -> float:
+        """Time from engagement to the end of the excitation, s."""
+        return float(self.pause + sum(self._each))
+
+    @cached_property
+    def _each(self) -> list[float]:
+        """Time of each input, its pause included, s."""
+        return [DOUBLETS * width + period + self.pause for width, period in zip(self.width, self.period, strict=True)]
+
+    def control_law(self) -> ControlLaw:
+        """The excitation."""
+        return EXCITATION
+
+    def law_params(self) -> Any:
+        """The arrays of the excitation."""
+        waves = [multisine(*one) for one in zip(self.period, self.lowest, self.highest, strict=True)]
+        table = np.zeros((3, max(len(harmonic) for harmonic, _, _ in waves), len(waves)))
+        for i, wave in enumerate(waves):
+            table[:, : len(wave[0]), i] = wave
+        begin = self.pause + np.cumsum([0.0, *self._each[:-1]])
+        return ExcitationParams(np.array(self.amplitude), np.array(self.width), begin, np.array(self.period), *table)
