@@ -20,6 +20,7 @@ from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, RESIDUALS, STA
 from flight_analysis.closed_loop.replay import recorded_parameters, recorded_scenario
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.bridge_identification import AMPLITUDE
 from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.identification import IdentifiedAircraft, manoeuvre_result
 from flight_analysis.design.identification import identify as identify_aircraft
@@ -31,6 +32,7 @@ from flight_analysis.report.html import Line, Page, Section, page_html
 from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, mask_spans, time_series_figure
 from flight_analysis.report.summary import DisplayUnit
 from flight_bringup.scenarios import find_scenario
+from flight_cli.bridge_experiment import identify_behind_bridge
 from flight_cli.gains import observed
 from flight_cli.output import COUNT_COLUMNS, new_table, progress_bar, write_text
 from flight_core.outcome import FlightEnded
@@ -75,15 +77,41 @@ def identify(
     margin: Annotated[
         float | None, typer.Option(help="Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests.")
     ] = None,
+    bridge: Annotated[
+        str | None,
+        typer.Option(metavar="MAP", help="Excite the aircraft behind a channel map, or with --log read such a flight."),
+    ] = None,
+    amplitude: Annotated[
+        float | None, typer.Option(help="With --bridge: amplitude of the excitation, a part of each input's limit; 0.2.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
     """Identify an aircraft of JSBSim by step tests, or with --log A and B of an airframe from a recorded flight.
 
     The step tests also select gains, fly the aircraft and write a scenario for `rise-di fly`. A model from a log is accepted if
-    it predicts the part of the flight that it was not fitted to better than the nominal airframe.
+    it predicts the part of the flight that it was not fitted to better than the nominal airframe. With --bridge, each input of
+    the aircraft behind a channel map is excited by itself, open loop, and --write is the folder for a scenario that flies it.
 
     Exit status: 0, 2 bad input or a model that is refused, 3 the aircraft does not trim or does not fly.
     """
+    if bridge is not None:
+        of_others = {
+            "aircraft": aircraft,
+            "--altitude": altitude,
+            "--output": output,
+            "--airframe": airframe,
+            "--margin": margin,
+        }
+        of_others |= {"--scenario": scenario, "--delay": delay, "--refly": refly or None, "--observer": observer or None}
+        for name, value in (of_others | {"--namespace": namespace}).items():
+            require(value is None, name, f"{value}", "none beside --bridge")
+        if speed is None or write is None:
+            raise ParameterError("identify: found too few arguments, expected --speed and --write beside --bridge")
+        require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
+        part = AMPLITUDE if amplitude is None else amplitude
+        identify_behind_bridge(bridge, speed, write, part, log, Path("runs"), as_json)
+        return
+    require(amplitude is None, "--amplitude", amplitude, "--bridge beside it")
     of_tests = {
         "aircraft": aircraft,
         "--speed": speed,

@@ -316,7 +316,7 @@ def second_order(t: FloatArray, delay: float, lag: float, damping: float, stiffn
     """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest, with lag v' = u(t - delay) - v; (N,) each."""
     begin = np.maximum(t - delay, 0.0)
     A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])  # z, z', v; y = z' or z
-    values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-6, 2e-6]))  # distinct eigenvalues
+    values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-3, 2e-3]))  # distinct eigenvalues
     parts = np.linalg.solve(vectors, np.array([0.0, 0.0, 1.0 / lag]))
     product = values[:, None] * begin
     small = np.abs(product) < 1e-6
