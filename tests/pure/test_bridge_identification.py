@@ -88,7 +88,7 @@ def test_a_longer_delay_lowers_the_bandwidths(response: Response, tmp_path: Path
 
 def test_a_refused_channel_and_a_sign_against_the_map_write_nothing(response: Response) -> None:
     refused = response._replace(refusal=("", "V by thrust: found no movement, expected one", "", ""))
-    with pytest.raises(ParameterError, match="^V by thrust: found no movement, expected one$"):
+    with pytest.raises(ParameterError, match=r"^V by thrust: found no movement, expected one$"):
         flying_scenario(MAP, refused, SPEED, "airframe.yaml")
     flipped = response._replace(Omega=response.Omega * np.array([1.0, 1.0, -1.0, 1.0]))
     sentence = r"inputs\.aileron: found p_dot that falls with aileron, expected the opposite: change `sign`"
