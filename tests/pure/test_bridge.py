@@ -5,13 +5,13 @@
 import numpy as np
 import pytest
 
-from autopilot_bridge.bridge import Bridge, Phase
+from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import to_raw
 from autopilot_bridge.params import ChannelMap, load_map
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError
 
-CHANNEL_MAP = load_map("ardupilot")
+CHANNEL_MAP = load_map("ardupilot_2024")
 OUTPUTS = tuple(CHANNEL_MAP.outputs)
 
 
@@ -98,8 +98,8 @@ def test_a_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None
     for t in np.arange(0.0, 1.2, 0.01).tolist():
         receive_outputs(bridge, t + 1e-3)
         phases.append((bridge.step(at(t + 1e-3)), t, bridge.raw(), bridge.sends("joy", at(t))))
-    starts = {phase: next(t for one, t, *_ in phases if one is phase) for phase in Phase}
     expected = {Phase.ENGAGED: 0.0, Phase.NEUTRAL: 0.2, Phase.RELEASE: 0.5, Phase.DISENGAGED: 1.0}
+    starts = {phase: next(t for one, t, *_ in phases if one is phase) for phase in expected}
     assert starts == pytest.approx(expected, abs=0.011)  # a tick
     for phase, _, raw, sent in phases:
         assert sent == (phase is not Phase.DISENGAGED)
@@ -188,15 +188,168 @@ def test_stamps_of_another_clock_and_samples_out_of_order_are_refused() -> None:
         bridge.take_output("q", 0.0, at(0.0), at(0.01))
 
 
-def test_the_offboard_heartbeat_starts_before_engagement_and_ends_with_stale_inputs() -> None:
+PX4_STATUS = {"armed": 2.0, "offboard": 4.0}  # armed, in Hold
+
+
+def px4_bridge(t: float = 0.0, **status: float) -> Bridge:
+    """A bridge with the map of PX4 in Hold that has received y and u."""
     bridge = new_bridge(load_map("px4"))
-    assert not bridge.sends("offboard", at(0.0))
-    receive_outputs(bridge, 0.0)
-    receive_u(bridge, 0.0)
-    assert bridge.sends("offboard", at(0.0))
-    assert not bridge.sends("torque", at(0.0))
-    receive_outputs(bridge, 0.25, OUTPUTS[:3])
-    assert not bridge.sends("offboard", at(0.25))
+    refresh(bridge, t, **status)
+    return bridge
+
+
+def refresh(bridge: Bridge, t: float, **status: float) -> None:
+    """Fresh y, u and conditions."""
+    receive_outputs(bridge, t, tuple(bridge.outputs), 20.0 if t == 0.0 else 21.0)
+    receive_u(bridge, t)
+    for name, raw in (PX4_STATUS | status).items():
+        bridge.take_condition(name, raw, at(t))
+
+
+def sent(bridge: Bridge, t: float) -> set[str]:
+    return {name for name in bridge.channel_map.messages if bridge.sends(name, at(t))}
+
+
+def test_engagement_requests_the_mode_sends_setpoints_in_it_and_requests_hold_after_it() -> None:
+    bridge = px4_bridge()
+    assert sent(bridge, 0.0) == set()  # no heartbeat before the request: without it PX4 leaves offboard
+    assert bridge.engage(at(0.0)) == ""
+    assert bridge.phase is Phase.ENGAGING
+    assert bridge.reason == "the mode is not offboard (nav_state is 4)"
+    assert sent(bridge, 0.0) == {"offboard", "enter"}  # no setpoint beside those of PX4's own law
+    refresh(bridge, 0.1, offboard=14.0)
+    assert bridge.step(at(0.1)) is Phase.ENGAGED
+    assert sent(bridge, 0.1) == {"offboard", "torque", "thrust"}
+    bridge.disengage("disengaged by request", at(0.2))
+    assert sent(bridge, 0.2) == {"leave"}  # heartbeats and setpoints end at once
+    bridge.take_condition("offboard", 4.0, at(0.3))
+    assert sent(bridge, 0.3) == set()  # the mode that the pilot chose stays
+    assert bridge.step(at(0.71)) is Phase.DISENGAGED
+
+
+def test_an_engagement_without_the_awaited_mode_ends_after_its_time_with_the_reason() -> None:
+    bridge = px4_bridge()
+    assert bridge.engage(at(0.0)) == ""
+    refresh(bridge, 4.9)
+    assert bridge.step(at(4.9)) is Phase.ENGAGING
+    refresh(bridge, 5.1)
+    assert bridge.step(at(5.1)) is Phase.RELEASE
+    assert bridge.reason == "the mode is not offboard (nav_state is 4), after 5 s"
+    assert sent(bridge, 5.1) == set()
+
+
+def test_an_engagement_is_refused_with_the_sentence_of_the_condition() -> None:
+    bridge = new_bridge(load_map("px4"))
+    assert bridge.engage(at(0.0)) == "armed: arming_state not received yet (/fmu/out/vehicle_status_v1)"
+    bridge = px4_bridge(armed=1.0)
+    assert bridge.engage(at(0.0)) == "the aircraft is not armed (arming_state is 1)"
+    assert bridge.phase is Phase.DISENGAGED
+
+
+@pytest.mark.parametrize(
+    ("status", "reason"),
+    [
+        ({"armed": 1.0}, "the aircraft is not armed (arming_state is 1)"),
+        ({"offboard": 5.0}, "the mode is not offboard (nav_state is 5)"),
+    ],
+)
+def test_a_lost_condition_ends_an_engagement_with_its_sentence(status: dict[str, float], reason: str) -> None:
+    bridge = px4_bridge(offboard=14.0)
+    assert bridge.engage(at(0.0)) == ""
+    assert bridge.phase is Phase.ENGAGED
+    refresh(bridge, 0.1, **({"offboard": 14.0} | status))
+    assert bridge.step(at(0.1)) is Phase.RELEASE
+    assert bridge.reason == reason
+
+
+def test_a_condition_that_is_not_reported_any_more_ends_an_engagement() -> None:
+    bridge = px4_bridge(offboard=14.0)
+    assert bridge.engage(at(0.0)) == ""
+    for t in np.arange(0.1, 1.7, 0.1).tolist():
+        receive_outputs(bridge, t, tuple(bridge.outputs))
+        receive_u(bridge, t)
+        assert (bridge.step(at(t)) is Phase.ENGAGED) == (t < 1.55), t
+    assert bridge.reason.startswith("armed: arming_state is 1.60 s old")
+
+
+def test_a_captured_output_is_zero_until_engagement_and_then_its_change() -> None:
+    bridge = px4_bridge(offboard=14.0)
+    samples = [bridge.y(at(0.0))]
+    assert bridge.engage(at(0.0)) == ""
+    refresh(bridge, 0.1, offboard=14.0)  # V from 20 to 21 m/s
+    samples.append(bridge.y(at(0.1)))
+    place = bridge.outputs.index("V")
+    assert [None if one is None else one.value[place] for one in samples] == [0.0, 1.0]
+
+
+STICKS = {"elevator": 1400.0, "thrust": 1450.0, "aileron": 1520.0, "rudder": 1490.0}  # us
+
+
+def ardupilot_bridge(t: float = 0.0, sticks: dict[str, float] = STICKS) -> Bridge:
+    """A bridge with the map of ArduPilot in MANUAL, with the sticks in these positions."""
+    bridge = new_bridge(load_map("ardupilot"))
+    receive_outputs(bridge, t, tuple(bridge.outputs))
+    receive_u(bridge, t)
+    for name, raw in {"manual": 0.0, "armed": 1.0, "flying": 1.0}.items():
+        bridge.take_condition(name, raw, at(t))
+    for name, us in sticks.items():
+        receive_outputs(bridge, t, (trim_key(name),), us)
+    return bridge
+
+
+def test_each_trim_is_captured_from_its_own_stick_at_engagement_and_kept() -> None:
+    """-1 to 1 over 1000 to 2000 us, 30 deg and half of the throttle at 1."""
+    bridge = ardupilot_bridge()
+    assert bridge.engage(at(0.0)) == ""
+    for name in STICKS:
+        receive_outputs(bridge, 0.05, (trim_key(name),), 1900.0)  # while overridden, ArduPilot reports what it is sent
+    assert bridge.raw() == pytest.approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
+    assert [bridge.trim(name) for name in STICKS] == pytest.approx([-0.10472, 0.45, 0.020944, -0.010472], abs=1e-6)
+
+
+def test_an_engagement_needs_the_sources_of_the_trims() -> None:
+    bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1450.0})
+    receive_outputs(bridge, 0.6, tuple(bridge.outputs))
+    receive_u(bridge, 0.6)
+    assert bridge.engage(at(0.6)).startswith("trim of elevator is 0.60 s old (/ap/rc); trim of thrust is 0.60 s old")
+
+
+def test_an_engagement_whose_limits_leave_the_range_around_the_trim_is_refused() -> None:
+    bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1900.0})  # 90 % of throttle, upper limit 30 % above
+    assert bridge.engage(at(0.0)) == "thrust: its trim is 0.9 now, and the limits [-0.2, 0.3] around it leave its range"
+
+
+def test_u_that_times_out_sends_the_captured_trim_where_the_map_says_so() -> None:
+    content = load_map("ardupilot").model_dump()
+    content["silence"] = {"max_age": 0.2, "neutral": 0.3, "release": 0.5}
+    bridge = ardupilot_bridge()
+    bridge.channel_map = ChannelMap.validate_mapping(content, "map")
+    assert bridge.engage(at(0.0)) == ""
+    receive_outputs(bridge, 0.19, tuple(bridge.outputs))
+    assert bridge.step(at(0.21)) is Phase.NEUTRAL
+    assert bridge.raw() == pytest.approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
+
+
+def test_an_override_by_a_stick_counts_its_way_since_engagement() -> None:
+    content = CHANNEL_MAP.model_dump()
+    content["overrides"]["gamepad"] |= {"above": None, "moved": 0.2}
+    bridge = ready_bridge(channel_map=ChannelMap.validate_mapping(content, "map"))
+    bridge.take_override("gamepad", 0.7, at(0.0))
+    assert bridge.engage(at(0.0)) == ""
+    bridge.take_override("gamepad", 0.55, at(0.01))
+    assert bridge.step(at(0.01)) is Phase.ENGAGED
+    bridge.take_override("gamepad", 0.45, at(0.02))
+    assert bridge.step(at(0.02)) is Phase.RELEASE
+    assert bridge.reason == "pilot override by gamepad"
+
+
+def test_an_override_whose_topic_has_ended_does_not_block_an_engagement() -> None:
+    bridge = new_bridge()
+    bridge.take_override("gamepad", 1.0, at(0.0))
+    receive_outputs(bridge, 0.9)
+    receive_u(bridge, 0.9)
+    assert bridge.engage(at(0.9)) == "pilot override active: gamepad"
+    assert bridge.engage(at(1.05)) == ""
 
 
 ENVELOPE = {"phi": [-0.8, 0.8], "theta": [-0.4, 0.5], "V": [-5.0, 8.0]}

@@ -31,13 +31,15 @@ FLU = Message(x=0.3, y=-0.2, z=-0.1)  # roll right at 0.3 rad/s, nose up at 0.2,
 FRD = np.array([0.3, 0.2, 0.1], dtype=np.float32)  # the same motion as a fixed array of a message
 MOTION = {"p": 0.3, "q": 0.2, "r": 0.1}  # the expected channels for each map
 RATES = {
-    "ardupilot": Message(twist=Message(linear=Message(x=9.0, y=9.0, z=9.0), angular=FLU)),
+    "ardupilot": Message(angular_velocity=Message(x=0.3, y=0.2, z=0.1)),
+    "ardupilot_2024": Message(twist=Message(linear=Message(x=9.0, y=9.0, z=9.0), angular=FLU)),
     "mavros": Message(angular_velocity=FLU),
     "px4": Message(angular_velocity=FRD),
     "rosflight": Message(p=0.3, q=0.2, r=0.1, va=27.0),
 }
 AIRSPEED = {  # 27 m/s, 2 m/s above the trim of 25 m/s
-    "ardupilot": Message(vector=Message(x=-18.0, y=18.0, z=-9.0)),  # 9 (2, 2, 1), of length 27
+    "ardupilot": Message(true_airspeed=Message(x=-18.0, y=18.0, z=-9.0)),  # 9 (2, 2, 1), of length 27
+    "ardupilot_2024": Message(vector=Message(x=-18.0, y=18.0, z=-9.0)),
     "mavros": Message(airspeed=27.0),
     "px4": Message(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
     "rosflight": RATES["rosflight"],
@@ -48,7 +50,8 @@ SENT = {  # elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to
     "mavros": {"channels[1]": 1595.493, "channels[2]": 1600.0, "channels[0]": 1595.493, "channels[3]": 1595.493},
     "rosflight": {"u[4]": -0.1 / 0.523599, "u[0]": 0.6, "u[3]": 0.1 / 0.523599, "u[5]": -0.1 / 0.523599},
 }
-RELEASED = {"ardupilot": math.nan, "px4": math.nan, "mavros": 0.0, "rosflight": 0.0}
+SENT["ardupilot_2024"] = SENT["ardupilot"]
+RELEASED = {"ardupilot": math.nan, "ardupilot_2024": math.nan, "px4": None, "mavros": 0.0, "rosflight": 0.0}
 
 
 @pytest.mark.parametrize("name", MAPS)
@@ -87,6 +90,8 @@ def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name
         assert is_array, channel
         assert int(place) < (length or 0), channel
         for raw in (*input_row.range, input_row.neutral, input_row.release, to_raw(input_row.trim + 0.123, input_row.line)):
+            if not isinstance(raw, float):  # trim, or nothing to be sent
+                continue
             set_field(message, input_row.field, raw)
             error = 1e-7 * abs(raw) if element == "float32" else 0.5
             assert get_field(message, input_row.field) == pytest.approx(raw, rel=0.0, abs=error, nan_ok=True)
@@ -101,6 +106,13 @@ def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name
 
 
 @pytest.mark.parametrize("name", MAPS)
+def test_each_input_of_a_map_states_its_own_trim(name: str) -> None:
+    """A merged row would hand a changed trim of the elevator to the other surfaces."""
+    inputs = (LIBRARY / f"{name}.yaml").read_text(encoding="utf-8").split("\ninputs:\n")[1].split("\n\n")[0]
+    assert inputs.count("\n    trim: ") == len(load_map(name).inputs)
+
+
+@pytest.mark.parametrize("name", MAPS)
 def test_each_map_is_a_dry_run_by_default_and_names_the_source_of_each_row(name: str) -> None:
     channel_map = load_map(name)
     assert channel_map.dry_run
@@ -109,12 +121,12 @@ def test_each_map_is_a_dry_run_by_default_and_names_the_source_of_each_row(name:
     rows: list[Any] = [*channel_map.outputs.values(), *channel_map.inputs.values(), *channel_map.overrides.values()]
     assert all(len(row.source) > 10 for row in rows)
     for row in channel_map.inputs.values():
-        assert row.release == pytest.approx(RELEASED[name], nan_ok=True)
-        assert to_channel(row.neutral, row.line) == pytest.approx(row.trim, abs=1e-6)
+        assert row.release == (None if RELEASED[name] is None else pytest.approx(RELEASED[name], nan_ok=True))
+        assert row.neutral == "trim" or to_channel(row.neutral, row.line) == pytest.approx(row.trim, abs=1e-6)
 
 
-def test_the_map_ardupilot_needs_only_message_types_of_common_interfaces() -> None:
-    types = {kind for _, _, kind in load_map("ardupilot").used_topics()}
+def test_the_map_of_older_sources_of_ardupilot_needs_only_message_types_of_common_interfaces() -> None:
+    types = {kind for _, _, kind in load_map("ardupilot_2024").used_topics()}
     stamped = {f"geometry_msgs/msg/{kind}Stamped" for kind in ("Pose", "Twist", "Vector3")}
     assert types == {*stamped, "sensor_msgs/msg/Joy"}
 
@@ -253,8 +265,10 @@ REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
     (("inputs", "elevator", "trim"), math.nan, r"map test\.inputs\.elevator\.trim"),
     (("inputs", "elevator", "neutral"), 1.5, r"map test\.inputs\.elevator\.neutral: found 1\.5"),
     (("inputs", "elevator", "source"), "", r"map test\.inputs\.elevator\.source"),
-    (("messages", "joy", "when"), "ready", r"map test\.inputs\.elevator\.message: found one sent when ready"),
-    (("overrides", "gamepad", "above"), None, r"map test\.overrides\.gamepad: found above and below, or neither"),
+    (("messages", "joy", "when"), "heartbeat", r"map test\.inputs\.elevator\.message: found one sent when heartbeat"),
+    (("overrides", "gamepad", "above"), None, r"map test\.overrides\.gamepad: found no threshold, expected one of above"),
+    (("overrides", "gamepad", "moved"), 0.1, r"map test\.overrides\.gamepad: found above and moved"),
+    (("trims",), {"flaps": ROW}, r"map test\.trims\.flaps: found a channel, expected one of the inputs elevator, .*"),
     (("topics", "/ap/joy", "depth"), 0, r"map test\.topics\./ap/joy\.depth"),
     (("pose", "phi", "topic"), "/other", r"map test\.pose\.phi\.topic: found /other"),
     (("pose", "up"), ROW, r"map test\.pose\.up: found a channel, expected one of phi, .*, climb"),
@@ -269,7 +283,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
     ("place", "value", "sentence"), REFUSALS, ids=lambda one: ".".join(one) if isinstance(one, tuple) else ""
 )
 def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], value: object, sentence: str) -> None:
-    content = yaml.safe_load((LIBRARY / "ardupilot.yaml").read_text(encoding="utf-8"))
+    content = yaml.safe_load((LIBRARY / "ardupilot_2024.yaml").read_text(encoding="utf-8"))
     part = content
     for key in place[:-1]:
         part[key] = dict(part[key])  # merged keys share one object
@@ -281,7 +295,7 @@ def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], va
 
 
 def test_a_missing_map_is_one_sentence() -> None:
-    sentence = r"bridge\.map: found 'nowhere', expected one of ardupilot, mavros, px4, rosflight"
+    sentence = r"bridge\.map: found 'nowhere', expected one of ardupilot, ardupilot_2024, mavros, px4, rosflight"
     with pytest.raises(ParameterError, match=sentence):
         BridgeParameters.validate_mapping({"map": "nowhere"}, "bridge")
     with pytest.raises(ParameterError, match="lockstep"):

@@ -445,11 +445,19 @@ def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
     assert output["theorem"]["delay_margin"] == 0.0
 
 
+def test_a_y_that_is_slower_than_the_law_counts_as_delay() -> None:
+    """1.5 periods of 1 / 28.4 Hz less 1.5 of 1 / 50 Hz are 22.817 ms. A faster y adds nothing."""
+    common = ("gains", "osprey", "--samples", "2", "--json", "--rate", "50", "--delay", "0.04", "--y-rate")
+    delays = [json.loads(rise_di(*common, rate).stdout)["engineering"]["controller"]["delay"] for rate in ("28.4", "139")]
+    assert delays == pytest.approx([0.062817, 0.04], abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("option", "value", "expected"),
     [
         ("--rate", "0", "--rate: found 0.0, expected 1 to 1000 Hz"),
         ("--rate", "nan", "--rate: found nan, expected 1 to 1000 Hz"),
+        ("--y-rate", "0", "--y-rate: found 0.0, expected 1 to 1000 Hz"),
         ("--delay", "nan", "--delay: found nan, expected 0 to 0.5 s"),
         ("--gamma-2", "nan", "--gamma-2: found nan, expected 0 or more, 1/s"),
         ("--lag", "nan", "--lag: found nan, expected seconds, 0 or more"),

@@ -156,9 +156,15 @@ def test_deactivation_holds_or_ramps_the_input_as_configured(policy: str, osprey
     assert (states[5].u == states[4].u).all()  # bumpless re-engagement
 
 
-def test_a_controller_that_was_never_engaged_commands_nothing_when_inactive() -> None:
-    state, inputs = tick(guard.initial_state(4), 0, sample(0, 1.0), [sample(0)], active=False)
+def test_an_inactive_controller_commands_trim_before_its_first_engagement_once_it_has_y_and_y_m() -> None:
+    """A bridge engages only with a fresh u, and activates the controller after that."""
+    state, inputs = tick(guard.initial_state(4), 0, None, [sample(0)], active=False)
     assert (state.mode, inputs) == (Mode.INACTIVE, None)
+    state, inputs = tick(state, 0, sample(0, 1.0), [sample(0)], active=False)
+    assert state.mode is Mode.INACTIVE
+    assert inputs is not None
+    assert inputs.y.tolist() == [1.0] * 4
+    assert not state.u.any()
 
 
 @given(instants=st.lists(st.tuples(st.integers(1, 400), st.booleans(), st.floats(-1, 1)), min_size=2, max_size=40))

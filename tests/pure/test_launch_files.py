@@ -260,7 +260,8 @@ def test_a_bridge_is_a_dry_run_by_default_and_its_topics_are_recorded(tmp_path: 
     assert set(load_map("ardupilot").topics) <= set(recorder["topics"])
     assert "bridge/would_send" in recorder["topics"]
     assert bridge["map"] in recorder["attach"]
-    follow = all_ready(*started("bridge", map="ardupilot", dry_run="false", runs=tmp_path))
+    slow = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
+    follow = all_ready(*started("bridge", map="ardupilot_2024", scenario=slow, dry_run="false", runs=tmp_path))
     assert overrides(nodes(follow)["bridge"])["dry_run"] is False
     assert not every(TimerAction, follow)  # until Ctrl-C
     follow = all_ready(*started("bridge", map="ardupilot", duration=5, runs=tmp_path))
@@ -275,6 +276,17 @@ def test_a_bridge_with_a_flipped_sign_is_refused_before_anything_starts(tmp_path
     with pytest.raises(ParameterError, match="D of r and rudder is -1, the controller has \\+1"):
         started("bridge", map=tmp_path / "flipped.yaml", runs=tmp_path)
     assert not list(tmp_path.glob("*-osprey_gust"))
+
+
+def test_limits_beyond_those_of_the_map_are_refused_before_anything_is_sent(tmp_path: Path) -> None:
+    """The bridge clips u, which the anti-windup of the law does not know."""
+    scenario = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"  # thrust from -0.4 to 0.4, the map from -0.2 to 0.3
+    sentence = r"controller\.lower: found -0\.4, expected at least -0\.2, the lower limit of thrust in the map ardupilot"
+    with pytest.raises(ParameterError, match=sentence):
+        started("bridge", map="ardupilot", scenario=scenario, dry_run="false", runs=tmp_path)
+    with pytest.raises(ParameterError, match=r"osprey_gust: controller\.lower: found -inf"):
+        started("bridge", map="ardupilot", dry_run="false", runs=tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def player(actions: Sequence[Any]) -> ExecuteProcess:

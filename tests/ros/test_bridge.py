@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge, over DDS: the unchanged controller flies a simulated autopilot through the shipped map `ardupilot`.
+"""The bridge, over DDS: the unchanged controller flies a simulated autopilot through the shipped map `ardupilot_2024`.
 
 tests/ros/autopilot.py is no autopilot. These tests show that frames, signs, rates, quality of service and engagement agree with
 the map, not that the map agrees with ArduPilot.
 """
 
+import json
 import math
 import time
 from collections import Counter
@@ -18,7 +19,6 @@ import numpy as np
 import pytest
 import yaml
 from geometry_msgs.msg import Twist, TwistStamped, Vector3, Vector3Stamped
-from lifecycle_msgs.msg import Transition
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import FluidPressure, Imu, Joy
@@ -34,6 +34,7 @@ from flight_cli.cli import COMMANDS, application
 from flight_core.rates import NANOSECONDS
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
+from rise_di_controller.guard import Mode
 
 app = application([*COMMANDS])
 
@@ -53,7 +54,7 @@ class BridgeSetup:
     def __init__(self, start: Start, peer_node: Peer, folder: Path) -> None:
         self._start = start
         self.map = str(folder / "ardupilot.yaml")
-        Path(self.map).write_bytes((LIBRARY / "ardupilot.yaml").read_bytes())
+        Path(self.map).write_bytes((LIBRARY / "ardupilot_2024.yaml").read_bytes())
         for place in (("silence",), *(("outputs", name) for name in ("q", "V", "p", "r"))):
             self.change_map(*place, max_age=MAX_AGE)
         self.peer = peer_node
@@ -89,13 +90,12 @@ class BridgeSetup:
         return str(self.peer.call(SetBool, "bridge/engage", SetBool.Request(data=True), each).message)
 
     def engage_from_trim(self) -> None:
-        """Engage as in docs/autopilots.md: deactivate, wait for trim, engage, activate."""
-        assert self.peer.transition(Transition.TRANSITION_DEACTIVATE)
+        """Wait for trim and engage: the bridge deactivates the controller, and activates it when it engages."""
         self.peer.received["u"].clear()
         self.peer.until(lambda: self.peer.received["u"] and not any(self.peer.received["u"][-1].position))
         self.peer.until(lambda: self.engage() == "")
-        assert self.peer.transition(Transition.TRANSITION_ACTIVATE)
         self.wait_for_joys()
+        self.peer.until(lambda: any(self.peer.received["u"][-1].position))
 
     def engage_by_command(self) -> None:
         """Engage by `rise-di engage`."""
@@ -305,8 +305,12 @@ def test_rise_di_fly_starts_the_bridge_and_logs_the_autopilot_topics(setup: Brid
     flight.succeed()
     run = tmp_path / "runs" / "latest"
     log = read_run(run)
-    assert {"y", "y_m", "u", "internals", "bridge/would_send"} <= log.tape.signals.keys()
-    assert "truth" not in log.tape
+    assert {"y", "y_m", "u", "bridge/would_send"} <= log.tape.signals.keys()
+    assert not {"truth", "internals"} & log.tape.signals.keys()  # the law is inactive: its integrals would wind up
+    assert not log.tape["u"].values.any()  # what is sent at an engagement: the trim
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["outcome"], summary["engagements"]) == ("completed", [])
+    assert summary["notes"][0].startswith("never engaged")
     assert Path(setup.map).read_bytes() in [file.content for file in log.attachments]
     counts = Counter(one.topic for one in stored_messages(run))
     assert counts["/ap/twist/filtered"] > 100  # of 600
@@ -314,11 +318,57 @@ def test_rise_di_fly_starts_the_bridge_and_logs_the_autopilot_topics(setup: Brid
     assert not setup.joys
 
 
+def test_the_controller_is_active_only_while_engaged_and_the_summary_says_when_and_why(
+    setup: BridgeSetup, start: Start, tmp_path: Path
+) -> None:
+    setup.autopilot()
+    duration = "25"
+    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send", "--duration", duration, "--json")
+    engaged = start("flight_cli.cli", "engage")  # before the nodes run: it waits for the first u
+    setup.peer.until(lambda: engaged.popen.poll() is not None, timeout=60.0)
+    engaged.succeed()
+    setup.peer.until(lambda: any(any(u.position) for u in setup.peer.received["u"]))
+    off = start("flight_cli.cli", "engage", "--off")
+    setup.peer.until(lambda: flight.popen.poll() is not None, timeout=90.0)
+    off.succeed()
+    flight.succeed()
+    run = tmp_path / "runs" / "latest"
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    (engagement,) = summary["engagements"]
+    assert engagement["reason"] == "disengaged by request"
+    tape = read_run(run).tape
+    mode, t = tape["internals"]["mode"], tape.time("internals")
+    flies = t[mode == Mode.ENGAGED]
+    assert engagement["start"] - 0.05 < flies[0] < engagement["start"] + 1.0  # the timeout of an activation
+    assert engagement["stop"] - 0.1 < flies[-1] < engagement["stop"] + LATE
+    u, t_u = tape["u"].values, tape.time("u")
+    assert not u[t_u < flies[0]].any()  # no integral before the engagement, none 2 s after it
+    assert not u[t_u > engagement["stop"] + 2.0].any()
+    assert (
+        summary["notes"][0] == f"engaged from {engagement['start']:.1f} s to {engagement['stop']:.1f} s: disengaged by request"
+    )
+
+
+def test_a_flight_without_the_topics_of_its_autopilot_ends_with_the_sentence_of_the_bridge(
+    setup: BridgeSetup, start: Start
+) -> None:
+    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "60")
+    setup.peer.node.create_publisher(TwistStamped, "/ap/airspeed", 10)
+    setup.peer.until(lambda: flight.popen.poll() is not None, timeout=60.0)
+    assert flight.end() == 3
+    assert "bridge ended with status 3: no y after 20 s: " in flight.output
+    assert (
+        "/ap/twist/filtered: no publisher. The autopilot's agent needs the same DDS profile, FASTRTPS_DEFAULT_" in flight.output
+    )
+    expected = "geometry_msgs/msg/TwistStamped, expected geometry_msgs/msg/Vector3Stamped"
+    assert f"/ap/airspeed: /peer publishes {expected}" in flight.output
+
+
 def test_a_map_with_a_wrong_sign_is_refused(setup: BridgeSetup, start: Start) -> None:
     setup.change_map("inputs", "elevator", sign=-1)
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send")
     assert flight.end() == 2
-    assert "with the map ardupilot D of q and elevator is -1, the controller has +1" in flight.output
+    assert "with the map ardupilot_2024 D of q and elevator is -1, the controller has +1" in flight.output
 
 
 def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeSetup) -> None:
@@ -337,7 +387,7 @@ def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeS
 
 
 def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Start) -> None:
-    bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot")
+    bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot_2024")
     with peer(topics=()) as other:
         other.node.create_publisher(TwistStamped, "/ap/airspeed", 10)  # as an AP_DDS would whose type has changed
         other.node.create_subscription(Imu, "/ap/joy", lambda _: None, 10)
@@ -369,8 +419,8 @@ AIRSPEED = Vector3Stamped(vector=Vector3(x=-18.0, y=18.0, z=-9.0))  # of length 
 @pytest.mark.parametrize(
     ("name", "message", "expected"),
     [
-        ("ardupilot", TwistStamped(twist=Twist(angular=RATES)), {"q": 0.2, "p": 0.3, "r": 0.1}),
-        ("ardupilot", AIRSPEED, {"V": 2.0}),
+        ("ardupilot_2024", TwistStamped(twist=Twist(angular=RATES)), {"q": 0.2, "p": 0.3, "r": 0.1}),
+        ("ardupilot_2024", AIRSPEED, {"V": 2.0}),
         ("mavros", Imu(angular_velocity=RATES), {"q": 0.2, "p": 0.3, "r": 0.1}),
     ],
     ids=("twist", "airspeed", "imu"),
@@ -389,7 +439,7 @@ def test_a_real_pressure_gives_the_speed() -> None:
 
 
 def test_inputs_are_written_into_a_real_joy() -> None:
-    channel_map = load_map("ardupilot")
+    channel_map = load_map("ardupilot_2024")
     message = Joy()
     for path, value in channel_map.messages["joy"].values.items():
         set_field(message, path, value)

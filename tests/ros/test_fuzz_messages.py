@@ -79,7 +79,7 @@ def test_any_payload_is_decoded_or_rejected_without_effect_on_the_next_one(raw: 
 @many
 @given(st.data())
 def test_any_payload_of_an_autopilots_topic_is_a_value_or_rejected(data: st.DataObject) -> None:
-    channel_map = load_map("ardupilot")  # its message types are installed
+    channel_map = load_map("ardupilot_2024")  # its message types are installed
     row = data.draw(st.sampled_from([*channel_map.outputs.values()]))
     kind: Any = message_type(row.type)
     raw = data.draw(payloads() | st.binary(max_size=200))

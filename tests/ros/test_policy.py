@@ -111,7 +111,7 @@ def test_the_policy_allows_exactly_those_of_the_bridge_with_every_map(start: Sta
     published = {topic for key, topic, _ in used if key.startswith("messages.")}
     subscribed = {topic for key, topic, _ in used if not key.startswith("messages.")}
     policy = allowed()["bridge"]
-    start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot").wait_for("dry run")
+    start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot_2024").wait_for("dry run")
     own = discovered(peer_node, ("bridge",))["bridge"]
     assert own.publish | published == policy.publish
     assert own.subscribe | subscribed == policy.subscribe
@@ -124,5 +124,6 @@ def test_the_policy_allows_no_wildcard() -> None:
 
 
 @pytest.mark.parametrize("node", allowed())
-def test_the_policy_allows_no_service_request(node: str) -> None:
-    assert not allowed()[node].request
+def test_the_policy_allows_no_service_request_but_that_of_the_bridge_to_the_controller(node: str) -> None:
+    """The controller is active only while the bridge is engaged."""
+    assert allowed()[node].request == (frozenset({"/controller/change_state"}) if node == "bridge" else frozenset())

@@ -1,18 +1,19 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bridge to an autopilot, without ROS: y from its messages, setpoints for u, engagement, pilot override and failsafe.
+"""Bridge to an autopilot, without ROS: y from its messages, setpoints for u to it, engagement, pilot override and failsafe.
 
 It reads no clock: every instant is an argument, in ns of one clock. The watchdogs of y and u end an engagement.
 """
 
 import math
+from collections.abc import Callable
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from autopilot_bridge.channel_map import to_channel, to_raw
-from autopilot_bridge.params import ChannelMap, MeasuredRow
+from autopilot_bridge.params import ROUNDING, ChannelMap, ConditionRow, InputRow, MeasuredRow
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer
 
@@ -20,17 +21,23 @@ from flight_core.vectors import ChannelError, FloatArray, StampedVector, require
 class Phase(IntEnum):
     """Phase of the engagement: what the autopilot is sent."""
 
-    DISENGAGED = 0  # nothing, except an offboard heartbeat
+    DISENGAGED = 0  # nothing
     ENGAGED = 1  # u
     NEUTRAL = 2  # failsafe: u timed out, the neutral values are sent
     RELEASE = 3  # the release values, which return the channels to the autopilot
+    ENGAGING = 4  # heartbeats and requests, until the awaited conditions hold
 
 
 class Reading(NamedTuple):
-    """The newest value of a channel and the instant to which it belongs."""
+    """The newest value of a field and the instant to which it belongs."""
 
     stamp_ns: int
     value: float
+
+
+def trim_key(name: str) -> str:
+    """The name under which the bridge takes the source of an input's trim."""
+    return f"trim of {name}"
 
 
 class Bridge:
@@ -41,15 +48,20 @@ class Bridge:
         self.dry_run = dry_run
         self.outputs, self.inputs = tuple(channel_map.outputs), tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
-        self.reason = "not engaged yet"  # why the bridge is not engaged
-        self._rows: dict[str, MeasuredRow] = {**channel_map.pose, **channel_map.outputs}
+        self.reason = "not engaged yet"  # why the bridge is not engaged, or what an engagement waits for
+        sources = {trim_key(name): row for name, row in channel_map.trims.items()}
+        self._rows: dict[str, MeasuredRow] = {**channel_map.pose, **channel_map.outputs, **sources}
         self._readings: dict[str, Reading] = {}
+        self._zero: dict[str, float] = {}  # captured outputs: their value at engagement
+        self._trim: dict[str, float] = {}  # captured inputs: their trim at engagement
         self._last_y_ns = -1  # stamp of the last y
         self._last_pose_ns = -1  # stamp of the last pose
         self._u: FloatArray = np.zeros(len(self.inputs))
         self._u_sender: str | None = None
         self._u_ns = 0  # when u was received
-        self._active_override = ""  # name of the pilot override
+        self._conditions: dict[str, Reading] = {}
+        self._overrides: dict[str, Reading] = {}
+        self._overrides_at_engagement: dict[str, float] = {}
         self._phase_ns = 0  # start of the phase
         rows = channel_map.inputs.values()
         self._lower, self._upper = (np.array([getattr(row, key) for row in rows]) for key in ("lower", "upper"))
@@ -58,7 +70,7 @@ class Bridge:
     # Inputs
 
     def take_output(self, name: str, raw: float, stamp_ns: int, now_ns: int) -> None:
-        """Take a value of a channel of y or of the pose: sign scale raw + offset.
+        """Take a value of a channel of y, of the pose or of a trim's source: sign scale raw + offset.
 
         Raises ChannelError: reason "stamp" where the stamp differs from now by more than the age limit, reason "order" where it
         is not later than the previous one.
@@ -78,14 +90,15 @@ class Bridge:
             raise ChannelError("sender", f"conflicting publisher {sender} ignored: already receiving from {self._u_sender}")
         self._u, self._u_sender, self._u_ns = u, sender, now_ns
 
+    def take_condition(self, name: str, raw: float, now_ns: int) -> None:
+        """Take the field of a condition. A condition that is lost ends an engagement at the next step."""
+        self._conditions[name] = Reading(now_ns, raw)
+
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a pilot override. Beyond its threshold the bridge disengages at once."""
-        if self.channel_map.overrides[name].is_active(raw):
-            self._active_override = name
-            if self.phase in {Phase.ENGAGED, Phase.NEUTRAL}:
-                self.disengage(f"pilot override by {name}", now_ns)
-        elif self._active_override == name:
-            self._active_override = ""
+        self._overrides[name] = Reading(now_ns, raw)
+        if self._is_active(name, now_ns):
+            self.disengage(f"pilot override by {name}", now_ns)
 
     # State
 
@@ -95,22 +108,39 @@ class Bridge:
         return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
 
     def _staleness(self, name: str, now_ns: int) -> str:
-        """Why a channel of y or of the pose is stale, as a sentence; empty where it is fresh."""
-        row, reading = self._rows[name], self._readings.get(name)
-        if reading is None:
-            return f"{name} not received yet ({row.topic})"
-        if now_ns - reading.stamp_ns > nanoseconds(row.max_age):
-            return f"{name} is {seconds(now_ns - reading.stamp_ns):.2f} s old ({row.topic})"
-        return ""
+        """Why a channel is stale, as a sentence; empty where it is fresh."""
+        row = self._rows[name]
+        return _staleness(name, row.topic, self._readings.get(name), row.max_age, now_ns)
 
     def _outside(self) -> str:
-        """The fresh channels that are outside the envelope, as a sentence; empty where none is."""
-        values = ((name, self._readings[name].value, limits) for name, limits in self.channel_map.envelope.items())
+        """The channels that are outside the envelope, as a sentence; empty where none is. All of them were received."""
+        values = ((name, self._value(name), limits) for name, limits in self.channel_map.envelope.items())
         return "; ".join(
             f"{name} is {value:.3g}, outside the envelope [{lower:g}, {upper:g}]"
             for name, value, (lower, upper) in values
             if not lower <= value <= upper
         )
+
+    def _unmet(self, now_ns: int, *, awaited: bool) -> str:
+        """The conditions that do not hold, as a sentence; those that an engagement awaits, or the others."""
+        rows = ((name, row) for name, row in self.channel_map.conditions.items() if row.awaited is awaited)
+        return "; ".join(filter(None, (self._violation(name, row, now_ns) for name, row in rows)))
+
+    def _violation(self, name: str, row: ConditionRow, now_ns: int) -> str:
+        reading = self._conditions.get(name)
+        if stale := _staleness(f"{name}: {row.field}", row.topic, reading, row.max_age, now_ns):
+            return stale
+        holds = reading is not None and reading.value in row.one_of
+        return "" if holds or reading is None else f"{row.sentence} ({row.field} is {reading.value:g})"
+
+    def _is_active(self, name: str, now_ns: int) -> bool:
+        """Whether a pilot override is active. It ends with its topic: an old one does not block an engagement."""
+        row, reading = self.channel_map.overrides[name], self._overrides.get(name)
+        if reading is None or now_ns - reading.stamp_ns > nanoseconds(row.max_age):
+            return False
+        engaged = self.phase in {Phase.ENGAGED, Phase.NEUTRAL}
+        at_engagement = self._overrides_at_engagement.setdefault(name, reading.value) if engaged else None
+        return row.is_active(reading.value, at_engagement)
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
@@ -122,35 +152,66 @@ class Bridge:
             return "u not received yet"
         return f"u is {seconds(now_ns - self._u_ns):.2f} s old" if self.u_timed_out(now_ns) else ""
 
-    def ready(self, now_ns: int) -> bool:
-        """Whether y and u are fresh."""
-        return not self.stale(now_ns) and not self.u_timed_out(now_ns)
-
     def refusal(self, now_ns: int) -> str:
-        """The reason why `engage` would be refused now; empty where it would not."""
-        if self.dry_run:
-            return "dry_run is true: nothing is sent"
-        if self._active_override:
-            return f"pilot override active: {self._active_override}"
-        if stale := "; ".join(filter(None, (*self.stale(now_ns).values(), self._u_timeout(now_ns)))):
-            return stale
-        if outside := self._outside():
-            return outside
+        """The reason why `engage` would be refused now; empty where it would not. Awaited conditions do not count."""
+        checks: tuple[Callable[[int], str], ...] = (
+            lambda _: "dry_run is true: nothing is sent" if self.dry_run else "",
+            self._active_overrides,
+            lambda now_ns: self._unmet(now_ns, awaited=False),
+            self._missing,
+            lambda _: self._outside(),
+            lambda _: self._away_from_trim(),
+            lambda _: "; ".join(filter(None, map(self._beyond_range, self.channel_map.trims))),
+        )
+        return next(filter(None, (check(now_ns) for check in checks)), "")
+
+    def _active_overrides(self, now_ns: int) -> str:
+        active = [name for name in self.channel_map.overrides if self._is_active(name, now_ns)]
+        return f"pilot override active: {', '.join(active)}" if active else ""
+
+    def _missing(self, now_ns: int) -> str:
+        """What is stale of y, of the envelope, of the trims' sources and of u, as a sentence."""
+        sources = (self._staleness(trim_key(name), now_ns) for name in self.channel_map.trims)
+        return "; ".join(filter(None, (*self.stale(now_ns).values(), *sources, self._u_timeout(now_ns))))
+
+    def _away_from_trim(self) -> str:
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
         for name, u, limit in zip(self.inputs, self._u, limits, strict=True):
             if abs(u) > limit:
                 return f"u.{name} is {u:.3g} from trim, more than {limit:.3g}: deactivate the controller until u is at trim"
         return ""
 
+    def _beyond_range(self, name: str) -> str:
+        """Why the limits around the trim of a captured input leave the range of its field; empty where they do not."""
+        row, trim = self.channel_map.inputs[name], self.trim(name)
+        (low, high), ends = row.range, (trim + row.lower, trim + row.upper)
+        if all(low - ROUNDING <= to_raw(end, row.line) <= high + ROUNDING for end in ends):
+            return ""
+        return f"{name}: its trim is {trim:.3g} now, and the limits [{row.lower:g}, {row.upper:g}] around it leave its range"
+
     def engage(self, now_ns: int) -> str:
-        """Engage. Returns the reason of a refusal as a sentence, empty where it engaged."""
-        if self.phase is Phase.ENGAGED:
+        """Engage, or begin to: the phase tells. Returns the reason of a refusal as a sentence, empty where there is none."""
+        if self.phase in {Phase.ENGAGED, Phase.ENGAGING}:
             return ""
         refusal = self.refusal(now_ns)
         if not refusal:
-            self.reason = ""
-            self._enter(Phase.ENGAGED, now_ns)
+            self._enter(Phase.ENGAGING, now_ns)
+            self._continue_engagement(now_ns)
         return refusal
+
+    def _continue_engagement(self, now_ns: int) -> None:
+        """Engage once the awaited conditions hold; give up after their time, or where something else would refuse."""
+        self.reason = self._unmet(now_ns, awaited=True)
+        timed_out = now_ns - self._phase_ns > nanoseconds(self.channel_map.engage_timeout)
+        if refusal := self.refusal(now_ns):
+            self.disengage(refusal, now_ns)
+        elif self.reason and timed_out:
+            self.disengage(f"{self.reason}, after {self.channel_map.engage_timeout:g} s", now_ns)
+        elif not self.reason:
+            self._trim = {name: self.trim(name) for name in self.channel_map.trims}
+            self._zero = {name: self._readings[name].value for name, row in self.channel_map.outputs.items() if row.captured}
+            self._overrides_at_engagement = {name: reading.value for name, reading in self._overrides.items()}
+            self._enter(Phase.ENGAGED, now_ns)
 
     def disengage(self, reason: str, now_ns: int) -> None:
         """Disengage from any phase: return the channels to the autopilot."""
@@ -159,12 +220,17 @@ class Bridge:
             self._enter(Phase.RELEASE, now_ns)
 
     def step(self, now_ns: int) -> Phase:
-        """Phase at an instant. A stale y or u ends an engagement, and the phases NEUTRAL and RELEASE end after their times."""
-        if self.phase is Phase.ENGAGED:
-            if stale := self.stale(now_ns):
-                self.disengage("; ".join(stale.values()), now_ns)
-            elif outside := self._outside():
-                self.disengage(outside, now_ns)
+        """Phase at an instant.
+
+        A stale y or u, a value outside the envelope or a lost condition ends an engagement. The phases ENGAGING, NEUTRAL and
+        RELEASE end after their times.
+        """
+        if self.phase is Phase.ENGAGING:
+            self._continue_engagement(now_ns)
+        elif self.phase is Phase.ENGAGED:
+            lost = filter(None, (self._unmet(now_ns, awaited=awaited) for awaited in (False, True)))
+            if ended := "; ".join((*lost, *self.stale(now_ns).values())) or self._outside():
+                self.disengage(ended, now_ns)
             elif timeout := self._u_timeout(now_ns):
                 self.reason = timeout
                 self._enter(Phase.NEUTRAL, now_ns)
@@ -183,7 +249,26 @@ class Bridge:
         if newest is None or newest.stamp_ns <= self._last_y_ns or any(self._staleness(name, now_ns) for name in self.outputs):
             return None
         self._last_y_ns = newest.stamp_ns
-        return StampedVector(newest.stamp_ns, np.array([self._readings[name].value for name in self.outputs]))
+        return StampedVector(newest.stamp_ns, np.array([self._value(name) for name in self.outputs]))
+
+    def _value(self, name: str) -> float:
+        """The newest value of a channel. A captured output is 0 until it is engaged, then its change since engagement."""
+        value = self._readings[name].value
+        row = self.channel_map.outputs.get(name)
+        if row is None or not row.captured:
+            return value
+        return value - self._zero[name] if self._is_captured() else 0.0
+
+    def _is_captured(self) -> bool:
+        """Whether the trims are those captured at engagement; otherwise they follow their sources."""
+        return self.phase in {Phase.ENGAGED, Phase.NEUTRAL, Phase.RELEASE} and bool(self._zero or self._trim)
+
+    def trim(self, name: str) -> float:
+        """The trim of an input: captured at engagement where `trims` has its source, which it follows until then."""
+        row, source = self.channel_map.inputs[name], self._readings.get(trim_key(name))
+        if name in self._trim and self._is_captured():
+            return self._trim[name]
+        return row.trim if source is None else to_channel(source.value, row.line)
 
     def pose(self, now_ns: int) -> tuple[tuple[str, ...], StampedVector] | None:
         """Names and values of the fresh channels of the pose, at the stamp of its first row; None where that is not new.
@@ -204,23 +289,46 @@ class Bridge:
     def raw_u(self) -> FloatArray:
         """Raw values of the newest u after saturation, shape (m,): raw of trim + min(max(u, lower), upper)."""
         u = np.minimum(np.maximum(self._u, self._lower), self._upper)
-        rows = self.channel_map.inputs.values()
-        return np.array([to_raw(row.trim + u_i, row.line) for row, u_i in zip(rows, u.tolist(), strict=True)])
+        return np.array([self._raw(name, u_i) for name, u_i in zip(self.inputs, u.tolist(), strict=True)])
+
+    def _raw(self, name: str, u: float) -> float:
+        return to_raw(self.trim(name) + u, self.channel_map.inputs[name].line)
 
     def raw(self) -> FloatArray:
         """Raw values that are sent in this phase, shape (m,)."""
         if self.phase is Phase.ENGAGED:
             return self.raw_u()
-        key = "neutral" if self.phase is Phase.NEUTRAL else "release"
-        return np.array([getattr(row, key) for row in self.channel_map.inputs.values()])
+        return np.array([self._resting(name, row) for name, row in self.channel_map.inputs.items()])
+
+    def _resting(self, name: str, row: InputRow) -> float:
+        """The neutral or the release value of an input."""
+        if self.phase is not Phase.NEUTRAL:
+            return math.nan if row.release is None else row.release
+        return self._raw(name, 0.0) if row.neutral == "trim" else row.neutral
 
     def sends(self, name: str, now_ns: int) -> bool:
         """Whether a message of the map is sent now. A dry run sends none."""
         if self.dry_run:
             return False
-        if self.channel_map.messages[name].when == "ready":
-            return self.ready(now_ns)
-        return self.phase is not Phase.DISENGAGED
+        when, phase = self.channel_map.messages[name].when, self.phase
+        if when == "heartbeat":
+            return phase in {Phase.ENGAGING, Phase.ENGAGED, Phase.NEUTRAL}
+        if when == "engaging":
+            return phase is Phase.ENGAGING
+        if when == "release":
+            return phase is Phase.RELEASE and not self._unmet(now_ns, awaited=True)
+        own = [row.release for row in self.channel_map.inputs.values() if row.message == name]
+        return phase in {Phase.ENGAGED, Phase.NEUTRAL} or (phase is Phase.RELEASE and None not in own)
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
+        if phase is Phase.ENGAGED:
+            self.reason = ""
         self.phase, self._phase_ns = phase, now_ns
+
+
+def _staleness(what: str, topic: str, reading: Reading | None, max_age: float, now_ns: int) -> str:
+    """Why a field is stale, as a sentence; empty where it is fresh."""
+    if reading is None:
+        return f"{what} not received yet ({topic})"
+    age_ns = now_ns - reading.stamp_ns
+    return f"{what} is {seconds(age_ns):.2f} s old ({topic})" if age_ns > nanoseconds(max_age) else ""

@@ -2,32 +2,49 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge node, in place of the aircraft node: y from an autopilot and setpoints for u to it, by a channel map."""
 
+import os
 import time
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
-from autopilot_bridge.bridge import Bridge, Phase
+from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field
-from autopilot_bridge.params import BridgeParameters, InputRow, MeasuredRow, MessageRow, OverrideRow, QosRow, load_map
+from autopilot_bridge.params import (
+    BridgeParameters,
+    ConditionRow,
+    InputRow,
+    MeasuredRow,
+    MessageRow,
+    QosRow,
+    WatchedRow,
+    load_map,
+)
+from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError
+from flight_ros import transport
+from flight_ros.endpoints import mismatch, type_name
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Encoder
 from flight_ros.rclpy_private import DeserializationError
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
-from flight_ros.topics import POSE, Topic, U, Y
+from flight_ros.topics import ENGAGEMENT, POSE, PUBLISH, Topic, U, Y
 
 WOULD_SEND = Topic("bridge/would_send", JointState)
 RELEASES_AT_SHUTDOWN = 5  # messages with release values at the end of the node; a single one may be lost
 
-NamedRow = tuple[str, MeasuredRow | OverrideRow]
+ACTIVATION_TIMEOUT_NS = NANOSECONDS  # of the controller at engagement; it answers within some of its ticks
+
+NamedRow = tuple[str, MeasuredRow | WatchedRow]
 
 
 class BridgeNode(FlightNode[BridgeParameters]):
@@ -39,7 +56,13 @@ class BridgeNode(FlightNode[BridgeParameters]):
         dry_run = self._map.dry_run if self.parameters.dry_run is None else self.parameters.dry_run
         self._bridge = Bridge(self._map, dry_run=dry_run)
         self._logged_phase = self._bridge.phase
-        named: list[NamedRow] = [*self._map.outputs.items(), *self._map.pose.items(), *self._map.overrides.items()]
+        named: list[NamedRow] = [
+            *self._map.outputs.items(),
+            *self._map.pose.items(),
+            *((trim_key(name), row) for name, row in self._map.trims.items()),
+            *self._map.conditions.items(),
+            *self._map.overrides.items(),
+        ]
         rows_by_topic: dict[str, list[NamedRow]] = {}
         for name, row in named:
             rows_by_topic.setdefault(row.topic, []).append((name, row))
@@ -58,6 +81,13 @@ class BridgeNode(FlightNode[BridgeParameters]):
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
         self._would_send_encoder = self.encoder(WOULD_SEND, names)
         self.create_service(SetBool, "~/engage", self._engage)
+        self._engagement = self.create_publisher(ENGAGEMENT.type, ENGAGEMENT.name, PUBLISH)
+        self._first_y, self._start_ns = False, 0
+        self._report_ns = 0  # of the last report on the engagement
+        self._controller = self.create_client(ChangeState, "controller/change_state")
+        self._controller_ready = False
+        self._activation: Any = None  # the pending activation of the controller
+        self._activation_ns = 0
         self.get_logger().info(
             f"map {self._map.name}: "
             + ("dry run, nothing is sent" if dry_run else f"disengaged, waiting for {self.get_name()}/engage")
@@ -71,7 +101,8 @@ class BridgeNode(FlightNode[BridgeParameters]):
                 set_field(message, path, value)
             for _, one in rows:
                 for raw in (one.neutral, one.release, *one.range):
-                    set_field(message, one.field, raw)
+                    if isinstance(raw, float):
+                        set_field(message, one.field, raw)
             if row.stamped:
                 get_field(message, "header.stamp")
         except ChannelError as error:
@@ -88,7 +119,10 @@ class BridgeNode(FlightNode[BridgeParameters]):
             for received in subscription.take():
                 self._read(subscription, rows, received.message, received.received_ns or now_ns, now_ns)
         sample = self._bridge.y(now_ns)
-        if sample is not None:
+        if sample is None:
+            self._require_first_y(now_ns)
+        else:
+            self._first_y = True
             self._publish_y(self._y_encoder.encode(sample.stamp_ns, sample.value))
         if self._publish_pose is not None and (fresh := self._bridge.pose(now_ns)) is not None:
             names, pose = fresh
@@ -98,7 +132,10 @@ class BridgeNode(FlightNode[BridgeParameters]):
         if self._take_u(now_ns):
             self._publish_would_send(self._would_send_encoder.encode(now_ns, self._bridge.raw_u()))
         self._bridge.step(now_ns)
+        self._check_activation(now_ns)
         self._log_phase()
+        if now_ns - self._report_ns >= NANOSECONDS:
+            self._report(now_ns)
         self._send(now_ns, self.period_ns() // 2)
         self._warn_stale_inputs(now_ns)
 
@@ -110,8 +147,9 @@ class BridgeNode(FlightNode[BridgeParameters]):
             return
         for name, row in rows:
             try:
-                if isinstance(row, OverrideRow):
-                    self._bridge.take_override(name, read_raw(message, row.field, "value"), now_ns)
+                if isinstance(row, WatchedRow):
+                    take = self._bridge.take_condition if isinstance(row, ConditionRow) else self._bridge.take_override
+                    take(name, read_raw(message, row.field, "value"), now_ns)
                     continue
                 stamp_ns = arrived_ns
                 if row.stamp == "header":
@@ -143,7 +181,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
                     self.get_logger().error(f"messages.{name} not sent: {error}", throttle_duration_sec=2.0)
 
     def _engage(self, request: Any, response: Any) -> Any:
-        now_ns = self.get_clock().now().nanoseconds
+        now_ns = self.now_ns()
         if request.data:
             response.message = self._bridge.engage(now_ns)
         else:
@@ -154,6 +192,37 @@ class BridgeNode(FlightNode[BridgeParameters]):
         self._log_phase()
         return response
 
+    def _activate(self, active: bool) -> None:
+        """Request that the controller is active: only while engaged, so that its integrals do not wind up."""
+        if not self._controller.service_is_ready():
+            return  # u of another node, which has no lifecycle
+        transition = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
+        future = self._controller.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        self._activation, self._activation_ns = (future, self.now_ns()) if active else (None, 0)
+
+    def _check_activation(self, now_ns: int) -> None:
+        """Disengage where the controller did not activate: its u would stay at trim."""
+        if self._activation is None:
+            return
+        if self._activation.done():
+            success, self._activation = self._activation.result().success, None
+            if not success:
+                self._bridge.disengage("the controller refused to activate: see its log", now_ns)
+        elif now_ns - self._activation_ns > ACTIVATION_TIMEOUT_NS:
+            self._activation = None
+            self._bridge.disengage("timed out waiting for the controller to activate", now_ns)
+
+    def _report(self, now_ns: int) -> None:
+        """Publish the phase and its reason; once a second also what would refuse an engagement."""
+        bridge, self._report_ns = self._bridge, now_ns
+        refusal = "" if bridge.phase in {Phase.ENGAGED, Phase.ENGAGING} else bridge.refusal(now_ns)
+        sentence = "; would refuse: ".join(filter(None, (bridge.reason, refusal)))
+        self._engagement.publish(KeyValue(key=bridge.phase.name, value=sentence))
+        ready = self._controller.service_is_ready()
+        if ready and not self._controller_ready and bridge.phase is not Phase.ENGAGED:
+            self._activate(active=False)
+        self._controller_ready = ready
+
     def _log_phase(self) -> None:
         phase = self._bridge.phase
         if phase is not self._logged_phase:
@@ -162,6 +231,9 @@ class BridgeNode(FlightNode[BridgeParameters]):
                 self.get_logger().info(sentence)
             else:
                 self.get_logger().warning(f"{sentence}: {self._bridge.reason}")
+            if Phase.ENGAGED in (phase, self._logged_phase):
+                self._activate(active=phase is Phase.ENGAGED)
+            self._engagement.publish(KeyValue(key=phase.name, value=self._bridge.reason))
             self._logged_phase = phase
 
     def _warn_stale_inputs(self, now_ns: int) -> None:
@@ -172,6 +244,31 @@ class BridgeNode(FlightNode[BridgeParameters]):
         if self._bridge.u_timed_out(now_ns):
             self.warn_no_publisher(self._u_subscription)
 
+    def _require_first_y(self, now_ns: int) -> None:
+        """Raise FlightEnded with the reasons where y does not become complete in time."""
+        self._start_ns = self._start_ns or now_ns
+        limit = self.parameters.first_y
+        if self._first_y or limit == 0.0 or now_ns - self._start_ns < nanoseconds(limit):
+            return
+        stale = self._bridge.stale(now_ns)
+        found = dict.fromkeys(
+            f"{subscription.name}: {self._cause(subscription)}"
+            for subscription, rows in self._readers
+            if any(name in stale for name, _ in rows)
+        )
+        raise FlightEnded(f"no y after {limit:g} s: {'; '.join(found)}")
+
+    def _cause(self, subscription: PolledSubscription) -> str:
+        """Why no sample of a topic was accepted, as a sentence."""
+        publishers = self.get_publishers_info_by_topic(subscription.name)
+        if not publishers:
+            profile = os.environ.get(transport.PROFILE_VARIABLE, "")
+            return f"no publisher. The autopilot's agent needs the same DDS profile, {transport.PROFILE_VARIABLE}={profile}"
+        kind = type_name(subscription.topic.type)
+        faults = (mismatch(subscription.name, one, kind, subscription.qos) for one in publishers)
+        refused = (what for what in self.rejected if what.startswith(f"{subscription.topic.name}: "))
+        return next(filter(None, (*faults, *refused)), "its publisher sends no samples")
+
     def check_graph(self) -> None:
         """Also report a topic to which the autopilot subscribes with another type or an incompatible quality of service."""
         super().check_graph()
@@ -179,7 +276,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
             self.check_subscribers(outgoing.publisher)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
-        bridge, now_ns = self._bridge, self.get_clock().now().nanoseconds
+        bridge, now_ns = self._bridge, self.now_ns()
         refusal = "" if bridge.phase is Phase.ENGAGED else bridge.refusal(now_ns)
         level = DiagnosticStatus.OK if bridge.phase is Phase.ENGAGED else DiagnosticStatus.WARN
         sentence = "ENGAGED" if bridge.phase is Phase.ENGAGED else f"{bridge.phase.name}: {bridge.reason}"
@@ -226,7 +323,7 @@ def _qos(row: QosRow) -> QoSProfile:
     )
 
 
-def _require_field(empty: Any, name: str, row: MeasuredRow | OverrideRow) -> None:
+def _require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None:
     """Raise ParameterError for a field that is missing. One inside a sequence is checked with the first message only."""
     if "[" in row.field:
         return

@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from autopilot_bridge.channel_map import PATH, Line, to_raw
 from flight_core.files import is_file, read_yaml
-from flight_core.parameters import KeyedParameters, NonNegative, Parameters, Positive, as_tuple, require
+from flight_core.parameters import KeyedParameters, NonNegative, Numbers, Parameters, Positive, as_tuple, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 
@@ -97,17 +97,23 @@ class PoseRow(MeasuredRow):
 class OutputRow(MeasuredRow, MovingRow):
     """A channel of y, the deviation from trim."""
 
+    captured: bool = Field(
+        default=False, description="whether the channel begins at 0 at each engagement, in place of the trim in `offset`"
+    )
+
 
 class InputRow(MovingRow):
     """A channel of u, the deviation from trim: message and field of its setpoint. trim + u = sign scale raw + offset."""
 
     message: str = Field(description="the message with the field, one of `messages`")
-    trim: float = Field(description="the command in trim, to which u is added, SI")
+    trim: float = Field(description="the command in trim, to which u is added, SI; a row of `trims` replaces it")
     lower: Annotated[float, Field(le=0)] = Field(description="the lower limit of u around trim, SI")
     upper: Annotated[float, Field(ge=0)] = Field(description="the upper limit of u around trim, SI")
     range: Range = Field(description="the lowest and the highest raw value of the field")
-    neutral: float = Field(description="failsafe: the raw value that is sent when u has timed out")
-    release: Raw = Field(description="the raw value that returns the channel to the autopilot, for example NaN")
+    neutral: float | Literal["trim"] = Field(description="failsafe: the raw value that is sent when u has timed out, or trim")
+    release: Raw | None = Field(
+        description="the raw value that returns the channel to the autopilot, for example NaN; null where nothing is sent"
+    )
 
 
 class MessageRow(Parameters):
@@ -116,28 +122,51 @@ class MessageRow(Parameters):
     topic: TopicName = Field(description="the autopilot's topic")
     type: MessageType = Field(description="its type, package/msg/Type")
     rate: Rate = Field(description="the rate at which it is sent, Hz")
-    when: Literal["engaged", "ready"] = Field(
-        description="engaged: from engagement to the end of the release; ready: while y and u are fresh"
+    when: Literal["engaged", "heartbeat", "engaging", "release"] = Field(
+        description="engaged: from engagement to the end of the release; heartbeat: from the request to the release; engaging:"
+        " while the engagement waits for a condition; release: during the release while the conditions hold"
     )
     stamped: bool = Field(description="whether header.stamp is set to the instant of sending")
     values: dict[str, Value] = Field(default={}, description="values of its other fields, by their paths")
 
 
-class OverrideRow(Parameters):
-    """A pilot override: the bridge disengages at once where the field is beyond the threshold."""
+class WatchedRow(Parameters):
+    """A field of the autopilot that decides on the engagement."""
 
     topic: TopicName = Field(description="the topic")
     type: MessageType = Field(description="its type, package/msg/Type")
     field: str = Field(description="the path of the field")
-    above: float | None = Field(default=None, description="the override is active where the field is above this")
-    below: float | None = Field(default=None, description="the override is active where the field is below this")
-    bits: Annotated[int, Field(gt=0)] | None = Field(default=None, description="for a bit field: mask of the bits that count")
     source: str = Field(min_length=1, description="where the row is from")
 
-    def is_active(self, raw: float) -> bool:
-        """Whether the override is active."""
+
+class ConditionRow(WatchedRow):
+    """A condition of the engagement: the field has one of some values. The bridge disengages where it has not."""
+
+    one_of: Numbers = Field(description="the values with which the condition holds; false is 0 and true is 1")
+    sentence: str = Field(min_length=1, description="what is wrong where the condition does not hold")
+    max_age: Positive = Field(description="the age above which the field is stale, s")
+    awaited: bool = Field(
+        default=False, description="whether an engagement waits for the condition, up to `engage_timeout`, instead of a refusal"
+    )
+
+
+class OverrideRow(WatchedRow):
+    """A pilot override: the bridge disengages at once where the field is beyond the threshold."""
+
+    above: float | None = Field(default=None, description="the override is active where the field is above this")
+    below: float | None = Field(default=None, description="the override is active where the field is below this")
+    moved: Positive | None = Field(
+        default=None, description="the override is active where the field has moved by more than this since engagement"
+    )
+    bits: Annotated[int, Field(gt=0)] | None = Field(default=None, description="for a bit field: mask of the bits that count")
+    max_age: Positive = Field(default=1.0, description="the age above which the override is not active any more, s")
+
+    def is_active(self, raw: float, at_engagement: float | None) -> bool:
+        """Whether the override is active. `at_engagement` is its value at engagement; None where it is not engaged."""
         if self.bits is not None:
             raw = float(int(raw) & self.bits)
+        if self.moved is not None:
+            return at_engagement is not None and abs(raw - at_engagement) > self.moved
         return (self.above is not None and raw > self.above) or (self.below is not None and raw < self.below)
 
 
@@ -168,6 +197,9 @@ class ChannelMap(Parameters):
     engage_within: Annotated[float, Field(gt=0, le=1)] = Field(
         description="the largest deviation of u from trim at engagement, as a fraction of its limits"
     )
+    engage_timeout: Positive = Field(
+        default=5.0, description="how long an engagement waits for its awaited conditions, s; then it is refused"
+    )
     silence: SilenceParameters = Field(description="failsafe for a u that times out")
     outputs: Annotated[dict[str, OutputRow], Field(min_length=1)] = Field(description="the channels of y")
     pose: dict[str, PoseRow] = Field(
@@ -177,7 +209,11 @@ class ChannelMap(Parameters):
         default={}, description="limits of channels of the pose or of y: the bridge disengages beyond them"
     )
     inputs: Annotated[dict[str, InputRow], Field(min_length=1)] = Field(description="the channels of u")
+    trims: dict[str, MeasuredRow] = Field(
+        default={}, description="sources of the raw values of inputs in trim, by input: captured at each engagement"
+    )
     messages: Annotated[dict[str, MessageRow], Field(min_length=1)] = Field(description="the messages to the autopilot")
+    conditions: dict[str, ConditionRow] = Field(default={}, description="the conditions of an engagement")
     overrides: dict[str, OverrideRow] = Field(default={}, description="the pilot overrides")
     topics: dict[str, QosRow] = Field(description="the quality of service by topic")
 
@@ -201,7 +237,10 @@ class ChannelMap(Parameters):
                 raw = to_raw(row.trim + u, row.line)
                 inside = low - ROUNDING <= raw <= high + ROUNDING
                 require(inside, f"{key}.{limit}", f"{row.field} = {raw:.6g}", f"one in the range [{low:g}, {high:g}]")
-            require(low <= row.neutral <= high, f"{key}.neutral", row.neutral, f"one in the range [{low:g}, {high:g}]")
+            neutral = low if row.neutral == "trim" else row.neutral
+            require(low <= neutral <= high, f"{key}.neutral", row.neutral, f"one in the range [{low:g}, {high:g}]")
+        for name in self.trims:
+            require(name in self.inputs, f"trims.{name}", "a channel", f"one of the inputs {', '.join(self.inputs)}")
         for name in self.pose:
             require(name in POSE, f"pose.{name}", "a channel", f"one of {', '.join(POSE)}")
         for name in self.outputs:
@@ -211,8 +250,9 @@ class ChannelMap(Parameters):
             require(name in watched, f"envelope.{name}", "a channel", f"one of the pose or of y: {', '.join(watched)}")
             require(lower < upper, f"envelope.{name}", [lower, upper], "the lower end before the upper one")
         for name, override in self.overrides.items():
-            one_threshold = (override.above is None) != (override.below is None)
-            require(one_threshold, f"overrides.{name}", "above and below, or neither", "one of the two")
+            thresholds = [key for key in ("above", "below", "moved") if getattr(override, key) is not None]
+            found = " and ".join(thresholds) or "no threshold"
+            require(len(thresholds) == 1, f"overrides.{name}", found, "one of above, below and moved")
         return self
 
     def _check_fields(self) -> None:
@@ -234,7 +274,8 @@ class ChannelMap(Parameters):
 
     def _readers(self) -> dict[str, Mapping[str, Any]]:
         """The sections whose rows read a field of a topic."""
-        return {"outputs": self.outputs, "pose": self.pose, "overrides": self.overrides}
+        kinds = ("outputs", "pose", "trims", "conditions", "overrides")
+        return {kind: getattr(self, kind) for kind in kinds}
 
     def used_topics(self) -> list[tuple[str, str, str]]:
         """(key of the row, topic, type) of each row that names a topic."""
@@ -271,6 +312,9 @@ class BridgeParameters(KeyedParameters):
     map: str = Field(description="the name of a channel map of the library, or the path of a file ending in .yaml")
     dry_run: bool | None = Field(
         default=None, description="replaces dry_run of the map: publish what would be sent and send nothing"
+    )
+    first_y: NonNegative = Field(
+        default=0.0, description="how long the node waits for its first y before it ends with the reason, s; 0: without end"
     )
 
     @model_validator(mode="after")

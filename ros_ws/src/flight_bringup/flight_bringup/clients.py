@@ -8,8 +8,6 @@ from collections.abc import Callable
 from typing import Any, Self
 
 import rclpy
-from lifecycle_msgs.msg import State, Transition
-from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool
@@ -21,7 +19,20 @@ from flight_ros import transport
 from flight_ros.messages import Decoder, stamp_of
 from flight_ros.player import Player
 from flight_ros.subscriptions import PolledSubscription
-from flight_ros.topics import INTERNALS, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, RECORDED, STATES, Y_M, NodeState, U, Y
+from flight_ros.topics import (
+    ENGAGEMENT,
+    INTERNALS,
+    LOCKSTEP,
+    NEWEST_SAMPLES,
+    NODE_STATE,
+    PUBLISH,
+    RECORDED,
+    STATES,
+    Y_M,
+    NodeState,
+    U,
+    Y,
+)
 from rise_di_controller.guard import Mode
 
 __all__ = ["EngagementClient", "FlightMonitor", "Player"]
@@ -29,6 +40,7 @@ __all__ = ["EngagementClient", "FlightMonitor", "Player"]
 MODES = {float(mode): mode.name for mode in Mode}
 
 SERVICE_TIMEOUT = 10.0  # s
+FIRST_U = 30.0  # s: the nodes of a flight start, and the autopilot may send its first messages late
 AT_REST = 20  # so many equal samples of u in a row: it has reached trim
 
 
@@ -59,6 +71,7 @@ class FlightMonitor(_Client):
         self._recorded = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
         self._node_state = PolledSubscription(self._node, NODE_STATE, STATES)
         self._states: dict[str, str] = {}  # by process
+        self._engagement = None if lockstep else PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
         self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
 
     def is_ready(self, node: str, pid: int) -> bool:
@@ -78,6 +91,11 @@ class FlightMonitor(_Client):
             if sample is not None:
                 status = MODES.get(sample.value[0], "?"), sample.value[1:]
         return status
+
+    def engagement(self) -> list[tuple[str, str]]:
+        """Phases of a bridge with their reasons, in order, since the last call."""
+        messages = () if self._engagement is None else self._engagement.take()
+        return [(one.message.key, one.message.value) for one in messages]
 
     def recorded(self) -> float | None:
         """The flight time up to which the log of a lockstep flight is complete, s; None without a change."""
@@ -99,25 +117,25 @@ class EngagementClient(_Client):
     def __init__(self, namespace: str) -> None:
         super().__init__("engage", namespace)
         self._u: list[tuple[float, ...]] = []
+        self._phases: list[tuple[str, str]] = []
+        self._waits_for = ""  # the last reason that was reported
+        self._engagement_subscription = PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
         self._u_subscription = PolledSubscription(self._node, U, NEWEST_SAMPLES, raw=True)
 
-    def engage(self) -> str:
-        """Bring u to trim, engage the bridge, activate the controller. Returns the bridge's reason to refuse, or ""."""
-        state = self._call(GetState, "controller/get_state", GetState.Request()).current_state.id
-        active = state == State.PRIMARY_STATE_ACTIVE
-        if active:
-            self._change_state(Transition.TRANSITION_DEACTIVATE)
-        try:
-            self._u.clear()
-            self._spin_until(self._at_rest, f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim")
-            refusal = self._set_engaged(engaged=True)
-        except ParameterError:
-            if active:
-                self._change_state(Transition.TRANSITION_ACTIVATE)
-            raise
-        if active or not refusal:
-            self._change_state(Transition.TRANSITION_ACTIVATE)
-        return refusal
+    def engage(self, progress: Callable[[str], None]) -> str:
+        """Wait for u at trim and engage the bridge, which activates the controller. Returns the reason of a refusal, or "".
+
+        `progress` is called with the phase and the reason while the bridge waits for the autopilot.
+        """
+        self._spin_until(lambda: bool(self._received_u()), "u: not received, expected a controller with y and y_m", FIRST_U)
+        self._spin_until(self._at_rest, f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim")
+        self._spin_until(lambda: bool(self._received_phases()), "bridge/engagement: not received, expected a running bridge")
+        self._phases.clear()
+        if refusal := self._set_engaged(engaged=True):
+            return refusal
+        self._spin_until(lambda: self._settled(progress), "bridge/engagement: no change, expected ENGAGED or a reason", FIRST_U)
+        phase, reason = self._phases[-1]
+        return "" if phase == "ENGAGED" else reason
 
     def disengage(self) -> str:
         """Disengage the bridge. Returns its reason to refuse, or ""."""
@@ -126,14 +144,28 @@ class EngagementClient(_Client):
     def _set_engaged(self, *, engaged: bool) -> str:
         return str(self._call(SetBool, "bridge/engage", SetBool.Request(data=engaged)).message)
 
-    def _change_state(self, transition: int) -> None:
-        request = ChangeState.Request(transition=Transition(id=transition))
-        success = self._call(ChangeState, "controller/change_state", request).success
-        require(success, "controller", "a failed lifecycle transition", "a configured controller; see its log")
-
-    def _at_rest(self) -> bool:
+    def _received_u(self) -> list[tuple[float, ...]]:
         for received in self._u_subscription.take():
             self._u.append(tuple(deserialize_message(received.message, U.type).position))
+        return self._u
+
+    def _received_phases(self) -> list[tuple[str, str]]:
+        """Phases of the bridge with their reasons, since the request."""
+        self._phases += [(one.message.key, one.message.value) for one in self._engagement_subscription.take()]
+        return self._phases
+
+    def _settled(self, progress: Callable[[str], None]) -> bool:
+        """Whether the bridge has engaged, or has given up after it began to. Reports from before the request do not count."""
+        phases = [phase for phase, _ in self._received_phases()]
+        while phases and phases[0] not in {"ENGAGING", "ENGAGED"}:
+            del phases[0], self._phases[0]
+        if phases and phases[-1] == "ENGAGING" and self._phases[-1][1] != self._waits_for:
+            self._waits_for = self._phases[-1][1]
+            progress(self._waits_for)
+        return bool(phases) and phases[-1] != "ENGAGING"
+
+    def _at_rest(self) -> bool:
+        self._received_u()
         return len(self._u) >= AT_REST and len(set(self._u[-AT_REST:])) == 1
 
     def _call(self, kind: Any, name: str, request: Any) -> Any:
@@ -144,8 +176,8 @@ class EngagementClient(_Client):
         self._spin_until(future.done, f"{service}: no response, expected one within {SERVICE_TIMEOUT:g} s")
         return future.result()
 
-    def _spin_until(self, condition: Callable[[], bool], message: str) -> None:
-        deadline = time.monotonic() + SERVICE_TIMEOUT
+    def _spin_until(self, condition: Callable[[], bool], message: str, timeout: float = SERVICE_TIMEOUT) -> None:
+        deadline = time.monotonic() + timeout
         while not condition():
             if time.monotonic() > deadline:
                 raise ParameterError(message)

@@ -40,12 +40,13 @@ def fly_over_topics(
     lockstep: bool = False,
     one_process: bool = False,
     autopilot: Autopilot | None = None,
+    announce: Callable[[str], None] = lambda line: None,
 ) -> str:
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
     Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one process, in lockstep only.
-    `autopilot` flies in the aircraft's place, in real time only. Outcomes: "completed", "interrupted" (Ctrl-C or SIGTERM), or a
-    sentence that names the process that ended early.
+    `autopilot` flies in the aircraft's place, in real time only; `announce` gets a line for each change of its engagement.
+    Outcomes: "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence that names the process that ended early.
     """
     from flight_bringup.clients import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
@@ -57,19 +58,33 @@ def fly_over_topics(
                 scenario, run, monitor, lockstep=lockstep, one_process=one_process, autopilot=autopilot
             ) as processes,
         ):
-            follow = _follow_lockstep if lockstep else _follow_real_time
-            return follow(scenario, processes, monitor, progress)
+            if lockstep:
+                return _follow_lockstep(scenario, processes, monitor, progress)
+            return _follow_real_time(scenario, processes, monitor, progress, announce)
     except KeyboardInterrupt:
         return INTERRUPTED
 
 
-def _follow_real_time(scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", progress: Progress) -> str:
+def _follow_real_time(
+    scenario: Scenario,
+    processes: FlightProcesses,
+    monitor: "FlightMonitor",
+    progress: Progress,
+    announce: Callable[[str], None],
+) -> str:
     units, outputs = display_units(scenario), scenario.controller.outputs
-    text = "starting"
+    text, phase, why = "starting", "", ""
     while (t := time.time() - processes.start_time) < scenario.flight.duration:
         if (reason := processes.ended_early()) is not None:
             return reason
-        if (status := monitor.newest()) is not None:
+        before = phase
+        for phase, why in monitor.engagement():
+            if phase != before:
+                announce(f"t = {t:.1f} s: {phase}{f': {why}' if why else ''}")
+            before = phase
+        if phase not in {"", "ENGAGED"}:
+            text = f"{phase}: {why}"
+        elif (status := monitor.newest()) is not None:
             mode, values = status
             errors = (f"{name} {e * units[name].factor:+.2f}" for name, e in zip(outputs, values, strict=True))
             text = f"{mode}  e: {', '.join(errors)}"

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from autopilot_bridge.params import ChannelMap, find_map, load_map
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_analysis.report.run_folder import attachments_for
+from flight_core.parameters import require
 
 
 class NodeSpec(NamedTuple):
@@ -39,7 +40,7 @@ FIRST_STAGE = (RECORDER, CONTROLLER)
 SECOND_STAGE = (AIRCRAFT, REFERENCE_MODEL)
 SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
-POSE, WOULD_SEND = "pose", "bridge/would_send"
+POSE, WOULD_SEND, ENGAGEMENT = "pose", "bridge/would_send", "bridge/engagement"
 
 # The bridge also publishes the messages of its channel map.
 PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
@@ -47,7 +48,7 @@ PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
         AIRCRAFT: ("y", "truth"),
         REFERENCE_MODEL: ("y_m",),
         CONTROLLER: ("u", "internals"),
-        BRIDGE: ("y", POSE, WOULD_SEND),
+        BRIDGE: ("y", POSE, WOULD_SEND, ENGAGEMENT),
         RECORDER: ("recorded",),
     }
 )
@@ -62,13 +63,33 @@ class Autopilot(NamedTuple):
 
     @property
     def topics(self) -> list[str]:
-        """The topics to record: those of the map, the pose where the map has one, and WOULD_SEND."""
-        return [*self.channel_map.topics, *([POSE] if self.channel_map.pose else []), WOULD_SEND]
+        """The topics to record: those of the map, the pose where the map has one, WOULD_SEND, ENGAGEMENT."""
+        return [*self.channel_map.topics, *([POSE] if self.channel_map.pose else []), WOULD_SEND, ENGAGEMENT]
 
 
 def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
     """An autopilot by the name of its channel map, or the path of one. Raises ParameterError."""
     return Autopilot(load_map(map_name), find_map(map_name), dry_run)
+
+
+def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
+    """Raise ParameterError where the controller may command more than the map sends; a dry run sends nothing.
+
+    The bridge would clip u, and the anti-windup of the law would not know. The limits of the scenario are not narrowed here:
+    the log holds the parameters that flew.
+    """
+    if autopilot.dry_run:
+        return
+    channel_map = autopilot.channel_map
+    controller, key = scenario.controller, f"scenario {scenario.name}: controller"
+    lowest, highest = ([sign * float("inf")] * len(controller.inputs) for sign in (-1.0, 1.0))
+    lower, upper = controller.lower or lowest, controller.upper or highest
+    for name, low, high in zip(controller.inputs, lower, upper, strict=True):
+        if (row := channel_map.inputs.get(name)) is None:
+            continue  # another check names the channels that differ
+        of_map = f"of {name} in the map {channel_map.name}: what the bridge clips, the law's anti-windup does not know"
+        require(low >= row.lower, f"{key}.lower", f"{low:g}", f"at least {row.lower:g}, the lower limit {of_map}")
+        require(high <= row.upper, f"{key}.upper", f"{high:g}", f"at most {row.upper:g}, the upper limit {of_map}")
 
 
 def start_lead(startup: float) -> float:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_bringup.graph import (
+    BRIDGE,
     FIRST_STAGE,
     ONE_PROCESS,
     RECORDER,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 STOP_TIMEOUT = 2.5  # s, for all processes together; a node needs 0.2 s
 READY_TIMEOUT = 20.0  # s
+FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
 POLL_PERIOD = 0.005  # s, while nodes start
 
 
@@ -146,6 +148,8 @@ class FlightProcesses:
         overrides = parameter_overrides(
             node, self._scenario, self._run, self.start_time, lockstep=self._lockstep, autopilot=self._autopilot
         )
+        if node is BRIDGE:
+            overrides = {**overrides, "first_y": FIRST_Y}
         self.processes.append(NodeProcess(node, self._scenario.path, overrides, log))
 
     def _wait_until_ready(self, deadline: float) -> None:

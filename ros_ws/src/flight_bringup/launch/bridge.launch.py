@@ -26,6 +26,7 @@ from flight_bringup.graph import (
     NodeSpec,
     find_autopilot,
     parameter_overrides,
+    require_limits,
 )
 from flight_bringup.launch.stages import (
     argument,
@@ -65,6 +66,7 @@ def _fly(context: LaunchContext) -> list[Action]:
     scenario = find_scenario(argument(context, "scenario"), duration)
     autopilot = find_autopilot(argument(context, "map"), dry_run=argument(context, "dry_run") == "true")
     require_signs(autopilot.channel_map, scenario)
+    require_limits(autopilot, scenario)
     recorded = argument(context, "recorder") == "true"
     run = new_run(scenario, Path(argument(context, "runs"))) if recorded else Path()
     end_with_launch(context)

@@ -16,13 +16,14 @@ def engage(
 ) -> None:
     """Engage the autopilot behind a running bridge without a jump of u, or disengage it.
 
-    The controller is deactivated until u is at trim, the bridge is engaged, the controller is activated. A refusal leaves the
-    controller as it was. Exit status: 0 done, 1 refused with the bridge's reason, 2 service not available.
+    It waits until u is at trim, and until the autopilot has changed its mode where the map asks for that. The bridge activates
+    the controller, and deactivates it at the end of the engagement. Exit status: 0 done, 1 refused with the bridge's reason,
+    2 service not available.
     """
     from flight_bringup.clients import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     with EngagementClient(namespace) as client:
-        refusal = client.disengage() if off else client.engage()
+        refusal = client.disengage() if off else client.engage(lambda reason: print(f"waiting: {reason}", file=sys.stderr))
     if refusal:
         print(f"error: not {'disengaged' if off else 'engaged'}: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)

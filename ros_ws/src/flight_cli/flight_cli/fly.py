@@ -13,7 +13,7 @@ from rich.console import Console
 from flight_analysis.design.sign_check import require_signs
 from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
-from flight_bringup.graph import find_autopilot
+from flight_bringup.graph import find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario
 from flight_cli.output import CLOCK_COLUMNS, ENDED_EARLY, INTERRUPTED, display_path, progress_bar, show_flight
 from flight_core import outcome as ends
@@ -51,6 +51,7 @@ def fly(
     autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
     if autopilot is not None:
         require_signs(autopilot.channel_map, chosen)
+        require_limits(autopilot, chosen)
     require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
     real_time = "a flight in real time over topics: an autopilot does not wait"
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
@@ -64,7 +65,15 @@ def fly(
         if in_process:
             outcome = fly_in_process(chosen, run, progress)
         else:
-            outcome = fly_over_topics(chosen, run, progress, lockstep=stepping, one_process=one_process, autopilot=autopilot)
+            outcome = fly_over_topics(
+                chosen,
+                run,
+                progress,
+                lockstep=stepping,
+                one_process=one_process,
+                autopilot=autopilot,
+                announce=lambda line: bar.console.print(line, highlight=False, soft_wrap=True),
+            )
         if outcome == "completed":
             progress(chosen.flight.duration, outcome)
     status = STATUS.get(outcome, ENDED_EARLY)

@@ -50,6 +50,9 @@ def gains(
     uncertainty: Annotated[float, typer.Option(help="Largest relative deviation of each entry of A and B.")] = 0.3,
     scenario: Annotated[str, typer.Option(help="Scenario with the commands, the gusts and the loop.")] = "osprey_servo",
     rate: Annotated[float | None, typer.Option(help="Rate of the law in Hz; by default that of the scenario.")] = None,
+    y_rate: Annotated[
+        float | None, typer.Option(help="Rate of y in Hz where it is below that of the law: its longer period counts as delay.")
+    ] = None,
     lag: Annotated[str | None, typer.Option(help="Lags of the actuators in s, in the airframe's order: 0.02,0.1")] = None,
     delay: Annotated[float | None, typer.Option(help="Pure delay in s; by default that of the scenario.")] = None,
     inputs: Annotated[str | None, typer.Option(help="Input of each output, in the airframe's order: rudder,aileron")] = None,
@@ -81,8 +84,13 @@ def gains(
     chosen, frame = find_scenario(scenario), load_airframe(airframe)
     require(rate is None or 1.0 <= rate <= 1000.0, "--rate", rate, "1 to 1000 Hz")
     require(delay is None or 0.0 <= delay <= MAX_DELAY_MARGIN, "--delay", delay, f"0 to {MAX_DELAY_MARGIN:g} s")
+    require(y_rate is None or 1.0 <= y_rate <= 1000.0, "--y-rate", y_rate, "1 to 1000 Hz")
     require(0.0 <= gamma_2 < math.inf, "--gamma-2", gamma_2, "0 or more, 1/s")
-    options = {"rate": rate, "delay": delay, "lag": None if lag is None else _parse_lags(lag, frame)}
+    options = {
+        "rate": rate,
+        "delay": delay if y_rate is None else _delay_with(y_rate, chosen, rate, delay),
+        "lag": None if lag is None else _parse_lags(lag, frame),
+    }
     loop: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     paired = tuple(inputs.split(",")) if inputs else ()
     setting = gain_selection.loop_setting(chosen, gamma_2)._replace(inputs=paired, feedforward=feedforward, **loop)
@@ -123,6 +131,15 @@ def gains(
             console.print(f"gains: {write}")
     if check and failing(answers["scenario"].loop):
         raise typer.Exit(CONDITION_FAILS)
+
+
+def _delay_with(y_rate: float, scenario: Scenario, rate: float | None, delay: float | None) -> float:
+    """The delay, s, with a y that is slower than the law.
+
+    The law steps with each y, so the lag of sampling is 1.5 periods of y. Those of the law are counted from its own rate.
+    """
+    declared = scenario.controller.delay if delay is None else delay
+    return declared + 1.5 * max(1.0 / y_rate - 1.0 / (rate or scenario.controller.rate), 0.0)
 
 
 def observed(controller: RiseDiParameters, scenario: Scenario, model: Airframe, margin: float) -> tuple[RiseDiParameters, str]:

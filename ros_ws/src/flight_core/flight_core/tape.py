@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tape: the in-memory log of a flight, in one process, over topics or read from a bag."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,12 @@ class Signal:
     def until(self, end_ns: int) -> "Signal":
         """The samples up to and including an instant."""
         keep = self.stamp_ns <= end_ns
+        return Signal(self.stamp_ns[keep], self.names, self.values[keep])
+
+    def within(self, windows: Sequence[tuple[int, int]]) -> "Signal":
+        """The samples inside windows (first, last instant), ns."""
+        inside = [(self.stamp_ns >= first) & (self.stamp_ns <= last) for first, last in windows]
+        keep = np.logical_or.reduce(inside, axis=0) if inside else np.zeros(len(self.stamp_ns), dtype=bool)
         return Signal(self.stamp_ns[keep], self.names, self.values[keep])
 
     def group(self, prefix: str) -> "Signal":

@@ -74,6 +74,7 @@ TRUTH = Topic("truth", JointState)
 DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, foreign=True)
 CLOCK = Topic("/clock", Clock)
 RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the log is complete
+ENGAGEMENT = Topic("bridge/engagement", KeyValue)  # key: the phase of the bridge; value: why it is not engaged
 NODE_STATE = Topic("node_state", KeyValue)  # key: the process, "/controller#4711"; value: a NodeState
 
 FLIGHT = (Y, Y_M, U, U_M, INTERNALS, TRUTH, DIAGNOSTICS)

@@ -46,6 +46,11 @@ class Controller:
         """Mode of the guard."""
         return self._state.mode
 
+    @property
+    def has_internals(self) -> bool:
+        """Whether the law has a state to log: from its first engagement on."""
+        return self._state.law is not None
+
     def restart(self) -> None:
         """Reset the state and keep u (bumpless transfer)."""
         self._state = guard.initial_state(len(self._state.u))._replace(u=self._state.u)
@@ -92,7 +97,7 @@ class Controller:
         self._state, inputs = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, active)
         if inputs is None:
             return None
-        self._number += 1
+        self._number += self.has_internals
         age = seconds(now_ns - inputs.stamp_ns)
         limits, digest = self._guard.limits, self._digest
         log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest)

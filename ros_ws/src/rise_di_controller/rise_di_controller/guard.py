@@ -137,7 +137,8 @@ def tick(
     measured dt, clipped to DT_RANGE periods. A law that predicts does so for each whole period without a y before that. The law
     adds to u_trim, or to u_trim + u_ff with a feedforward. Without a new y nothing changes.
     Stale inputs start the failsafe: HOLD (nothing is integrated), then RAMP to trim, then TRIM. Where `active` is false the
-    mode is INACTIVE, and u is held or ramps to trim. Returns None for the inputs where nothing is to be published.
+    mode is INACTIVE, and u is held or ramps to trim; with fresh inputs it is published at trim before the first engagement too.
+    Returns None for the inputs where nothing is to be published.
 
     Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps; both in the law's order. `u_ff_recorded`
     stands in for a feedforward whose state is not known, in replay.
@@ -145,6 +146,8 @@ def tick(
     reference = None
     if y is not None and y_m and max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) <= guard.max_age_ns:
         reference = align(y_m, y.stamp_ns, guard.period_ns)
+    if not active and state.law is None and y is not None and reference is not None and not state.u.any():
+        return state._replace(mode=Mode.INACTIVE), TickInputs(now_ns, y.value, reference, 0.0, 0.0)
     if not active or y is None or reference is None:
         return _failsafe(state, now_ns, guard, active)
     offset = seconds(y_m[-1].stamp_ns - y.stamp_ns)

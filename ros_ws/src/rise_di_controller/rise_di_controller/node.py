@@ -154,7 +154,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         # A tick that was stopped half-way does not publish its old u: the aircraft has started its failsafe, and u would jump.
         if self.parameters.lockstep or self.now_ns() - now_ns <= self._max_age_ns:
             self._publish_u(self._u_encoder.encode(output.stamp_ns, output.u))
-        self._publish_internals(self._internals_encoder.encode(output.stamp_ns, output.internals))
+        if self._controller.has_internals:
+            self._publish_internals(self._internals_encoder.encode(output.stamp_ns, output.internals))
         return True
 
     def advance(self) -> bool:

@@ -9,21 +9,23 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, load_scenario, scenario_yaml
-from flight_analysis.report.summary import RecordedFlight, empty_summary, summarise
+from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise
 from flight_core.files import writing
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError, printable
+from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_log.bag import LogAttachments
 from flight_log.latency import latency
 from flight_log.provenance import provenance
 from flight_log.rosbag2_metadata import bag_files
+from flight_log.stored_messages import Engagement, engagements
 from flight_log.tape_reader import RecordedRun, read_run
 
 SUMMARY, REPORT = "summary.json", "report.html"
@@ -82,10 +84,29 @@ def read_flight(run: Path, outcome: str | None = None) -> RecordedFlight:
     latencies = latency(run)
     signals = recorded.tape.signals if latencies is None else {**recorded.tape.signals, "latency": latencies}
     tape = _until_last_input(replace(recorded.tape, signals=signals))
-    if outcome == COMPLETED and "internals" not in tape:
+    flown = engagements(run)
+    if outcome == COMPLETED and "internals" not in tape and flown is None:
         outcome = "the controller never engaged"
     name = folder.name if run.is_dir() else run.stem
-    return RecordedFlight(name, scenario, tape, summarise(scenario, tape, outcome or _previous_outcome(folder / SUMMARY)))
+    summary = summarise(scenario, _engaged(tape, flown or []), outcome or _previous_outcome(folder / SUMMARY))
+    if flown is not None:
+        summary["engagements"] = [_engagement(tape, one) for one in flown]
+        summary["notes"] = [*engagement_notes(summary["engagements"]), *summary["notes"]]
+    return RecordedFlight(name, scenario, tape, summary)
+
+
+def _engaged(tape: Tape, flown: Sequence[Engagement]) -> Tape:
+    """The engaged part of a flight with a bridge, for its figures. Without an engagement: the whole tape, for its duration."""
+    end_ns = max(int(signal.stamp_ns[-1]) for signal in tape.signals.values())
+    windows = [(one.start_ns, one.stop_ns or end_ns) for one in flown]
+    signals = {name: signal.within(windows) for name, signal in tape.signals.items()} if windows else tape.signals
+    return replace(tape, signals={name: signal for name, signal in signals.items() if len(signal.stamp_ns)})
+
+
+def _engagement(tape: Tape, flown: Engagement) -> dict[str, Any]:
+    """Start and end of an engagement in flight time, s, and why it ended."""
+    start, stop = ((one - tape.start_ns) / NANOSECONDS if one else None for one in (flown.start_ns, flown.stop_ns))
+    return {"start": start, "stop": stop, "reason": flown.reason}
 
 
 def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:

@@ -115,6 +115,17 @@ def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
     return {key: finite_or_null(value) for key, value in summary.items()}
 
 
+def engagement_notes(flown: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Sentences on the engagements of a flight with a bridge."""
+    if not flown:
+        return ["never engaged: the figures are of an aircraft that this controller did not fly"]
+    sentences = []
+    for one in flown:
+        end = "the end of the log" if one["stop"] is None else f"{one['stop']:.1f} s: {one['reason']}"
+        sentences.append(f"engaged from {one['start']:.1f} s to {end}")
+    return [*sentences, "the figures are of the engaged time alone"]
+
+
 def empty_summary(scenario: Scenario, outcome: str) -> dict[str, Any]:
     """The summary of a flight that ended before its first sample."""
     return {
