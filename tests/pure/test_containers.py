@@ -10,12 +10,16 @@ from typing import Any
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
+from autopilot_bridge.params import LIBRARY
 from flight_analysis.closed_loop.scenario import SCHEMAS
+from flight_cli.cli import application
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCKER = ROOT / "docker"
 INSTALLED = ROOT / "ros_ws" / "install"
+AUTOPILOT: dict[str, dict[str, Any]] = yaml.safe_load((DOCKER / "autopilot.yaml").read_text(encoding="utf-8"))["services"]
 DOCKERFILES = sorted(DOCKER.glob("Dockerfile*"))
 COMPOSE: dict[str, Any] = yaml.safe_load((DOCKER / "compose.yaml").read_text(encoding="utf-8"))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
@@ -150,3 +154,34 @@ def test_a_service_has_a_health_check_a_grace_period_and_no_restart(name: str) -
     assert service["restart"] == "no"
     assert service["stop_grace_period"] == "5s"
     assert service["depends_on"] == ([] if name == "recorder" else ["recorder"])  # compose stops them in reverse order
+
+
+def test_only_the_link_of_the_autopilot_is_open() -> None:
+    """The agent's topics and the flight's are on one loopback interface, with the stack's own profile."""
+    agent, flight = AUTOPILOT["agent"], AUTOPILOT["flight"]
+    assert AUTOPILOT.keys() == {"agent", "flight"}
+    (profile,) = agent["volumes"]
+    source, target, access = profile.split(":")
+    assert (DOCKER / source).resolve() == ROOT / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopback.xml"
+    assert (DOCKER / source).is_file()
+    assert agent["environment"] == {"FASTRTPS_DEFAULT_PROFILES_FILE": target}
+    assert access == "ro"
+    (port,) = agent["ports"]
+    assert port == f"{agent['command'][-1]}:{agent['command'][-1]}/udp"
+    assert flight["network_mode"] == "service:agent"
+    assert not flight.keys() & {"ports", "networks", "privileged", "user", "pid", "ipc", "environment"}
+    for service in AUTOPILOT.values():
+        assert service["cap_drop"] == ["ALL"]
+        assert service["security_opt"] == ["no-new-privileges:true"]
+        assert service["restart"] == "no"
+
+
+def test_the_flight_of_an_autopilot_is_dry_unless_it_is_told_to_send(tmp_path: Path) -> None:
+    """The command as compose expands it without variables, but for the scenario. It ends at the scenario, which is missing."""
+    command = re.sub(r"\$\{SCENARIO:\?[^}]*\}", str(tmp_path / "absent.yaml"), AUTOPILOT["flight"]["command"])
+    words = re.sub(r"\$\{\w+:-(.*?)\}", r"\1", command).split()
+    assert words[0] == "rise-di"
+    assert "--send" not in words
+    assert (LIBRARY / f"{words[words.index('--bridge') + 1]}.yaml").is_file()
+    done = CliRunner().invoke(application(["fly"]), words[1:])
+    assert str(done.exception).startswith("scenario"), done.output  # no option is unknown
