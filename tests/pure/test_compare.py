@@ -153,7 +153,6 @@ def test_the_share_of_lost_aircraft_is_that_of_the_first_level_by_the_delay_of_u
     assert found.levels[0].scores[GUST].lost == 0.0
 
 
-@pytest.mark.xfail(strict=True, reason="the gains are not tuned yet on the costs of gusts and turbulence")
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_law_ships_with_gains_for_gusts_and_turbulence(name: str) -> None:
     shipped = tuned_gains.load(tuned_gains.TUNED / f"{name}.yaml")
