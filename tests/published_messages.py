@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 PACKAGES = {
+    "ardupilot_msgs": "ArduPilot/ardupilot, Tools/ros2/ardupilot_msgs, March 2026",
     "px4_msgs": "PX4/px4_msgs v1.16.2, 392e831c",
     "mavros_msgs": "mavlink/mavros 2.12.0, f8f462dd",
     "rosflight_msgs": "rosflight/rosflight_ros_pkgs v2.0.1, cefdb425",

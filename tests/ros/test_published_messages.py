@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from std_srvs.srv import SetBool
 from tests.published_messages import PACKAGES, PUBLISHED, kind
@@ -24,6 +24,8 @@ from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_
 from autopilot_bridge.params import ChannelMap, load_map
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+STORED = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+DO_SET_MODE = 176  # MAVLink's MAV_CMD_DO_SET_MODE, as PX4's VEHICLE_CMD_DO_SET_MODE
 AS_PYTHON = {"float32": "float", "bool": "boolean"}  # as rclpy names the types of a definition
 
 
@@ -87,50 +89,74 @@ def test_inputs_are_written_into_real_messages(name: str) -> None:
 
 
 class Px4:
-    """Publishes y as PX4 does, and subscribes to the topics to which PX4 subscribes."""
+    """Publishes y and its mode as PX4 does, and takes the messages to which PX4 subscribes: a command changes the mode."""
+
+    HOLD, OFFBOARD, ARMED = 4, 14, 2
+    MODES = ((6.0, 0.0, OFFBOARD), (4.0, 3.0, HOLD))  # main mode and submode of DO_SET_MODE
 
     def __init__(self, peer_node: Peer) -> None:
         types, node = import_module("px4_msgs.msg"), peer_node.node
         self._peer = peer_node
         # nose up and 2 m/s fast
         odometry, airspeed = fill(types.VehicleOdometry(), RATES["px4"]), fill(types.AirspeedValidated(), AIRSPEED["px4"])
+        self._status = types.VehicleStatus(arming_state=self.ARMED, nav_state=self.HOLD)
         self._publishers = [
-            (node.create_publisher(type(message), f"/fmu/out/{topic}", BEST_EFFORT), message)
-            for topic, message in (("vehicle_odometry", odometry), ("airspeed_validated", airspeed))
+            (node.create_publisher(type(message), f"/fmu/out/{topic}", STORED), message)
+            for topic, message in (
+                ("vehicle_odometry", odometry),
+                ("airspeed_validated", airspeed),
+                ("vehicle_status_v1", self._status),
+            )
         ]
         self.received: dict[str, list[Any]] = {}
-        for topic in ("offboard_control_mode", "vehicle_torque_setpoint", "vehicle_thrust_setpoint"):
+        for topic in ("offboard_control_mode", "vehicle_torque_setpoint", "vehicle_thrust_setpoint", "vehicle_command"):
             name = topic.title().replace("_", "")
             received = self.received[name] = []
             node.create_subscription(getattr(types, name), f"/fmu/in/{topic}", received.append, BEST_EFFORT)
 
     def publish(self) -> None:
-        """Publish a sample of y, and of u: elevator 0.02 rad."""
+        """Publish y, the mode, and u: elevator 0.02 rad. Offboard is entered with a heartbeat alone."""
+        commands = [(one.param2, one.param3) for one in self.received["VehicleCommand"][-1:] if one.command == DO_SET_MODE]
+        for main, sub, nav_state in self.MODES:
+            if commands == [(main, sub)] and self.received["OffboardControlMode"]:
+                self._status.nav_state = nav_state
         for publisher, message in self._publishers:
             publisher.publish(message)
         self._peer.command(0.02, 0.0, 0.0, 0.0)
 
+    @property
+    def mode(self) -> int:
+        """Its nav_state."""
+        return int(self._status.nav_state)
 
-def test_a_bridge_exchanges_the_messages_of_px4(start: Start) -> None:
-    """Offboard heartbeats with fresh y and u, setpoints while engaged; a stale u ends both."""
+
+def test_a_bridge_flies_px4_in_offboard_and_returns_it_to_hold(start: Start) -> None:
+    """Heartbeats from the request on, setpoints in offboard; a release ends both and requests Hold."""
     needs("px4_msgs")
-    bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false").wait_for("ready")
+    start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false").wait_for("ready")
     with peer(topics=("y",)) as peer_node:
         px4 = Px4(peer_node)
-        peer_node.until(lambda: peer_node.received["y"] and len(px4.received["OffboardControlMode"]) > 2, each=px4.publish)
+        peer_node.until(lambda: bool(peer_node.received["y"]), each=px4.publish)
         y = peer_node.received["y"][-1]
-        assert dict(zip(y.name, y.position, strict=True)) == pytest.approx({**MOTION, "V": 2.0}, abs=1e-6)
-        assert not px4.received["VehicleTorqueSetpoint"]
-        assert px4.received["OffboardControlMode"][-1].thrust_and_torque
+        # V is captured: 0 until the engagement
+        assert dict(zip(y.name, y.position, strict=True)) == pytest.approx({**MOTION, "V": 0.0}, abs=1e-6)
+        assert not any(px4.received.values())  # a heartbeat before the request would keep PX4 in offboard
         client = peer_node.node.create_client(SetBool, "bridge/engage")
-        peer_node.until(client.service_is_ready, each=px4.publish)
-        future = client.call_async(SetBool.Request(data=True))
-        peer_node.until(future.done, each=px4.publish)
-        assert future.result().success, future.result().message
+
+        def request(engaged: bool) -> None:
+            peer_node.until(client.service_is_ready, each=px4.publish)
+            future = client.call_async(SetBool.Request(data=engaged))
+            peer_node.until(future.done, each=px4.publish)
+            assert future.result().success, future.result().message
+
+        request(engaged=True)
         peer_node.until(lambda: len(px4.received["VehicleThrustSetpoint"]) > 5, each=px4.publish)
+        assert px4.mode == Px4.OFFBOARD
+        assert px4.received["OffboardControlMode"][-1].thrust_and_torque
         assert list(px4.received["VehicleTorqueSetpoint"][-1].xyz) == pytest.approx([0.0, 0.02 / 0.523599, 0.0], abs=1e-6)
         assert list(px4.received["VehicleThrustSetpoint"][-1].xyz) == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
-        peer_node.until(lambda: any("-> DISENGAGED: " in line for line in bridge.lines))
+        request(engaged=False)
+        peer_node.until(lambda: px4.mode == Px4.HOLD, each=px4.publish)
         peer_node.spin(0.2)  # for messages in transit
         for messages in px4.received.values():
             messages.clear()
