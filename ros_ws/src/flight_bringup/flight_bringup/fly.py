@@ -80,7 +80,7 @@ def _follow_real_time(
         before = phase
         for phase, why in monitor.engagement():
             if phase != before:
-                announce(f"t = {t:.1f} s: {phase}{f': {why}' if why else ''}")
+                announce(f"{phase}{f': {why}' if why else ''}")
             before = phase
         if phase not in {"", "ENGAGED"}:
             text = f"{phase}: {why}"
