@@ -12,8 +12,9 @@ from rich.console import Console
 
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.params import ChannelMap, InputRow, OutputRow, load_map
-from autopilot_bridge.signs import MIN_ERROR_RATIO
+from flight_analysis.design.response_identification import MIN_RATIO
 from flight_analysis.design.sign_check import SignCheck, check_scenario, motion_as_channel_grows
+from flight_analysis.report.summary import finite_or_null
 from flight_bringup.scenarios import find_scenario
 from flight_cli.output import new_table
 
@@ -24,23 +25,28 @@ def check_signs(
     map_name: Annotated[str, typer.Argument(metavar="MAP", help="Name of a channel map, or path of one (.yaml).")],
     airframe: Annotated[str | None, typer.Option(help="Airframe; by default that of the scenario.")] = None,
     scenario: Annotated[str, typer.Option(help="Scenario with the controller.")] = "osprey_gust",
-    bag: Annotated[Path | None, typer.Option(help="A recorded flight with y and u, each input excited.")] = None,
+    bag: Annotated[
+        Path | None, typer.Option(help="A recorded flight with y and u, each input excited; with a bridge, its engaged time.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
     """Compare the D of the controller with the D that follows from a channel map, and with a recorded flight.
 
-    Exit status: 0 they agree, 1 they contradict each other, 2 bad input.
+    A sign that the flight does not show for certain is no contradiction: a ? in the table, and a sentence with the excitation
+    that would show it. Exit status: 0 they agree, 1 they contradict each other, 2 bad input.
     """
     channel_map = load_map(map_name)
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe or chosen.aircraft.airframe)
     checked = check_scenario(channel_map, chosen, frame, bag)
     if as_json:
-        channels, sentences = [one._asdict() for one in checked.channels], list(checked.contradictions)
-        result = {"map": channel_map.name, "channels": channels, "intervals": checked.intervals, "contradictions": sentences}
+        channels, sentences = [finite_or_null(one._asdict()) for one in checked.channels], list(checked.contradictions)
+        result = {"map": channel_map.name, "channels": channels, "seconds": checked.seconds, "contradictions": sentences}
         print(json.dumps(result))
     else:
         _show(Console(), channel_map, checked, frame.name)
+    for sentence in checked.uncertain:
+        print(f"not certain: {sentence}", file=sys.stderr)
     for sentence in checked.contradictions:
         print(f"error: {sentence}", file=sys.stderr)
     if checked.contradictions:
@@ -49,7 +55,7 @@ def check_signs(
 
 def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airframe: str) -> None:
     title = f"Map {channel_map.name}, airframe {airframe}: what a positive u does"
-    headings = ("u", "moves", "seen in", "effect", "D", "of law", *(["recorded"] if checked.intervals else []))
+    headings = ("u", "moves", "seen in", "effect", "D", "of law", *(["recorded"] if checked.seconds else []))
     table = new_table(title, headings, left=("u", "moves", "seen in"))
     for one in checked.channels:
         cells = [
@@ -61,7 +67,7 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
             f"{one.D_controller:+d}" + ("" if one.D_controller == one.D else " !"),
         ]
         if one.measured is not None and one.ratio is not None:
-            cells.append(f"{one.measured:+.3g} ({one.ratio:.0f}){' ' if one.ratio >= MIN_ERROR_RATIO else '?'}")
+            cells.append(f"{one.measured:+.3g} ({one.ratio:.0f}){' ' if one.ratio >= MIN_RATIO else '?'}")
         table.add_row(*cells)
     console.print(table)
     headings = ("channel", "raw value", "topic")
@@ -71,10 +77,10 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
         fields.add_row(f"u.{one.input}", _format_field(given), channel_map.messages[given.message].topic)
         fields.add_row(f"y.{one.output}", _format_field(taken), taken.topic)
     console.print(fields)
-    if checked.intervals:
+    if checked.seconds:
         console.print(
-            f"recorded: least squares over {checked.intervals} intervals, in brackets the ratio to its standard error;"
-            f" below {MIN_ERROR_RATIO:g} the sign is unsure (?)",
+            f"recorded: Omega_ii from {checked.seconds:.0f} s, in brackets the response in standard errors;"
+            f" below {MIN_RATIO:g} the sign is not certain (?)",
             style="dim",
         )
 

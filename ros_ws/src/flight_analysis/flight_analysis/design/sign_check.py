@@ -10,12 +10,18 @@ import numpy as np
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from autopilot_bridge.params import ChannelMap, InputRow, OutputRow
-from autopilot_bridge.signs import MIN_ERROR_RATIO, Estimate, estimate, output_signs, through
+from autopilot_bridge.signs import output_signs, through
+from flight_analysis.closed_loop.replay import recorded_parameters
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.design.response_identification import MIN_RATIO, Response, identify_response
 from flight_core.parameters import ParameterError, require
+from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
+from flight_log.stored_messages import engagements
 from flight_log.tape_reader import read_run
 from rise_di_controller.decomposition import signs
+
+OPEN_LOOP = "excitation"  # the law that does not use y
 
 
 class Channel(NamedTuple):
@@ -26,8 +32,8 @@ class Channel(NamedTuple):
     effect: float  # Omega_ii of the controller's channels, SI
     D: int  # of the airframe and the map
     D_controller: int
-    measured: float | None  # Omega_ii of a recorded flight
-    ratio: float | None  # abs(measured) / its standard error
+    measured: float | None  # Omega_ii of a recorded flight, NaN where the input never moves
+    ratio: float | None  # response of the recorded flight in standard errors: the sign is certain from MIN_RATIO on
 
 
 class SignCheck(NamedTuple):
@@ -35,7 +41,8 @@ class SignCheck(NamedTuple):
 
     channels: tuple[Channel, ...]
     contradictions: tuple[str, ...]  # sentences
-    intervals: int  # of the recorded flight
+    uncertain: tuple[str, ...]  # sentences on the channels whose sign the recorded flight does not show
+    seconds: float  # of the recorded flight that were used
 
 
 def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
@@ -57,13 +64,30 @@ def check_scenario(channel_map: ChannelMap, scenario: Scenario, frame: Airframe,
         require(sorted(found) == sorted(expected), key, ", ".join(found), f"the controller's: {', '.join(expected)}")
     Omega = frame.matrix_c() @ frame.matrix_b()
     in_map = Omega[np.ix_(_places(channel_map.outputs, frame.outputs), _places(channel_map.inputs, frame.inputs))]
-    measured = None
-    if bag is not None:
-        tape = read_run(bag).tape
-        for topic in ("y", "u"):
-            require(topic in tape, str(bag), f"no {topic}", "a log with y and u")
-        measured = estimate(tape["y"], tape["u"], outputs, inputs)
+    measured = None if bag is None else recorded_response(bag, outputs, inputs)
     return check(channel_map, in_map, outputs, inputs, scenario.controller.D, measured)
+
+
+def recorded_response(bag: Path, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> Response:
+    """Response of the aircraft in a log, from the time in which u acted: all of it, or while its bridge was engaged.
+
+    y_m excites the loop of a flight under a law. Without y_m, and under the law `excitation`, u itself is the excitation.
+    Raises ParameterError for a log without y and u, or one in which the bridge was never engaged.
+    """
+    recorded = read_run(bag)
+    tape = recorded.tape
+    for topic in ("y", "u"):
+        require(topic in tape, str(bag), f"no {topic}", "a log with y and u")
+    flown = engagements(bag)
+    if flown is None:
+        require("bridge/would_send" not in tape, str(bag), "no engagement of its bridge", "a flight with an engaged bridge")
+        spans = None
+    else:
+        require(bool(flown), str(bag), "a bridge that was never engaged", "a flight with an engaged bridge")
+        spans = [(one.start_ns, one.stop_ns or int(tape["u"].stamp_ns[-1])) for one in flown]
+    open_loop = recorded.scenario is not None and recorded_parameters(recorded.scenario).law == OPEN_LOOP
+    excitation: Signal | None = tape["y_m"] if "y_m" in tape and not open_loop else None
+    return identify_response(tape["y"], tape["u"], outputs, inputs, excitation=excitation, engaged=spans)
 
 
 def check(
@@ -72,7 +96,7 @@ def check(
     outputs: tuple[str, ...],
     inputs: tuple[str, ...],
     D: tuple[int, ...],
-    measured: Estimate | None = None,
+    measured: Response | None = None,
 ) -> SignCheck:
     """D of diag(output signs) Omega diag(input signs) against the controller's, and against a recorded flight.
 
@@ -87,22 +111,26 @@ def check(
         for name, sign in zip(channel_map.outputs, output_signs(channel_map), strict=True)
         if sign < 0
     ]
-    channels = []
+    channels, uncertain = [], []
     for i, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
         effect = None if measured is None else float(measured.Omega[i, i])
-        ratio = None if measured is None else float(measured.ratio[i, i])
+        ratio = None if measured is None else float(measured.sign_ratio[i])
         channels.append(Channel(output, name, float(mapped[i, i]), D_mapped[i], D[i], effect, ratio))
         if D_mapped[i] != D[i]:
             sentences.append(
                 f"with the map {channel_map.name} D of {output} and {name} is {D_mapped[i]:+d}, the controller has {D[i]:+d}:"
                 f" a positive {name} makes the aircraft {motion_as_channel_grows(channel_map.inputs[name])}"
             )
-        if effect is not None and ratio is not None and ratio >= MIN_ERROR_RATIO and effect * mapped[i, i] < 0.0:
+        if measured is None or effect is None or ratio is None:
+            continue
+        if ratio < MIN_RATIO:
+            uncertain.append(f"the recorded flight does not show the sign of {name}: {measured.sign_refusal(i)}")
+        elif effect * mapped[i, i] < 0.0:
             sentences.append(
                 f"the recorded flight has {output}_dot {'rise' if effect > 0.0 else 'fall'} with {name}"
                 f" ({effect:.3g}, {ratio:.0f} standard errors), the map {channel_map.name} has the opposite sign"
             )
-    return SignCheck(tuple(channels), tuple(sentences), 0 if measured is None else measured.intervals)
+    return SignCheck(tuple(channels), tuple(sentences), tuple(uncertain), 0.0 if measured is None else measured.seconds)
 
 
 def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:
