@@ -4,24 +4,34 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+import yaml
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.params import AircraftParameters
-from autopilot_bridge.params import load_map
+from autopilot_bridge.params import ChannelMap, load_map
+from control_laws import excitation
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.bridge_identification import (
+    Channels,
     channel_pairs,
     experiment,
     flying_scenario,
+    join,
+    map_text,
+    measured_trims,
+    require_envelope,
 )
+from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
 from flight_analysis.design.response_identification import Response, identify_response
-from flight_analysis.metrics import best_error, engaged_spans, error_metrics
+from flight_analysis.metrics import best_error, error_metrics
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
+from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 
 MAP, SPEED, DELAY = load_map("ardupilot"), 25.0, 0.05  # m/s; s, by which y is late
@@ -42,33 +52,42 @@ def loaded(folder: Path, name: str, airframe: str, scenario: str) -> Scenario:
     return replace(load_scenario(folder / f"{name}.yaml"), aircraft=aircraft())
 
 
+class Identified(NamedTuple):
+    """What a flight of the experiment told."""
+
+    response: Response
+    models: list[ChannelModel | None]
+    channels: Channels
+
+
 @pytest.fixture(scope="module")
-def response(tmp_path_factory: pytest.TempPathFactory) -> Response:
+def identified(tmp_path_factory: pytest.TempPathFactory) -> Identified:
     folder = tmp_path_factory.mktemp("experiment")
     planned = experiment(MAP, SPEED, 0.15, str(folder / "experiment_airframe.yaml"), wait=1.0)
     tape = simulate(loaded(folder, "experiment", planned.airframe, planned.scenario))
-    pairing, _ = channel_pairs(MAP)
-    return identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=engaged_spans(tape))
+    pairing, sign = channel_pairs(MAP)
+    y, u = tape["y"], tape["u"]
+    response = identify_response(y, u, pairing.outputs, pairing.inputs)
+    models = [fit_channel(y, u, *channel) for channel in zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True)]
+    return Identified(response, models, join(MAP, response, models))
 
 
-def test_the_response_of_an_unknown_aircraft_is_identified(response: Response) -> None:
+def test_the_channels_of_an_unknown_aircraft_are_identified(identified: Identified) -> None:
+    response, channels = identified.response, identified.channels
     rows = [OSPREY.outputs.index(name) for name in response.outputs]
     columns = [list(OSPREY.inputs).index(name) for name in response.inputs]
     known = np.diag((OSPREY.matrix_c() @ OSPREY.matrix_b())[np.ix_(rows, columns)])
-    assert response.refusal == ("",) * 4
-    found = np.diag(response.Omega)
-    np.testing.assert_allclose(found, known, rtol=0.15)
-    # four standard errors: one flight in 16,000 is further away
-    assert (np.abs(found - known) < 4.0 * np.diag(response.Omega_deviation)).all()
+    # 30 %: Omega, lag and damping change places in what 8 Hz show; a loop with a phase margin of 54 degrees bears twice as much
+    np.testing.assert_allclose(np.diag(channels.Omega), known, rtol=0.3)
     lag = np.array([0.02 if name != "thrust" else 0.1 for name in response.inputs])
     # u is held for a period of 10 ms, so that it acts half of one late
-    np.testing.assert_allclose(response.lag + response.delay, lag + DELAY + 0.005, atol=0.03)
+    np.testing.assert_allclose(channels.lag + channels.delay, lag + DELAY + 0.005, atol=0.03)
 
 
-def test_the_written_scenario_flies_the_aircraft_and_tracks(response: Response, tmp_path: Path) -> None:
-    selection, airframe, text = flying_scenario(MAP, response, SPEED, str(tmp_path / "flight_airframe.yaml"))
-    assert selection.engineering.controller.D == (1, 1, 1, 1)
-    tape = simulate(loaded(tmp_path, "flight", airframe, text))
+def test_the_written_scenario_flies_the_aircraft_and_tracks(identified: Identified, tmp_path: Path) -> None:
+    found = flying_scenario(MAP, identified.channels, SPEED, str(tmp_path / "flight_airframe.yaml"))
+    assert found.controller.D == (1, 1, 1, 1)
+    tape = simulate(loaded(tmp_path, "flight", found.airframe, found.scenario))
     _, error = best_error(tape)
     rms = {name: error_metrics(error[name]).rms for name in error.names}
     # the figures that a first flight of an autopilot is asked for: 10, 20, 15 mrad/s in q, p, r and 0.05 m/s
@@ -78,22 +97,72 @@ def test_the_written_scenario_flies_the_aircraft_and_tracks(response: Response, 
     assert rms["V"] < 0.06
 
 
-def test_a_longer_delay_lowers_the_bandwidths(response: Response, tmp_path: Path) -> None:
-    def bandwidths(found: Response) -> FloatArray:
-        selection, *_ = flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml"))
-        return np.asarray(selection.engineering.controller.law_params().K)
+def test_a_longer_delay_lowers_the_bandwidths(identified: Identified, tmp_path: Path) -> None:
+    def bandwidths(found: Channels) -> FloatArray:
+        params = flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml")).controller.law_params()
+        return np.asarray(params.K * params.input_scale)  # per response, which is the same in both
 
-    assert (bandwidths(response._replace(delay=response.delay + 0.1)) < bandwidths(response)).all()
+    channels = identified.channels
+    assert (bandwidths(channels._replace(delay=channels.delay + 0.1)) < bandwidths(channels)).all()
 
 
-def test_a_refused_channel_and_a_sign_against_the_map_write_nothing(response: Response) -> None:
+def test_a_channel_of_which_nothing_is_certain_is_refused(identified: Identified) -> None:
+    response, models, _ = identified
     refused = response._replace(refusal=("", "V by thrust: found no movement, expected one", "", ""))
+    unusable = [*models[:1], None, *models[2:]]
     with pytest.raises(ParameterError, match=r"^V by thrust: found no movement, expected one$"):
-        flying_scenario(MAP, refused, SPEED, "airframe.yaml")
-    flipped = response._replace(Omega=response.Omega * np.array([1.0, 1.0, -1.0, 1.0]))
+        join(MAP, refused, unusable)
+
+
+def test_a_sign_against_the_map_is_refused(identified: Identified) -> None:
+    response, models, _ = identified
+    aileron = models[2]
+    assert aileron is not None
+    flipped = [*models[:2], aileron._replace(Omega=-aileron.Omega, slow=-aileron.slow), models[3]]
     sentence = r"inputs\.aileron: found p_dot that falls with aileron, expected the opposite: change `sign`"
     with pytest.raises(ParameterError, match=sentence):
-        flying_scenario(MAP, flipped, SPEED, "airframe.yaml")
+        join(MAP, response, flipped)
+
+
+def test_the_model_of_a_channel_is_that_of_its_own_simulation() -> None:
+    # y_dot = 80 v - 12 y with a lag of 0.05 s, integrated in steps of 1 ms, and y late by 0.08 s; noise as of a gyroscope
+    params = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
+    t = np.arange(0.0, 14.0, 0.001)
+    arrays = params.law_params()
+    u = np.array([(arrays.amplitude * excitation.signal(one, arrays))[0] for one in np.floor(t / 0.01 + 1e-9) * 0.01])
+    v, y = np.zeros_like(t), np.zeros_like(t)
+    for k in range(len(t) - 1):
+        v[k + 1] = v[k] + 0.001 * (u[k] - v[k]) / 0.05
+        y[k + 1] = y[k] + 0.001 * (80.0 * v[k] - 12.0 * y[k])
+    late = np.interp(t - 0.08, t, y) + 0.002 * np.random.default_rng(1).standard_normal(len(t))
+    stamps = np.round(t * 1e9).astype(np.int64)
+    measured, commanded = (Signal(stamps[::10], (name,), one[::10, None]) for name, one in (("q", late), ("elevator", u)))
+    model = fit_channel(measured, commanded, "q", "elevator", 1.0)
+    assert model is not None
+    assert model.usable
+    assert model.stiffness == 0.0
+    np.testing.assert_allclose(model.Omega / model.damping, 80.0 / 12.0, rtol=0.02)
+    np.testing.assert_allclose([model.Omega, model.lag + model.delay], [80.0, 0.13], rtol=0.1)
+
+
+def test_a_map_without_an_envelope_is_refused() -> None:
+    sentence = r"envelope: found none of phi, theta, V, expected limits of phi, theta, V: an experiment is open loop$"
+    with pytest.raises(ParameterError, match=sentence):
+        require_envelope(MAP.model_copy(update={"envelope": {}}))
+    require_envelope(MAP.model_copy(update={"envelope": dict.fromkeys(("phi", "theta", "V"), (-1.0, 1.0))}))
+
+
+def test_a_written_map_has_the_trims_that_were_sent() -> None:
+    row = MAP.inputs["elevator"]
+    names = tuple(f"{one.message}.{one.field}" for one in MAP.inputs.values())
+    raw = np.full((20, 4), 0.25)  # of the axes; the pause after engagement is at trim
+    raw[10:] = 0.9
+    sent = Signal(np.arange(20) * 150_000_000, names, raw)
+    trims = measured_trims(MAP, sent, 0)
+    assert trims["elevator"] == pytest.approx(0.25 * row.scale)
+    written = ChannelMap.validate_mapping(yaml.safe_load(map_text(MAP, {"elevator": trims["elevator"]}, "a log")), "map")
+    assert written.inputs["elevator"].trim == pytest.approx(0.25 * row.scale, rel=1e-4)
+    assert written.outputs == MAP.outputs
 
 
 def test_an_experiment_stays_within_a_part_of_the_limits_of_the_map() -> None:

@@ -152,13 +152,6 @@ def engagements(tape: Tape) -> list[Transient]:
     return [Transient("engagement", "", float(t), float(t)) for t in tape.time("internals")[begins]]
 
 
-def engaged_spans(tape: Tape) -> list[tuple[int, int]]:
-    """First and last instant, ns, of each stretch in which the controller was engaged, from the modes in `internals`."""
-    internals = tape["internals"]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], internals["mode"] == Mode.ENGAGED, [False]])))
-    return [(int(internals.stamp_ns[first]), int(internals.stamp_ns[after - 1])) for first, after in edges.reshape(-1, 2)]
-
-
 def live_commands(tape: Tape) -> list[Transient]:
     """Changes of a live command, from `u_m`. Changes of one channel less than SETTLING_DWELL apart are one transient."""
     if "u_m" not in tape:

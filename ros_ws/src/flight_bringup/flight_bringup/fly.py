@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a scenario: over topics in real time or in lockstep, or in one process."""
 
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -41,11 +42,13 @@ def fly_over_topics(
     one_process: bool = False,
     autopilot: Autopilot | None = None,
     announce: Callable[[str], None] = lambda line: None,
+    engaged_for: float = math.inf,
 ) -> str:
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
     Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one process, in lockstep only.
-    `autopilot` flies in the aircraft's place, in real time only; `announce` gets a line for each change of its engagement.
+    `autopilot` flies in the aircraft's place, in real time only; `announce` gets a line for each change of its engagement. With
+    `engaged_for`, s, the flight ends so long after its first engagement, or with it.
     Outcomes: "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence that names the process that ended early.
     """
     from flight_bringup.clients import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -60,7 +63,7 @@ def fly_over_topics(
         ):
             if lockstep:
                 return _follow_lockstep(scenario, processes, monitor, progress)
-            return _follow_real_time(scenario, processes, monitor, progress, announce)
+            return _follow_real_time(scenario, processes, monitor, progress, announce, engaged_for)
     except KeyboardInterrupt:
         return INTERRUPTED
 
@@ -71,9 +74,11 @@ def _follow_real_time(
     monitor: "FlightMonitor",
     progress: Progress,
     announce: Callable[[str], None],
+    engaged_for: float,
 ) -> str:
     units, outputs = display_units(scenario), scenario.controller.outputs
     text, phase, why = "starting", "", ""
+    engaged_at = math.inf
     while (t := time.time() - processes.start_time) < scenario.flight.duration:
         if (reason := processes.ended_early()) is not None:
             return reason
@@ -82,6 +87,10 @@ def _follow_real_time(
             if phase != before:
                 announce(f"{phase}{f': {why}' if why else ''}")
             before = phase
+            if phase == "ENGAGED":
+                engaged_at = min(engaged_at, t)
+        if t > engaged_at + engaged_for or (engaged_for < math.inf and engaged_at < math.inf and phase != "ENGAGED"):
+            return COMPLETED
         if phase not in {"", "ENGAGED"}:
             text = f"{phase}: {why}"
         elif (status := monitor.newest()) is not None:

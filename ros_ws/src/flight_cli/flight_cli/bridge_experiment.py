@@ -4,27 +4,35 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
-from autopilot_bridge.params import ChannelMap, find_map, load_map
+from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.design.bridge_identification import (
+    Channels,
     Experiment,
+    Flyable,
     channel_pairs,
     experiment,
     flying_scenario,
+    join,
+    map_text,
+    measured_trims,
+    require_envelope,
 )
-from flight_analysis.design.gain_selection import Selection
+from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
 from flight_analysis.design.response_identification import Response, identify_response
-from flight_analysis.metrics import engaged_spans
 from flight_analysis.report.run_folder import new_run
+from flight_analysis.report.summary import finite_or_null
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
 from flight_cli.output import CLOCK_COLUMNS, display_path, new_table, progress_bar, write_text
 from flight_core.parameters import ParameterError, require
-from flight_core.vectors import FloatArray
+from flight_core.tape import Tape
+from flight_log.stored_messages import engagements
 from flight_log.tape_reader import read_run
 
 
@@ -37,19 +45,30 @@ def identify_behind_bridge(
     require(folder.is_dir() or not folder.exists(), "--write", folder, "a folder, or the name of a new one")
     folder.mkdir(parents=True, exist_ok=True)
     console = Console(quiet=as_json)
+    if log is None:
+        require_envelope(channel_map)
     run = _excite(console, channel_map, map_name, speed, folder, amplitude, runs) if log is None else log
-    response = _response(channel_map, run)
-    _show_response(console, channel_map, response)
+    tape, spans = _engaged(run)
+    pairing, sign = channel_pairs(channel_map)
+    trims = measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
+    response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans)
+    _show_response(console, channel_map.name, response, trims)
+    y, u = tape["y"].within(spans), tape["u"].within(spans)
+    channels = zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True)
+    models = [fit_channel(y, u, output, name, one) for output, name, one in channels]
+    _show_models(console, response, models)
+    found = join(channel_map, response, models)
     airframe = folder / "airframe.yaml"
-    selection, airframe_text, text = flying_scenario(channel_map, response, speed, str(airframe.resolve()))
-    for path, content in ((airframe, airframe_text), (folder / "scenario.yaml", text)):
-        write_text("--write", path, content)
-    write_text("--write", folder / "map.yaml", find_map(map_name).read_text(encoding="utf-8"))
+    flyable = flying_scenario(channel_map, found, speed, str(airframe.resolve()))
+    written_map = map_text(channel_map, trims, run.name)
+    files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
+    for name, content in files.items():
+        write_text("--write", folder / f"{name}.yaml", content)
     load_scenario(folder / "scenario.yaml")
     if as_json:
-        print(json.dumps(_as_json(response, selection, folder)))
+        print(json.dumps(_as_json(response, found, flyable, trims, folder)))
         return
-    _show_gains(console, selection)
+    _show_gains(console, found, response, flyable)
     scenario, copied = folder / "scenario.yaml", folder / "map.yaml"
     console.print(f"to fly it: rise-di fly {scenario} --bridge {copied} --send", highlight=False, soft_wrap=True)
 
@@ -71,7 +90,14 @@ def _excite(
         def progress(t: float, shown: str) -> None:
             bar.update(task, completed=t, clock=f"t = {t:5.1f} of {chosen.flight.duration:g} s", shown=shown)
 
-        outcome = fly_over_topics(chosen, run, progress, autopilot=find_autopilot(map_name, dry_run=False))
+        outcome = fly_over_topics(
+            chosen,
+            run,
+            progress,
+            autopilot=find_autopilot(map_name, dry_run=False),
+            announce=lambda line: bar.console.print(line, highlight=False, soft_wrap=True),
+            engaged_for=planned.controller.duration,
+        )
     console.print(f"outcome: {outcome}\nlog:     {display_path(run)}", highlight=False)
     return run
 
@@ -98,21 +124,20 @@ def _announce(console: Console, planned: Experiment, duration: float) -> None:
     )
 
 
-def _response(channel_map: ChannelMap, run: Path) -> Response:
-    """The response in the log of a run. Raises ParameterError for a log in which the bridge was never engaged."""
-    tape, (pairing, _) = read_run(run).tape, channel_pairs(channel_map)
-    for topic in ("y", "u", "internals"):
-        require(topic in tape, str(run), f"no {topic}", "a log of a flight with a controller")
-    spans = engaged_spans(tape)
-    if not spans:
-        raise ParameterError(f"{run}: found no engaged stretch, expected a flight in which the bridge was engaged")
-    return identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans)
+def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]]]:
+    """The tape of a run and its engaged spans, ns. Raises ParameterError for a log without an engagement."""
+    tape, flown = read_run(run).tape, engagements(run)
+    for topic in ("y", "u", "bridge/would_send"):
+        require(topic in tape, str(run), f"no {topic}", "a log of a flight with a bridge")
+    if not flown:
+        raise ParameterError(f"{run}: found no engagement, expected a flight in which the bridge was engaged")
+    return tape, [(one.start_ns, one.stop_ns or int(tape["u"].stamp_ns[-1])) for one in flown]
 
 
-def _show_response(console: Console, channel_map: ChannelMap, response: Response) -> None:
-    headings = ("input", "moves", "Omega_ii", "+-", "lag, s", "+-", "delay, s", "+-")
+def _show_response(console: Console, name_of_map: str, response: Response, trims: dict[str, float]) -> None:
+    headings = ("input", "trim", "moves", "Omega", "+-", "lag", "+-", "delay", "+-")
     table = new_table(
-        f"Response of the aircraft behind {channel_map.name}, {response.seconds:.0f} s of log; SI, standard errors",
+        f"Response of the aircraft behind {name_of_map}, {response.seconds:.0f} s of log; SI, standard errors",
         headings,
         left=("input", "moves"),
     )
@@ -122,36 +147,46 @@ def _show_response(console: Console, channel_map: ChannelMap, response: Response
             (response.lag[i], response.lag_deviation[i]),
             (response.delay[i], response.delay_deviation[i]),
         )
-        table.add_row(name, f"{output}_dot", *(f"{value:.3g}" for pair in pairs for value in pair))
+        table.add_row(name, f"{trims[name]:.3g}", f"{output}_dot", *(f"{value:.3g}" for pair in pairs for value in pair))
     console.print(table)
 
 
-def _show_gains(console: Console, selection: Selection) -> None:
-    answer = selection.engineering
-    controller, params = answer.controller, answer.controller.law_params()
+def _show_models(console: Console, response: Response, models: list[ChannelModel | None]) -> None:
+    headings = ("channel", "Omega", "lag", "delay", "damping", "stiffness", "zero", "misfit")
+    table = new_table(
+        "Models of the channels, SI, fitted to the output error; a misfit below 30 % is usable", headings, left=("channel",)
+    )
+    for output, name, model in zip(response.outputs, response.inputs, models, strict=True):
+        if model is not None:
+            values = (model.Omega, model.lag, model.delay, model.damping, model.stiffness, model.slow / model.Omega)
+            table.add_row(f"{output} by {name}", *(f"{value:.3g}" for value in values), f"{100 * model.misfit:.0f} %")
+    console.print(table)
+
+
+def _show_gains(console: Console, found: Channels, response: Response, flyable: Flyable) -> None:
+    controller, params = flyable.controller, flyable.controller.law_params()
     table = new_table("Gains by lag and delay", ("channel", "bandwidth, rad/s", "Lambda, 1/s"), left=("channel",))
-    response = np.abs(np.diag(_in_law_order(selection))) * params.input_scale
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
-        table.add_row(f"{output} by {name}", f"{params.K[i] * response[i]:.3g}", f"{params.Lambda[i]:.3g}")
+        place = response.outputs.index(output)
+        bandwidth = params.K[i] * params.input_scale[i] * abs(found.Omega[place, place])
+        table.add_row(f"{output} by {name}", f"{bandwidth:.3g}", f"{params.Lambda[i]:.3g}")
     console.print(table)
-    if answer.delay_margin is not None:
-        console.print(f"delay margin beyond the identified delay: {1e3 * answer.delay_margin:.0f} ms", highlight=False)
+    if flyable.delay_margin is not None:
+        console.print(f"delay margin beyond the identified delay: {1e3 * flyable.delay_margin:.0f} ms", highlight=False)
 
 
-def _in_law_order(selection: Selection) -> FloatArray:
-    airframe, controller = selection.study.airframe, selection.engineering.controller
-    rows = [airframe.outputs.index(name) for name in controller.outputs]
-    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
-    return np.asarray(selection.study.Omega[np.ix_(rows, columns)])
+def _as_json(response: Response, found: Channels, flyable: Flyable, trims: dict[str, float], folder: Path) -> dict[str, object]:
+    def numbers(values: Any) -> dict[str, Any]:
+        arrays = {key: value for key, value in values._asdict().items() if isinstance(value, np.ndarray)}
+        return {key: finite_or_null(value.tolist()) for key, value in arrays.items()}
 
-
-def _as_json(response: Response, selection: Selection, folder: Path) -> dict[str, object]:
-    arrays = {key: value.tolist() for key, value in response._asdict().items() if isinstance(value, np.ndarray)}
     return {
         "outputs": list(response.outputs),
         "inputs": list(response.inputs),
-        **arrays,
-        "delay_margin": selection.engineering.delay_margin,
-        "controller": selection.engineering.controller.model_dump(exclude_defaults=True),
+        "step_response": numbers(response),
+        "channels": numbers(found),
+        "trim": trims,
+        "delay_margin": flyable.delay_margin,
+        "controller": flyable.controller.model_dump(exclude_defaults=True),
         "folder": str(folder),
     }

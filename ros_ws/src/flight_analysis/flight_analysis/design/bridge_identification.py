@@ -14,14 +14,18 @@ import yaml
 
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.jsbsim_aircraft import OUTPUTS
+from autopilot_bridge.channel_map import to_channel
 from autopilot_bridge.params import ChannelMap
 from control_laws.excitation import ExcitationParameters
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import bandwidths
-from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre, Selection
+from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre
 from flight_analysis.design.identification import SOFTENING, reference_parameters
-from flight_analysis.design.response_identification import Response
+from flight_analysis.design.open_loop_fit import ChannelModel
+from flight_analysis.design.response_identification import MIN_RATIO, Response
 from flight_core.parameters import ParameterError, require
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelParameters
 from rise_di_controller.linear_loop import Loop
@@ -30,7 +34,7 @@ from rise_di_controller.rise_di import RiseDiParameters
 RATE = 100.0  # Hz, of law and reference model by default
 
 AMPLITUDE = 0.2  # of the smaller limit of an input, by default
-WIDTH, PERIOD, BAND = 0.25, 6.0, (0.3, 3.0)  # s, s, Hz: of the excitation of an input that turns the aircraft
+WIDTH, PERIOD, BAND = 0.25, 6.0, (0.3, 8.0)  # s, s, Hz: of the excitation of an input that turns the aircraft
 SPEED_WIDTH, SPEED_PERIOD, SPEED_BAND = 1.0, 12.0, (0.1, 0.8)  # the same of thrust: engines take longer
 PAUSE = 1.5  # s, between the inputs
 
@@ -60,6 +64,15 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
     outputs = tuple(channel_map.outputs)
     inputs = tuple(driven[name][0] for name in outputs)
     return ChannelPairing(outputs, inputs), np.array([float(driven[name][1]) for name in outputs])
+
+
+def require_envelope(channel_map: ChannelMap) -> None:
+    """Raise ParameterError for a map without limits of the speed, and of the attitude where it has one: nothing else guards."""
+    needed = [name for name in ("phi", "theta", "V") if name in channel_map.pose or name in channel_map.outputs]
+    missing = [name for name in needed if name not in channel_map.envelope]
+    limits = ", ".join(needed)
+    found = f"none of {', '.join(missing)}"
+    require(not missing, f"map {channel_map.name}: envelope", found, f"limits of {limits}: an experiment is open loop")
 
 
 class Experiment(NamedTuple):
@@ -97,42 +110,81 @@ def experiment(channel_map: ChannelMap, speed: float, amplitude: float, airframe
     none["second_order"] = {"natural_frequency": [1.0] * m, "damping": [1.0] * m}
     heading = f"Experiment on the aircraft behind the map {channel_map.name}: each input is excited by itself, open loop."
     return Experiment(
-        airframe_yaml(channel_map, pairing, np.diag(sign), speed, "signs of the channel map; sizes not known"),
+        airframe_yaml(channel_map, pairing, signs_alone(sign), speed, "signs of the channel map; sizes not known"),
         scenario_text(heading, airframe_file, wait + controller.duration, none, controller.model_dump(exclude_defaults=True)),
         controller,
     )
 
 
-def flying_scenario(
-    channel_map: ChannelMap, response: Response, speed: float, airframe_file: str
-) -> tuple[Selection, str, str]:
-    """Gains for an identified response, and the texts of the airframe and of the scenario that fly it.
+class Channels(NamedTuple):
+    """What is known of m channels, output i driven by input i; SI."""
 
-    The bandwidths follow from lag, delay and rate by the engineering procedure. Raises ParameterError for a response that was
-    refused in a channel, and for signs that contradict those of the map.
+    Omega: FloatArray  # (m, m)
+    Omega_deviation: FloatArray  # (m,) of its diagonal
+    lag: FloatArray  # (m,) s
+    delay: FloatArray  # (m,) s
+    damping: FloatArray  # (m,) 1/s; 0 where none is known
+    stiffness: FloatArray  # (m,) 1/s^2
+    zero: FloatArray  # (m,) 1/s, slow / Omega
+    misfit: FloatArray  # (m,) rms of the output error / rms of y; NaN where the step response alone is known
+
+
+def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelModel | None]) -> Channels:
+    """The models of the channels that have one, the step responses of the others.
+
+    Raises ParameterError for a channel of which neither is certain, and for signs that contradict each other or the map.
     """
     pairing, sign = channel_pairs(channel_map)
-    if refused := "; ".join(filter(None, response.refusal)):
-        raise ParameterError(refused)
-    Omega, effects = response.Omega, np.diag(response.Omega)
-    for name, output, effect, expected in zip(pairing.inputs, pairing.outputs, effects, sign, strict=True):
-        opposite = f"{output}_dot that {'falls' if effect < 0.0 else 'rises'} with {name}"
-        require(effect * expected > 0.0, f"map {channel_map.name}: inputs.{name}", opposite, "the opposite: change `sign`")
-    delay = float(np.max(response.delay))
+    Omega, m = np.where(np.isfinite(response.Omega), response.Omega, 0.0), len(sign)
+    Omega = np.where(np.abs(Omega) > MIN_RATIO * np.nan_to_num(response.Omega_deviation, nan=np.inf), Omega, 0.0)
+    deviation, lag, delay = np.diag(response.Omega_deviation).copy(), response.lag.copy(), response.delay.copy()
+    damping, stiffness, zero, misfit = np.zeros(m), np.zeros(m), np.zeros(m), np.full(m, np.nan)
+    refused = []
+    for i, (name, output, model) in enumerate(zip(pairing.inputs, pairing.outputs, models, strict=True)):
+        if model is not None and model.usable:
+            Omega[i, i], deviation[i], lag[i], delay[i] = model.Omega, model.deviation[2], model.lag, model.delay
+            damping[i], stiffness[i], zero[i] = model.damping, model.stiffness, model.slow / model.Omega
+            misfit[i] = model.misfit
+        elif response.refusal[i] or response.sign_ratio[i] < MIN_RATIO:
+            ratio = f"{output} by {name}: found a response of {response.sign_ratio[i]:.1f} standard errors, expected"
+            refused.append(response.refusal[i] or f"{ratio} {MIN_RATIO:g} or more: excite {name} more strongly")
+            continue
+        else:
+            Omega[i, i] = response.Omega[i, i]
+        opposite = f"{output}_dot that {'falls' if Omega[i, i] < 0.0 else 'rises'} with {name}"
+        require(Omega[i, i] * sign[i] > 0.0, f"map {channel_map.name}: inputs.{name}", opposite, "the opposite: change `sign`")
+    if refused:
+        raise ParameterError("; ".join(refused))
+    return Channels(Omega, deviation, lag, delay, damping, stiffness, zero, misfit)
+
+
+class Flyable(NamedTuple):
+    """A controller for an identified aircraft, and the files that fly it."""
+
+    controller: RiseDiParameters
+    delay_margin: float | None  # s, of y_dot = Omega u with the lags and the delay; None for the literal sign
+    airframe: str  # text of the airframe file
+    scenario: str  # text of the scenario file
+
+
+def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airframe_file: str) -> Flyable:
+    """Gains for identified channels, and the texts of the airframe and of the scenario that fly them.
+
+    The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega u. Integrals cancel the
+    damping. The feedforward has the airframe as its model.
+    """
+    pairing, _ = channel_pairs(channel_map)
+    delay = float(np.max(found.delay))
     products = np.array([gain_selection.CROSSOVER_LAG_PRODUCTS[name] for name in pairing.outputs])
-    loop = Loop(response.lag, delay, 1.0 / RATE)
+    loop = Loop(found.lag, delay, 1.0 / RATE)
     bandwidth = dict(zip(pairing.outputs, bandwidths(loop, products).tolist(), strict=True))
     rows = {name: channel_map.inputs[name] for name in pairing.inputs}
-    authority = abs(float(Omega[pairing.outputs.index("V"), pairing.outputs.index("V")])) if "V" in pairing.outputs else 1.0
+    authority = (
+        abs(float(found.Omega[pairing.outputs.index("V"), pairing.outputs.index("V")])) if "V" in pairing.outputs else 1.0
+    )
     throttle = rows[pairing.inputs[pairing.outputs.index("V")]] if "V" in pairing.outputs else next(iter(rows.values()))
     commands = _commands(pairing.outputs, bandwidth, speed, authority * min(-throttle.lower, throttle.upper))
-    airframe = airframe_yaml(channel_map, pairing, Omega, speed, "step responses identified in flight; A is not known")
-    frame = Airframe.validate_mapping(yaml.safe_load(airframe), "airframe")
-    manoeuvre = Manoeuvre(ReferenceModelParameters.validate_mapping(commands, "reference_model"), {}, WAIT + 60.0)
-    studied = gain_selection.study_airframe(frame, manoeuvre, samples=5)
-    range_rate = np.array([min(-row.lower, row.upper) / FULL_RANGE_TIME for row in rows.values()])
-    studied = studied._replace(slew=np.maximum(studied.slew, range_rate))
-    lag = dict(zip(pairing.inputs, response.lag.tolist(), strict=True))
+    lag = dict(zip(pairing.inputs, found.lag.tolist(), strict=True))
     ones = [1.0] * len(pairing.inputs)
     base = RiseDiParameters.validate_mapping(
         _controller(channel_map, pairing)
@@ -141,10 +193,65 @@ def flying_scenario(
         | {"lag": list(lag.values()), "delay": delay},
         "controller",
     )
+    manoeuvre = Manoeuvre(ReferenceModelParameters.validate_mapping(commands, "reference_model"), {}, WAIT + 60.0)
+    range_rate = np.array([min(-row.lower, row.upper) / FULL_RANGE_TIME for row in rows.values()])
+
+    airframe = airframe_yaml(channel_map, pairing, found, speed, "identified in flight")
+    frame = Airframe.validate_mapping(yaml.safe_load(airframe), "airframe")
+    slew = gain_selection.study_airframe(frame, manoeuvre, samples=1).slew
+    none = found._replace(damping=0.0 * found.damping, stiffness=0.0 * found.stiffness, zero=0.0 * found.zero)
+    integrators = Airframe.validate_mapping(
+        yaml.safe_load(airframe_yaml(channel_map, pairing, none, speed, "none")), "airframe"
+    )
+    # the literal gain set alone needs more of the manoeuvre than the slew, and it is not used
+    studied = gain_selection.study_airframe(integrators, manoeuvre._replace(duration=1.0), samples=1)
+    studied = studied._replace(slew=np.maximum(slew, range_rate))
     selection = gain_selection.select_gains(studied, LoopSetting(base, RATE, lag, delay, {}))
+    flown = _with_damping(selection.engineering.controller, pairing, found, loop)
+    flown = gain_selection.with_feedforward(flown, frame)
     heading = f"The aircraft behind the map {channel_map.name}, with gains from its identified response."
-    chosen = selection.engineering.controller.model_dump(exclude_defaults=True)
-    return selection, airframe, scenario_text(heading, airframe_file, manoeuvre.duration, commands, chosen)
+    text = scenario_text(heading, airframe_file, manoeuvre.duration, commands, flown.model_dump(exclude_defaults=True))
+    return Flyable(flown, selection.engineering.delay_margin, airframe, text)
+
+
+def _with_damping(controller: RiseDiParameters, pairing: ChannelPairing, found: Channels, loop: Loop) -> RiseDiParameters:
+    """The controller with integrals that cancel the damping of channels of first order: K (s + damping) / s over s + damping.
+
+    Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals. The loop K / s has the margins that
+    the gains were selected for. Source: K. J. Astrom, T. Hagglund, "Advanced PID Control", 2006, 6.5 (lambda tuning).
+    """
+    places = [pairing.outputs.index(name) for name in controller.outputs]
+    first_order = (found.stiffness == 0.0) & (found.zero == 0.0)
+    of_sign = 1.0 / (np.broadcast_to(controller.softening, (len(places),)) * loop.total[places])
+    cancelled = np.where(first_order, found.damping, 0.0)[places] - of_sign
+    Lambda = np.maximum(controller.Lambda, cancelled).tolist()
+    return RiseDiParameters.validate_mapping(controller.model_dump() | {"Lambda": Lambda}, "controller")
+
+
+def measured_trims(channel_map: ChannelMap, would_send: Signal, engaged_ns: int) -> dict[str, float]:
+    """The commands in trim by input, from what the bridge sent in the pause after an engagement, when u was 0; SI."""
+    stamps = (would_send.stamp_ns - engaged_ns) / NANOSECONDS
+    still = (stamps > 0.2 * PAUSE) & (stamps < 0.8 * PAUSE)
+    require(bool(still.any()), "bridge/would_send", "no sample after the engagement", "a log of the experiment")
+    rows = channel_map.inputs.items()
+    return {name: to_channel(float(np.median(would_send[f"{row.message}.{row.field}"][still])), row.line) for name, row in rows}
+
+
+def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
+    """The text of a channel map with measured trims. A captured trim is measured again at each engagement."""
+    values = channel_map.model_dump(exclude_unset=True)
+    values["source"] = f"{values['source']}; trims measured in {source}"
+    for name, trim in trims.items():
+        values["inputs"][name]["trim"] = float(f"{trim:.5g}")
+    ChannelMap.validate_mapping(values, f"map {channel_map.name}")
+    return yaml.dump(_plain(values), Dumper=_WholeRows, sort_keys=False, width=128)
+
+
+class _WholeRows(yaml.SafeDumper):
+    """Rows without references to each other."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
 
 
 def _controller(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[str, Any]:
@@ -180,20 +287,43 @@ def _commands(outputs: Sequence[str], bandwidth: Mapping[str, float], speed: flo
     }
 
 
-def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, Omega: FloatArray, speed: float, source: str) -> str:
-    """The text of the airframe y_dot = Omega u, Omega (m, m) in the order of the pairing, in units of the map's channels."""
+def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Channels, speed: float, source: str) -> str:
+    """The text of the airframe of identified channels, in units of the map's channels.
+
+    With z_i of the dimension of y_i dt:
+
+    y_i_dot = -(damping_i - zero_i) y_i + (damping_i zero_i - stiffness_i - zero_i^2) z_i + sum_j Omega_ij u_j
+    z_i_dot = y_i - zero_i z_i                                             only where stiffness or zero are not 0
+    """
+    m = len(pairing.outputs)
+    second = [i for i in range(m) if found.stiffness[i] or found.zero[i]]
+    A = np.zeros((m + len(second), m + len(second)))
+    for i in range(m):
+        A[i, i] = found.zero[i] - found.damping[i]
+    for place, i in enumerate(second, m):
+        A[i, place] = found.damping[i] * found.zero[i] - found.stiffness[i] - found.zero[i] ** 2
+        A[place, i], A[place, place] = 1.0, -found.zero[i]
+    B = np.vstack([found.Omega, np.zeros((len(second), m))])
+    states: dict[str, str] = {name: OUTPUTS[name] for name in pairing.outputs}
+    states |= {f"{pairing.outputs[i]}_integral": "1" for i in second}
     values = {
         "name": f"{channel_map.name}_aircraft",
         "source": source,
         "speed": float(speed),
-        "states": {name: OUTPUTS[name] for name in pairing.outputs},
+        "states": states,
         "inputs": {name: {"unit": "1", "positive": channel_map.inputs[name].positive} for name in pairing.inputs},
         "outputs": list(pairing.outputs),
-        "A": np.zeros_like(Omega).tolist(),
-        "B": [[float(f"{value:.4g}") for value in row] for row in Omega],
+        "A": [[float(f"{value:.4g}") for value in row] for row in A],
+        "B": [[float(f"{value:.4g}") for value in row] for row in B],
     }
     Airframe.validate_mapping(values, "airframe")
     return yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=128)
+
+
+def signs_alone(sign: FloatArray) -> Channels:
+    """Channels of which nothing but the sign is known."""
+    none = 0.0 * sign
+    return Channels(np.diag(sign), none + np.nan, none, none, none, none, none, none + np.nan)
 
 
 def scenario_text(
@@ -217,6 +347,8 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
     def plain(value: Any) -> Any:
         if isinstance(value, (list, tuple)):
             return [plain(one) for one in value]
+        if isinstance(value, Mapping):
+            return {key: plain(one) for key, one in value.items()}
         return float(f"{value:.6g}") if isinstance(value, float) else value
 
     return {key: plain(value) for key, value in values.items() if value is not None}

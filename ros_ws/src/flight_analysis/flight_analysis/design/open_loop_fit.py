@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A low-order model of each channel from a log in which one input after another was excited, open loop.
+
+    lag v_dot = u(t - delay) - v,    z'' + damping z' + stiffness z = v,    y = Omega z' + slow z
+
+The output error is fitted: the model is simulated from u alone, and y less its output is smallest in the squares. Source:
+L. Ljung, "System Identification", 1999, 4.2 and 10.2.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import cont2discrete, lfilter, ss2tf
+
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal
+from flight_core.vectors import FloatArray
+
+STEP = 0.004  # s, of the simulation
+BEFORE, AFTER = 0.3, 0.5  # s around the excitation of an input
+MAX_MISFIT = 0.3  # rms of the output error by the rms of y: 9 % of the power, as disturbances and other channels leave
+MIN_GAIN = 0.8  # of the misfit: a second order has to lower it by a fifth
+STARTS = ((0.03, 0.03), (0.1, 0.1))  # s, delay and lag
+# Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow
+LOWER = np.array([0.0, 0.003, -np.inf, 0.0, 0.0, -np.inf])
+UPPER = np.array([0.4, 1.0, np.inf, 60.0, 1000.0, np.inf])
+ORDERS = (4, 6)  # parameters of the first and of the second order
+CORRELATION = 0.5  # s, over which errors of neighbouring samples are taken as correlated
+
+
+class ChannelModel(NamedTuple):
+    """The model of one channel, SI, and standard errors of its parameters in their order."""
+
+    delay: float  # s
+    lag: float  # s
+    Omega: float
+    damping: float  # 1/s
+    stiffness: float  # 1/s^2; 0 where the first order is enough
+    slow: float
+    deviation: FloatArray  # (6,)
+    misfit: float  # rms of the output error / rms of y
+
+    @property
+    def usable(self) -> bool:
+        """Whether the model explains the response, and its zero is stable."""
+        return self.misfit <= MAX_MISFIT and self.slow * self.Omega >= 0.0
+
+
+def fit_channel(y: Signal, u: Signal, output: str, name: str, sign: float) -> ChannelModel | None:
+    """The model from the time in which an input is excited, of the lowest order that explains it; None where it never is.
+
+    The search begins with an Omega of this sign, and may end with the other one.
+    """
+    excited = np.flatnonzero(u[name] != 0.0)
+    if not len(excited):
+        return None
+    first = int(u.stamp_ns[excited[0]] - BEFORE * NANOSECONDS)
+    last = int(u.stamp_ns[excited[-1]] + AFTER * NANOSECONDS)
+    measured = y.within([(first, last)])
+    t = (measured.stamp_ns - first) / NANOSECONDS
+    t_u = (u.stamp_ns - first) / NANOSECONDS
+    impulse = np.concatenate([[0.0], np.cumsum(u[name][:-1] * np.diff(t_u))])
+    trend, _ = np.linalg.qr(np.stack([np.ones(len(t)), t], axis=1))
+    values = measured[output] - trend @ (trend.T @ measured[output])
+
+    def residuals(theta: FloatArray) -> FloatArray:
+        e = measured[output] - _simulated(t, t_u, impulse, np.concatenate([theta, np.zeros(6 - len(theta))]))
+        return np.asarray(e - trend @ (trend.T @ e))
+
+    fits = [_search(residuals, values, order, sign * float(np.max(np.abs(u[name])))) for order in ORDERS]
+    misfits = [float(np.linalg.norm(fit.fun) / np.linalg.norm(values)) for fit in fits]
+    chosen = 1 if misfits[1] < MIN_GAIN * misfits[0] and _has_stable_zero(fits[1].x) else 0
+    return _model(fits[chosen], misfits[chosen], float(np.median(np.diff(t))))
+
+
+def _has_stable_zero(theta: FloatArray) -> bool:
+    return bool(theta[2] * theta[5] >= 0.0)
+
+
+def _simulated(t: FloatArray, t_u: FloatArray, impulse: FloatArray, theta: FloatArray) -> FloatArray:
+    """Output of the model from rest at the instants t, (N,). `impulse` is the integral of u, which is held between t_u."""
+    delay, lag, Omega, damping, stiffness, slow = theta
+    grid = np.arange(0.0, t[-1] + 2.0 * STEP, STEP)
+    u = np.diff(np.interp(grid - delay, t_u, impulse)) / STEP
+    A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])
+    plant = A, np.array([[0.0], [0.0], [1.0 / lag]]), np.array([[slow, Omega, 0.0]]), np.zeros((1, 1))
+    numerator, denominator = ss2tf(*cont2discrete(plant, STEP)[:4])
+    return np.asarray(np.interp(t, grid[:-1], lfilter(numerator[0], denominator, u)))
+
+
+def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) -> Any:
+    size = float(np.ptp(values)) / amplitude
+    fits = []
+    for delay, lag in STARTS:
+        start = np.array([delay, lag, 5.0 * size, 5.0, 30.0, 30.0 * size])[:order]
+        scale = np.array([0.05, 0.05, 5.0 * abs(size), 10.0, 100.0, 50.0 * abs(size)])[:order]
+        fits.append(least_squares(residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60))
+    return min(fits, key=lambda one: float(one.cost))
+
+
+def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
+    """Standard errors with the correlation of the output error. Source: L. Ljung, 9.4 (errors that are not white)."""
+    e = fit.fun
+    lags = max(round(CORRELATION / period), 1)
+    rho = np.correlate(e, e, "full")[len(e) : len(e) + lags] / (e @ e)
+    inflation = 1.0 + 2.0 * float(np.sum(np.maximum(rho, 0.0)))
+    J = fit.jac
+    deviation = np.zeros(6)
+    variance = float(e @ e) / (len(e) - len(fit.x)) * inflation
+    deviation[: len(fit.x)] = np.sqrt(variance * np.diag(np.linalg.pinv(J.T @ J)))
+    delay, lag, Omega, damping, stiffness, slow = np.concatenate([fit.x, np.zeros(6 - len(fit.x))]).tolist()
+    return ChannelModel(delay, lag, Omega, damping, stiffness, slow, deviation, misfit)
