@@ -54,7 +54,7 @@ def with_silence(neutral: float, release: float) -> ChannelMap:
 
 def test_only_the_service_engages_and_only_with_fresh_y_and_u() -> None:
     bridge = new_bridge()
-    for reason, receive in (("q not received yet", receive_outputs), ("u not received yet", receive_u)):
+    for reason, receive in (("q, p, r not received yet", receive_outputs), ("u not received yet", receive_u)):
         assert reason in bridge.engage(at(0.0))
         assert bridge.step(at(0.0)) is Phase.DISENGAGED
         receive(bridge, 0.0)
@@ -67,7 +67,7 @@ def test_engagement_with_stale_inputs_is_refused_with_the_reason() -> None:
     bridge = new_bridge()
     receive_outputs(bridge, 0.0)
     receive_u(bridge, 0.3)
-    assert bridge.engage(at(0.3)).startswith("q is 0.30 s old (/ap/twist/filtered)")
+    assert bridge.engage(at(0.3)).startswith("q, p, r are 0.30 s old (/ap/twist/filtered)")
     receive_outputs(bridge, 0.6)
     assert bridge.engage(at(0.6)) == "u is 0.30 s old"
 
@@ -124,7 +124,7 @@ def test_a_timeout_of_y_releases_the_channels() -> None:
     bridge = engaged_bridge()
     receive_u(bridge, 0.25)
     assert bridge.step(at(0.25)) is Phase.RELEASE
-    assert bridge.reason.startswith("q is 0.25 s old")
+    assert bridge.reason.startswith("q, p, r are 0.25 s old")
     assert bridge.step(at(0.76)) is Phase.DISENGAGED
 
 
@@ -311,7 +311,7 @@ def test_an_engagement_needs_the_sources_of_the_trims() -> None:
     bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1450.0})
     receive_outputs(bridge, 0.6, tuple(bridge.outputs))
     receive_u(bridge, 0.6)
-    assert bridge.engage(at(0.6)).startswith("trim of elevator is 0.60 s old (/ap/rc); trim of thrust is 0.60 s old")
+    assert bridge.engage(at(0.6)).startswith("trim of elevator, trim of thrust, trim of aileron, trim of rudder are 0.60 s")
 
 
 def test_an_engagement_whose_limits_leave_the_range_around_the_trim_is_refused() -> None:
@@ -360,7 +360,7 @@ def enveloped_bridge() -> Bridge:
     bridge = new_bridge(ChannelMap.validate_mapping(CHANNEL_MAP.model_dump() | {"envelope": ENVELOPE}, "map"))
     receive_u(bridge, 0.0)
     receive_outputs(bridge, 0.0)
-    assert bridge.engage(at(0.0)) == "phi not received yet (/ap/pose/filtered); theta not received yet (/ap/pose/filtered)"
+    assert bridge.engage(at(0.0)) == "phi, theta not received yet (/ap/pose/filtered)"
     receive_outputs(bridge, 0.0, ("phi", "theta"))
     assert bridge.engage(at(0.0)) == "V is -25, outside the envelope [-5, 8]"
     receive_outputs(bridge, 0.01, ("V",), raw=25.0)
@@ -386,7 +386,7 @@ def test_an_envelope_whose_channel_is_stale_releases_the_channels() -> None:
     receive_outputs(bridge, 0.16, ("V",), raw=25.0)
     receive_u(bridge, 0.15)
     assert bridge.step(at(0.25)) is Phase.RELEASE
-    assert bridge.reason.startswith("phi is 0.25 s old (/ap/pose/filtered)")
+    assert bridge.reason.startswith("phi, theta are 0.25 s old (/ap/pose/filtered)")
 
 
 def test_a_pose_has_the_fresh_channels_and_the_stamp_of_its_first_row() -> None:

@@ -199,7 +199,7 @@ def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the
     setup.engage_from_trim()
     with autopilot.stopped():
         stopped = time.time()
-        bridge.wait_for("RELEASE -> DISENGAGED: q is")
+        bridge.wait_for("RELEASE -> DISENGAGED: q, p, r are")
     setup.peer.spin(0.1)
     finite, released = setup.after(stopped)
     assert max(finite) < MAX_AGE + LATE

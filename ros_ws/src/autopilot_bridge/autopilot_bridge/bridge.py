@@ -6,7 +6,7 @@ It reads no clock: every instant is an argument, in ns of one clock. The watchdo
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -103,14 +103,14 @@ class Bridge:
     # State
 
     def stale(self, now_ns: int) -> dict[str, str]:
-        """The stale channels of y and of the envelope, each with the reason as a sentence."""
+        """The stale channels of y and of the envelope, each with what is wrong: "0.30 s old (/topic)"."""
         watched = dict.fromkeys((*self.outputs, *self.channel_map.envelope))
         return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
 
     def _staleness(self, name: str, now_ns: int) -> str:
-        """Why a channel is stale, as a sentence; empty where it is fresh."""
+        """What is wrong with a channel; empty where it is fresh."""
         row = self._rows[name]
-        return _staleness(name, row.topic, self._readings.get(name), row.max_age, now_ns)
+        return _staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
 
     def _outside(self) -> str:
         """The channels that are outside the envelope, as a sentence; empty where none is. All of them were received."""
@@ -128,8 +128,8 @@ class Bridge:
 
     def _violation(self, name: str, row: ConditionRow, now_ns: int) -> str:
         reading = self._conditions.get(name)
-        if stale := _staleness(f"{name}: {row.field}", row.topic, reading, row.max_age, now_ns):
-            return stale
+        if stale := _staleness(row.topic, reading, row.max_age, now_ns):
+            return _sentence({f"{name}: {row.field}": stale})
         holds = reading is not None and reading.value in row.one_of
         return "" if holds or reading is None else f"{row.sentence} ({row.field} is {reading.value:g})"
 
@@ -171,8 +171,8 @@ class Bridge:
 
     def _missing(self, now_ns: int) -> str:
         """What is stale of y, of the envelope, of the trims' sources and of u, as a sentence."""
-        sources = (self._staleness(trim_key(name), now_ns) for name in self.channel_map.trims)
-        return "; ".join(filter(None, (*self.stale(now_ns).values(), *sources, self._u_timeout(now_ns))))
+        sources = {key: stale for key in map(trim_key, self.channel_map.trims) if (stale := self._staleness(key, now_ns))}
+        return "; ".join(filter(None, (_sentence(self.stale(now_ns) | sources), self._u_timeout(now_ns))))
 
     def _away_from_trim(self) -> str:
         limits = self.channel_map.engage_within * np.where(self._u > 0.0, self._upper, -self._lower)
@@ -229,7 +229,7 @@ class Bridge:
             self._continue_engagement(now_ns)
         elif self.phase is Phase.ENGAGED:
             lost = filter(None, (self._unmet(now_ns, awaited=awaited) for awaited in (False, True)))
-            if ended := "; ".join((*lost, *self.stale(now_ns).values())) or self._outside():
+            if ended := "; ".join(filter(None, (*lost, _sentence(self.stale(now_ns))))) or self._outside():
                 self.disengage(ended, now_ns)
             elif timeout := self._u_timeout(now_ns):
                 self.reason = timeout
@@ -326,9 +326,18 @@ class Bridge:
         self.phase, self._phase_ns = phase, now_ns
 
 
-def _staleness(what: str, topic: str, reading: Reading | None, max_age: float, now_ns: int) -> str:
-    """Why a field is stale, as a sentence; empty where it is fresh."""
+def _staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) -> str:
+    """What is wrong with the age of a field; empty where it is fresh."""
     if reading is None:
-        return f"{what} not received yet ({topic})"
+        return f"not received yet ({topic})"
     age_ns = now_ns - reading.stamp_ns
-    return f"{what} is {seconds(age_ns):.2f} s old ({topic})" if age_ns > nanoseconds(max_age) else ""
+    return f"{seconds(age_ns):.2f} s old ({topic})" if age_ns > nanoseconds(max_age) else ""
+
+
+def _sentence(faults: Mapping[str, str]) -> str:
+    """What is wrong with some channels, by name, as a sentence in which channels with the same fault stand together."""
+    names: dict[str, list[str]] = {}
+    for name, fault in faults.items():
+        names.setdefault(fault, []).append(name)
+    verbs = {fault: "" if fault.startswith("not") else "is " if len(named) == 1 else "are " for fault, named in names.items()}
+    return "; ".join(f"{', '.join(named)} {verbs[fault]}{fault}" for fault, named in names.items())
