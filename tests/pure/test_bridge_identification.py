@@ -80,8 +80,10 @@ def test_the_channels_of_an_unknown_aircraft_are_identified(identified: Identifi
     # 30 %: Omega, lag and damping change places in what 8 Hz show; a loop with a phase margin of 54 degrees bears twice as much
     np.testing.assert_allclose(np.diag(channels.Omega), known, rtol=0.3)
     lag = np.array([0.02 if name != "thrust" else 0.1 for name in response.inputs])
-    # u is held for a period of 10 ms, so that it acts half of one late
-    np.testing.assert_allclose(channels.lag + channels.delay, lag + DELAY + 0.005, atol=0.03)
+    # u is held for a period of 10 ms, so that it acts half of one late. V has no model, and its step response is slow: its lag
+    # is less certain, and its bandwidth of 1.4 rad/s turns 50 ms into 4 degrees of phase.
+    expected = lag + DELAY + 0.005
+    assert (np.abs(channels.lag + channels.delay - expected) < np.where(lag > 0.05, 0.05, 0.02)).all()
 
 
 def test_the_written_scenario_flies_the_aircraft_and_tracks(identified: Identified, tmp_path: Path) -> None:
