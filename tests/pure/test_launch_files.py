@@ -308,11 +308,11 @@ def options(process: ExecuteProcess) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("given", "topics"),
     [
-        ({}, "/truth,/y,/y_m"),  # the controller publishes u and internals
+        ({}, "/pose,/truth,/y,/y_m"),  # the controller publishes u and internals
         ({"controller": "false", "aircraft": "true"}, "/internals,/u,/y_m"),
-        ({"controller": "false", "reference_model": "true"}, "/internals,/truth,/u,/y"),
+        ({"controller": "false", "reference_model": "true"}, "/internals,/pose,/truth,/u,/y"),
         ({"map": "ardupilot"}, "/truth,/y_m"),  # y is the bridge's
-        ({"namespace": "one"}, "/internals,/truth,/u,/y,/y_m"),  # a flight without one: no node publishes these
+        ({"namespace": "one"}, "/internals,/pose,/truth,/u,/y,/y_m"),  # a flight without one: no node publishes these
         ({"topics": "y,y_m"}, "y,y_m"),
     ],
     ids=str,
@@ -341,7 +341,7 @@ def test_playing_follows_the_arguments_and_the_end_of_the_log_is_the_end(short: 
 def test_without_nodes_the_log_is_played_at_once(short: Path) -> None:
     actions, context = started("replay", run=short, controller="false")
     process = player(actions)
-    assert options(process)["topics"] == "/internals,/truth,/u,/y,/y_m"
+    assert options(process)["topics"] == "/internals,/pose,/truth,/u,/y,/y_m"
     assert process.on_exit is not None
     assert ends(process.on_exit(ProcessExited("play-1", 0), context))
 

@@ -20,6 +20,15 @@ class Coupling(NamedTuple):
     second: Array  # (P,)
 
 
+class EulerKinematics(NamedTuple):
+    """Nonlinear kinematics in place of the linear ones of A. Angles are those of the stability axes: 0 in trim."""
+
+    select: Array  # (5, n), picks phi, theta, p, q, r
+    into: Array  # (n, 3), adds to alpha_dot, phi_dot, theta_dot
+    linear: Array  # (3, n), rows of A that they replace: none of alpha_dot, those of phi_dot, theta_dot
+    turn_rate: Array  # () g/V0, 1/s
+
+
 class Aircraft(NamedTuple):
     """Matrices of equation (1) and the terms of f as arrays, SI and radians. None: the term is absent."""
 
@@ -33,12 +42,14 @@ class Aircraft(NamedTuple):
     coupling: Coupling | None = None
     bias: Bias | None = None
     sines: Sines | None = None
+    kinematics: EulerKinematics | None = None
 
 
 def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Array:
     """Uncertain part of equation (1), shape (n,):
 
         f = gravity @ sin(x) + gain @ (x[first] x[second]) + gust_direction @ (w(t) + turbulence) + bias(t) + sines(t)
+            + kinematics(x)
 
     `turbulence` is the wind along the G axes, shape (G,), m/s; None: no turbulence. x may hold N states in columns, (n, N).
     """  # noqa: D400, D415 - what follows is an equation
@@ -56,12 +67,33 @@ def x_dot_forced(x: Array, forced: Array, params: Aircraft) -> Array:
 
 
 def f_state(x: Array, params: Aircraft) -> Array:
-    """The part of f that depends on the state: gravity @ sin(x) + gain @ (x[first] x[second]), shape (n,)."""
-    gravity = params.gravity @ array_namespace(x).sin(x)
-    if params.coupling is None:
-        return gravity
-    gain, first, second = params.coupling
-    return gravity + gain @ (x[first] * x[second])
+    """The part of f that depends on the state: gravity @ sin(x) + gain @ (x[first] x[second]) + kinematics(x), shape (n,)."""
+    total = params.gravity @ array_namespace(x).sin(x)
+    if params.coupling is not None:
+        gain, first, second = params.coupling
+        total = total + gain @ (x[first] * x[second])
+    return total if params.kinematics is None else total + kinematics(x, params.kinematics)
+
+
+def kinematics(x: Array, params: EulerKinematics) -> Array:
+    """What the nonlinear kinematics add to the linear ones, shape (n,):
+
+        alpha_dot += g/V0 (cos phi cos theta - 1)
+        phi_dot    = p + tan theta (q sin phi + r cos phi)
+        theta_dot  = q cos phi - r sin phi
+
+    The first is the loss of lift along the vertical in a bank. Source: B. L. Stevens, F. L. Lewis, Aircraft Control and
+    Simulation, 2nd ed. (2003), eqs. (1.3-22), (2.4-5).
+    """  # noqa: D400, D415 - what follows is an equation
+    xp = array_namespace(x)
+    phi, theta, p, q, r = params.select @ x
+    sine, cosine = xp.sin(phi), xp.cos(phi)
+    rates = [
+        params.turn_rate * (cosine * xp.cos(theta) - 1.0),
+        p + xp.tan(theta) * (q * sine + r * cosine),
+        q * cosine - r * sine,
+    ]
+    return params.into @ (xp.stack(rates) - params.linear @ x)
 
 
 def f_time(t: Any, wind: Array, params: Aircraft) -> Array:

@@ -7,7 +7,7 @@ import math
 import jsbsim
 import numpy as np
 
-from aircraft_sim import actuators, jsbsim_trim, turbulence
+from aircraft_sim import actuators, jsbsim_trim, pose, turbulence
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, one_minus_cosine
 from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
@@ -15,6 +15,18 @@ from aircraft_sim.plant import DIVERGENCE_LIMIT
 from flight_core.outcome import FlightEnded
 from flight_core.rates import divide, seconds
 from flight_core.vectors import FloatArray
+
+POSE = (
+    ("attitude/phi-rad", 1.0),
+    ("attitude/theta-rad", 1.0),
+    ("attitude/psi-rad", 1.0),
+    ("position/h-sl-ft", FOOT),
+    ("velocities/v-north-fps", FOOT),
+    ("velocities/v-east-fps", FOOT),
+    ("velocities/h-dot-fps", FOOT),
+    ("aero/beta-rad", 1.0),
+)
+"""Properties of the pose other than the position, with the SI value of their units."""
 
 
 class JsbsimModel:
@@ -54,6 +66,9 @@ class JsbsimModel:
         self._apply_wind(self._wind(0))
         jsbsim_trim.settle(self._fdm, seconds(condition.step_ns))  # one step: the wind of t = 0 acts from t = 0 on
         self._x = self._deviations()
+        self._pose_nodes = [(self._node(path), si) for path, si in POSE]
+        self._position_ground = np.zeros(2)  # to the north and the east of the start
+        self._velocity = self._ground_velocity()
         self.truth_names = (
             *(f"x.{name}" for name in STATES),
             *(f"gust.{name}" for name in AXES),
@@ -86,6 +101,8 @@ class JsbsimModel:
                 title, after = self.condition.title, seconds(after_ns)
                 raise FlightEnded(f"{title} failed at t = {after:.2f} s: {jsbsim_trim.error_text(error)}") from None
         self._x = self._deviations()
+        before, self._velocity = self._velocity, self._ground_velocity()
+        self._position_ground = self._position_ground + seconds(duration_ns) / 2.0 * (before + self._velocity)
         now = f"at t = {seconds(t_ns + duration_ns):.2f} s"
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
             raise FlightEnded(f"{self.condition.title} hit the ground {now}")
@@ -99,6 +116,14 @@ class JsbsimModel:
     def truth(self, t_ns: int) -> FloatArray:
         """Values in the order of `truth_names`."""
         return np.concatenate([self._x, self._wind(t_ns), self._position])
+
+    def pose(self) -> FloatArray:
+        """See `simulator.FlightDynamicsModel`. Position is integrated from the velocity by the trapezoidal rule."""
+        phi, theta, psi, altitude, *velocity, beta = (node.get_double_value() * si for node, si in self._pose_nodes)
+        return np.array([phi, theta, pose.wrapped(psi), *self._position_ground, altitude, *velocity, beta])
+
+    def _ground_velocity(self) -> FloatArray:
+        return np.array([node.get_double_value() * si for node, si in self._pose_nodes[4:6]])
 
     def diverged(self) -> bool:
         """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""

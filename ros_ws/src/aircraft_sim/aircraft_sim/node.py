@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node of the simulated aircraft: it subscribes u and publishes y and truth, in real time or in lockstep.
+"""The node of the simulated aircraft: it subscribes u and publishes y, pose and truth, in real time or in lockstep.
 
 A watchdog measures the age of u. A u that times out gets the failsafe: hold the last value, then ramp it to trim.
 """
@@ -8,6 +8,7 @@ A watchdog measures the age of u. A u that times out gets the failsafe: hold the
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from aircraft_sim import pose
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
 from flight_core.rates import nanoseconds, period_ns, seconds
@@ -16,7 +17,7 @@ from flight_ros.flight_node import FlightNode
 from flight_ros.messages import NO_CHANNELS, instant, stamp_of
 from flight_ros.publisher_lock import PublisherLock
 from flight_ros.ticker import Tick
-from flight_ros.topics import CLOCK, RECORDED, TRUTH, NodeState, U, Y
+from flight_ros.topics import CLOCK, POSE, RECORDED, TRUTH, NodeState, U, Y
 
 WINDOW = 100
 """Largest lead of a lockstep flight over its log, in samples: less than publishers keep for a recorder that overruns."""
@@ -25,7 +26,7 @@ WINDOW = 100
 class AircraftNode(FlightNode[AircraftParameters]):
     """At tick k it integrates from t(k-1) to t(k) with the last u held, publishes y and truth, then takes the newest u.
 
-    In lockstep it sets the time: it publishes /clock, y and truth at each of its instants. At the controller's instants it
+    In lockstep it sets the time: it publishes /clock, y, truth and pose at its instants. At the controller's instants it
     waits for u before it goes on. Each instant has exactly one y, without channels where no sample arrives.
     """
 
@@ -38,6 +39,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         self._timeout_logged = False
         self._u_subscription, self._decoder = self.subscribe(U), self.decoder(U, self._simulator.inputs)
         self._publish_y, self._publish_truth = self.advertise(Y), self.advertise(TRUTH)
+        self._publish_pose, self._pose_encoder = self.advertise(POSE), self.encoder(POSE, pose.CHANNELS)
         self._y_encoder = self.encoder(Y, self._simulator.outputs)
         self._truth_encoder = self.encoder(TRUTH, self._simulator.truth_names)
         if self.parameters.lockstep:
@@ -66,6 +68,8 @@ class AircraftNode(FlightNode[AircraftParameters]):
         for sample in arrived:
             self._publish_y(self._y_encoder.encode(start_ns + sample.stamp_ns, sample.value))
         stamp_ns = start_ns + number * self.period_ns()
+        if number % self._simulator.pose_every == 0:
+            self._publish_pose(self._pose_encoder.encode(stamp_ns, self._simulator.pose()))
         self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
         return bool(arrived)
 

@@ -3,7 +3,7 @@
 """Parameters of the simulated aircraft, validated once, and their conversion to the arrays of the equations."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, NamedTuple, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
@@ -12,7 +12,7 @@ from aircraft_sim import uncertainty
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import Airframe, Unit, load_airframe
 from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines
-from aircraft_sim.dynamics import Aircraft, Coupling
+from aircraft_sim.dynamics import Aircraft, Coupling, EulerKinematics
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, FlightCondition, WindModel, require_aircraft
 from aircraft_sim.plant import PlantParams
 from aircraft_sim.sensors import Sensors
@@ -20,8 +20,9 @@ from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filte
 from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
 from flight_core import parameters
 from flight_core.failsafe import failsafe_scale
-from flight_core.parameters import KeyedParameters, NonNegative, ParameterError, Parameters, Positive, require
+from flight_core.parameters import KeyedParameters, NonNegative, Numbers, ParameterError, Parameters, Positive, require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
+from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 
 
@@ -156,6 +157,14 @@ class AircraftParameters(KeyedParameters):
     inertial_coupling: float = Field(
         default=0.0, ge=0, le=1, description="the factor on the airframe's inertial coupling, 0 to 1"
     )
+    kinematics: Literal["linear", "euler"] = Field(
+        default="linear",
+        description="of an airframe: the attitude by the linear rows of A, or by Euler's equations, with the loss of lift in a"
+        " bank; guidance needs euler",
+    )
+    wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
+        default=(0.0, 0.0), description="the steady wind, m/s, where the air moves to: north, east"
+    )
     uncertainty: UncertaintyParameters = Field(
         default=UncertaintyParameters(), description="how far the aircraft differs from its airframe"
     )
@@ -213,6 +222,9 @@ class AircraftParameters(KeyedParameters):
         has_none = f"the airframe {airframe.name} has no"
         possible = bool(airframe.inertial_coupling) or self.inertial_coupling == 0.0
         require(possible, "inertial_coupling", f"{self.inertial_coupling:g}", f"0: {has_none} inertial_coupling")
+        missing = [name for name in ("alpha", *EULER_STATES) if name not in airframe.states]
+        known = self.kinematics == "linear" or not missing
+        require(known, "kinematics", f"{self.kinematics!r}", f"linear: {has_none} state {', '.join(missing)}")
         require(bool(airframe.gusts) or self.turbulence is None, "turbulence", "a section", f"none: {has_none} gusts")
 
     def _check_jsbsim(self) -> None:
@@ -226,6 +238,7 @@ class AircraftParameters(KeyedParameters):
             ("bias", self.bias),
             ("sines", self.sines),
             ("inertial_coupling", self.inertial_coupling),
+            ("kinematics", self.kinematics != "linear"),
             ("uncertainty", uncertain),
         ):
             require(not value, key, "a value", f"none: {self.airframe} has no matrices to change")
@@ -276,6 +289,7 @@ class AircraftParameters(KeyedParameters):
             Coupling(self.inertial_coupling * gain, first, second) if self.inertial_coupling > 0.0 else None,
             Bias(*_by_state(biases, Bias._fields, airframe)) if biases else None,
             Sines(*_by_state(sines, Sines._fields, airframe)) if sines else None,
+            _euler_kinematics(airframe) if self.kinematics == "euler" else None,
         )
 
     def plant(self) -> PlantParams:
@@ -322,6 +336,21 @@ class AircraftParameters(KeyedParameters):
             drift=None if drift is None else drift * np.sqrt(1.0 / self.rate),
             quantum=_array(sensors.quantisation, zero_is_none=True),
         )
+
+
+EULER_STATES = ("phi", "theta", "p", "q", "r")
+"""States of Euler's equations, in the order of `dynamics.EulerKinematics.select`."""
+
+
+def _euler_kinematics(airframe: Airframe) -> EulerKinematics:
+    unit, rows = np.eye(len(airframe.states)), airframe.matrix_a()
+    alpha, phi, theta = (airframe.index(name) for name in ("alpha", "phi", "theta"))
+    return EulerKinematics(
+        select=unit[[airframe.index(name) for name in EULER_STATES]],
+        into=unit[:, [alpha, phi, theta]],
+        linear=np.stack([0.0 * rows[alpha], rows[phi], rows[theta]]),
+        turn_rate=np.array(GRAVITY / airframe.speed),
+    )
 
 
 STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from aircraft_sim import plant, sensors, truth
+from aircraft_sim import plant, pose, sensors, truth
 from aircraft_sim.dynamics import Forcing
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.sensors import DelayLine
@@ -18,6 +18,8 @@ from flight_core.rates import divide, period_ns, seconds
 from flight_core.vectors import FloatArray
 
 BLOCK = 100  # steps
+POSE_STATES = ("V", "alpha", "beta", "phi", "theta", "q", "r")
+"""States of an airframe from which its pose follows."""
 
 
 class FlightDynamicsModel(Protocol):
@@ -36,6 +38,9 @@ class FlightDynamicsModel(Protocol):
     def truth(self, t_ns: int) -> FloatArray:
         """Values in the order of `truth_names`."""
 
+    def pose(self) -> FloatArray:
+        """The pose relative to the air mass, in the order of `pose.CHANNELS`, absolute values, SI."""
+
     def diverged(self) -> bool:
         """Whether the state is not finite or too large for a flight."""
 
@@ -43,7 +48,9 @@ class FlightDynamicsModel(Protocol):
 class StateSpaceModel:
     """Equation (1) with the matrices of an airframe, behind its actuators.
 
-    The forcing is computed for BLOCK steps together, which takes a tenth of the time.
+    The forcing is computed for BLOCK steps together, which takes a tenth of the time. Heading, position and altitude are no
+    states of an airframe: they are integrated by the trapezoidal rule over each `advance`, from 0. States that the airframe
+    lacks are 0, as in trim.
     """
 
     def __init__(self, parameters: AircraftParameters) -> None:
@@ -51,7 +58,13 @@ class StateSpaceModel:
         self._state = plant.initial_state(self._plant)
         self._block_ns = 0
         self._block = plant.forcing(0, BLOCK, self._plant)
-        self.truth_names = truth.names(parameters.sampled_airframe())
+        airframe = parameters.sampled_airframe()
+        self.truth_names = truth.names(airframe)
+        states = list(airframe.states)
+        self._places = [states.index(name) if name in states else None for name in POSE_STATES]
+        self._speed, self._euler = airframe.speed, parameters.kinematics == "euler"
+        self._psi, self._position = 0.0, np.zeros(3)  # north, east, altitude
+        self._psi_dot, self._velocity = self._heading_rate(), self._air_velocity()
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """See FlightDynamicsModel."""
@@ -62,6 +75,32 @@ class StateSpaceModel:
             self._block = plant.forcing(t_ns, max(steps, BLOCK), self._plant)
         forced = Forcing(*(part[2 * begin : 2 * (begin + steps) + 1] for part in self._block))
         self._state = plant.advance(t_ns, self._state, u, duration_ns, self._plant, forced)
+        half, psi_dot, velocity = seconds(duration_ns) / 2.0, self._psi_dot, self._velocity
+        self._psi_dot = self._heading_rate()
+        self._psi += half * (psi_dot + self._psi_dot)
+        self._velocity = self._air_velocity()
+        self._position = self._position + half * (velocity + self._velocity)
+
+    def pose(self) -> FloatArray:
+        """See FlightDynamicsModel."""
+        _, _, beta, phi, theta, *_ = self._states()
+        attitude = (pose.wrapped(phi), theta, pose.wrapped(self._psi))
+        return np.array([*attitude, *self._position, *self._velocity, beta])
+
+    def _states(self) -> list[float]:
+        """The POSE_STATES, deviations from trim."""
+        x = self._state.x.tolist()
+        return [0.0 if place is None else x[place] for place in self._places]
+
+    def _heading_rate(self) -> float:
+        """psi_dot in rad/s; r with the linear kinematics."""
+        *_, phi, theta, q, r = self._states()
+        return pose.psi_dot(phi, theta, q, r) if self._euler else r
+
+    def _air_velocity(self) -> FloatArray:
+        """Velocity relative to the air mass: north, east, up, shape (3,), m/s."""
+        V, alpha, beta, phi, theta, *_ = self._states()
+        return np.array(pose.velocity(self._speed + V, alpha, beta, phi, theta, self._psi))
 
     def y(self) -> FloatArray:
         """See FlightDynamicsModel."""
@@ -92,6 +131,8 @@ class Simulator:
             self._model = JsbsimModel(parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model())
         else:
             self._model = StateSpaceModel(parameters)
+        self._wind = parameters.wind
+        self.pose_every = pose.every(parameters.rate)
         self._sensors = parameters.sensor_arrays()
         self.truth_names = ("t", *self._model.truth_names, *(f"noise.{name}" for name in self.outputs))
         self._drift = sensors.initial_drift(self._sensors)
@@ -115,6 +156,10 @@ class Simulator:
         y = measured if sensors.arrives(number, self._sensors) else None
         self._delay_line, arrived = sensors.transmit(self._delay_line, t_ns, y, self._sensors)
         return arrived
+
+    def pose(self) -> FloatArray:
+        """The true pose at the instant of the last sample, in the order of `pose.CHANNELS`."""
+        return pose.over_ground(self._model.pose(), seconds(self._number * self.period_ns), self._wind)
 
     def truth(self) -> FloatArray:
         """The true values at the instant of the last sample, in the order of `truth_names`."""

@@ -45,7 +45,7 @@ POSE, WOULD_SEND, ENGAGEMENT = "pose", "bridge/would_send", "bridge/engagement"
 # The bridge also publishes the messages of its channel map.
 PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
     {
-        AIRCRAFT: ("y", "truth"),
+        AIRCRAFT: ("y", POSE, "truth"),
         REFERENCE_MODEL: ("y_m",),
         CONTROLLER: ("u", "internals"),
         BRIDGE: ("y", POSE, WOULD_SEND, ENGAGEMENT),

@@ -77,4 +77,4 @@ RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the l
 ENGAGEMENT = Topic("bridge/engagement", KeyValue)  # key: the phase of the bridge; value: why it is not engaged
 NODE_STATE = Topic("node_state", KeyValue)  # key: the process, "/controller#4711"; value: a NodeState
 
-FLIGHT = (Y, Y_M, U, U_M, INTERNALS, TRUTH, DIAGNOSTICS)
+FLIGHT = (Y, Y_M, U, U_M, POSE, INTERNALS, TRUTH, DIAGNOSTICS)

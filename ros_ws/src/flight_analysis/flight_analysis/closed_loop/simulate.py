@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from aircraft_sim import pose
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
@@ -52,7 +53,7 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
     outcome, t_ns = COMPLETED, 0
     try:
         aircraft = Simulator(scenario.aircraft)
-        signals["truth"] = _SignalBuilder(aircraft.truth_names)
+        signals["truth"], signals["pose"] = _SignalBuilder(aircraft.truth_names), _SignalBuilder(pose.CHANNELS)
         base_ns = math.gcd(aircraft.period_ns, reference.period_ns)
         u = np.zeros(len(inputs))
         for t_ns in range(0, nanoseconds(scenario.flight.duration) + 1, base_ns):
@@ -60,6 +61,8 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
                 for sample in aircraft.sample(t_ns // aircraft.period_ns, u):
                     signals["y"].add(sample.stamp_ns, sample.value)
                     controller.take_y(StampedVector(sample.stamp_ns, select(outputs, aircraft.outputs, sample.value)), t_ns)
+                if t_ns % (aircraft.pose_every * aircraft.period_ns) == 0:
+                    signals["pose"].add(t_ns, aircraft.pose())
                 signals["truth"].add(t_ns, aircraft.truth())
             if t_ns % reference.period_ns == 0:
                 y_m = reference.sample(t_ns // reference.period_ns)

@@ -1,0 +1,58 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Pose of the aircraft: attitude, position and velocity over ground as absolute values, for guidance and the log.
+
+Position is that in a local tangent plane whose origin is below the aircraft at t = 0. A steady wind moves the air mass as a
+whole: the flight relative to the air is that in still air, and the pose alone gets the wind (Galilean invariance).
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from flight_core.vectors import FloatArray
+
+CHANNELS = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
+"""rad (body FRD in NED, psi from true north in (-pi, pi]), m, m/s over ground, and the sideslip in rad."""
+
+RATE = 50.0
+"""Hz, the highest rate of pose: the aircraft publishes it at every k-th of its instants, with the least such k."""
+
+
+def every(rate: float) -> int:
+    """Number k of the aircraft's instants from one pose to the next, by the aircraft's rate in Hz."""
+    return max(1, math.ceil(rate / RATE))
+
+
+def wrapped(angle: float) -> float:
+    """An angle in (-pi, pi], rad."""
+    return angle - 2.0 * math.pi * math.ceil(angle / (2.0 * math.pi) - 0.5)
+
+
+def velocity(speed: float, alpha: float, beta: float, phi: float, theta: float, psi: float) -> tuple[float, float, float]:
+    """Velocity to the north, to the east and up, m/s, of an aircraft with this airspeed, m/s, and these angles, rad.
+
+        [v_north, v_east, -climb] = R_z(psi) R_y(theta) R_x(phi) V [cos(alpha) cos(beta), sin(beta), sin(alpha) cos(beta)]
+
+    Source: B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed. (2003), eqs. (1.3-20), (2.3-6).
+    """
+    u, v, w = speed * math.cos(alpha) * math.cos(beta), speed * math.sin(beta), speed * math.sin(alpha) * math.cos(beta)
+    right, down = v * math.cos(phi) - w * math.sin(phi), v * math.sin(phi) + w * math.cos(phi)
+    forward, climb = u * math.cos(theta) + down * math.sin(theta), u * math.sin(theta) - down * math.cos(theta)
+    north, east = math.cos(psi), math.sin(psi)
+    return forward * north - right * east, forward * east + right * north, climb
+
+
+def psi_dot(phi: float, theta: float, q: float, r: float) -> float:
+    """Rate of the heading, rad/s: (q sin(phi) + r cos(phi)) / cos(theta). Source: Stevens, Lewis, eq. (1.3-22)."""
+    return (q * math.sin(phi) + r * math.cos(phi)) / math.cos(theta)
+
+
+def over_ground(pose: FloatArray, t: float, wind: Sequence[float]) -> FloatArray:
+    """A pose relative to the air mass as that over ground after t s of a steady wind (m/s to the north, to the east)."""
+    moved = pose.copy()
+    for i, speed in enumerate(wind):
+        moved[CHANNELS.index("north") + i] += speed * t
+        moved[CHANNELS.index("v_north") + i] += speed
+    return np.asarray(moved)
