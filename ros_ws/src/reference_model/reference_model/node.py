@@ -2,12 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference model node: publishes y_m of equation (2) in real time or in lockstep."""
 
-from flight_core.rates import nanoseconds
-from flight_core.vectors import ChannelError
+from collections import deque
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from flight_core.rates import nanoseconds, period_ns
+from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_not_future
 from flight_ros.flight_node import FlightNode
-from flight_ros.messages import stamp_of
+from flight_ros.messages import Decoder, stamp_of
+from flight_ros.publisher_lock import PublisherLock
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, U_M, Y_M
+from reference_model.live import ATTITUDE
 from reference_model.params import ReferenceModelParameters
 from reference_model.reference import Reference
 
@@ -15,7 +22,8 @@ from reference_model.reference import Reference
 class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
     """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k). Commands are the scenario's profile until u_m is received.
 
-    In lockstep it publishes every y_m up to the instant of /clock and computes the next one ahead, from the profile only.
+    In lockstep it publishes every y_m up to the instant of /clock and computes the next one ahead. Where `u_m_rate` is set it
+    computes it once u_m has arrived: each instant of u_m has exactly one, without channels where there is no command.
     """
 
     def __init__(self) -> None:
@@ -23,11 +31,18 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
         self._reference = Reference(self.parameters)
         self._publish_y_m = self.advertise(Y_M)
         self._encoder = self.encoder(Y_M, self.parameters.outputs)
+        self._publisher_lock = PublisherLock()
+        self._decoder = self.decoder(U_M, self.parameters.outputs)
+        self._attitude_decoder = Decoder((*self.parameters.outputs, *ATTITUDE))
+        rate = self.parameters.u_m_rate
+        self._u_m_ns = period_ns(rate, "u_m_rate") if rate else 0
         if self.parameters.lockstep:
-            self._number, self._next = 0, self._reference.sample(0)
+            self._number, self._clock_ns = 0, -1
+            self._next: FloatArray | None = None
             self._clock_subscription = self.subscribe(CLOCK)
-        else:
-            self._u_m_subscription, self._decoder = self.subscribe(U_M), self.decoder(U_M, self.parameters.outputs)
+        if self._u_m_ns or not self.parameters.lockstep:
+            self._u_m_subscription = self.subscribe(U_M)
+            self._u_m_due: deque[bytes] = deque()
 
     def period_ns(self) -> int:
         return self._reference.period_ns
@@ -36,32 +51,81 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
         return nanoseconds(self.parameters.start_time)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
+        before = self._reference.source()
         self._publish_y_m(self._encoder.encode(now_ns, self._reference.sample(tick.number)))
         for received in self._u_m_subscription.take():
-            try:
-                sample = self._decoder.decode(received.message)
-            except ChannelError as error:
-                self.reject(self._u_m_subscription, error.reason, str(error))
-                continue
+            self._take_u_m(received.message, now_ns, now_ns - tick.number * self.period_ns())
+        if (source := self._reference.source()) != before:
+            self._log_source(source)
+
+    def _take_u_m(self, message: bytes, now_ns: int, start_ns: int) -> None:
+        """Give a u_m to the reference, unless it is invalid, old or from a conflicting publisher."""
+        max_age_ns, live = nanoseconds(self.parameters.live.max_age), self.parameters.live
+        try:
+            sample = self._decode(message)
             if sample is None:
-                continue
-            if self._reference.live is None:
-                self.get_logger().info(f"commands from {self._u_m_subscription.name} replace the profile")
-            self._reference.live = sample.value
+                return
+            require_not_future(sample.stamp_ns, now_ns, max_age_ns)
+            if now_ns - sample.stamp_ns > max_age_ns:
+                raise ChannelError("old", f"u_m is {(now_ns - sample.stamp_ns) / 1e9:g} s old")
+            takeover_ns = max_age_ns + nanoseconds(live.levelling)
+            self._publisher_lock.check(sample.sender, now_ns, max_age_ns, takeover_ns)
+            m = len(self.parameters.outputs)
+            attitude = sample.value[m:] if len(sample.value) > m else None
+            self._reference.take(sample.stamp_ns - start_ns, sample.value[:m], attitude)
+            self._publisher_lock.refresh(sample.sender, now_ns)
+        except ChannelError as error:
+            self.reject(self._u_m_subscription, error.reason, str(error))
+
+    def _decode(self, message: bytes) -> StampedVector | None:
+        """The commands, and the attitude where the message has it."""
+        sample = self._decoder.decode(message)
+        if sample is None:
+            return None
+        try:
+            with_attitude = self._attitude_decoder.decode(message)
+        except ChannelError as error:
+            if error.reason != "name":
+                raise
+            return sample
+        return sample if with_attitude is None else sample._replace(value=np.asarray(with_attitude.value))
+
+    def _log_source(self, source: str) -> None:
+        if source == "ending":
+            levels = "wings are levelled, then" if self.parameters.live.speed is not None else "from now on"
+            self.get_logger().error(f"{self._u_m_subscription.name} timed out: {levels} all commands are zero")
+        else:
+            self.get_logger().info(f"commands from {self._u_m_subscription.name} replace the profile")
 
     def advance(self) -> bool:
-        now_ns = max((stamp_of(received.message) for received in self._clock_subscription.take()), default=-1)
-        if now_ns < 0:
+        self._clock_ns = max([self._clock_ns, *(stamp_of(received.message) for received in self._clock_subscription.take())])
+        advanced = False
+        while True:
+            if self._next is None and self._commands_known():
+                self._next = self._reference.sample(self._number)
+            t_ns = self._number * self.period_ns()
+            if self._next is None or t_ns > self._clock_ns:
+                return advanced
+            self._publish_y_m(self._encoder.encode(t_ns, self._next))
+            self._number, self._next, advanced = self._number + 1, None, True
+
+    def _commands_known(self) -> bool:
+        """Lockstep: whether u_m of the instant before the next sample is here, if there is one; it is taken."""
+        t_ns = (self._number - 1) * self.period_ns()
+        if not self._u_m_ns or t_ns < 0 or t_ns % self._u_m_ns:
+            return True
+        if not self._u_m_due:
+            self._u_m_due.extend(received.message for received in self._u_m_subscription.take())
+        if not self._u_m_due:
             return False
-        while self._number * self.period_ns() <= now_ns:
-            self._publish_y_m(self._encoder.encode(self._number * self.period_ns(), self._next))
-            self._number += 1
-            self._next = self._reference.sample(self._number)
+        self._take_u_m(self._u_m_due.popleft(), t_ns, 0)
         return True
 
     def awaited_topic(self) -> str:
-        return self._clock_subscription.name
+        waits = self._u_m_ns and self._next is None
+        return (self._u_m_subscription if waits else self._clock_subscription).name
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         level, _, figures = super().status()
-        return level, "profile" if self._reference.live is None else "live commands", figures
+        source = self._reference.source()
+        return DiagnosticStatus.ERROR if source == "ending" else level, source, figures

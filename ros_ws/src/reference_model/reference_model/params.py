@@ -9,10 +9,14 @@ from pydantic import Field, model_validator
 
 from flight_core import parameters
 from flight_core.parameters import KeyedParameters, Names, Numbers, ParameterError, Parameters, Positive, Positives, require
-from flight_core.rates import period_ns
+from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
 from reference_model.command import Profile
+from reference_model.live import LiveParams
 from reference_model.model import Model, second_order
+
+RATES_AND_SPEED = ("q", "V", "p", "r")
+"""Channels by which the ending of u_m levels the wings."""
 
 
 class Pulses(Parameters):
@@ -47,6 +51,20 @@ class CoordinatedTurn(Parameters):
     speed: Positive = Field(description="the speed V0, m/s")
 
 
+class LiveCommands(Parameters):
+    """Live commands on the topic u_m in place of the profile, and their ending when their publisher is lost."""
+
+    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(default=0.2, description="the age at which u_m times out, s")
+    speed: Positive | None = Field(
+        default=None, description="the trim speed V0, m/s, for the turn while the wings are levelled; none: zero at once"
+    )
+    levelling: Annotated[float, Field(ge=0, le=1e6)] = Field(
+        default=10.0, description="how long the wings are levelled after a timeout, s; then all commands are zero"
+    )
+    roll_rate: Positive = Field(default=0.35, description="the largest roll rate while the wings are levelled, rad/s")
+    bounds: dict[str, Positive] = Field(default={}, description="largest absolute commands by channel, none where left out")
+
+
 class SecondOrder(Parameters):
     """The model as one second-order filter per channel."""
 
@@ -76,17 +94,29 @@ class ReferenceModelParameters(KeyedParameters):
     pulses: dict[str, Pulses] = Field(default={}, description="pulses by channel")
     sines: dict[str, Sine] = Field(default={}, description="sines by channel")
     coordinated_turn: CoordinatedTurn | None = Field(default=None, description="turn coordination")
+    live: LiveCommands = Field(default=LiveCommands(), description="live commands u_m")
+    u_m_rate: float = Field(
+        default=0.0, ge=0, le=1000, description="in lockstep: the rate of u_m, at whose instants it is waited for, Hz; 0: none"
+    )
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        period_ns(self.rate, "rate")
+        period = period_ns(self.rate, "rate")
+        if self.u_m_rate:
+            divides = period_ns(self.u_m_rate, "u_m_rate") % period == 0
+            require(divides, "u_m_rate", f"{self.u_m_rate:g} Hz", f"a whole fraction of rate ({self.rate:g} Hz)")
         turn = self.coordinated_turn
         named = {f"pulses.{name}": name for name in self.pulses} | {f"sines.{name}": name for name in self.sines}
         if turn is not None:
             named |= {"coordinated_turn.bank_rate": turn.bank_rate, "coordinated_turn.turn_rate": turn.turn_rate}
+        named |= {f"live.bounds.{name}": name for name in self.live.bounds}
         for key, name in named.items():
             require(name in self.outputs, key, f"channel {name!r}", f"one of {', '.join(self.outputs)}")
         self._check_model()
+        missing = [name for name in RATES_AND_SPEED if name not in self.outputs]
+        levels = self.live.speed is None or (not missing and self.second_order is not None)
+        expected = f"none: wings are levelled by {', '.join(RATES_AND_SPEED)} of a second_order model"
+        require(levels, "live.speed", self.live.speed, expected)
         return self
 
     def _check_model(self) -> None:
@@ -120,6 +150,26 @@ class ReferenceModelParameters(KeyedParameters):
         n, m = len(self.linear.states), len(self.outputs)
         C = np.array([[float(state == output) for state in self.linear.states] for output in self.outputs])
         return Model(np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C)
+
+    def live_params(self) -> LiveParams:
+        """Limits of u_m and the gains of its ending: a quarter of the reference's bandwidths of p and q.
+
+        With a second-order reference of damping 0.9 this gain gives the loop of the angle a damping of about 0.74.
+        """
+        section, channels, gain = self.live, None, (0.0, 0.0)
+        if section.speed is not None and self.second_order is not None:
+            q, V, p, r = (self.outputs.index(name) for name in RATES_AND_SPEED)
+            channels, frequency = (q, V, p, r), self.second_order.natural_frequency
+            gain = (frequency[p] / 4.0, frequency[q] / 4.0)
+        return LiveParams(
+            nanoseconds(section.max_age),
+            nanoseconds(section.levelling),
+            np.array([section.bounds.get(name, np.inf) for name in self.outputs]),
+            section.speed,
+            channels,
+            gain,
+            section.roll_rate,
+        )
 
     def profile(self) -> Profile:
         """The commands u_m(t) as arrays over the outputs: two edges per pulse, padded with edges of height 0."""

@@ -5,16 +5,17 @@
 import numpy as np
 
 from flight_core.rates import period_ns, seconds
-from flight_core.vectors import FloatArray
-from reference_model import model
+from flight_core.vectors import FloatArray, require_newer
+from reference_model import live, model
 from reference_model.command import command
+from reference_model.live import Live
 from reference_model.params import ReferenceModelParameters
 
 BLOCK = 100  # steps for which the profile is evaluated at once
 
 
 class Reference:
-    """Equation (2) and its state x_m at the instants k periods. The commands are the profile's until `live` is set."""
+    """Equation (2) and its state x_m at the instants k periods. The commands are the profile's until the first live u_m."""
 
     def __init__(self, parameters: ReferenceModelParameters) -> None:
         self._model, self._profile = parameters.model(), parameters.profile()
@@ -23,7 +24,25 @@ class Reference:
         self._x_m = np.zeros(len(self._model.A_m))  # the reference starts in trim
         self._number = 0
         self._u_m = self._block(0)
-        self.live: FloatArray | None = None  # (m,) commands that replace the profile's
+        self._live_params = parameters.live_params()
+        self._live: Live | None = None
+
+    def take(self, t_ns: int, u_m: FloatArray, attitude: FloatArray | None = None) -> None:
+        """Take a live u_m, shape (m,), of flight time t; it acts from the next step on.
+
+        `attitude` is [phi, theta] as in `live.ATTITUDE`, None where it is not known. Raises ChannelError for an old u_m or one
+        beyond its bounds.
+        """
+        if self._live is not None:
+            require_newer(t_ns, self._live.t_ns, "u_m")
+        self._live = live.take(t_ns, u_m, attitude, self._live_params)
+
+    def source(self) -> str:
+        """Where the commands come from at the last sample: "profile", "live commands", or "ending" of an u_m that timed out."""
+        if self._live is None:
+            return "profile"
+        aged = self._number * self.period_ns - self._live.t_ns > self._live_params.max_age_ns
+        return "ending" if aged else "live commands"
 
     def sample(self, number: int) -> FloatArray:
         """y_m at sample `number`, shape (m,), computed in steps of one period."""
@@ -31,7 +50,13 @@ class Reference:
             index = self._number % BLOCK
             if index == 0:
                 self._u_m = self._block(self._number)
-            u_m = self._u_m[2 * index : 2 * index + 3].ravel() if self.live is None else np.tile(self.live, 3)
+            if self._live is None:
+                u_m = self._u_m[2 * index : 2 * index + 3].ravel()
+            else:
+                u_m = np.tile(self._live_u_m(self._live), 3)
+                self._live = live.dead_reckon(
+                    self._live, model.output(self._x_m, self._model), self.period_ns, self._live_params
+                )
             self._x_m = model.step(self._x_m, u_m, self._stepper)
             self._number += 1
         y_m: FloatArray = model.output(self._x_m, self._model)
@@ -41,9 +66,13 @@ class Reference:
         """Derivative of y_m at the last sample, shape (m,): C x_m_dot, equation (2)."""
         index = self._number % BLOCK
         u_m = self._block(self._number)[0] if index == 0 else self._u_m[2 * index]
-        u_m = u_m if self.live is None else self.live
+        u_m = u_m if self._live is None else self._live_u_m(self._live)
         y_m_dot: FloatArray = model.output(model.x_m_dot(0.0, self._x_m, u_m, self._model), self._model)
         return y_m_dot
+
+    def _live_u_m(self, state: Live) -> FloatArray:
+        y_m = model.output(self._x_m, self._model)
+        return live.commands(self._number * self.period_ns, state, y_m, self._live_params)
 
     def _block(self, number: int) -> FloatArray:
         """Commands of the profile at the starts, middles and ends of BLOCK steps, ten times faster than BLOCK calls."""

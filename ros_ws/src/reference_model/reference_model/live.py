@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Live commands u_m of a publisher, their age limit, and their ending when the publisher is lost.
+
+Zero rates would keep the bank of that instant. So the ending levels the wings first, from the attitude that came with u_m.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.failsafe import failsafe_scale
+from flight_core.rates import seconds
+from flight_core.units import GRAVITY
+from flight_core.vectors import ChannelError, FloatArray
+
+ATTITUDE = ("phi", "theta")
+"""Channels of u_m beside the commands: bank, and pitch above that of level flight, rad. They serve the ending alone."""
+
+MAX_TILT = math.radians(80.0)  # the ending's limit on cos phi and tan theta, which are singular at 90 deg
+
+
+class LiveParams(NamedTuple):
+    """Limits of u_m and the gains of its ending."""
+
+    max_age_ns: int  # an older u_m has timed out
+    levelling_ns: int  # how long the ending levels the wings before all commands are zero
+    bounds: FloatArray  # (m,) largest absolute values of u_m
+    speed: float | None  # trim speed V0, m/s; None: the ending cannot turn the aircraft level
+    channels: tuple[int, int, int, int] | None  # places of q, V, p, r in u_m; None where one is missing
+    gain: tuple[float, float]  # of bank and of pitch, 1/s
+    roll_rate: float  # largest roll rate of the ending, rad/s
+
+
+class Live(NamedTuple):
+    """The last u_m and the attitude since then, by dead reckoning."""
+
+    t_ns: int  # flight time of its stamp
+    u_m: FloatArray  # (m,)
+    attitude: tuple[float, float] | None  # phi, theta, rad, at present; None where it is not known
+
+
+def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LiveParams) -> Live:
+    """The state after a new u_m. Raises ChannelError, reason "bounds", for a command beyond its bound."""
+    if (np.abs(u_m) > params.bounds).any():
+        raise ChannelError("bounds", f"{u_m.tolist()} is beyond the bounds {params.bounds.tolist()}")
+    return Live(t_ns, u_m, None if attitude is None else (float(attitude[0]), float(attitude[1])))
+
+
+def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> FloatArray:
+    """u_m at t, shape (m,): the last one up to its age limit, then its ending.
+
+    For `levelling_ns`, where the attitude is known, with phi and theta by dead reckoning and V = V0 + V_m,
+
+        phi_dot_c = -k_phi phi, at most `roll_rate`;  theta_dot_c = -k_theta theta;  psi_dot = g tan(phi) / V
+        r = psi_dot cos(phi) cos(theta) - theta_dot_c sin(phi)
+        q = (theta_dot_c + r sin(phi)) / cos(phi)
+        p = phi_dot_c - tan(theta) (q sin(phi) + r cos(phi))
+
+    the inverse of Euler's equations in a coordinated turn; all other commands ramp to zero. After that, and where the
+    attitude is not known, all commands are zero. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), ch. 9.
+    """
+    silent_ns = t_ns - live.t_ns - params.max_age_ns
+    if silent_ns <= 0:
+        return live.u_m
+    if silent_ns > params.levelling_ns or live.attitude is None or params.channels is None or params.speed is None:
+        return np.zeros_like(live.u_m)
+    at_q, at_v, at_p, at_r = params.channels
+    phi, theta = (min(max(angle, -MAX_TILT), MAX_TILT) for angle in live.attitude)
+    phi_dot = min(max(-params.gain[0] * phi, -params.roll_rate), params.roll_rate)
+    theta_dot = -params.gain[1] * theta
+    psi_dot = GRAVITY * math.tan(phi) / max(params.speed + float(y_m[at_v]), params.speed / 2.0)
+    r = psi_dot * math.cos(phi) * math.cos(theta) - theta_dot * math.sin(phi)
+    q = (theta_dot + r * math.sin(phi)) / math.cos(phi)
+    u_m = failsafe_scale(silent_ns, 0, params.levelling_ns) * live.u_m
+    u_m[[at_q, at_p, at_r]] = q, phi_dot - math.tan(theta) * (q * math.sin(phi) + r * math.cos(phi)), r
+    return u_m
+
+
+def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams) -> Live:
+    """The state a period later: the attitude moves by Euler's equations with the reference rates, which the law tracks."""
+    if live.attitude is None or params.channels is None:
+        return live
+    at_q, _, at_p, at_r = params.channels
+    p, q, r, dt = float(y_m[at_p]), float(y_m[at_q]), float(y_m[at_r]), seconds(period_ns)
+    phi, theta = live.attitude
+    turn = q * math.sin(phi) + r * math.cos(phi)
+    tilt = min(max(theta, -MAX_TILT), MAX_TILT)
+    phi_dot, theta_dot = p + math.tan(tilt) * turn, q * math.cos(phi) - r * math.sin(phi)
+    return live._replace(attitude=(phi + dt * phi_dot, theta + dt * theta_dot))
