@@ -284,6 +284,22 @@ def test_waits_for_configure_and_activate_without_autostart(start_node: Start, p
     peer_node.until(lambda: peer_node.modes()[-1] == Mode.INACTIVE, each=lambda: peer_node.send(0.01))
 
 
+def test_a_deactivated_controller_publishes_trim_but_a_standby_that_was_never_activated_nothing(
+    start_node: Start, peer_node: Peer
+) -> None:
+    """A bridge engages with a fresh u. Beside another controller the u of a standby would be a conflict."""
+    start_node("rise_di_controller", "-p", "autostart:=false").wait_for("waiting to be configured")
+    assert peer_node.transition(Transition.TRANSITION_CONFIGURE)
+    peer_node.spin(0.3, each=lambda: peer_node.send(0.01))
+    assert peer_node.received["u"] == []
+    peer_node.spin(0.5)  # longer than max_age: y is stale, so the law does not engage
+    assert peer_node.transition(Transition.TRANSITION_ACTIVATE)
+    assert peer_node.transition(Transition.TRANSITION_DEACTIVATE)
+    wait_for_messages(peer_node, "u", 5, each=lambda: peer_node.send(0.01))
+    assert not any(any(u.position) for u in peer_node.received["u"])
+    assert peer_node.received["internals"] == []
+
+
 def test_node_survives_an_invalid_transition(start_node: Start, peer_node: Peer) -> None:
     process = start_node("rise_di_controller")
     engage(peer_node)

@@ -34,7 +34,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
     def __init__(self) -> None:
         FlightNode.__init__(self, "controller", ControllerParameters)
         LifecycleNodeMixin.__init__(self)
-        self._active = False
+        self._active = self._was_active = False
         self._controller = Controller(self.parameters)
         outputs = self.parameters.outputs
         self._y_subscription, self._y_decoder = self.subscribe(Y), self.decoder(Y, outputs)
@@ -64,7 +64,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Allow the law to engage with the next fresh y and y_m."""
-        self._active = True
+        self._active = self._was_active = True
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -149,8 +149,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         output = self._controller.tick(now_ns, late_ns, active=self._active)
         if self._controller.mode is not before:
             self.get_logger().info(f"{before.name} -> {self._controller.mode.name}")
-        if output is None:
-            return False
+        if output is None or not (self._was_active or self._controller.has_internals):
+            return False  # a standby that was never activated publishes no u beside that of another controller
         # A tick that was stopped half-way does not publish its old u: the aircraft has started its failsafe, and u would jump.
         if self.parameters.lockstep or self.now_ns() - now_ns <= self._max_age_ns:
             self._publish_u(self._u_encoder.encode(output.stamp_ns, output.u))
