@@ -35,7 +35,8 @@ MEMORY = 0.2  # s, decay of the coefficients of the predictor before the fit
 MIN_ROWS_PER_COEFFICIENT = 5.0
 MIN_SHARE = 0.9  # of the motion in a closed loop: then feedback of disturbances is too little to be taken for a response
 LOOP_MEMORY, LOOP_FINE, PERIOD = 8.0, 6, 0.05  # s before an instant that the excitation has an effect, windows of PERIOD, s
-FOLDS, RIDGE = 6, 1e-4
+FOLDS, RIDGES = 6, (1e-4, 1e-2)  # the better ridge counts: few commands need the one, many disturbances the other
+LEAST_DELAY = 0.01  # s, in a closed loop: an earlier response is the reaction of u to y, for no servo is as fast
 ITERATIONS = 3  # of the variance of a prediction and the coefficients
 MIN_RATIO = 5.0  # standard errors from which on the sign of Omega is certain
 
@@ -250,7 +251,7 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
         variance = (1e-3 * moves[i]) ** 2 or 1.0
         for _ in range(ITERATIONS):
             values, vectors = np.linalg.eigh(normal * moves[i] ** 2 / variance + np.eye(len(normal)))
-            root = moves[i] * prior @ (vectors / np.sqrt(values))
+            root = moves[i] * prior @ (vectors / np.sqrt(np.maximum(values, 1.0)))
             fit = root @ (root.T @ (X.T @ Y[:, i])) / variance
             e = Y[:, i] - X @ fit
             variance = float(e @ e) / (len(e) - coefficients - len(used)) or 1.0
@@ -269,7 +270,7 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
     is predicted with coefficients from the others. Source of the cross-validation: M. Stone, J. Royal Statistical Society B 36,
     1974.
     """
-    left, total = np.zeros(len(names)), np.zeros(len(names))
+    left, total = np.zeros((len(RIDGES), len(names))), np.zeros(len(names))
     for span in spans:
         before = int(excitation.stamp_ns[0])
         (t, values), (t_w, w) = _within(signal, names, span), _within(excitation, excitation.names, (before, span[1]))
@@ -290,10 +291,12 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
         fold = np.arange(len(at)) * FOLDS // len(at)
         for number in range(FOLDS):
             others, own = Z[fold != number], fold == number
-            fit = np.linalg.solve(others.T @ others + RIDGE * np.eye(Z.shape[1]), others.T @ X[fold != number])
-            left += np.sum((X[own] - Z[own] @ fit) ** 2, axis=0)
+            normal, product = others.T @ others, others.T @ X[fold != number]
+            for k, ridge in enumerate(RIDGES):
+                fit = np.linalg.solve(normal + ridge * np.eye(len(normal)), product)
+                left[k] += np.sum((X[own] - Z[own] @ fit) ** 2, axis=0)
         total += np.sum(X**2, axis=0)
-    return np.asarray(1.0 - left / np.where(total > 0.0, total, np.inf)) * (total > 0.0)
+    return np.asarray(1.0 - left.min(axis=0) / np.where(total > 0.0, total, np.inf)) * (total > 0.0)
 
 
 # The step response
@@ -322,8 +325,10 @@ def _responses(
     columns, refusal = [], []
     for j in range(len(inputs)):
         moved = max(float(np.ptp(one.u[:, j])) if len(one.u) else 0.0 for one in rows)
-        columns.append(_column(t, responses[..., j], j) if moved > 0.0 else _no_column(len(outputs)))
+        usable = moved > 0.0 and bool(np.isfinite(responses[..., j]).all())
+        columns.append(_column(t, responses[..., j], j) if usable else _no_column(len(outputs)))
         refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, moved, float(share[j])))
+    counts = (share >= MIN_SHARE) & ~((share < 1.0) & (np.array([one.delay for one in columns]) < LEAST_DELAY))
     return Response(
         outputs,
         inputs,
@@ -336,7 +341,7 @@ def _responses(
         tuple(refusal),
         sum(len(one.y) for one in rows) * layout.period,
         share,
-        np.where(share >= MIN_SHARE, [one.sign_ratio for one in columns], 0.0),
+        np.array([one.sign_ratio for one in columns]) * counts,
     )
 
 
@@ -347,6 +352,8 @@ def _no_column(m: int) -> _Column:
 def _refusal(output: str, name: str, column: _Column, j: int, moved: float, share: float) -> str:
     if moved == 0.0:
         return f"{output} by {name}: found a {name} that never changes, expected one that moves"
+    if not np.isfinite(column.Omega[j]):
+        return f"{output} by {name}: found a response that grows beyond all bounds, expected a flight that does not diverge"
     if share < MIN_SHARE:
         return f"{output} by {name}: {_too_little_share(output, name, share)}"
     ratio = abs(column.Omega[j]) / column.deviation[j]
