@@ -3,6 +3,7 @@
 #
 # make fly     set up what is needed, fly the default scenario     make fly SCENARIO=... ARGS="--duration 10"
 # make test    set up what is needed, run all checks and tests
+# make test-sitl   fly a real autopilot in software: docs/autopilots.md
 # make evidence   measure what has not been measured yet, write docs/evidence.md     make evidence ARGS="--again speed"
 # make messages PACKAGE=... SOURCE=...   build a message package of an autopilot for the stack: docs/autopilots.md
 # make setup   what flying and its report need: .venv/, the workspace built, .venv/bin/rise-di; make setup-all: campaigns and tests too
@@ -23,13 +24,16 @@ ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group dev
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
 
-.PHONY: fly test check evidence messages setup setup-all lock clean
+.PHONY: fly test test-sitl check evidence messages setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
 
 test: check
 	$(BIN)/python -m pytest $(ARGS)
+
+test-sitl: setup-all
+	$(BIN)/python -m pytest tests/sitl $(ARGS)
 
 check: setup-all
 	$(BIN)/ruff check .

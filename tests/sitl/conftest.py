@@ -1,0 +1,31 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tests with a real autopilot in software: `make test-sitl`. They are skipped, with the reason, where the kit cannot run."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.sitl.kit import ArduPlane, missing
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip where something is missing. The hook of a folder gets the tests of the whole session."""
+    here = [item for item in items if Path(__file__).parent in item.path.parents]
+    if here and (reason := missing()):
+        for item in here:
+            item.add_marker(pytest.mark.skip(reason=reason))
+
+
+@pytest.fixture(scope="session")
+def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
+    """An ArduPlane in flight, with servos of 0.03 s, for all tests of the session."""
+    os.environ.pop("ROS_DOMAIN_ID", None)  # the autopilot is in domain 0, in a network of its own
+    autopilot = ArduPlane(tmp_path_factory.mktemp("arduplane"))
+    try:
+        autopilot.up(SIM_SERVO_SPEED=0.03)
+        autopilot.take_off()
+        yield autopilot
+    finally:
+        autopilot.down()
