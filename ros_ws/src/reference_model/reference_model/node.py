@@ -4,10 +4,9 @@
 
 from collections import deque
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from flight_core.rates import nanoseconds, period_ns
+from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_not_future
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, stamp_of
@@ -60,15 +59,15 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
 
     def _take_u_m(self, message: bytes, now_ns: int, start_ns: int) -> None:
         """Give a u_m to the reference, unless it is invalid, old or from a conflicting publisher."""
-        max_age_ns, live = nanoseconds(self.parameters.live.max_age), self.parameters.live
+        live = self.parameters.live
+        max_age_ns, takeover_ns = nanoseconds(live.max_age), nanoseconds(live.max_age + live.levelling)
         try:
             sample = self._decode(message)
             if sample is None:
                 return
             require_not_future(sample.stamp_ns, now_ns, max_age_ns)
             if now_ns - sample.stamp_ns > max_age_ns:
-                raise ChannelError("old", f"u_m is {(now_ns - sample.stamp_ns) / 1e9:g} s old")
-            takeover_ns = max_age_ns + nanoseconds(live.levelling)
+                raise ChannelError("old", f"stamp {seconds(now_ns - sample.stamp_ns):g} s old")
             self._publisher_lock.check(sample.sender, now_ns, max_age_ns, takeover_ns)
             m = len(self.parameters.outputs)
             attitude = sample.value[m:] if len(sample.value) > m else None
@@ -88,7 +87,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
             if error.reason != "name":
                 raise
             return sample
-        return sample if with_attitude is None else sample._replace(value=np.asarray(with_attitude.value))
+        return sample if with_attitude is None else sample._replace(value=with_attitude.value)
 
     def _log_source(self, source: str) -> None:
         if source == "ending":
