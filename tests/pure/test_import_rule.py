@@ -24,6 +24,7 @@ IMPORTS: dict[str, set[str]] = {
     "reference_model": {"flight_core"},
     "aircraft_sim": {"flight_core"},
     "rise_di_controller": {"flight_core"},
+    "guidance": {"flight_core"},
     "autopilot_bridge": {"flight_core"},
     "flight_recorder": {"flight_core", "flight_log"},
     "control_laws": {"flight_core", "rise_di_controller"},

@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Attitude: body rates that hold or reach a bank and a pitch, in a coordinated turn."""
+
+import math
+from typing import NamedTuple
+
+from flight_core.units import GRAVITY
+
+
+class AttitudeParams(NamedTuple):
+    """Gains and limits of the attitude loop."""
+
+    k_phi: float  # 1/s, a quarter of the reference's bandwidth of p: damping 0.74
+    k_theta: float  # 1/s, a quarter of that of q
+    roll_rate: float  # largest phi_dot, rad/s
+    load: float  # largest change of the load factor, 1
+    n_alpha: float  # slope of the load factor over the angle of attack, 1/rad
+    k_beta: float  # 1/s, 0 where beta is not measured
+
+
+class BodyRates(NamedTuple):
+    """Commands of the reference model, rad/s, FRD."""
+
+    p: float
+    q: float
+    r: float
+
+
+def body_rates(
+    phi_c: float, theta_c: float, phi: float, theta: float, r: float, beta: float, speed: float, params: AttitudeParams
+) -> BodyRates:
+    """Rates that bring phi and theta to their commands, by the inverse of Euler's equations in a coordinated turn:
+
+        phi_dot_c   = clip(k_phi (phi_c - phi), +-roll_rate),  theta_dot_c = clip(k_theta (theta_c - theta), +-load g/V)
+        r_m = psi_dot cos(phi) cos(theta) - theta_dot_c sin(phi) + k_beta beta,  psi_dot = g tan(phi) / V
+        q_m = (theta_dot_c + r sin(phi)) / cos(phi) + phi_dot_c tan(phi) / (cos(phi) n_alpha)
+        p_m = phi_dot_c - tan(theta) (q_m sin(phi) + r cos(phi))
+
+    with the measured r where it is not tracked exactly. The last term of q_m leads the angle of attack that the turn needs.
+    Arguments: angles in rad, `speed` V in m/s, phi and theta within +-90 deg. Source: R. W. Beard, T. W. McLain, Small Unmanned
+    Aircraft (2012), chapters 2 and 9.
+    """  # noqa: D400, D415 - what follows is an equation
+    sine, cosine, tilt = math.sin(phi), math.cos(phi), math.tan(phi)
+    phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)
+    theta_dot = clip(params.k_theta * (theta_c - theta), params.load * GRAVITY / speed)
+    q = (theta_dot + r * sine) / cosine + phi_dot * tilt / (cosine * params.n_alpha)
+    p = phi_dot - math.tan(theta) * (q * sine + r * cosine)
+    return BodyRates(p, q, GRAVITY * tilt / speed * cosine * math.cos(theta) - theta_dot * sine + params.k_beta * beta)
+
+
+def clip(value: float, limit: float) -> float:
+    """A value within +-limit."""
+    return min(max(value, -limit), limit)

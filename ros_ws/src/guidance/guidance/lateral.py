@@ -1,0 +1,68 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Lateral: the acceleration to the right that holds a heading or course, or follows a path, and the bank that gives it."""
+
+import math
+from typing import NamedTuple
+
+from flight_core.units import GRAVITY
+
+
+class PathError(NamedTuple):
+    """Where the aircraft is beside a path."""
+
+    e: float  # cross-track error, m, positive to the right of the path
+    track: float  # course of the path at its nearest point, rad
+    curvature: float  # of the path there, 1/m, positive to the right
+
+
+class PathParams(NamedTuple):
+    """Parameters of path following."""
+
+    period: float  # P, s
+    damping: float  # zeta, 1
+    capture: float  # largest angle at which the path is approached, rad
+
+
+def course_acceleration(course_c: float, course: float, speed: float, k: float) -> float:
+    """A = k V sin(course_c - course), m/s^2; k V from a difference of 90 deg on. Also for a heading."""
+    difference = math.remainder(course_c - course, 2.0 * math.pi)
+    return k * speed * (math.sin(difference) if abs(difference) < math.pi / 2.0 else math.copysign(1.0, difference))
+
+
+def path_acceleration(error: PathError, course: float, ground_speed: float, params: PathParams) -> float:
+    """Acceleration to the right that follows a path, m/s^2:
+
+        x       = min(abs(e) / (v_g P zeta), 1),  look-ahead angle l = pi/2 (1 - x)^2
+        bearing = track - sign(e) min(pi/2 - l, capture)
+        a       = (4 pi zeta / P) v_g sin(bearing - course) + sin(l)^2 kappa / (1 - kappa e) v_g^2 cos(course - track)
+
+    Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The velocity is that over ground, so a wind changes nothing.
+    On the inner side of an arc, e is limited to half of its radius.
+    Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp, without its adaptation to wind.
+    """  # noqa: D400, D415 - what follows is an equation
+    e, track, kappa = error
+    x = min(abs(e) / (ground_speed * params.period * params.damping), 1.0)
+    look_ahead = math.pi / 2.0 * (1.0 - x) ** 2
+    bearing = track - math.copysign(min(math.pi / 2.0 - look_ahead, params.capture), e)
+    feedback = 4.0 * math.pi * params.damping / params.period * ground_speed * math.sin(bearing - course)
+    bend = kappa / (1.0 - min(kappa * e, 0.5))
+    return feedback + math.sin(look_ahead) ** 2 * bend * ground_speed**2 * math.cos(course - track)
+
+
+def bank_for(acceleration: float, path_angle: float, limit: float) -> float:
+    """Bank of a coordinated turn, rad: atan(a / (g cos(gamma))) within +-limit."""
+    return min(max(math.atan(acceleration / (GRAVITY * math.cos(path_angle))), -limit), limit)
+
+
+def least_period(speed: float, bank: float, roll_rate: float) -> float:
+    """Least period of path following, s: max(14, 1.5 V / (g tan(phi_max)), 7 phi_max / p_max).
+
+    A bank reversal takes 2 phi_max / p_max. With a period of four such times a path following fell into a limit cycle.
+    """
+    return max(14.0, 1.5 * speed / (GRAVITY * math.tan(bank)), 7.0 * bank / roll_rate)
+
+
+def least_radius(speed: float, wind: float, bank: float) -> float:
+    """Least radius of a turn that stays on its circle in a wind, m: (V + W)^2 / (g tan(0.8 phi_max))."""
+    return (speed + wind) ** 2 / (GRAVITY * math.tan(0.8 * bank))

@@ -1,0 +1,109 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Paths: lines and arcs in the local tangent plane, and routes of waypoints whose corners are fillets."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+from flight_core.parameters import require
+from guidance.lateral import PathError
+
+Point = tuple[float, float]  # north, east, m
+
+SHARPEST = math.radians(150.0)
+"""Largest change of course at a waypoint: beyond it the fillet cuts the corner by more than 2.8 radii."""
+
+
+class Line(NamedTuple):
+    """A straight leg."""
+
+    start: Point
+    end: Point
+
+
+class Arc(NamedTuple):
+    """A leg on a circle, less than a full turn; without an end it is an orbit."""
+
+    centre: Point
+    radius: float  # m, positive to the right (clockwise from above), negative to the left
+    end: Point | None = None
+
+
+Leg = Line | Arc
+
+
+def course_of(start: Point, end: Point) -> float:
+    """Course from one point to another, rad from north."""
+    return math.atan2(end[1] - start[1], end[0] - start[0])
+
+
+def error(leg: Leg, position: Point) -> PathError:
+    """The cross-track error of a position, and course and curvature of the leg at its nearest point."""
+    if isinstance(leg, Line):
+        track = course_of(leg.start, leg.end)
+        north, east = position[0] - leg.start[0], position[1] - leg.start[1]
+        return PathError(east * math.cos(track) - north * math.sin(track), track, 0.0)
+    side = math.copysign(1.0, leg.radius)
+    bearing = course_of(leg.centre, position)  # from the centre
+    return PathError(
+        side * (abs(leg.radius) - math.dist(leg.centre, position)), bearing + side * math.pi / 2.0, 1.0 / leg.radius
+    )
+
+
+def end_course(leg: Leg) -> float:
+    """Course at the end of a leg, rad. An orbit has none: raises ValueError."""
+    if isinstance(leg, Line):
+        return course_of(leg.start, leg.end)
+    if leg.end is None:
+        raise ValueError("an orbit has no end")
+    return error(leg, leg.end).track
+
+
+def passed(leg: Leg, position: Point) -> bool:
+    """Whether a position lies beyond the half plane at the end of a leg, across its course there. Never for an orbit."""
+    if leg.end is None:
+        return False
+    course = end_course(leg)
+    north, east = position[0] - leg.end[0], position[1] - leg.end[1]
+    return north * math.cos(course) + east * math.sin(course) >= 0.0
+
+
+def route(waypoints: Sequence[Point], radius: float, least: float) -> tuple[Leg, ...]:
+    """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the last waypoint.
+
+    A corner of the turn tau begins and ends radius tan(tau / 2) from its waypoint. Raises ParameterError for fewer than two
+    waypoints, a radius below `least` (`lateral.least_radius`), a corner beyond SHARPEST, and a leg too short for its fillets.
+    Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
+    """
+    require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
+    require(radius >= least, "guidance.radius", f"{radius:g} m", f"at least {math.ceil(least)} m at this speed, wind and bank")
+    turns = [0.0]
+    for k, (before, at, after) in enumerate(zip(waypoints, waypoints[1:], waypoints[2:], strict=False), 1):
+        turn = math.remainder(course_of(at, after) - course_of(before, at), 2.0 * math.pi)
+        found, expected = f"a turn of {math.degrees(turn):.0f} deg", f"at most {math.degrees(SHARPEST):.0f} deg either way"
+        require(abs(turn) <= SHARPEST, f"route[{k}]", found, expected)
+        turns.append(turn)
+    turns.append(0.0)
+    cut = [radius * math.tan(abs(turn) / 2.0) for turn in turns]
+    legs: list[Leg] = []
+    start = waypoints[0]
+    for k, (here, there) in enumerate(pairwise(waypoints)):
+        length, needed = math.dist(here, there), cut[k] + cut[k + 1]
+        found = f"{length:g} m from the waypoint before"
+        require(length > needed, f"route[{k + 1}]", found, f"more than {math.ceil(needed)} m, for fillets of {radius:g} m")
+        course, turn = course_of(here, there), turns[k + 1]
+        end = _along(there, course, -cut[k + 1])
+        legs.append(Line(start, end))
+        if turn:
+            side = math.copysign(1.0, turn)
+            start = _along(there, course + turn, cut[k + 1])
+            legs.append(Arc(_along(end, course + side * math.pi / 2.0, radius), side * radius, start))
+        else:
+            start = there
+    return (*legs, Arc(waypoints[-1], radius))
+
+
+def _along(point: Point, course: float, distance: float) -> Point:
+    return point[0] + distance * math.cos(course), point[1] + distance * math.sin(course)

@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Vertical: climb rate from the altitude, pitch from the climb rate."""
+
+import math
+from typing import NamedTuple
+
+
+class VerticalParams(NamedTuple):
+    """Gains and limits of the vertical loop."""
+
+    k_h: float  # 1/s
+    acceleration: float  # permitted vertical acceleration a, m/s^2
+    climb: float  # largest climb rate, m/s
+    sink: float  # largest sink rate, m/s
+    alpha_time: float  # time constant of the angle of attack's low-pass, s
+
+
+def climb_for(error: float, params: VerticalParams) -> float:
+    """Climb rate for an error of altitude (command less altitude, m), in m/s, within -sink and climb:
+
+        k_h e  near,  sign(e) sqrt(a (abs(e) - e_l / 2))  from e_l = a / (2 k_h^2) on
+
+    Both and their slopes agree at e_l. Far away the climb rate falls by a/2 a second, which the aircraft can follow.
+    """  # noqa: D400, D415 - what follows is an equation
+    k_h, a = params.k_h, params.acceleration
+    near = a / (2.0 * k_h * k_h)
+    far = math.copysign(math.sqrt(a * max(abs(error) - near / 2.0, 0.0)), error)
+    return min(max(k_h * error if abs(error) <= near else far, -params.sink), params.climb)
+
+
+def slewed(value: float, target: float, rate: float, dt: float) -> float:
+    """A value moved towards a target by at most rate dt."""
+    return value + min(max(target - value, -rate * dt), rate * dt)
+
+
+def alpha_estimate(alpha: float, theta: float, climb: float, speed: float, dt: float, params: VerticalParams) -> float:
+    """Low-pass of theta - gamma a step later, gamma = asin(climb / V).
+
+        alpha+ = alpha + (1 - exp(-dt/T)) (theta - gamma - alpha)
+
+    It stands in the place of an integrator: bumpless, without windup, right in any bank, speed or trim.
+    """
+    return alpha + (1.0 - math.exp(-dt / params.alpha_time)) * (theta - path_angle(climb, speed) - alpha)
+
+
+def pitch_for(climb: float, speed: float, alpha: float) -> float:
+    """Pitch for a climb rate, rad: theta_c = asin(climb / V) + alpha."""
+    return path_angle(climb, speed) + alpha
+
+
+def path_angle(climb: float, speed: float) -> float:
+    """Flight path angle in the air mass, rad: asin(climb / V)."""
+    return math.asin(min(max(climb / speed, -1.0), 1.0))

@@ -1,0 +1,15 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+from setuptools import setup
+
+setup(
+    name="guidance",
+    version="0.1.0",
+    description="Guidance of the RISE-DI flight stack: attitude, altitude, course and routes outside the control law.",
+    license="Apache-2.0",
+    packages=["guidance"],
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/guidance"]),
+        ("share/guidance", ["package.xml"]),
+    ],
+)

@@ -1,0 +1,196 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Equations of guidance against closed forms: attitude, altitude, course, paths, protection."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.polynomial import Polynomial
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from flight_core.parameters import ParameterError
+from flight_core.units import GRAVITY
+from flight_core.vectors import FloatArray
+from guidance import path, protection
+from guidance.attitude import AttitudeParams, body_rates
+from guidance.lateral import PathError, PathParams, bank_for, course_acceleration, least_period, least_radius, path_acceleration
+from guidance.path import Arc, Line
+from guidance.vertical import VerticalParams, alpha_estimate, climb_for, pitch_for, slewed
+
+SPEED = 40.0  # m/s
+HOLD = AttitudeParams(k_phi=1.25, k_theta=1.0, roll_rate=0.3, load=0.5, n_alpha=1e9, k_beta=0.0)
+CLIMB = VerticalParams(k_h=0.2, acceleration=1.0, climb=5.0, sink=4.0, alpha_time=2.0)
+FOLLOW = PathParams(period=20.0, damping=0.75, capture=math.radians(30.0))
+
+
+def loop_damping(gain: float, frequency: float, damping: float) -> float:
+    """Damping of the slow poles of phi_dot = p, p a second-order filter of gain (phi_c - phi)."""
+    poles = Polynomial([frequency**2 * gain, frequency**2, 2.0 * damping * frequency, 1.0]).roots()
+    return float(np.min(-np.real(poles) / np.abs(poles)))
+
+
+def test_a_quarter_of_the_bandwidth_gives_the_bank_loop_a_damping_of_0_74() -> None:
+    # Known values of the same cubic: 0.48 with k = 2, 0.31 with 3, unstable from 2 zeta w = 9 on (Hurwitz).
+    assert loop_damping(5.0 / 4.0, 5.0, 0.9) == pytest.approx(0.74, abs=0.01)
+    assert loop_damping(2.0, 5.0, 0.9) == pytest.approx(0.48, abs=0.01)
+    assert loop_damping(9.0, 5.0, 0.9) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("phi", [-0.9, 0.0, 0.5])
+def test_a_bank_that_is_held_gives_the_rates_of_a_level_turn(phi: float) -> None:
+    turn = GRAVITY * math.tan(phi) / SPEED
+    rates = body_rates(phi, 0.0, phi, 0.0, turn * math.cos(phi), 0.0, SPEED, HOLD)
+    assert rates == pytest.approx((0.0, turn * math.sin(phi), turn * math.cos(phi)), abs=1e-15)
+
+
+def test_commanded_rates_turn_the_attitude_at_the_commanded_rates() -> None:
+    # With r as commanded, a rotation by the body rates changes (phi, theta) by k times the errors and psi by the level turn.
+    phi, theta, phi_c, theta_c = 0.4, 0.1, 0.5, 0.15
+    turn = GRAVITY * math.tan(phi) / SPEED
+    r = turn * math.cos(phi) * math.cos(theta) - HOLD.k_theta * (theta_c - theta) * math.sin(phi)
+    rates, dt = body_rates(phi_c, theta_c, phi, theta, r, 0.0, SPEED, HOLD), 1e-6
+    assert rates.r == pytest.approx(r, rel=1e-12)
+    moved = Rotation.from_euler("ZYX", [0.0, theta, phi]) * Rotation.from_rotvec(np.array(rates) * dt)
+    psi_after, theta_after, phi_after = moved.as_euler("ZYX")
+    assert (phi_after - phi) / dt == pytest.approx(HOLD.k_phi * (phi_c - phi), abs=1e-6)
+    assert (theta_after - theta) / dt == pytest.approx(HOLD.k_theta * (theta_c - theta), abs=1e-6)
+    assert psi_after / dt == pytest.approx(turn, abs=1e-6)
+
+
+def test_roll_rate_and_load_are_limited() -> None:
+    rates = body_rates(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, SPEED, HOLD)
+    assert (rates.p, rates.q) == pytest.approx((0.3, 0.5 * GRAVITY / SPEED))
+
+
+def test_a_sideslip_to_the_right_turns_the_nose_right() -> None:
+    assert body_rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.1, SPEED, HOLD._replace(k_beta=1.0)).r == pytest.approx(0.1)
+
+
+def test_the_climb_rate_is_continuous_in_value_and_slope_and_brakes_at_half_the_acceleration() -> None:
+    free = CLIMB._replace(climb=1e3, sink=1e3)
+    near, step = 1.0 / (2.0 * 0.2**2), 1e-6
+    assert climb_for(near - step, free) == pytest.approx(climb_for(near + step, free), abs=1e-6)
+    slope = (climb_for(near + 2.0 * step, free) - climb_for(near + step, free)) / step
+    assert slope == pytest.approx(0.2, abs=1e-4)
+    far = 100.0  # d(climb)/dt = -climb d(climb)/de = -a/2
+    assert climb_for(far, free) * (climb_for(far + step, free) - climb_for(far, free)) / step == pytest.approx(0.5, abs=1e-4)
+    assert climb_for(-far, free) == -climb_for(far, free)
+    assert (climb_for(far, CLIMB), climb_for(-far, CLIMB)) == (5.0, -4.0)
+
+
+def test_pitch_settles_where_the_angle_of_attack_is_estimated() -> None:
+    alpha = 0.0
+    for _ in range(1000):  # 20 s, ten time constants: exp(-10)
+        alpha = alpha_estimate(alpha, 0.13, 2.0, SPEED, 0.02, CLIMB)
+    assert alpha == pytest.approx(0.13 - math.asin(2.0 / SPEED), abs=1e-5)
+    assert pitch_for(2.0, SPEED, alpha) == pytest.approx(0.13, abs=1e-5)
+    assert slewed(1.0, 2.0, 0.5, 0.1) == pytest.approx(1.05)
+
+
+def test_a_course_is_approached_on_the_shorter_side_and_with_all_it_has_beyond_90_degrees() -> None:
+    assert course_acceleration(math.radians(-170.0), math.radians(170.0), SPEED, 0.4) > 0.0  # to the right, over south
+    assert course_acceleration(math.radians(135.0), 0.0, SPEED, 0.4) == 0.4 * SPEED
+    assert course_acceleration(math.radians(30.0), 0.0, SPEED, 0.4) == pytest.approx(0.2 * SPEED)
+    assert bank_for(GRAVITY, 0.0, 1.0) == pytest.approx(math.pi / 4.0)
+    assert bank_for(-1e3, 0.0, 0.6) == -0.6
+
+
+def cross_track(e_0: float, times: FloatArray) -> FloatArray:
+    """Cross-track error of a point with the acceleration of `path_acceleration` beside a line to the north."""
+
+    def derivative(_: float, z: FloatArray) -> list[float]:
+        e, course = z
+        a = path_acceleration(PathError(float(e), 0.0, 0.0), float(course), SPEED, FOLLOW)
+        return [SPEED * math.sin(course), a / SPEED]
+
+    solution = solve_ivp(derivative, (0.0, times[-1]), [e_0, 0.0], t_eval=times, rtol=1e-9, atol=1e-9, max_step=0.5)
+    return np.asarray(solution.y[0])
+
+
+def test_near_a_line_the_error_is_that_of_a_second_order_system() -> None:
+    # e'' + 2 zeta w e' + w^2 e = 0, w = 2 pi / P, from rest: its closed solution. 0.1 m is 1/6000 of v_g P zeta.
+    times, zeta, w = np.linspace(0.0, 40.0, 81), 0.75, 2.0 * math.pi / 20.0
+    damped = w * math.sqrt(1.0 - zeta**2)
+    exact = np.exp(-zeta * w * times) * (np.cos(damped * times) + zeta * w / damped * np.sin(damped * times))
+    assert cross_track(0.1, times) / 0.1 == pytest.approx(exact, abs=2e-3)
+
+
+def test_a_line_is_captured_from_far_at_the_capture_angle() -> None:
+    times = np.linspace(0.0, 200.0, 401)
+    e = cross_track(2000.0, times)
+    assert np.diff(e)[100] / 0.5 == pytest.approx(-SPEED * math.sin(FOLLOW.capture), rel=1e-3)
+    assert abs(e[-1]) < 0.01
+    assert e.min() > -0.05 * SPEED * FOLLOW.period * FOLLOW.damping  # no limit cycle, small overshoot
+
+
+@pytest.mark.parametrize("radius", [300.0, -300.0])
+def test_on_a_circle_the_acceleration_is_centripetal_and_drives_an_offset_back(radius: float) -> None:
+    orbit = Arc((0.0, 0.0), radius)
+    on = path.error(orbit, (300.0, 0.0))  # to the north of the centre: east on a right turn, west on a left one
+    assert on == pytest.approx((0.0, math.copysign(math.pi / 2.0, radius), 1.0 / radius))
+    assert path_acceleration(on, on.track, SPEED, FOLLOW) == pytest.approx(SPEED**2 / radius)
+    outside = path.error(orbit, (320.0, 0.0))
+    assert outside.e == pytest.approx(-math.copysign(20.0, radius))
+    assert abs(path_acceleration(outside, outside.track, SPEED, FOLLOW)) > SPEED**2 / 320.0
+
+
+def test_the_error_of_a_line_is_positive_to_its_right() -> None:
+    east = Line((0.0, 0.0), (0.0, 1000.0))
+    assert path.error(east, (-7.0, 400.0)) == pytest.approx((7.0, math.pi / 2.0, 0.0))
+    assert not path.passed(east, (50.0, 999.0))
+    assert path.passed(east, (50.0, 1001.0))
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_fillet_touches_both_legs(side: float) -> None:
+    corner = [(0.0, 0.0), (1000.0, 0.0), (1000.0, side * 1000.0)]
+    first, arc, second, orbit = path.route(corner, 200.0, 100.0)
+    assert isinstance(arc, Arc)
+    assert isinstance(orbit, Arc)
+    assert first.end == pytest.approx((800.0, 0.0))  # a right angle cuts one radius
+    assert arc.centre == pytest.approx((800.0, side * 200.0))
+    assert arc.radius == side * 200.0
+    assert arc.end == pytest.approx((1000.0, side * 200.0))
+    assert second == Line(pytest.approx(arc.end), corner[2])  # type: ignore[arg-type]  # approx stands for a point
+    assert path.error(arc, (800.0, 0.0)) == pytest.approx((0.0, 0.0, side / 200.0), abs=1e-12)
+    assert path.end_course(arc) == pytest.approx(side * math.pi / 2.0)
+    assert (orbit.centre, orbit.end) == (corner[2], None)
+    assert not path.passed(orbit, (0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("waypoints", "radius", "sentence"),
+    [
+        ([(0.0, 0.0)], 200.0, "route: found 1 waypoints, expected two or more"),
+        ([(0.0, 0.0), (1000.0, 0.0)], 90.0, "guidance.radius: found 90 m, expected at least 100 m"),
+        ([(0.0, 0.0), (1000.0, 0.0), (0.0, 100.0)], 200.0, r"route\[1\]: found a turn of 174 deg, expected at most 150 deg"),
+        ([(0.0, 0.0), (150.0, 0.0), (150.0, 900.0)], 200.0, r"route\[1\]: found 150 m .* expected more than 200 m"),
+        ([(0.0, 0.0), (900.0, 0.0), (900.0, 300.0), (0.0, 300.0)], 200.0, r"route\[2\]: found 300 m .* more than 400 m"),
+    ],
+)
+def test_a_route_that_cannot_be_flown_is_refused_with_what_would_do(
+    waypoints: list[tuple[float, float]], radius: float, sentence: str
+) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        path.route(waypoints, radius, 100.0)
+
+
+def test_rules_of_radius_and_period() -> None:
+    bank = math.radians(30.0)
+    # A circle of the least radius asks for 0.8 of the bank at the speed with the wind from behind.
+    assert math.atan(56.0**2 / (GRAVITY * least_radius(46.0, 10.0, bank))) == pytest.approx(0.8 * bank)
+    assert least_period(46.0, bank, 0.15) == pytest.approx(7.0 * bank / 0.15)
+    assert least_period(25.0, bank, 1.0) == 14.0
+
+
+def test_protection_follows_from_the_stall_speed() -> None:
+    assert protection.bank_limit(1.2, 25.0, 40.0) == pytest.approx(math.acos((27.5 / 40.0) ** 2))
+    assert protection.bank_limit(0.5, 25.0, 60.0) == 0.5
+    assert protection.bank_limit(0.5, 25.0, 27.0) == 0.0  # below 1.1 V_s: wings level
+    floor = protection.speed_floor(20.0)
+    assert floor == pytest.approx(23.0)
+    assert protection.climb_limit(4.0, 3.0, 30.0, floor) == 4.0
+    assert protection.climb_limit(4.0, 3.0, 0.95 * floor, floor) == pytest.approx(0.5)
+    assert protection.climb_limit(4.0, 3.0, 0.8 * floor, floor) == -3.0
