@@ -16,6 +16,7 @@ from autopilot_bridge.params import ChannelMap, load_map
 from control_laws import excitation
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design import open_loop_fit
 from flight_analysis.design.bridge_identification import (
     Channels,
     channel_pairs,
@@ -96,7 +97,7 @@ def test_the_written_scenario_flies_the_aircraft_and_tracks(identified: Identifi
     assert rms["q"] < 0.010
     assert rms["p"] < 0.020
     assert rms["r"] < 0.015
-    assert rms["V"] < 0.06
+    assert rms["V"] < 0.05
 
 
 def test_a_longer_delay_lowers_the_bandwidths(identified: Identified, tmp_path: Path) -> None:
@@ -126,8 +127,13 @@ def test_a_sign_against_the_map_is_refused(identified: Identified) -> None:
         join(MAP, response, flipped)
 
 
-def test_the_model_of_a_channel_is_that_of_its_own_simulation() -> None:
-    # y_dot = 80 v - 12 y with a lag of 0.05 s, integrated in steps of 1 ms, and y late by 0.08 s; noise as of a gyroscope
+@pytest.mark.parametrize("lag", [0.03, 0.4])
+def test_the_model_of_a_channel_is_that_of_its_own_simulation_from_any_start(
+    lag: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # y_dot = 80 v - 12 y with a lag of 0.05 s, integrated in steps of 1 ms, and y late by 0.08 s; noise as of a gyroscope.
+    # From a slow start the search meets the same response with a lag of 1/12 s and a pole at 20 1/s.
+    monkeypatch.setattr(open_loop_fit, "STARTS", ((0.03, lag),))
     params = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
     t = np.arange(0.0, 14.0, 0.001)
     arrays = params.law_params()

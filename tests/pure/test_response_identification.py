@@ -70,7 +70,7 @@ def test_an_input_that_never_moves_is_refused_by_name() -> None:
     y, u = flown(0.1)
     still = Signal(u.stamp_ns, u.names, u.values * np.array([1.0, 0.0]))
     found = identified(y, still)
-    assert found.refusal[1].startswith("r by rudder: found a rudder that never changes")
+    assert found.refusal[1].startswith("r by rudder: found rudder constant")
     assert np.isnan(found.Omega[:, 1]).all()
     assert not found.refusal[0]
 

@@ -4,7 +4,8 @@
 
     lag v_dot = u(t - delay) - v,    z'' + damping z' + stiffness z = v,    y = Omega z' + slow z
 
-The output error is fitted: the model is simulated from u alone, and y less its output is smallest in the squares. Source:
+The output error is fitted: the model is simulated from u alone, and y less its output is smallest in the squares. Without
+stiffness the response does not tell lag from 1 / damping: the lag is the smaller of the two, that of the faster pole. Source:
 L. Ljung, "System Identification", 1999, 4.2 and 10.2.
 """
 
@@ -97,7 +98,12 @@ def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) ->
         start = np.array([delay, lag, 5.0 * size, 5.0, 30.0, 30.0 * size])[:order]
         scale = np.array([0.05, 0.05, 5.0 * abs(size), 10.0, 100.0, 50.0 * abs(size)])[:order]
         fits.append(least_squares(residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60))
-    return min(fits, key=lambda one: float(one.cost))
+    best = min(fits, key=lambda one: float(one.cost))
+    if order == ORDERS[0] and best.x[1] * best.x[3] > 1.0:
+        delay, lag, Omega, damping = best.x
+        start = np.array([delay, 1.0 / damping, Omega / (lag * damping), 1.0 / lag])  # the same response
+        best = least_squares(residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60)
+    return best
 
 
 def _model(fit: Any, misfit: float, period: float) -> ChannelModel:

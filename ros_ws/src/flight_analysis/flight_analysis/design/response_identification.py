@@ -351,7 +351,7 @@ def _no_column(m: int) -> _Column:
 
 def _refusal(output: str, name: str, column: _Column, j: int, moved: float, share: float) -> str:
     if moved == 0.0:
-        return f"{output} by {name}: found a {name} that never changes, expected one that moves"
+        return f"{output} by {name}: found {name} constant, expected it to move"
     if not np.isfinite(column.Omega[j]):
         return f"{output} by {name}: found a response that grows beyond all bounds, expected a flight that does not diverge"
     if share < MIN_SHARE:
