@@ -21,16 +21,16 @@ from flight_log.tape_writer import write_run
 
 @pytest.fixture(scope="module")
 def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One second in one process: y, y_m and truth at 500 Hz, u and internals at 100 Hz, from t = 0 to 1 s."""
+    """One second in one process: y, y_m and truth at 500 Hz, u and internals at 100 Hz, pose at 50 Hz, from t = 0 to 1 s."""
     tape = simulate(osprey_gust.vary(flight={"duration": 1.0}))
     return write_run(tape, tmp_path_factory.mktemp("playback") / "run", LogAttachments(osprey_gust.path)).parent
 
 
 def test_every_message_of_a_flight_in_one_process_is_due_at_its_stamp(run: Path) -> None:
     playback = read_playback(run)
-    assert len(playback.messages) == 3 * 501 + 2 * 101
+    assert len(playback.messages) == 3 * 501 + 2 * 101 + 51
     assert dict.fromkeys(playback.types.values()) == {JOINT_STATE: None}
-    assert list(playback.types) == ["/internals", "/truth", "/u", "/y", "/y_m"]
+    assert list(playback.types) == ["/internals", "/pose", "/truth", "/u", "/y", "/y_m"]
     for message in playback.messages:
         stamp = STORE.deserialize_cdr(message.data, JOINT_STATE).header.stamp  # type: ignore[attr-defined] # made at run time
         assert message.stamped
@@ -50,7 +50,7 @@ def test_topics_are_selected_by_full_or_last_name_and_the_start_by_flight_time(r
 @pytest.mark.parametrize(
     ("topics", "start", "sentence"),
     [
-        (["y", "z"], 0.0, r"run: found no message of z, expected some of /internals, /truth, /u, /y, /y_m"),
+        (["y", "z"], 0.0, r"run: found no message of z, expected some of /internals, /pose, /truth, /u, /y, /y_m"),
         ([], 1.5, r"start: found 1.5 s, expected a flight time before the end of the log, 1 s"),
     ],
 )

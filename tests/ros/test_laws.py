@@ -102,7 +102,7 @@ def test_a_law_flies_in_lockstep_as_without_ros_and_is_replayed(
 @pytest.mark.parametrize(
     ("law", "sentence"),
     [
-        ("pid", "found 'pid', expected a registered law: indi, l1, lqg, lqi, pi, rise_di"),
+        ("pid", "found 'pid', expected a registered law: excitation, indi, l1, lqg, lqi, pi, rise_di"),
         (
             "lqi",
             "found 'lqi', which needs the full state, expected a law of y and y_m: the topics have no more",

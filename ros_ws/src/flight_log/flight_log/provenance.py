@@ -27,6 +27,7 @@ STACK = (
     "flight_log",
     "flight_recorder",
     "flight_ros",
+    "guidance",
     "reference_model",
     "rise_di_controller",
 )

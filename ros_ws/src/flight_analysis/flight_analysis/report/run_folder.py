@@ -97,7 +97,7 @@ def read_flight(run: Path, outcome: str | None = None) -> RecordedFlight:
 
 def _engaged(tape: Tape, flown: Sequence[Engagement]) -> Tape:
     """The engaged part of a flight with a bridge, for its figures. Without an engagement: the whole tape, for its duration."""
-    end_ns = max(int(signal.stamp_ns[-1]) for signal in tape.signals.values())
+    end_ns = max((int(signal.stamp_ns[-1]) for signal in tape.signals.values() if len(signal.stamp_ns)), default=0)
     windows = [(one.start_ns, one.stop_ns or end_ns) for one in flown]
     signals = {name: signal.within(windows) for name, signal in tape.signals.items()} if windows else tape.signals
     return replace(tape, signals={name: signal for name, signal in signals.items() if len(signal.stamp_ns)})
