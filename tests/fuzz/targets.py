@@ -33,6 +33,7 @@ from flight_log.repair import repair
 from flight_log.rosbag2_metadata import FileContents, TopicCount, bag_metadata_yaml, read_bag_metadata
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
 from flight_log.tape_reader import read_run
+from guidance.route_file import READERS, Origin, read_route
 from rise_di_controller.controller import Controller
 from rise_di_controller.rise_di import RiseDiParameters
 
@@ -131,6 +132,14 @@ def message(data: bytes, folder: Path) -> None:
     rejected(lambda: parameter_changes(run, "controller", RiseDiParameters.model_fields))
 
 
+def route(data: bytes, folder: Path) -> None:
+    """A route file, by each reader."""
+    for ending in READERS:
+        path = folder / f"route{ending}"
+        path.write_bytes(data)
+        rejected(lambda path=path: read_route(path, Origin(47.4, 8.5)))  # type: ignore[misc]  # bound in the loop
+
+
 TARGETS: Mapping[str, Target] = {
     "mcap": mcap,
     "metadata": metadata,
@@ -138,6 +147,7 @@ TARGETS: Mapping[str, Target] = {
     "airframe": airframe,
     "map": channel_map,
     "message": message,
+    "route": route,
 }
 
 
@@ -237,6 +247,13 @@ def _files(folder: Path) -> list[bytes]:
     return [path.read_bytes() for path in sorted(folder.glob("*.yaml"))]
 
 
+_ROUTES = [
+    b"route: [[0, 0, 120], [500.5, -2, 130, 25.0], {latitude: 47.4, longitude: 8.5, altitude: 500, V: 25}]\n",
+    b'{"type": "LineString", "coordinates": [[8.5, 47.4, 500], [8.51, 47.4, 510.5]]}',
+    b'{"features": [{"properties": {"V": 25}, "geometry": {"type": "Point", "coordinates": [8.5, 47.4, 500]}}]}',
+    b"<kml><Point><altitudeMode>absolute</altitudeMode><coordinates>8.5,47.4,500</coordinates></Point></kml>",
+]
+
 SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "mcap": _mcaps,
     "metadata": _metadata,
@@ -244,4 +261,5 @@ SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "airframe": lambda: _files(AIRFRAMES),
     "map": lambda: _files(MAPS),
     "message": lambda: [_SAMPLE, _event(), vector(1, (), ())],
+    "route": lambda: _ROUTES,
 }

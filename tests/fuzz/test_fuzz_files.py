@@ -42,7 +42,7 @@ def test_the_corpus_is_small() -> None:
 
 # Bytes: truncated, changed, moved
 
-BINARY = {name: SEEDS[name]() for name in ("mcap", "message")}
+BINARY = {name: SEEDS[name]() for name in ("mcap", "message", "route")}
 
 
 @st.composite
@@ -110,6 +110,7 @@ def edited(draw: st.DrawFn, seeds: list[Any]) -> bytes:
 INPUTS = {
     "mcap": damaged("mcap"),
     "message": damaged("message") | st.binary(max_size=200),
+    "route": damaged("route") | edited(SEEDS["route"]()[:3]),
     **{name: edited(SEEDS[name]()) for name in ("scenario", "airframe", "map")},
     "metadata": edited(SEEDS["metadata"]()) | st.binary(max_size=100),
 }

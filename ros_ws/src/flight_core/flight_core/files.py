@@ -84,8 +84,8 @@ def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
         raise ParameterError(f"{place} cannot be written ({error.strerror or error}), expected {expected}") from None
 
 
-def read_yaml(path: Path, key: str, expected: str) -> Any:
-    """Content of a YAML file. Raises ParameterError for a file that cannot be read, is not YAML or has a duplicate key.
+def read_file(path: Path, key: str, expected: str) -> bytes:
+    """Content of an input file of at most MAX_FILE_BYTES. Raises ParameterError for one that cannot be read or is longer.
 
     `key` names the file in the sentence, `expected` what it should be.
     """
@@ -95,7 +95,12 @@ def read_yaml(path: Path, key: str, expected: str) -> Any:
     except (OSError, ValueError) as error:
         raise ParameterError(f"{key}: cannot be read ({error}), expected {expected}") from None
     require(len(content) <= MAX_FILE_BYTES, key, f"more than {MAX_FILE_BYTES} bytes", expected)
-    return parse_yaml(content, key, expected)
+    return content
+
+
+def read_yaml(path: Path, key: str, expected: str) -> Any:
+    """Content of a YAML file. Raises ParameterError as `read_file`, and for what is not YAML or has a duplicate key."""
+    return parse_yaml(read_file(path, key, expected), key, expected)
 
 
 def parse_yaml(content: bytes | str, key: str, expected: str) -> Any:

@@ -47,7 +47,8 @@ class _ShortRepr(reprlib.Repr):
             return f"a number of {value.bit_length()} bits"
 
 
-_short_repr = _ShortRepr().repr
+short_repr = _ShortRepr().repr
+"""repr of a value of any size, for an error sentence."""
 
 
 class Parameters(BaseModel):
@@ -142,7 +143,7 @@ def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
     location, kind, found = error["loc"], error["type"], error["input"]
     if kind == "invalid_key" or location[-1:] == ("[key]",):
         key = ".".join([where, *map(str, location[: -1 if kind == "invalid_key" else -2])])
-        return f"{key}: found the key {_short_repr(found)}, expected a name"
+        return f"{key}: found the key {short_repr(found)}, expected a name"
     key = where + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
     if kind == "extra_forbidden":
         known = sorted(_fields_at(cls, location[:-1]))
@@ -160,7 +161,7 @@ def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
     expected = (
         "a list of values" if kind == "tuple_type" else error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
     )
-    return f"{key}: found {_short_repr(found)}, expected {expected}"
+    return f"{key}: found {short_repr(found)}, expected {expected}"
 
 
 def _fields_at(cls: type[BaseModel], location: Sequence[str | int]) -> dict[str, Any]:
