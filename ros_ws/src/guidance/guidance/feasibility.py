@@ -1,0 +1,68 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Feasibility: a route that the aircraft cannot fly is refused before the flight, with the value that would do."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from flight_core.parameters import require
+from guidance import path, protection
+from guidance.lateral import least_period, least_radius
+from guidance.path import Leg, Line
+from guidance.route_file import Waypoint
+
+
+class Performance(NamedTuple):
+    """What the aircraft can do, and the wind it has to meet."""
+
+    speed: float  # airspeed where the route names none, m/s
+    stall_speed: float  # m/s
+    bank: float  # largest bank, rad
+    roll_rate: float  # largest phi_dot, rad/s
+    climb: float  # largest climb rate, m/s
+    sink: float  # largest sink rate, m/s
+    wind: float  # largest wind from any side, m/s
+
+
+def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
+    """Airspeed on the leg to each waypoint, m/s: its own, or that of the leg before; `first` where none is named yet."""
+    named = []
+    for waypoint in waypoints:
+        first = waypoint.speed or first
+        named.append(first)
+    return tuple(named)
+
+
+def flyable_legs(waypoints: Sequence[Waypoint], radius: float, period: float, can: Performance) -> tuple[Leg, ...]:
+    """The legs of a route with fillets of `radius`, m, and path following with `period`, s.
+
+    Raises ParameterError for a speed below the floor, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)),
+    a leg too short for its fillets, and an altitude that the climb or sink along the straight part of its leg, with the wind
+    from behind, does not reach. phi_max is the bank that the stall speed permits at V.
+    """
+    floor, flown = protection.speed_floor(can.stall_speed), speeds(waypoints, can.speed)
+    for k, speed in enumerate(flown):
+        require(speed >= floor, f"route[{k}].V", f"{speed:g} m/s", f"at least {_up(floor, 0.1):g} m/s, the speed floor")
+    least, slowest = 0.0, 0.0
+    for speed in flown:
+        bank = protection.bank_limit(can.bank, can.stall_speed, speed)
+        least = max(least, least_radius(speed, can.wind, bank))
+        slowest = max(slowest, least_period(speed, bank, can.roll_rate))
+    expected = f"at least {_up(slowest, 0.1):g} s at this speed, bank and roll rate"
+    require(period >= slowest, "guidance.period", f"{period:g} s", expected)
+    legs = path.route([waypoint.point for waypoint in waypoints], radius, least)
+    lines = [leg for leg in legs if isinstance(leg, Line)]
+    for k, (line, speed) in enumerate(zip(lines, flown[1:], strict=True), 1):
+        change = waypoints[k].altitude - waypoints[k - 1].altitude
+        length, rate = math.dist(*line), can.climb if change > 0.0 else can.sink
+        reach = rate * length / (speed + can.wind)
+        found = f"{abs(change):g} m {'above' if change > 0.0 else 'below'} the waypoint before"
+        expected = f"at most {math.floor(reach)} m at {rate:g} m/s over {length:.0f} m"
+        require(abs(change) <= reach, f"route[{k}].altitude", found, expected)
+    return legs
+
+
+def _up(value: float, step: float) -> float:
+    """A value rounded up to a multiple of a step, which still does."""
+    return math.ceil(value / step) * step

@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A route that cannot be flown is refused with the value that would do, and that value does."""
+
+import math
+import re
+from typing import Any
+
+import pytest
+
+from flight_core.parameters import ParameterError
+from guidance.feasibility import Performance, flyable_legs, speeds
+from guidance.path import Arc, Line
+from guidance.route_file import Waypoint
+
+CAN = Performance(
+    speed=40.0, stall_speed=25.0, bank=math.radians(30.0), roll_rate=0.3, climb=2.5, sink=4.0, wind=10.0
+)  # fmt: skip
+CORNER = (Waypoint(0, 0, 1000), Waypoint(3000, 0, 1050), Waypoint(3000, 3000, 1000))
+RADIUS, PERIOD = 580.0, 14.0  # m: (40 + 10)^2 / (g tan(24 deg)) = 572.6; s
+
+
+def refusal(waypoints: tuple[Waypoint, ...], radius: float = RADIUS, period: float = PERIOD, **can: Any) -> str:
+    with pytest.raises(ParameterError) as refused:
+        flyable_legs(waypoints, radius, period, CAN._replace(**can))
+    return str(refused.value)
+
+
+def number(sentence: str) -> float:
+    """The number that a sentence says would do."""
+    found = re.search(r"at (?:least|most) ([\d.]+)", sentence)
+    assert found
+    return float(found[1])
+
+
+def test_a_route_within_all_limits_gives_its_legs() -> None:
+    first, fillet, second, orbit = flyable_legs(CORNER, RADIUS, PERIOD, CAN)
+    assert (type(first), type(fillet), type(second), type(orbit)) == (Line, Arc, Line, Arc)
+    assert first.end == pytest.approx((3000.0 - RADIUS, 0.0))
+
+
+def test_a_speed_lasts_until_the_next_one() -> None:
+    route = (Waypoint(0, 0, 0), Waypoint(1, 0, 0, 45.0), Waypoint(2, 0, 0), Waypoint(3, 0, 0, 35.0))
+    assert speeds(route, 40.0) == (40.0, 45.0, 45.0, 35.0)
+
+
+def test_a_radius_too_small_for_the_wind_is_refused() -> None:
+    sentence = refusal(CORNER, radius=400.0)
+    assert sentence == "guidance.radius: found 400 m, expected at least 573 m at this speed, wind and bank"
+    assert flyable_legs(CORNER, number(sentence), PERIOD, CAN)
+    assert flyable_legs(CORNER, 400.0, PERIOD, CAN._replace(wind=0.0))  # 40^2 / (g tan(24 deg)) = 366
+
+
+def test_at_low_speed_the_stall_limits_the_bank_and_with_it_the_radius() -> None:
+    # V = 29: acos((27.5 / 29)^2) = 25.95 deg, below the 30 of the parameters, so 39^2 / (g tan(20.76 deg)) = 409.1.
+    assert number(refusal(CORNER, radius=300.0, speed=29.0)) == 410.0
+
+
+def test_a_period_below_the_rule_is_refused() -> None:
+    sentence = refusal(CORNER, roll_rate=0.15)  # 7 * 30 deg / 0.15 = 24.43
+    assert sentence == "guidance.period: found 14 s, expected at least 24.5 s at this speed, bank and roll rate"
+    assert flyable_legs(CORNER, RADIUS, number(sentence), CAN._replace(roll_rate=0.15))
+
+
+def test_a_speed_below_the_floor_is_refused() -> None:
+    slow = (*CORNER[:2], CORNER[2]._replace(speed=28.0))
+    sentence = refusal(slow)  # 1.15 * 25 = 28.75
+    assert sentence == "route[2].V: found 28 m/s, expected at least 28.8 m/s, the speed floor"
+    assert flyable_legs((*CORNER[:2], CORNER[2]._replace(speed=number(sentence))), RADIUS, PERIOD, CAN)
+
+
+@pytest.mark.parametrize(("altitude", "side", "rate"), [(1300.0, "above", 2.5), (700.0, "below", 4.0)])
+def test_an_altitude_beyond_the_climb_to_the_next_point_is_refused(altitude: float, side: str, rate: float) -> None:
+    route = (CORNER[0], CORNER[1]._replace(altitude=altitude), CORNER[2]._replace(altitude=altitude))
+    sentence = refusal(route)
+    reach = math.floor(rate * (3000.0 - RADIUS) / 50.0)  # the straight part, with the wind from behind
+    assert sentence == (
+        f"route[1].altitude: found 300 m {side} the waypoint before, expected at most {reach} m at {rate:g} m/s over 2420 m"
+    )
+    change = math.copysign(number(sentence), altitude - 1000.0)
+    assert flyable_legs(
+        tuple(one._replace(altitude=1000.0 + change * (k > 0)) for k, one in enumerate(route)), RADIUS, PERIOD, CAN
+    )
+
+
+def test_a_leg_too_short_for_its_fillets_and_a_route_of_one_waypoint_are_refused() -> None:
+    short = (*CORNER, Waypoint(3500, 3000, 1000))
+    assert refusal(short) == "route[3]: found 500 m from the waypoint before, expected more than 580 m, for fillets of 580 m"
+    assert refusal(CORNER[:1]) == "route: found 1 waypoints, expected two or more"
+    assert refusal(()) == "route: found 0 waypoints, expected two or more"
