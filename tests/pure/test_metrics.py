@@ -3,6 +3,7 @@
 """Metrics of a flight against numbers worked by hand."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,6 +63,39 @@ def test_each_instant_belongs_to_one_part_of_the_flight() -> None:
         "command": [3.0, 3.4],
         "gust": [3.6, 4.5],  # although the command lasts to 4.1
     }
+
+
+def test_turn_and_capture_replace_the_commands_of_a_guided_flight() -> None:
+    transients = [Transient("capture", "", 1.0, 2.0), Transient("turn", "", 2.5, 3.0), Transient("gust", "vertical", 3.5, 4.0)]
+    t = np.array([0.5, 1.5, 2.2, 2.9, 3.8, 6.0])
+    masks = {part: t[mask].tolist() for part, mask in metrics.part_masks(t, transients, settle=1.0).items()}
+    assert masks == {"whole": t.tolist(), "calm": [0.5, 6.0], "capture": [1.5, 2.2], "turn": [2.9], "gust": [3.8]}
+
+
+def guided(**channels: Any) -> list[Any]:
+    """Kind, start and stop of the transients of 20 s of guidance at 40 m/s, with these channels from 5 to 8 s."""
+    t = np.arange(0.0, 20_000.0, 20.0)
+    level = {"phi_c": 0.0, "climb_c": 0.0, "xtrack": 0.0, "V_c": 40.0}
+    changed = {name: np.where((t >= 5_000) & (t < 8_000), value, level[name]) for name, value in channels.items()}
+    found = metrics.guided_transients(tape(guidance=signal(t.tolist(), **level | changed)))
+    return [(one.kind, one.start, one.stop) for one in found]
+
+
+@pytest.mark.parametrize(
+    ("channels", "expected"),
+    [
+        ({"phi_c": -0.1}, [("turn", 5.0, 8.0)]),  # 5.7 deg
+        ({"phi_c": 0.08}, []),  # 4.6 deg
+        ({"climb_c": 0.8}, [("capture", 5.0, 8.0)]),  # of 40 m/s: 1.15 deg
+        ({"climb_c": -0.6}, []),  # 0.86 deg
+        ({"xtrack": -21.0}, [("capture", 5.0, 8.0)]),  # 20 m is half a second
+        ({"xtrack": 19.0}, []),
+        ({"V_c": 42.0}, [("capture", 5.0, 6.0), ("capture", 8.0, 9.0)]),  # one step up, one down
+        ({"phi_c": 0.3, "xtrack": 100.0}, [("turn", 5.0, 8.0)]),  # a turn first of all
+    ],
+)
+def test_turns_and_captures_follow_from_the_commands_of_guidance(channels: Any, expected: Any) -> None:
+    assert guided(**channels) == [(kind, pytest.approx(start), pytest.approx(stop)) for kind, start, stop in expected]
 
 
 def test_errors_are_split_by_part_and_the_ultimate_bound_is_the_largest_undisturbed_error() -> None:

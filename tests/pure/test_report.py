@@ -14,10 +14,11 @@ import pytest
 from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.metrics import mask_spans
 from flight_analysis.report import comparison, figures, plotting, summary
 from flight_analysis.report.figures import input_limits
 from flight_analysis.report.html import Page, TableGroup, page_html, write_page
-from flight_analysis.report.plotting import Interval, PlotContext, SampleStore, decimate, mask_spans
+from flight_analysis.report.plotting import Interval, PlotContext, SampleStore, decimate
 from flight_analysis.report.summary import DisplayUnit, RecordedFlight, summarise
 from flight_analysis.report.tables import events
 from flight_bringup.scenarios import find_scenario

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics of a flight as pure functions of its tape: error, noise floor, ultimate bound, settling, saturation, ticks."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -33,11 +34,22 @@ PARTS_LEGEND = (
 )
 """Legend of the tables: the parts of a flight. Their keys are "whole", "calm" (undisturbed), "command" and "gust"."""
 
+TURN_BANK = math.radians(5.0)  # rad: a turn commands more bank
+CAPTURE_ANGLE = math.radians(1.0)  # rad: a capture commands a steeper flight path
+CAPTURE_TIME = 0.5  # s: a capture is farther beside its path than the aircraft flies in this time
+
+GUIDED_LEGEND = (
+    f"turn: a commanded bank above {math.degrees(TURN_BANK):.0f} deg; capture: outside of turns, a commanded path steeper"
+    f" than {math.degrees(CAPTURE_ANGLE):.0f} deg, a moving command of V, or a cross-track error above {CAPTURE_TIME:g} s of"
+    f" flight, each to {SETTLING_DWELL:g} s after its end; undisturbed: steady flight, all other times outside gusts"
+)
+"""Legend of the tables of a guided flight: the keys "turn" and "capture" replace "command"."""
+
 
 class Transient(NamedTuple):
-    """An engagement, a command or a gust, from its first to its last instant in s of flight time."""
+    """An engagement, a command, a gust, a turn or a capture, from its first to its last instant in s of flight time."""
 
-    kind: str  # "engagement", "command" or "gust"
+    kind: str  # "engagement", "command", "gust", "turn" or "capture"
     name: str  # of the commanded channel, or of the gust
     start: float
     stop: float
@@ -166,6 +178,39 @@ def live_commands(tape: Tape) -> list[Transient]:
     return sorted(commands, key=lambda command: command.start)
 
 
+def guided_transients(tape: Tape) -> list[Transient]:
+    """Turns and captures of a guided flight, from `guidance`, as GUIDED_LEGEND says; `u_m` itself never rests.
+
+    Those of one kind less than SETTLING_DWELL apart are one transient.
+    """
+    if "guidance" not in tape:
+        return []
+    t, commands = tape.time("guidance"), tape["guidance"]
+    speed, turns = commands["V_c"], np.abs(commands["phi_c"]) > TURN_BANK
+    captures = np.abs(commands["climb_c"]) > speed * math.sin(CAPTURE_ANGLE)
+    captures |= np.abs(commands["xtrack"]) > CAPTURE_TIME * speed
+    captures |= np.diff(speed, prepend=speed[:1]) != 0.0
+    spans = {"turn": mask_spans(t, turns, SETTLING_DWELL), "capture": mask_spans(t, captures & ~turns, SETTLING_DWELL)}
+    found = [Transient(kind, "", *span) for kind in spans for span in spans[kind]]
+    return sorted(found, key=lambda transient: transient.start)
+
+
+def mask_spans(t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0) -> list[tuple[float, float]]:
+    """Start and stop of each run of True in a mask of shape (N,), s; a run stops at the next sample that is False.
+
+    Spans less than `min_length` apart are merged, and shorter spans are lengthened to it.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
+    spans: list[tuple[float, float]] = []
+    for first, after in zip(edges[::2], edges[1::2], strict=True):
+        start = float(t[first])
+        stop = max(float(t[min(after, len(t) - 1)]), start + min_length)
+        if spans and start - spans[-1][1] < min_length:
+            start, _ = spans.pop()
+        spans.append((start, stop))
+    return spans
+
+
 def in_spans(t: FloatArray, spans: Iterable[tuple[float, float]], settle: float = 0.0) -> NDArray[np.bool_]:
     """Mask of the instants inside a span or up to `settle` seconds after it, shape (N,)."""
     inside = np.zeros(len(t), dtype=bool)
@@ -177,18 +222,18 @@ def in_spans(t: FloatArray, spans: Iterable[tuple[float, float]], settle: float 
 def part_masks(t: FloatArray, transients: Sequence[Transient], settle: float = SETTLING_DWELL) -> dict[str, NDArray[np.bool_]]:
     """Masks of the instants t of shape (N,) by part of the flight: "whole", "calm", "command", "gust".
 
-    An instant inside a gust and a command counts to the gust. "calm" is undisturbed: no engagement, command or gust.
+    Of a guided flight "capture" and "turn" replace "command". An instant counts to the last part in this order that has it.
+    "calm" is undisturbed: no transient of any kind.
     """
-    inside = {
-        kind: in_spans(t, [(transient.start, transient.stop) for transient in transients if transient.kind == kind], settle)
-        for kind in ("engagement", "command", "gust")
-    }
-    return {
-        "whole": np.ones(len(t), dtype=bool),
-        "calm": ~(inside["engagement"] | inside["command"] | inside["gust"]),
-        "command": inside["command"] & ~inside["gust"],
-        "gust": inside["gust"],
-    }
+    kinds = {transient.kind for transient in transients}
+    commands = ["capture", "turn"] if kinds & {"capture", "turn"} else ["command"]
+    parts = {}
+    free = np.ones(len(t), dtype=bool)
+    for kind in ("gust", *reversed(commands), "engagement"):
+        spans = [(transient.start, transient.stop) for transient in transients if transient.kind == kind]
+        parts[kind] = in_spans(t, spans, settle) & free
+        free &= ~parts[kind]
+    return {"whole": np.ones(len(t), dtype=bool), "calm": free, **{kind: parts[kind] for kind in (*commands, "gust")}}
 
 
 def error_metrics(errors: FloatArray) -> ErrorMetrics:
@@ -259,13 +304,15 @@ class Settling(NamedTuple):
 def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling]:
     """Settling time of `best_error` into `settling_bands` from the start of each transient, for each channel that it excites.
 
-    It is measured up to the next transient that excites the channel. Transients after the end of the flight are left out.
+    It is measured up to the next transient that excites the channel. Transients after the end of the flight are left out, and
+    turns and captures: their commands move until they end.
     """
     _, error = best_error(tape)
     t, bands = (error.stamp_ns - tape.start_ns) / 1e9, settling_bands(tape)
     end = float(t[-1]) if len(t) else 0.0
     results = []
-    for transient in sorted((one for one in transients if one.start <= end), key=lambda one: one.start):
+    judged = [one for one in transients if one.start <= end and one.kind not in {"turn", "capture"}]
+    for transient in sorted(judged, key=lambda one: one.start):
         start, leaves = transient.start, transient.stop + SETTLING_DWELL - transient.start
         until, times = {}, {}
         for name in filter(transient.excites, error.names):

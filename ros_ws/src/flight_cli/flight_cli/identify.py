@@ -27,9 +27,10 @@ from flight_analysis.design.identification import identify as identify_aircraft
 from flight_analysis.design.innovation_filters import Actuation, recording
 from flight_analysis.design.model_identification import Identification, model_yaml
 from flight_analysis.design.model_identification import identify as identify_model
+from flight_analysis.metrics import mask_spans
 from flight_analysis.report.figures import ERROR, GUST, PLANT
 from flight_analysis.report.html import Line, Page, Section, page_html
-from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, mask_spans, time_series_figure
+from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, time_series_figure
 from flight_analysis.report.summary import DisplayUnit
 from flight_bringup.scenarios import find_scenario
 from flight_cli.bridge_experiment import identify_behind_bridge

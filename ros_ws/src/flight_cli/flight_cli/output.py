@@ -11,15 +11,16 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from flight_analysis.metrics import PARTS_LEGEND
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
     SATURATION_COLUMN,
     Column,
     RecordedFlight,
+    columns_of,
     display_units,
     input_rows,
+    parts_legend,
     table_rows,
 )
 from flight_core.files import writing
@@ -31,12 +32,13 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
     """Print the tables of a flight."""
     summary, units = flight.summary, display_units(flight.scenario)
     title = f"Tracking error ({summary['error']}), {summary['duration']:.1f} s flown"
-    rows = table_rows(summary["errors"], ERROR_COLUMNS, units)
-    console.print(grouped_table(title, "channel", ERROR_COLUMNS, rows))
+    columns = columns_of(ERROR_COLUMNS, summary["errors"])
+    console.print(grouped_table(title, "channel", columns, table_rows(summary["errors"], columns, units)))
     if rows := input_rows(summary, units):
-        title, columns = "Inputs about trim, and mean abs(u_dot) per second", (*INPUT_COLUMNS, SATURATION_COLUMN)
+        title = "Inputs about trim, and mean abs(u_dot) per second"
+        columns = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
         console.print(grouped_table(title, "input", columns, rows))
-    console.print(f"{PARTS_LEGEND}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
+    console.print(f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
     for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"])):
         console.print(line, highlight=False)
 

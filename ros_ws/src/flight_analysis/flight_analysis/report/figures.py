@@ -12,7 +12,7 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import Windows, spectra, tick_periods, tracking_error, true_error
+from flight_analysis.metrics import Windows, mask_spans, spectra, tick_periods, tracking_error, true_error
 from flight_analysis.report.plotting import (
     Curve,
     Interval,
@@ -20,7 +20,6 @@ from flight_analysis.report.plotting import (
     SampleStore,
     add_line,
     first_in_legend,
-    mask_spans,
     set_layout,
     subplot,
     subplot_grid,

@@ -14,7 +14,7 @@ from plotly.offline import get_plotlyjs
 
 from flight_analysis.report import comparison, figures, plotting, tables
 from flight_analysis.report.plotting import SampleStore, pack
-from flight_analysis.report.summary import INPUT_COLUMNS, RecordedFlight, display_units, format_value
+from flight_analysis.report.summary import INPUT_COLUMNS, RecordedFlight, display_units, format_value, parts_legend
 from flight_core.outcome import COMPLETED
 
 HERE = Path(__file__).parent
@@ -85,9 +85,10 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
         text = f"{flight.scenario.name}: {_description(flight)} ({flight.summary['error']})"
         lines.append(Line(text, flight.summary["outcome"], label, colour))
     palette = list(colours.values())
+    legend = ". ".join(dict.fromkeys([*(parts_legend(flight.summary) for flight in flights), tables.ERROR_LEGEND]))
     inputs = comparison.metric_tables(flights, "inputs", INPUT_COLUMNS, lower_is_better=False)
     groups = [
-        TableGroup(comparison.error_tables(flights), "Tracking error", tables.ERROR_LEGEND, palette),
+        TableGroup(comparison.error_tables(flights), "Tracking error", legend, palette),
         TableGroup(inputs, "Inputs", tables.INPUT_LEGEND, palette),
         TableGroup(comparison.tick_tables(flights), "Time", "", palette),
     ]

@@ -110,22 +110,6 @@ def decimate(values: FloatArray, most: int = MAX_POINTS) -> NDArray[np.int64]:
     return np.unique(np.minimum(indices, len(values) - 1))
 
 
-def mask_spans(t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0) -> list[tuple[float, float]]:
-    """Start and stop of each run of True in a mask of shape (N,), s; a run stops at the next sample that is False.
-
-    Spans less than `min_length` apart are merged, and shorter spans are lengthened to it.
-    """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
-    spans: list[tuple[float, float]] = []
-    for first, after in zip(edges[::2], edges[1::2], strict=True):
-        start = float(t[first])
-        stop = max(float(t[min(after, len(t) - 1)]), start + min_length)
-        if spans and start - spans[-1][1] < min_length:
-            start, _ = spans.pop()
-        spans.append((start, stop))
-    return spans
-
-
 def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, columns: int = 1, height: int = 150) -> go.Figure:
     """One subplot of `height` pixels per channel, with every curve that has the channel; two columns are filled row by row."""
     channels = list(dict.fromkeys(name for curve in curves.values() for name in curve.signal.names))

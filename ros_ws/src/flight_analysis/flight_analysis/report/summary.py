@@ -10,10 +10,13 @@ import numpy as np
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import (
+    GUIDED_LEGEND,
+    PARTS_LEGEND,
     Transient,
     best_error,
     engagements,
     errors_by_part,
+    guided_transients,
     inputs_by_part,
     latency_metrics,
     live_commands,
@@ -71,10 +74,15 @@ def pulse_edges(scenario: Scenario) -> list[Transient]:
 
 
 def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
-    """Engagements, commands and gusts. From the first live command on, live commands replace those of the scenario."""
+    """Engagements, commands and gusts. From the first live command on, live commands replace those of the scenario.
+
+    Turns and captures replace all commands of a guided flight.
+    """
+    gusts = [Transient("gust", name, *window) for name, window in scenario.gust_windows().items()]
+    if "guidance" in tape:
+        return [*engagements(tape), *guided_transients(tape), *gusts]
     live = live_commands(tape)
     until = float(tape.time("u_m")[0]) if live else math.inf
-    gusts = [Transient("gust", name, *window) for name, window in scenario.gust_windows().items()]
     return [*engagements(tape), *(edge for edge in pulse_edges(scenario) if edge.start < until), *live, *gusts]
 
 
@@ -185,16 +193,20 @@ RMS_COLUMNS = (
     Column("rms", "whole", ("whole", "rms")),
     Column("rms", "undisturbed", ("calm", "rms")),
     Column("rms", "command", ("command", "rms")),
+    Column("rms", "capture", ("capture", "rms")),
+    Column("rms", "turn", ("turn", "rms")),
     Column("rms", "gust", ("gust", "rms")),
 )
 
 ERROR_COLUMNS = (
     *RMS_COLUMNS,
     Column("max", "command", ("command", "max")),
+    Column("max", "capture", ("capture", "max")),
+    Column("max", "turn", ("turn", "max")),
     Column("max", "gust", ("gust", "max")),
     Column("ultimate", "bound", ("bound",)),
 )
-"""Columns of every table of errors."""
+"""Columns of every table of errors; `columns_of` chooses those of a flight."""
 
 NOISE_FLOOR_COLUMN = Column("noise", "floor", ("floor",))
 SWITCH_COLUMN = Column("switches", "(1/s)", ("sign_switches",), scaled=False)
@@ -205,10 +217,22 @@ INPUT_COLUMNS = (
     Column("rate", "whole", ("whole", "rate")),
     Column("rate", "undisturbed", ("calm", "rate")),
 )
-"""Columns of every table of inputs, before SATURATION_COLUMN."""
+"""Columns of every table of inputs, before SATURATION_COLUMN; `columns_of` chooses those of a flight."""
 
 SATURATION_COLUMN = Column("saturated", "%")
 SETTLING_COLUMNS = {kind: Column("settling (s)", kind) for kind in ("command", "gust")}
+
+
+def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
+    """The columns whose part of the flight the metrics have: a guided flight has "capture" and "turn" in place of "command"."""
+    parts = {part for metrics in channels.values() for part in metrics}
+    return tuple(column for column in columns if column.path[0] in parts)
+
+
+def parts_legend(summary: Mapping[str, Any]) -> str:
+    """Legend of the parts of a flight."""
+    guided = any("turn" in metrics for metrics in summary["errors"].values())
+    return GUIDED_LEGEND if guided else PARTS_LEGEND
 
 
 def metric(summary: Mapping[str, Any], *path: str) -> float | None:
@@ -239,8 +263,8 @@ def table_rows(channels: Mapping[str, Any], columns: Sequence[Column], units: Ma
 
 
 def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Rows for INPUT_COLUMNS and SATURATION_COLUMN: ticks with saturation in percent, by magnitude / by rate."""
-    rows = table_rows(summary["inputs"], INPUT_COLUMNS, units)
+    """Rows for the flight's INPUT_COLUMNS and SATURATION_COLUMN: ticks with saturation in percent, by magnitude / by rate."""
+    rows = table_rows(summary["inputs"], columns_of(INPUT_COLUMNS, summary["inputs"]), units)
     for row, metrics in zip(rows, summary["inputs"].values(), strict=True):
         shares = metrics["limited"]
         row.append(NO_VALUE if shares is None else " / ".join(f"{100 * shares[kind]:.3g}" for kind in ("magnitude", "rate")))

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby, product
 from typing import Any, NamedTuple
 
-from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, PARTS_LEGEND, SETTLING_BAND, SETTLING_DWELL, Windows
+from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, SETTLING_BAND, SETTLING_DWELL, Windows
 from flight_analysis.report import figures
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,
@@ -17,7 +17,9 @@ from flight_analysis.report.summary import (
     SWITCH_COLUMN,
     Column,
     DisplayUnit,
+    columns_of,
     input_rows,
+    parts_legend,
     slowest_settling,
     table_rows,
 )
@@ -25,7 +27,7 @@ from flight_core.tape import Tape
 from rise_di_controller.internals import Saturation
 
 ERROR_LEGEND = (
-    f"{PARTS_LEGEND}. ultimate bound: the largest undisturbed error. switches: of the sign term's direction. settling: time"
+    "ultimate bound: the largest undisturbed error. switches: of the sign term's direction. settling: time"
     f" until the error stays for {SETTLING_DWELL:g} s within {SETTLING_BAND:.0%} of the largest y_m, or within"
     f" {MIN_BAND_NOISE_FLOORS:g} noise floors if it is measured; the slowest"
 )
@@ -84,7 +86,7 @@ def events(tape: Tape, gusts: Windows) -> list[Event]:
 
 def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], event_list: Sequence[Event]) -> list[Table]:
     """Tables of the error, the inputs, the events and the ticks; a table without rows is left out."""
-    inputs = (*INPUT_COLUMNS, SATURATION_COLUMN)
+    inputs = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
     times = [Column("", head) for head in ("from (s)", "to (s)", "")]
     tables = (
         _error_table(summary, units),
@@ -96,13 +98,14 @@ def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], 
 
 
 def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
-    columns = (*ERROR_COLUMNS, NOISE_FLOOR_COLUMN, SWITCH_COLUMN)
+    columns = columns_of((*ERROR_COLUMNS, NOISE_FLOOR_COLUMN, SWITCH_COLUMN), summary["errors"])
     rows = [
         [*row, *(slowest_settling(summary, channel, kind) for kind in SETTLING_COLUMNS)]
         for channel, row in zip(summary["errors"], table_rows(summary["errors"], columns, units), strict=True)
     ]
     caption = f"Tracking error ({summary['error']})"
-    return Table(caption, (*columns, *SETTLING_COLUMNS.values()), rows, ERROR_LEGEND + NOISE_FLOOR_LEGEND)
+    legend = f"{parts_legend(summary)}. {ERROR_LEGEND}{NOISE_FLOOR_LEGEND}"
+    return Table(caption, (*columns, *SETTLING_COLUMNS.values()), rows, legend)
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
