@@ -5,6 +5,8 @@
 import math
 from typing import NamedTuple
 
+from flight_core.kinematics import body_rates as inverse
+from flight_core.kinematics import tilt, turn_rate
 from flight_core.units import GRAVITY
 
 
@@ -38,15 +40,14 @@ def body_rates(
         p_m = phi_dot_c - tan(theta) (q_m sin(phi) + r cos(phi))
 
     with the measured r where it is not tracked exactly. The last term of q_m leads the angle of attack that the turn needs.
-    Arguments: angles in rad, `speed` V in m/s, phi and theta within +-90 deg. Source: R. W. Beard, T. W. McLain, Small Unmanned
+    Arguments: angles in rad, `speed` V in m/s. Source: R. W. Beard, T. W. McLain, Small Unmanned
     Aircraft (2012), chapters 2 and 9.
     """  # noqa: D400, D415 - what follows is an equation
-    sine, cosine, tilt = math.sin(phi), math.cos(phi), math.tan(phi)
     phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)
     theta_dot = clip(params.k_theta * (theta_c - theta), params.load * GRAVITY / speed)
-    q = (theta_dot + r * sine) / cosine + phi_dot * tilt / (cosine * params.n_alpha)
-    p = phi_dot - math.tan(theta) * (q * sine + r * cosine)
-    return BodyRates(p, q, GRAVITY * tilt / speed * cosine * math.cos(theta) - theta_dot * sine + params.k_beta * beta)
+    lead = phi_dot * math.tan(tilt(phi)) / params.n_alpha
+    p, q = inverse(phi, theta, phi_dot, theta_dot + lead, r)
+    return BodyRates(p, q, turn_rate(phi, theta, theta_dot, speed) + params.k_beta * beta)
 
 
 def clip(value: float, limit: float) -> float:

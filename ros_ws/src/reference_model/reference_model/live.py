@@ -5,20 +5,17 @@
 Zero rates would keep the bank of that instant. So the ending levels the wings first, from the attitude that came with u_m.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from flight_core.failsafe import failsafe_scale
+from flight_core.kinematics import body_rates, euler_rates, tilt, turn_rate
 from flight_core.rates import seconds
-from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, FloatArray
 
 ATTITUDE = ("phi", "theta")
 """Channels of u_m beside the commands: bank, and pitch above that of level flight, rad. They serve the ending alone."""
-
-MAX_TILT = math.radians(80.0)  # the ending's limit on cos phi and tan theta, which are singular at 90 deg
 
 
 class LiveParams(NamedTuple):
@@ -53,13 +50,10 @@ def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> Floa
 
     For `levelling_ns`, where the attitude is known, with phi and theta by dead reckoning and V = V0 + V_m,
 
-        phi_dot_c = -k_phi phi, at most `roll_rate`;  theta_dot_c = -k_theta theta;  psi_dot = g tan(phi) / V
-        r = psi_dot cos(phi) cos(theta) - theta_dot_c sin(phi)
-        q = (theta_dot_c + r sin(phi)) / cos(phi)
-        p = phi_dot_c - tan(theta) (q sin(phi) + r cos(phi))
+        phi_dot_c = -k_phi phi, at most `roll_rate`;  theta_dot_c = -k_theta theta
 
-    the inverse of Euler's equations in a coordinated turn; all other commands ramp to zero. After that, and where the
-    attitude is not known, all commands are zero. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), ch. 9.
+    p, q, r follow by the inverse of Euler's equations in a coordinated turn (`flight_core.kinematics`); all other commands ramp
+    to zero. After that, and where the attitude is not known, all commands are zero.
     """
     silent_ns = t_ns - live.t_ns - params.max_age_ns
     if silent_ns <= 0:
@@ -67,14 +61,13 @@ def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> Floa
     if silent_ns > params.levelling_ns or live.attitude is None or params.channels is None or params.speed is None:
         return np.zeros_like(live.u_m)
     at_q, at_v, at_p, at_r = params.channels
-    phi, theta = (min(max(angle, -MAX_TILT), MAX_TILT) for angle in live.attitude)
+    phi, theta = map(tilt, live.attitude)
     phi_dot = min(max(-params.gain[0] * phi, -params.roll_rate), params.roll_rate)
     theta_dot = -params.gain[1] * theta
-    psi_dot = GRAVITY * math.tan(phi) / max(params.speed + float(y_m[at_v]), params.speed / 2.0)
-    r = psi_dot * math.cos(phi) * math.cos(theta) - theta_dot * math.sin(phi)
-    q = (theta_dot + r * math.sin(phi)) / math.cos(phi)
+    r = turn_rate(phi, theta, theta_dot, max(params.speed + float(y_m[at_v]), params.speed / 2.0))
+    p, q = body_rates(phi, theta, phi_dot, theta_dot, r)
     u_m = failsafe_scale(silent_ns, 0, params.levelling_ns) * live.u_m
-    u_m[[at_q, at_p, at_r]] = q, phi_dot - math.tan(theta) * (q * math.sin(phi) + r * math.cos(phi)), r
+    u_m[[at_q, at_p, at_r]] = q, p, r
     return u_m
 
 
@@ -85,7 +78,5 @@ def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams)
     at_q, _, at_p, at_r = params.channels
     p, q, r, dt = float(y_m[at_p]), float(y_m[at_q]), float(y_m[at_r]), seconds(period_ns)
     phi, theta = live.attitude
-    turn = q * math.sin(phi) + r * math.cos(phi)
-    tilt = min(max(theta, -MAX_TILT), MAX_TILT)
-    phi_dot, theta_dot = p + math.tan(tilt) * turn, q * math.cos(phi) - r * math.sin(phi)
+    phi_dot, theta_dot = euler_rates(phi, theta, p, q, r)
     return live._replace(attitude=(phi + dt * phi_dot, theta + dt * theta_dot))
