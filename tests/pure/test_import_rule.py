@@ -29,7 +29,7 @@ IMPORTS: dict[str, set[str]] = {
     "flight_recorder": {"flight_core", "flight_log"},
     "control_laws": {"flight_core", "rise_di_controller"},
     "flight_analysis.closed_loop": {
-        "aircraft_sim", "flight_core", "flight_log", "flight_recorder", "reference_model", "rise_di_controller",
+        "aircraft_sim", "flight_core", "flight_log", "flight_recorder", "guidance", "reference_model", "rise_di_controller",
     },
     "flight_analysis.metrics": {"flight_core", "rise_di_controller"},
     "flight_analysis.design": {

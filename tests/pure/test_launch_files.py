@@ -22,11 +22,10 @@ from tests.conftest import REPOSITORY
 from tests.launch_stand_in import ExecuteProcess, LaunchContext, Node, OpaqueFunction, ProcessExited, TimerAction
 
 from autopilot_bridge.params import LIBRARY, BridgeParameters, load_map
-from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, read_scenario_sections
 from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError, Parameters
-from flight_core.scenario import read_sections
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
 from flight_ros.topics import NodeState
@@ -180,7 +179,7 @@ def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None
         assert node.namespace == stand_in.LaunchConfiguration("namespace")
         assert node.exec_name == executable
         file, given_to_node = node.parameters
-        section = {} if executable == "bridge" else read_sections(Path(file), tuple(SCHEMAS))[executable]
+        section = {} if executable == "bridge" else read_scenario_sections(Path(file))[executable]
         NODES[executable].validate_mapping(section | given_to_node, executable)
 
 

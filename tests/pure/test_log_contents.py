@@ -50,7 +50,7 @@ def recorder_attachments(scenario: Scenario, run: Path, *, one_process: bool) ->
     overrides: ParameterOverrides = parameter_overrides(node, scenario, run, 0.0, lockstep=True)
     attach, metadata = overrides[f"{prefix}attach"], overrides[f"{prefix}metadata_file"]
     assert isinstance(attach, list)
-    return LogAttachments(scenario.path, tuple(map(Path, attach)), Path(str(metadata)))
+    return LogAttachments(scenario.path, tuple(map(Path, map(str, attach))), Path(str(metadata)))
 
 
 def test_logged_parameters_are_a_scenario_of_that_flight(recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:

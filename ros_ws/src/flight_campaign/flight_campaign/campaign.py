@@ -16,7 +16,7 @@ from pydantic import Field
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import WindEffect, gust_directions, sampled_matrices
-from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, check_together
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
 from flight_campaign.statistics import Tally, score, score_units
@@ -54,9 +54,7 @@ class Definition(Parameters):
 
     def scenario(self, case: int = 0) -> Scenario:
         """The scenario of a case of the sweep, the airframe as published."""
-        sections = {name: schema.validate_mapping(self.sections[name], name) for name, schema in SCHEMAS.items()}
-        scenario = Scenario(name=self.name, path=Path(self.name), **sections)  # type: ignore[arg-type]  # the types are those of SCHEMAS
-        check_together(scenario)
+        scenario = scenario_of(self.name, Path(self.name), self.sections)
         if self.sweep is None:
             return scenario
         value, factor = getattr(scenario.controller, self.sweep.parameter), self.factor(case)
@@ -107,7 +105,9 @@ def define(
     published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
     values = {
         "name": scenario.name,
-        "sections": {name: getattr(published, name).model_dump(mode="json") for name in SCHEMAS},
+        "sections": {
+            name: section.model_dump(mode="json") for name in SCHEMAS if (section := getattr(published, name)) is not None
+        },
         "aircraft": aircraft,
         "uncertainty": uncertainty,
         "wind": scenario.aircraft.uncertainty.wind if wind is None else wind,

@@ -16,17 +16,19 @@ from flight_core.parameters import require
 Sections = dict[str, dict[str, Any]]
 
 
-def read_sections(path: Path, expected: tuple[str, ...]) -> Sections:
+def read_sections(path: Path, expected: tuple[str, ...], optional: tuple[str, ...] = ()) -> Sections:
     """Sections of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
 
-    Raises ParameterError for a file that cannot be read, is no scenario file, has a duplicate key, or lacks or adds a section.
+    Raises ParameterError for a file that cannot be read, is no scenario file, has a duplicate key, or lacks or adds a section;
+    those in `optional` may be absent.
     """
     tree = read_yaml(path, str(path), "a scenario file")
     require(isinstance(tree, dict), str(path), f"{type(tree).__name__}", f"a mapping with {', '.join(expected)}")
     sections: Sections = {}
     for key, content in tree.items():
         name = str(key).removeprefix("/**/").removeprefix("/")
-        require(name in expected, f"{path.name}: {name}", "a section", f"only {', '.join(expected)}")
+        known = (*expected, *optional)
+        require(name in known, f"{path.name}: {name}", "a section", f"only {', '.join(known)}")
         values = content.get("ros__parameters") if isinstance(content, dict) else None
         values = values if isinstance(values, dict) else {}
         require(

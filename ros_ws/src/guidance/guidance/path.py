@@ -34,6 +34,14 @@ class Arc(NamedTuple):
 Leg = Line | Arc
 
 
+class Route(NamedTuple):
+    """Legs with the altitude and the airspeed of each: those of the waypoint to which it leads."""
+
+    legs: tuple[Leg, ...]
+    altitude: tuple[float, ...]  # m
+    V: tuple[float, ...]  # m/s
+
+
 def course_of(start: Point, end: Point) -> float:
     """Course from one point to another, rad from north."""
     return math.atan2(end[1] - start[1], end[0] - start[0])
@@ -68,6 +76,26 @@ def passed(leg: Leg, position: Point) -> bool:
     course = end_course(leg)
     north, east = position[0] - leg.end[0], position[1] - leg.end[1]
     return north * math.cos(course) + east * math.sin(course) >= 0.0
+
+
+def to_go(leg: Leg, position: Point) -> float:
+    """Distance along a leg from its point nearest to a position to its end, m; 0 for an orbit."""
+    if leg.end is None:
+        return 0.0
+    if isinstance(leg, Line):
+        course = end_course(leg)
+        return (leg.end[0] - position[0]) * math.cos(course) + (leg.end[1] - position[1]) * math.sin(course)
+    turn = course_of(leg.centre, leg.end) - course_of(leg.centre, position)
+    return leg.radius * math.remainder(turn, 2.0 * math.pi)
+
+
+def leads(legs: Sequence[Leg]) -> list[int]:
+    """The number of the waypoint to which each leg of a route leads; an arc at a waypoint leads to the next one."""
+    numbers, at = [], 0
+    for leg in legs:
+        at += isinstance(leg, Line)
+        numbers.append(at + 1 if isinstance(leg, Arc) and leg.end is not None else at)
+    return numbers
 
 
 def route(waypoints: Sequence[Point], radius: float, least: float) -> tuple[Leg, ...]:

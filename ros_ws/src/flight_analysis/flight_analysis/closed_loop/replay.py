@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, load_scenario
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario, read_scenario_sections
 from flight_core.parameters import flatten, nest, require
 from flight_core.rates import NANOSECONDS
-from flight_core.scenario import read_sections
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
 from flight_log.tape_reader import StoredFile
@@ -90,7 +89,7 @@ def recorded_parameters(scenario: StoredFile) -> ControllerParameters:
     with TemporaryDirectory() as folder:
         path = Path(folder) / scenario.name
         path.write_bytes(scenario.content)
-        sections = read_sections(path, tuple(SCHEMAS))
+        sections = read_scenario_sections(path)
     return ControllerParameters.validate_mapping(sections["controller"], "controller")
 
 

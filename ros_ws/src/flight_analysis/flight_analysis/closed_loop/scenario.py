@@ -11,15 +11,17 @@ import yaml
 from pydantic import Field
 
 from aircraft_sim.params import AircraftParameters
+from aircraft_sim.pose import every
 from flight_core.parameters import ParameterError, Parameters, require
-from flight_core.rates import period_ns
-from flight_core.scenario import read_sections
+from flight_core.rates import NANOSECONDS, period_ns
+from flight_core.scenario import Sections, read_sections
 from flight_recorder.params import RecorderParameters
+from guidance.params import OUTPUTS, GuidanceParameters
 from reference_model.params import ReferenceModelParameters
 from rise_di_controller.params import ControllerParameters
 from rise_di_controller.rise_di import RiseDiParameters
 
-ParameterOverrides = dict[str, str | float | bool | list[str]]
+ParameterOverrides = dict[str, str | float | bool | list[str] | list[float]]
 """Parameters of one node by name that replace those of its section in the scenario."""
 
 
@@ -41,19 +43,26 @@ class Scenario:
     reference_model: ReferenceModelParameters
     controller: ControllerParameters
     recorder: RecorderParameters
+    guidance: GuidanceParameters | None = None  # None: the commands are those of the reference model
 
     def vary(self, **sections: Mapping[str, Any]) -> "Scenario":
         """A copy with some parameters replaced, as in scenario.vary(controller={"rate": 200.0}).
 
-        The copy is validated. Raises ParameterError.
+        The copy is validated. A section of guidance that the scenario lacks begins with the numbers by rule. Raises
+        ParameterError.
         """
         changed: dict[str, Any] = {
-            name: SCHEMAS[name].validate_mapping(getattr(self, name).model_dump() | changes, name)
-            for name, changes in sections.items()
+            name: SCHEMAS[name].validate_mapping({**self._values(name), **changes}, name) for name, changes in sections.items()
         }
         varied = replace(self, **changed)
         check_together(varied)
         return varied
+
+    def _values(self, name: str) -> dict[str, Any]:
+        section: Parameters | None = getattr(self, name)
+        return (
+            guidance_by_rule(self.aircraft, self.reference_model, self.controller) if section is None else section.model_dump()
+        )
 
     def rise_di(self) -> RiseDiParameters:
         """The parameters of a controller that flies RISE-DI. Raises ParameterError for another law."""
@@ -74,16 +83,54 @@ SCHEMAS: dict[str, type[Parameters]] = {
     "reference_model": ReferenceModelParameters,
     "controller": ControllerParameters,
     "recorder": RecorderParameters,
+    "guidance": GuidanceParameters,
 }
+OPTIONAL = ("guidance",)
 
 
 def load_scenario(path: Path) -> Scenario:
     """Read a scenario file and validate it. Raises ParameterError with one sentence."""
-    sections = read_sections(path, tuple(SCHEMAS))
-    checked = {name: schema.validate_mapping(sections[name], name) for name, schema in SCHEMAS.items()}
-    scenario = Scenario(name=path.stem, path=path, **checked)  # type: ignore[arg-type]  # SCHEMAS says which type each has
+    return scenario_of(path.stem, path, read_scenario_sections(path))
+
+
+def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]) -> Scenario:
+    """The scenario of these sections, validated. Raises ParameterError."""
+    checked: dict[str, Any] = {
+        key: schema.validate_mapping(sections[key], key) for key, schema in SCHEMAS.items() if key not in OPTIONAL
+    }
+    scenario = Scenario(name=name, path=path, **checked)
     check_together(scenario)
-    return scenario
+    return scenario.vary(**{key: sections[key] for key in OPTIONAL if sections.get(key)})
+
+
+def read_scenario_sections(path: Path) -> Sections:
+    """The sections of a scenario file, not validated yet. Raises ParameterError."""
+    return read_sections(path, tuple(name for name in SCHEMAS if name not in OPTIONAL), OPTIONAL)
+
+
+def guidance_by_rule(
+    aircraft: AircraftParameters, reference: ReferenceModelParameters, controller: ControllerParameters
+) -> dict[str, Any]:
+    """Parameters of guidance that follow from the other sections.
+
+    The throttle's authority is abs(Omega_VV) u of RISE-DI, Omega_ii = omega / input_scale, with the limits of u from trim; none
+    where the controller has no such numbers. Raises ParameterError for a model or an aircraft that guidance cannot fly.
+    """
+    key, channels = "reference_model.second_order", aircraft.channels()
+    if reference.second_order is None:
+        raise ParameterError(f"{key}: found linear, expected second_order: guidance needs its bounds on y_m_ddot")
+    missing = [name for name in OUTPUTS if name not in reference.outputs]
+    require(not missing, "guidance", f"an aircraft without {', '.join(missing)}", f"one with {', '.join(OUTPUTS)}")
+    values = {
+        "outputs": reference.outputs,
+        "natural_frequency": reference.second_order.natural_frequency,
+        "speed": channels.speed,
+    }
+    if isinstance(controller, RiseDiParameters) and controller.lower and controller.upper:
+        i = controller.outputs.index("V")
+        slope = controller.omega[i] / controller.input_scale[i]
+        values["throttle_authority"] = (-controller.lower[i] * slope, controller.upper[i] * slope)
+    return values
 
 
 def scenario_yaml(scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]] | None = None) -> str:
@@ -93,7 +140,9 @@ def scenario_yaml(scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]]
     """
     sections = {}
     for name, schema in SCHEMAS.items():
-        section: Parameters = getattr(scenario, name)
+        section: Parameters | None = getattr(scenario, name)
+        if section is None:
+            continue
         merged = schema.validate_mapping(section.model_dump() | dict((overrides or {}).get(name, {})), name)
         # The start time is known only once all nodes run; `truth` holds it.
         sections[f"/**/{name}"] = {"ros__parameters": _yaml_values(merged.model_dump(exclude={"start_time"}))}
@@ -127,3 +176,22 @@ def check_together(scenario: Scenario) -> None:
     for key, rate in (("aircraft.rate", scenario.aircraft.rate), ("reference_model.rate", reference.rate)):
         divides = control_ns % period_ns(rate, key) == 0
         require(divides, key, f"{rate:g} Hz", f"a whole multiple of controller.rate ({controller.rate:g} Hz)")
+    if scenario.guidance is not None:
+        _check_guidance(scenario, scenario.guidance)
+
+
+def _check_guidance(scenario: Scenario, guidance: GuidanceParameters) -> None:
+    reference, aircraft = scenario.reference_model, scenario.aircraft
+    rule = guidance_by_rule(aircraft, reference, scenario.controller)
+    for key in ("speed", "outputs", "natural_frequency"):
+        found = getattr(guidance, key)
+        require(found == rule[key], f"guidance.{key}", found, f"{rule[key]}, as the other sections have it")
+    euler = aircraft.is_jsbsim or aircraft.kinematics == "euler"
+    require(euler, "aircraft.kinematics", f"{aircraft.kinematics!r} beside guidance", "euler: a bank turns the aircraft")
+    levels = f"the trim speed {guidance.speed:g} m/s, by which the wings are levelled when guidance is lost"
+    require(reference.live.speed is not None, "reference_model.live.speed", "none beside guidance", levels)
+    pose_ns = every(aircraft.rate) * period_ns(aircraft.rate, "aircraft.rate")
+    period = period_ns(guidance.rate, "guidance.rate")
+    for what, part_ns in (("pose", pose_ns), ("y_m", period_ns(reference.rate, "reference_model.rate"))):
+        rate = f"a whole fraction of the rate of {what} ({NANOSECONDS / part_ns:g} Hz)"
+        require(period % part_ns == 0, "guidance.rate", f"{guidance.rate:g} Hz", rate)

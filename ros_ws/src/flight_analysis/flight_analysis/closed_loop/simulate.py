@@ -14,6 +14,7 @@ from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
 from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
+from guidance.guidance import ATTITUDE, Guidance
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
 
@@ -35,21 +36,27 @@ class _SignalBuilder:
         return Signal(np.array(self.stamps[: len(values)], dtype=np.int64), self.names, values)
 
 
-def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None) -> Tape:
+def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None) -> Tape:  # noqa: PLR0912 - one a node
     """Fly a scenario and return its tape. `progress` is called with the flight time once per simulated second.
 
-    Order at each instant: y of the aircraft, y_m of the reference model, u of the controller. The aircraft holds u until the
-    next one. A lost sample of y is not on the tape; a delayed one has its own stamp. A flight that diverges or is interrupted
-    (Ctrl-C) ends early: the tape holds the samples so far, and its `outcome` the reason.
+    Order at each instant: y of the aircraft, y_m of the reference model, u_m of guidance, u of the controller. The aircraft
+    holds u until the next one. A lost sample of y is not on the tape; a delayed one has its own stamp. A flight that diverges
+    or is interrupted (Ctrl-C) ends early: the tape holds the samples so far, and its `outcome` the reason.
     """
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     reference, controller = Reference(scenario.reference_model), Controller(scenario.controller)
+    guidance = None if scenario.guidance is None else Guidance(scenario.guidance)
     signals = {
         "y": _SignalBuilder(tuple(scenario.aircraft.channels().outputs)),
         "y_m": _SignalBuilder(scenario.reference_model.outputs),
         "u": _SignalBuilder(inputs),
         "internals": _SignalBuilder(controller.names),
     }
+    if guidance is not None:
+        signals |= {
+            "u_m": _SignalBuilder((*scenario.reference_model.outputs, *ATTITUDE)),
+            "guidance": _SignalBuilder(guidance.names),
+        }
     outcome, t_ns = COMPLETED, 0
     try:
         aircraft = Simulator(scenario.aircraft)
@@ -61,13 +68,23 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
                 for sample in aircraft.sample(t_ns // aircraft.period_ns, u):
                     signals["y"].add(sample.stamp_ns, sample.value)
                     controller.take_y(StampedVector(sample.stamp_ns, select(outputs, aircraft.outputs, sample.value)), t_ns)
+                    if guidance is not None:
+                        y = select(scenario.reference_model.outputs, aircraft.outputs, sample.value)
+                        guidance.take_y(StampedVector(sample.stamp_ns, y), t_ns)
                 if t_ns % (aircraft.pose_every * aircraft.period_ns) == 0:
                     signals["pose"].add(t_ns, aircraft.pose())
+                    if guidance is not None:
+                        guidance.take_pose(StampedVector(t_ns, signals["pose"].rows[-1]), t_ns)
                 signals["truth"].add(t_ns, aircraft.truth())
             if t_ns % reference.period_ns == 0:
                 y_m = reference.sample(t_ns // reference.period_ns)
                 signals["y_m"].add(t_ns, y_m)
                 controller.take_y_m(StampedVector(t_ns, select(outputs, scenario.reference_model.outputs, y_m)), t_ns)
+            if guidance is not None and t_ns % guidance.period_ns == 0 and (guided := guidance.step(t_ns, t_ns)) is not None:
+                m = len(scenario.reference_model.outputs)
+                reference.take(t_ns, guided.u_m[:m], guided.u_m[m:])  # acts from the next step on: y_m of t is given
+                signals["u_m"].add(t_ns, guided.u_m)
+                signals["guidance"].add(t_ns, guided.log)
             if t_ns % controller.period_ns == 0 and (output := controller.tick(t_ns)) is not None:
                 u = select(aircraft.inputs, inputs, output.u)
                 signals["u"].add(output.stamp_ns, output.u)

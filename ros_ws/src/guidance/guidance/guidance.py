@@ -1,0 +1,217 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Guidance without ROS: the step of `modes` with its state, the last samples, the program and the log.
+
+The node and the simulation in one process both use it.
+"""
+
+import zlib
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.rates import nanoseconds, seconds
+from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer, require_not_future
+from guidance import modes
+from guidance.modes import (
+    POSE,
+    TARGETS,
+    Begin,
+    Commands,
+    GuidanceParams,
+    GuidanceState,
+    Inputs,
+    Lateral,
+    Mode,
+    Target,
+    Vertical,
+)
+from guidance.params import GuidanceParameters
+from guidance.path import Route
+
+ATTITUDE = ("phi", "theta")
+"""Channels of u_m beside the commands, for its ending: bank, and pitch above that of level flight, rad."""
+
+LIMITED = ("bank", "theta", "climb", "V", "slew")
+STATE = ("phi", "theta", "alpha", "alpha_trim")
+
+
+class GuidanceOutput(NamedTuple):
+    """Output of one step."""
+
+    u_m: FloatArray  # the commands in the order of the parameters' outputs, then ATTITUDE
+    log: FloatArray  # in the order of `names`
+
+
+def names(outputs: Sequence[str]) -> tuple[str, ...]:
+    """Channels of the log."""
+    return (
+        *("mode", "mode.lateral", "mode.vertical", "leg", "route", "xtrack", "to_go"),
+        *("phi_c", "theta_c", "climb_c", "V_c"),
+        *(f"limited.{name}" for name in LIMITED),
+        *("age.pose", "begin", "given"),
+        *(f"target.{name}" for name in TARGETS),
+        *(f"state.{name}" for name in STATE),
+        *(f"pose.{name}" for name in POSE),
+        *(f"y.{name}" for name in outputs),
+        *(f"u_m.{name}" for name in outputs),
+    )
+
+
+def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: Route | None) -> FloatArray:
+    """A sample of the log, in the order of `names`: inputs, state after the step, commands."""
+    given = sum(1 << k for k, name in enumerate(TARGETS) if name in inputs.given)
+    return np.array(
+        [
+            *(state.mode, state.lateral, state.vertical, state.leg, digest(route), commands.xtrack, commands.to_go),
+            *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
+            *(getattr(commands, f"{name}_limited") for name in LIMITED),
+            *(seconds(inputs.pose_age_ns), inputs.begin, given),
+            *state.target,
+            *(getattr(state, name) for name in STATE),
+            *inputs.pose,
+            *inputs.y,
+            *state.u_m,
+        ],
+        dtype=np.float64,
+    )
+
+
+def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> tuple[Inputs, GuidanceState]:
+    """The inputs of a step and the state after it, from its sample of the log."""
+
+    def group(prefix: str, keys: Sequence[str]) -> tuple[float, ...]:
+        return tuple(logged[f"{prefix}.{key}"] for key in keys)
+
+    target, mask = Target(*group("target", TARGETS)), int(logged["given"])
+    given = {name: getattr(target, name) for k, name in enumerate(TARGETS) if mask >> k & 1}
+    begin, age_ns = Begin(int(logged["begin"])), nanoseconds(logged["age.pose"])
+    inputs = Inputs(t_ns, begin, group("pose", POSE), age_ns, group("y", outputs), given)
+    phi, theta, alpha, alpha_trim = group("state", STATE)
+    state = GuidanceState(
+        t_ns,
+        Mode(int(logged["mode"])),
+        Lateral(int(logged["mode.lateral"])),
+        Vertical(int(logged["mode.vertical"])),
+        target,
+        int(logged["leg"]),
+        phi,
+        theta,
+        alpha,
+        alpha_trim,
+        logged["climb_c"],
+        logged["V_c"],
+        group("u_m", outputs),
+    )
+    return inputs, state
+
+
+def digest(route: Route | None) -> int:
+    """A number that distinguishes routes; 0 for none."""
+    return 0 if route is None else zlib.crc32(repr(route).encode())
+
+
+class Guidance:
+    """`modes.step` with its state, the last pose and y, the route and the program of targets."""
+
+    def __init__(self, parameters: GuidanceParameters) -> None:
+        self._params: GuidanceParams = parameters.params()
+        self.period_ns, self.names = self._params.period_ns, names(parameters.outputs)
+        waypoints = parameters.waypoints()
+        self.route = parameters.plan(waypoints) if waypoints else None
+        self._program = deque((nanoseconds(start), target) for start, target in parameters.program_steps())
+        self._pose: StampedVector | None = None
+        self._y: StampedVector | None = None
+        self._given: dict[str, float] = {} if self.route is None else {"leg": 0.0}
+        self._state: GuidanceState | None = None
+        self._engaged, self._begin = True, Begin.HOLD
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of the last step."""
+        return Mode.OFF if self._state is None or self._begin is not Begin.NO else self._state.mode
+
+    @property
+    def state(self) -> GuidanceState | None:
+        """The state after the last step, None before the first."""
+        return self._state
+
+    def take_pose(self, sample: StampedVector, now_ns: int) -> None:
+        """Take a pose in the order of `modes.POSE`. Raises ChannelError for a stamp that is not newer, or in the future."""
+        self._pose = self._newest(self._pose, sample, now_ns)
+
+    def take_y(self, sample: StampedVector, now_ns: int) -> None:
+        """Take a y in the order of the parameters' outputs, as `take_pose` does."""
+        self._y = self._newest(self._y, sample, now_ns)
+
+    def _newest(self, last: StampedVector | None, sample: StampedVector, now_ns: int) -> StampedVector:
+        require_not_future(sample.stamp_ns, now_ns, self._params.max_age_ns)
+        if last is not None:
+            require_newer(sample.stamp_ns, last.stamp_ns)
+        return sample
+
+    def take_target(self, values: Mapping[str, float]) -> None:
+        """Take commands by channel of `modes.Target`; those of one instant are taken together. Raises ChannelError."""
+        modes.read_target(values, self._params)
+        if "leg" in values and self.route is None:
+            raise ChannelError("bounds", "target.leg: found no route, expected one")
+        # A lateral or vertical command replaces that of another mode.
+        for table in (modes.LATERAL, modes.VERTICAL):
+            if any(name in table for name in values):
+                self._given = {name: value for name, value in self._given.items() if name not in table}
+        self._given |= values
+
+    def take_route(self, route: Route) -> None:
+        """Fly a route from its first leg on."""
+        self.route = route
+        self.take_target({"leg": 0.0})
+
+    def hold(self) -> bool:
+        """Hold the heading, the altitude and the airspeed of now; False while guidance does not fly."""
+        if self.mode is not Mode.ENGAGED or self._pose is None or self._y is None:
+            return False
+        speed = modes.airspeed(tuple(self._y.value.tolist()), self._params)
+        self.take_target(modes.hold(tuple(self._pose.value.tolist()), speed, self._params))
+        return True
+
+    def skip(self) -> bool:
+        """Fly the next leg of the route; False while none is flown."""
+        if self.mode is not Mode.ENGAGED or self._state is None or self._state.lateral is not Lateral.ROUTE:
+            return False
+        self.take_target({"leg": self._state.leg + 1.0})
+        return True
+
+    def engage(self, *, engaged: bool) -> None:
+        """Engage, with the heading, the altitude and the airspeed of then; or publish no u_m."""
+        if engaged and not self._engaged:
+            self._begin = Begin.HOLD
+        self._engaged = engaged
+
+    def ages(self, now_ns: int) -> dict[str, float]:
+        """Ages of the last y and pose, s, of those that were received."""
+        samples = {"y": self._y, "pose": self._pose}
+        return {name: seconds(now_ns - one.stamp_ns) for name, one in samples.items() if one is not None}
+
+    def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
+        """One step at an instant, which is flight time t; None without fresh y, before the first pose, and while disengaged.
+
+        After such a time the filters start again at what is measured.
+        """
+        while self._program and self._program[0][0] <= t_ns:
+            self.take_target(self._program.popleft()[1])
+        y, pose = self._y, self._pose
+        if pose is None or y is None or now_ns - y.stamp_ns > self._params.max_age_ns or not self._engaged:
+            self._begin = max(self._begin, Begin.AGAIN)
+            return None
+        age_ns = now_ns - pose.stamp_ns
+        if self._begin is not Begin.NO and age_ns > self._params.max_age_ns:
+            return None
+        y_values, pose_values = tuple(y.value.tolist()), tuple(pose.value.tolist())
+        inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given)
+        self._begin, self._given = Begin.NO, {}
+        self._state, commands = modes.step(self._state, inputs, self.route, self._params)
+        state = self._state
+        u_m = np.array([*state.u_m, state.phi, state.theta - state.alpha])
+        return GuidanceOutput(u_m, row(inputs, state, commands, self.route))

@@ -1,0 +1,372 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Modes of guidance: one step from pose, y and target to u_m.
+
+Lateral: hold a bank, a heading or a course, or follow an orbit or a route. Vertical: hold a pitch, a climb rate or an altitude.
+Airspeed is held by the law; guidance limits its command. The step has no clock and no hidden state: all of its state is in the
+log, so that each sample of the log can be computed again from the one before.
+"""
+
+import math
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import NamedTuple
+
+from flight_core.kinematics import euler_rates
+from flight_core.rates import seconds
+from flight_core.units import GRAVITY
+from flight_core.vectors import ChannelError
+from guidance import path, protection
+from guidance.attitude import AttitudeParams, BodyRates, body_rates
+from guidance.lateral import PathParams, bank_for, course_acceleration, path_acceleration
+from guidance.path import Arc, Leg, Route
+from guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
+
+POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
+"""Channels of `pose`: rad, m, m/s; beta is 0 where it is not measured."""
+
+
+class Mode(IntEnum):
+    """What guidance does."""
+
+    OFF = 0  # no u_m
+    ENGAGED = 1
+    DEAD_RECKONING = 2  # pose is stale: wings level, attitude from the rates of y
+    POSE_LOST = 3  # pose is stale for longer: rates are zero
+
+
+class Lateral(IntEnum):
+    """What the bank serves."""
+
+    PHI = 0
+    HEADING = 1
+    COURSE = 2
+    ORBIT = 3
+    ROUTE = 4
+
+
+class Vertical(IntEnum):
+    """What the pitch serves."""
+
+    THETA = 0
+    CLIMB = 1
+    ALTITUDE = 2
+
+
+class Target(NamedTuple):
+    """Commands of all modes, of which those of the modes in force act."""
+
+    phi: float = 0.0  # rad
+    heading: float = 0.0  # rad from true north
+    course: float = 0.0  # rad from true north, over ground
+    north: float = 0.0  # m, centre of the orbit
+    east: float = 0.0  # m
+    radius: float = 0.0  # m, positive clockwise from above
+    leg: float = 0.0  # number of the leg of the route
+    theta: float = 0.0  # rad
+    climb: float = 0.0  # m/s
+    altitude: float = 0.0  # m
+    V: float = 0.0  # airspeed, m/s, absolute
+
+
+TARGETS = Target._fields
+LATERAL: Mapping[str, Lateral] = {
+    "phi": Lateral.PHI,
+    "heading": Lateral.HEADING,
+    "course": Lateral.COURSE,
+    **dict.fromkeys(("north", "east", "radius"), Lateral.ORBIT),
+    "leg": Lateral.ROUTE,
+}
+VERTICAL: Mapping[str, Vertical] = {"theta": Vertical.THETA, "climb": Vertical.CLIMB, "altitude": Vertical.ALTITUDE}
+
+
+class Limits(NamedTuple):
+    """Limits of commands."""
+
+    bank: float  # rad
+    least_pitch: float  # rad
+    largest_pitch: float  # rad
+    floor: float  # m/s, of the airspeed
+    stall_speed: float  # m/s
+    radius: float  # m, least one
+
+
+class GuidanceParams(NamedTuple):
+    """Parameters of the step."""
+
+    outputs: tuple[str, ...]  # order of u_m
+    period_ns: int
+    speed: float  # trim speed V0, m/s
+    k_chi: float  # of heading and course, 1/s
+    attitude: AttitudeParams
+    vertical: VerticalParams
+    path: PathParams
+    limits: Limits
+    slew: tuple[float, ...]  # largest derivatives of u_m
+    max_age_ns: int
+    hold_ns: int
+
+
+class Begin(IntEnum):
+    """Whether the filters begin at what is measured."""
+
+    NO = 0
+    AGAIN = 1  # modes and commands stay (bumpless transfer)
+    HOLD = 2  # with the heading, the altitude and the airspeed of now
+
+
+class Inputs(NamedTuple):
+    """What a step takes."""
+
+    t_ns: int
+    begin: Begin
+    pose: tuple[float, ...]  # the last one, in the order of POSE
+    pose_age_ns: int
+    y: tuple[float, ...]  # the last one, in the order of u_m
+    given: Mapping[str, float]  # commands that are new, by channel of Target; they name the modes
+
+
+class GuidanceState(NamedTuple):
+    """State after a step."""
+
+    t_ns: int
+    mode: Mode
+    lateral: Lateral
+    vertical: Vertical
+    target: Target
+    leg: int  # of the route
+    phi: float  # attitude, by dead reckoning while pose is stale, rad
+    theta: float
+    alpha: float  # estimated angle of attack, rad
+    alpha_trim: float  # the same at the start
+    climb_c: float  # m/s
+    V_c: float  # m/s
+    u_m: tuple[float, ...]
+
+
+class Commands(NamedTuple):
+    """What a step computes beside its state, for the log."""
+
+    phi_c: float = 0.0
+    theta_c: float = 0.0
+    xtrack: float = 0.0  # cross-track error, m, positive to the right of the path
+    to_go: float = 0.0  # m, to the end of the leg
+    bank_limited: bool = False
+    theta_limited: bool = False
+    climb_limited: bool = False
+    V_limited: bool = False
+    slew_limited: bool = False
+
+
+def read_target(values: Mapping[str, float], params: GuidanceParams, what: str = "target") -> None:
+    """Raise ChannelError for commands that name no mode or two, or that are beyond the limits."""
+    modes = [{table[name] for name in values if name in table} for table in (LATERAL, VERTICAL)]
+    unknown = [name for name in values if name not in TARGETS]
+    if unknown or not values:
+        raise ChannelError("name", f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of {', '.join(TARGETS)}")
+    if any(len(one) > 1 for one in modes):
+        raise ChannelError("name", f"{what}: found {', '.join(values)}, expected one lateral and one vertical command at most")
+    if Lateral.ORBIT in modes[0] and not {"north", "east", "radius"} <= set(values):
+        raise ChannelError("name", f"{what}: found {', '.join(values)}, expected north, east and radius of an orbit together")
+    limits, vertical = params.limits, params.vertical
+    for name, least, largest in (
+        ("phi", -limits.bank, limits.bank),
+        ("theta", limits.least_pitch, limits.largest_pitch),
+        ("climb", -vertical.sink, vertical.climb),
+        ("V", limits.floor, math.inf),
+        ("leg", 0.0, math.inf),
+    ):
+        if name in values and not least <= values[name] <= largest:
+            raise ChannelError("bounds", f"{what}.{name}: found {values[name]:g}, expected {least:.6g} to {largest:.6g}")
+    if "radius" in values and abs(values["radius"]) < limits.radius:
+        expected = f"at least {math.ceil(limits.radius)} m either way"
+        raise ChannelError("bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}")
+
+
+def hold(pose: tuple[float, ...], speed: float, params: GuidanceParams) -> dict[str, float]:
+    """Commands that hold the heading, the altitude and the airspeed of now; no airspeed below the floor."""
+    named = dict(zip(POSE, pose, strict=True))
+    return {"heading": named["psi"], "altitude": named["altitude"], "V": max(speed, params.limits.floor)}
+
+
+def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -> GuidanceState:
+    """The state before a step, its filters at what is measured where they begin."""
+    if state is not None and inputs.begin is Begin.NO:
+        return state
+    pose, speed = dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params)
+    alpha = pose["theta"] - path_angle(pose["climb"], speed)
+    begun = GuidanceState(
+        inputs.t_ns - params.period_ns,
+        Mode.ENGAGED,
+        Lateral.HEADING,
+        Vertical.ALTITUDE,
+        Target()._replace(**hold(inputs.pose, speed, params)),
+        0,
+        pose["phi"],
+        pose["theta"],
+        alpha,
+        max(alpha, 0.0),
+        pose["climb"],
+        speed,
+        (0.0,) * len(params.outputs),
+    )
+    if state is None or inputs.begin is Begin.HOLD:
+        return begun
+    return begun._replace(lateral=state.lateral, vertical=state.vertical, target=state.target, leg=state.leg)
+
+
+def airspeed(y: tuple[float, ...], params: GuidanceParams) -> float:
+    """True airspeed V0 + V, m/s, at least half of V0."""
+    return max(params.speed + y[params.outputs.index("V")], params.speed / 2.0)
+
+
+def step(
+    state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
+) -> tuple[GuidanceState, Commands]:
+    """One step: attitude, commands, u_m.
+
+    1. Attitude: phi and theta of pose. While pose is stale: Euler's kinematics with p, q, r of y (`Mode.DEAD_RECKONING`). After
+       `hold` the attitude is unknown (`Mode.POSE_LOST`) until pose returns; then wings level and the altitude of then.
+    2. Commands: the next leg at the end of a leg, then the commands given.
+    3. Protection in this order: bank, airspeed, climb, pitch; roll rate and load in `attitude.body_rates`; slew of u_m.
+    4. u_m: p, q, r by `attitude.body_rates`, V_m = V_c - V0. In POSE_LOST p, q, r are 0.
+    """
+    state = begin(state, inputs, params)
+    dt = seconds(inputs.t_ns - state.t_ns)
+    state = _with_attitude(state, inputs, dt, params)
+    state = _with_commands(state, inputs, route)
+    pose, speed, limits = dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params), params.limits
+    flies = state.mode is Mode.ENGAGED
+    if flies:
+        alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
+        state = state._replace(alpha=alpha)
+
+    bank = protection.bank_limit(limits.bank, limits.stall_speed, speed)
+    V_wanted = max(state.target.V, limits.floor)
+    V_c = slewed(state.V_c, V_wanted, params.slew[params.outputs.index("V")], dt)
+
+    phi_wanted, error, to_go = _bank(state, pose, speed, route, params) if flies else (0.0, 0.0, 0.0)
+    phi_c = min(max(phi_wanted, -bank), bank)
+    climb_c, climb_limited = _climb(state, pose, speed, dt, params) if flies else (0.0, False)
+    theta_wanted = state.target.theta if flies and state.vertical is Vertical.THETA else pitch_for(climb_c, speed, state.alpha)
+    theta_c = min(max(theta_wanted, limits.least_pitch), limits.largest_pitch)
+
+    r = inputs.y[params.outputs.index("r")]
+    attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
+    beta = pose["beta"] if flies else 0.0
+    rates = body_rates(phi_c, theta_c, state.phi, state.theta, r, beta, speed, attitude)
+    if state.mode is Mode.POSE_LOST:
+        rates = BodyRates(0.0, 0.0, 0.0)
+    wanted = {"V": V_c - params.speed, **rates._asdict()}
+    u_m = tuple(
+        wanted[name] if name == "V" else slewed(before, wanted[name], rate, dt)
+        for name, before, rate in zip(params.outputs, state.u_m, params.slew, strict=True)
+    )
+    commands = Commands(
+        phi_c,
+        theta_c,
+        error,
+        to_go,
+        bank_limited=phi_c != phi_wanted or abs(phi_c) == bank,
+        theta_limited=theta_c != theta_wanted,
+        climb_limited=climb_limited,
+        V_limited=V_wanted != state.target.V,
+        slew_limited=any(one != wanted[name] for name, one in zip(params.outputs, u_m, strict=True)),
+    )
+    return state._replace(t_ns=inputs.t_ns, climb_c=climb_c, V_c=V_c, u_m=u_m), commands
+
+
+def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: GuidanceParams) -> GuidanceState:
+    """Mode, and attitude from pose or by dead reckoning."""
+    pose = dict(zip(POSE, inputs.pose, strict=True))
+    if inputs.pose_age_ns <= params.max_age_ns:
+        if state.mode is Mode.POSE_LOST:  # the aircraft may be anywhere by now
+            target = state.target._replace(phi=0.0, altitude=pose["altitude"])
+            level = state._replace(lateral=Lateral.PHI, vertical=Vertical.ALTITUDE, target=target)
+            state = begin(level, inputs._replace(begin=Begin.AGAIN), params)
+        return state._replace(mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
+    lost = inputs.pose_age_ns > params.max_age_ns + params.hold_ns
+    p, q, r = (inputs.y[params.outputs.index(name)] for name in ("p", "q", "r"))
+    phi_dot, theta_dot = euler_rates(state.phi, state.theta, p, q, r)
+    return state._replace(
+        mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING,
+        phi=math.remainder(state.phi + dt * phi_dot, 2.0 * math.pi),
+        theta=state.theta + dt * theta_dot,
+    )
+
+
+def _with_commands(state: GuidanceState, inputs: Inputs, route: Route | None) -> GuidanceState:
+    """The modes and commands in force: those of the next leg once a leg is passed, then those given."""
+    position = (inputs.pose[POSE.index("north")], inputs.pose[POSE.index("east")])
+    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE
+    if on_route and route is not None and path.passed(route.legs[state.leg], position):
+        state = _on_leg(state, state.leg + 1, route)
+    if not inputs.given:
+        return state
+    state = state._replace(target=state.target._replace(**inputs.given))
+    for name in inputs.given:
+        state = state._replace(lateral=LATERAL.get(name, state.lateral), vertical=VERTICAL.get(name, state.vertical))
+    if "leg" in inputs.given and route is not None:
+        state = _on_leg(state, int(inputs.given["leg"]), route)
+        state = state._replace(target=state.target._replace(**inputs.given))
+        named = [VERTICAL[name] for name in inputs.given if name in VERTICAL]
+        state = state._replace(vertical=named[0] if named else Vertical.ALTITUDE)
+    return state
+
+
+def _on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
+    """The state on a leg of the route, with the leg's altitude and airspeed."""
+    leg = min(leg, len(route.legs) - 1)
+    target = state.target._replace(altitude=route.altitude[leg], V=route.V[leg])
+    return state._replace(leg=leg, target=target, vertical=Vertical.ALTITUDE)
+
+
+def _bank(
+    state: GuidanceState, pose: Mapping[str, float], speed: float, route: Route | None, params: GuidanceParams
+) -> tuple[float, float, float]:
+    """Bank that the lateral mode asks for, rad; cross-track error and distance to the end of the leg, m."""
+    target, gamma, largest = state.target, path_angle(pose["climb"], speed), math.radians(89.0)
+    if state.lateral is Lateral.PHI:
+        return target.phi, 0.0, 0.0
+    if state.lateral is Lateral.HEADING:
+        return bank_for(course_acceleration(target.heading, pose["psi"], speed, params.k_chi), gamma, largest), 0.0, 0.0
+    v_north, v_east = pose["v_north"], pose["v_east"]
+    course, ground_speed = math.atan2(v_east, v_north), max(math.hypot(v_north, v_east), 1.0)
+    if state.lateral is Lateral.COURSE:
+        return bank_for(course_acceleration(target.course, course, ground_speed, params.k_chi), gamma, largest), 0.0, 0.0
+    position, following = (pose["north"], pose["east"]), None
+    leg: Leg = Arc((target.north, target.east), target.radius)
+    if state.lateral is Lateral.ROUTE and route is not None:
+        leg = route.legs[state.leg]
+        following = route.legs[state.leg + 1] if leg.end is not None else None
+    error = path.error(leg, position)
+    if following is not None:
+        error = error._replace(curvature=_anticipated(error.curvature, leg, following, pose, ground_speed, params))
+    acceleration = path_acceleration(error, course, ground_speed, params.path)
+    return bank_for(acceleration, gamma, largest), error.e, path.to_go(leg, position)
+
+
+def _anticipated(
+    curvature: float, leg: Leg, following: Leg, pose: Mapping[str, float], ground_speed: float, params: GuidanceParams
+) -> float:
+    """Curvature of the following leg as early as the bank lags its command, else that of the leg; 1/m.
+
+    The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp, then the loop of the bank.
+    """
+    entry = path.error(following, leg.end or (0.0, 0.0)).curvature
+    banks = (math.atan(ground_speed**2 * each / GRAVITY) for each in (entry, -curvature))
+    lag = abs(sum(banks)) / (2.0 * params.attitude.roll_rate) + 0.5 / params.attitude.k_phi
+    ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
+    return entry if path.passed(leg, ahead) else curvature
+
+
+def _climb(
+    state: GuidanceState, pose: Mapping[str, float], speed: float, dt: float, params: GuidanceParams
+) -> tuple[float, bool]:
+    """Commanded climb rate, m/s, and whether protection limits it."""
+    if state.vertical is Vertical.THETA:
+        return pose["climb"], False  # from here the other modes start
+    vertical, target = params.vertical, state.target
+    wanted = target.climb if state.vertical is Vertical.CLIMB else climb_for(target.altitude - pose["altitude"], vertical)
+    largest = protection.climb_limit(vertical.climb, vertical.sink, speed, params.limits.floor)
+    return slewed(state.climb_c, min(wanted, largest), vertical.acceleration, dt), wanted > largest

@@ -1,0 +1,215 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of guidance. What is left out follows by rule from the reference model, the throttle and the speeds."""
+
+import math
+from collections.abc import Sequence
+from itertools import repeat, starmap
+from typing import Annotated, Self
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from flight_core.parameters import (
+    KeyedParameters,
+    Names,
+    NonNegative,
+    Numbers,
+    Parameters,
+    Positive,
+    Positives,
+    as_tuple,
+    require,
+    require_length,
+)
+from flight_core.rates import nanoseconds, period_ns
+from flight_core.units import GRAVITY
+from guidance import protection
+from guidance.attitude import AttitudeParams
+from guidance.feasibility import Performance, flyable_legs, speeds
+from guidance.lateral import PathParams, least_period, least_radius
+from guidance.modes import TARGETS, GuidanceParams, Limits, read_target
+from guidance.path import Route, leads
+from guidance.route_file import Waypoint
+from guidance.vertical import VerticalParams
+
+OUTPUTS = ("q", "V", "p", "r")
+FLOOR_FRACTION = 0.8
+"""Speed floor over the trim speed where no stall speed is known."""
+
+STEEPEST = 0.1
+"""Largest climb and sink rate over the trim speed."""
+
+
+class Steps(Parameters):
+    """Commands of one channel of `target`, one after another."""
+
+    start: Annotated[tuple[NonNegative, ...], Field(min_length=1), BeforeValidator(as_tuple)] = Field(description="times, s")
+    value: Numbers = Field(description="values, in the channel's unit")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_length("value", self.value, [f"{start:g} s" for start in self.start])
+        rises = all(later > earlier for earlier, later in zip(self.start, self.start[1:], strict=False))
+        require(rises, "start", list(self.start), "times in rising order")
+        return self
+
+
+class RouteParameters(Parameters):
+    """Waypoints in the local tangent plane of `pose`."""
+
+    north: Numbers = Field(description="m")
+    east: Numbers = Field(description="m")
+    altitude: Numbers = Field(description="m, as `pose` counts it")
+    V: Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(as_tuple)] = Field(
+        default=(), description="airspeed on the way to each waypoint, m/s; the trim speed where left out"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        waypoints = [f"waypoint {k}" for k in range(len(self.north))]
+        for key in ("east", "altitude", *(["V"] if self.V else [])):
+            require_length(key, getattr(self, key), waypoints)
+        return self
+
+
+class GuidanceParameters(KeyedParameters):
+    """All parameters of the guidance node."""
+
+    rate: Annotated[float, Field(ge=1, le=1000)] = Field(default=50.0, description="the rate at which u_m is published, Hz")
+    start_time: float = Field(
+        default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
+    )
+    y_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the rate of y, Hz")
+    outputs: Names = Field(default=OUTPUTS, description="the names of the commands u_m: q, V, p, r in any order")
+    natural_frequency: Positives = Field(description="those of the reference model, one per output, rad/s")
+    speed: Positive = Field(description="the trim speed V0, m/s: airspeed is speed + V")
+    throttle_authority: Annotated[tuple[Positive, ...], BeforeValidator(as_tuple)] = Field(
+        default=(), description="deceleration and acceleration of full throttle down and up from trim, m/s^2"
+    )
+    stall_speed: Positive | None = Field(
+        default=None, description="V_s, m/s, true airspeed; none: the speed floor 1.15 V_s is 0.8 V0"
+    )
+    wind: NonNegative = Field(default=0.0, description="the largest wind to be met, m/s")
+
+    bank: Annotated[float, Field(gt=0, le=math.radians(60.0))] = Field(
+        default=math.radians(30.0), description="largest bank phi_max, rad"
+    )
+    roll_rate: Positive = Field(default=0.15, description="largest rate of the bank p_max, rad/s")
+    load: Positive = Field(default=0.3, description="largest change of the load factor by pitch, 1")
+    pitch: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
+        default=(math.radians(-15.0), math.radians(25.0)), description="least and largest pitch, rad"
+    )
+    climb: Positive | None = Field(default=None, description="largest climb rate, m/s; none: by the throttle's authority")
+    sink: Positive | None = Field(default=None, description="largest sink rate, m/s; none: by the throttle's authority")
+    acceleration: Positive = Field(default=1.0, description="permitted vertical acceleration, m/s^2")
+    altitude_gain: Positive = Field(default=0.2, description="k_h, climb rate per altitude error, 1/s")
+    alpha_time: Positive = Field(default=2.0, description="time constant of the estimated angle of attack, s")
+    sideslip_gain: NonNegative = Field(default=0.5, description="k_beta, 1/s, used where `pose` has beta")
+    period: Positive | None = Field(default=None, description="period of path following, s; none: the least one by rule")
+    damping: Annotated[float, Field(ge=0.5, le=1.0)] = Field(default=0.75, description="damping of path following, 1")
+    capture: Annotated[float, Field(gt=0, le=math.pi / 4.0)] = Field(
+        default=math.radians(30.0), description="largest angle at which a path is approached, rad"
+    )
+    radius: Positive | None = Field(default=None, description="radius of fillets and of the last orbit, m; none: by rule")
+    max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(default=0.2, description="the age at which y and pose are stale, s")
+    hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
+        default=10.0, description="how long the attitude is known by dead reckoning when pose is stale, s"
+    )
+    program: dict[str, Steps] = Field(default={}, description="targets over flight time by channel")
+    route: RouteParameters | None = Field(default=None, description="the route, flown from the start on")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        period_ns(self.rate, "rate")
+        require(sorted(self.outputs) == sorted(OUTPUTS), "outputs", ", ".join(self.outputs), ", ".join(OUTPUTS))
+        require_length("natural_frequency", self.natural_frequency, self.outputs)
+        if self.throttle_authority:
+            require(len(self.throttle_authority) == 2, "throttle_authority", self.throttle_authority, "two: down and up")
+        require(self.pitch[0] < self.pitch[1], "pitch", list(self.pitch), "the least before the largest")
+        if self.lockstep:
+            require(self.y_rate > 0, "y_rate", "0 Hz", "the rate of y in lockstep")
+            divides = period_ns(self.rate, "rate") % period_ns(self.y_rate, "y_rate") == 0
+            require(divides, "rate", f"{self.rate:g} Hz", f"a whole fraction of y_rate ({self.y_rate:g} Hz)")
+        floor = self._floor()
+        require(floor < self.speed, "stall_speed", f"{self.stall_speed} m/s", f"a floor of 1.15 V_s below {self.speed:g} m/s")
+        least = math.ceil(self.least_period() * 10.0) / 10.0
+        fits = self.period is None or self.period >= least
+        rule = f"at least {least:g} s: max(14 s, 1.5 V0 / (g tan(bank)), 7 bank / roll_rate)"
+        require(fits, "period", f"{self.period} s", rule)
+        params = self.params()
+        for start, target in self.program_steps():
+            read_target(target, params, f"program at {start:g} s")
+        if self.route is not None:
+            self.plan(self.waypoints())
+        return self
+
+    def _floor(self) -> float:
+        return FLOOR_FRACTION * self.speed if self.stall_speed is None else protection.speed_floor(self.stall_speed)
+
+    def least_period(self) -> float:
+        """Least period of path following, s."""
+        return least_period(self.speed, self.bank, self.roll_rate)
+
+    def least_radius(self) -> float:
+        """Least radius of fillets and orbits, m."""
+        return least_radius(self.speed, self.wind, self.bank)
+
+    def climb_limits(self) -> tuple[float, float]:
+        """Largest climb and sink rate, m/s: 0.4 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0."""
+        down, up = self.throttle_authority or (math.inf, math.inf)
+        steepest, lift = STEEPEST * self.speed, self.speed / GRAVITY
+        return self.climb or min(0.4 * up * lift, steepest), self.sink or min(0.5 * down * lift, steepest)
+
+    def params(self) -> GuidanceParams:
+        """The numbers of the equations."""
+        frequency = dict(zip(self.outputs, self.natural_frequency, strict=True))
+        floor, (climb, sink) = self._floor(), self.climb_limits()
+        roll, pitch = frequency["p"] / 4.0, frequency["q"] / 4.0
+        turn = GRAVITY * math.tan(self.bank) / self.speed
+        slew = {
+            "p": frequency["p"] * self.roll_rate,
+            "q": frequency["q"] * (self.load * GRAVITY / self.speed + turn * math.sin(self.bank)),
+            "r": frequency["r"] * turn,
+            "V": 0.25 * frequency["V"],
+        }
+        return GuidanceParams(
+            outputs=self.outputs,
+            period_ns=period_ns(self.rate, "rate"),
+            speed=self.speed,
+            k_chi=roll / 3.5,
+            attitude=AttitudeParams(roll, pitch, self.roll_rate, self.load, 20.0, self.sideslip_gain),
+            vertical=VerticalParams(self.altitude_gain, self.acceleration, climb, sink, self.alpha_time),
+            path=PathParams(self.period or self.least_period(), self.damping, self.capture),
+            limits=Limits(self.bank, self.pitch[0], self.pitch[1], floor, floor / protection.FLOOR, self.least_radius()),
+            slew=tuple(slew[name] for name in self.outputs),
+            max_age_ns=nanoseconds(self.max_age),
+            hold_ns=nanoseconds(self.hold),
+        )
+
+    def waypoints(self) -> tuple[Waypoint, ...]:
+        """The waypoints of the section's route; none without one."""
+        route = self.route
+        if route is None:
+            return ()
+        return tuple(starmap(Waypoint, zip(route.north, route.east, route.altitude, route.V or repeat(None), strict=False)))
+
+    def plan(self, waypoints: Sequence[Waypoint]) -> Route:
+        """Legs through waypoints. Raises ParameterError for a route that cannot be flown."""
+        floor, (climb, sink) = self._floor(), self.climb_limits()
+        stall, flown = floor / protection.FLOOR, speeds(waypoints, self.speed)
+        can = Performance(self.speed, stall, self.bank, self.roll_rate, climb, sink, self.wind)
+        banks = [protection.bank_limit(self.bank, stall, max(speed, floor)) for speed in flown]
+        radius = max(least_radius(speed, self.wind, bank) for speed, bank in zip(flown, banks, strict=True))
+        legs = flyable_legs(waypoints, self.radius or math.ceil(radius), self.period or self.least_period(), can)
+        numbers = leads(legs)
+        return Route(legs, tuple(waypoints[k].altitude for k in numbers), tuple(flown[k] for k in numbers))
+
+    def program_steps(self) -> list[tuple[float, dict[str, float]]]:
+        """The targets of the program by instant, in order: (s, {channel: value})."""
+        for name in self.program:
+            require(name in TARGETS, f"program.{name}", "a channel", f"one of {', '.join(TARGETS)}")
+        steps: dict[float, dict[str, float]] = {}
+        for name, section in self.program.items():
+            for start, value in zip(section.start, section.value, strict=True):
+                steps.setdefault(start, {})[name] = value
+        return sorted(steps.items())

@@ -1,0 +1,238 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Guided flights in one process: holds, routes, protection, failsafe, refusals, and the log from which each step follows."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flight_analysis.closed_loop.scenario import Scenario, guidance_by_rule, load_scenario, scenario_yaml
+from flight_analysis.closed_loop.simulate import simulate
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError
+from flight_core.rates import nanoseconds
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from guidance import guidance, modes
+from guidance.guidance import Guidance
+from guidance.modes import Mode, Vertical
+from guidance.params import GuidanceParameters
+
+ROUTE = find_scenario("osprey_route")
+SECTION: dict[str, Any] = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0, "throttle_authority": [3.0, 3.0]}
+MS = 1_000_000  # ns
+LEVEL = (0.1, 0.05, 0.3, 0.0, 0.0, 100.0, 25.0 * math.cos(0.3), 25.0 * math.sin(0.3), 0.0, 0.0)  # a bank of 0.1 rad
+
+
+def calm(duration: float, **section: Any) -> Scenario:
+    """The osprey in calm air without noise, with a section of guidance, in larger steps than the scenario's."""
+    return ROUTE.vary(
+        flight={"duration": duration},
+        aircraft={"rate": 100.0, "step": 0.005, "wind": [0.0, 0.0], "turbulence": None, "sensors": {}},
+        reference_model={"rate": 100.0},
+        guidance={"route": None, "wind": 0.0} | section,
+    )
+
+
+def program(**channels: float) -> dict[str, Any]:
+    """Commands from 1 s on."""
+    return {name: {"start": [1.0], "value": [value]} for name, value in channels.items()}
+
+
+def channels(signal: Signal, *names: str) -> tuple[FloatArray, ...]:
+    return tuple(signal[name] for name in names)
+
+
+def after(tape: Tape, seconds: float) -> FloatArray:
+    return np.asarray(tape.time("guidance") > seconds)
+
+
+def test_a_heading_an_altitude_and_an_airspeed_are_reached_and_held() -> None:
+    tape = simulate(calm(45.0, program=program(heading=math.pi / 2.0, altitude=20.0, V=27.0)))
+    psi, altitude, V, phi = channels(tape["guidance"], "pose.psi", "pose.altitude", "y.V", "pose.phi")
+    end = after(tape, 40.0)
+    assert np.degrees(np.abs(psi[end] - math.pi / 2.0).max()) < 1.0
+    assert np.abs(altitude[end] - 20.0).max() < 0.5
+    assert np.abs(V[end] - 2.0).max() < 0.1
+    # The acceptance of a turn by 90 deg and of a climb: at most 2 and 3 % beyond.
+    assert np.degrees(psi.max()) < 91.8
+    assert altitude.max() < 20.6
+    assert np.degrees(np.abs(phi).max()) < 32.0  # the limit of 30 deg, and 2
+
+
+def test_a_short_route_is_flown_leg_by_leg_and_ends_in_an_orbit() -> None:
+    points = {"north": [0.0, 400.0, 400.0], "east": [0.0, 0.0, 400.0], "altitude": [0.0, 0.0, 10.0]}
+    tape = simulate(calm(60.0, route=points))
+    leg, xtrack, altitude = channels(tape["guidance"], "leg", "xtrack", "pose.altitude")
+    assert np.unique(leg).tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert (np.diff(leg) >= 0.0).all()
+    assert np.abs(xtrack[leg < 3.0]).max() < 0.35 * 25.0  # 0.35 s of flight, the acceptance of a route in calm air
+    assert altitude[-1] == pytest.approx(10.0, abs=1.0)
+
+
+def test_each_step_follows_from_the_log_to_the_last_bit() -> None:
+    scenario = calm(8.0, program=program(course=1.0, climb=1.0))
+    signal, section = simulate(scenario)["guidance"], scenario.guidance
+    assert section is not None
+    params, state = section.params(), None
+    for stamp_ns, values in zip(signal.stamp_ns.tolist(), signal.values, strict=True):
+        inputs, logged = guidance.restored(stamp_ns, dict(zip(signal.names, values.tolist(), strict=True)), params.outputs)
+        state, commands = modes.step(state, inputs, None, params)
+        assert guidance.row(inputs, state, commands, None).tobytes() == values.tobytes()
+        assert state == logged
+        state = logged
+
+
+def flying(**section: Any) -> Guidance:
+    """Guidance after its first step, in a bank of 0.1 rad to the right."""
+    made = Guidance(GuidanceParameters.validate_mapping(SECTION | section, "guidance"))
+    made.take_pose(StampedVector(0, np.array(LEVEL)), 0)
+    made.take_y(StampedVector(0, np.zeros(4)), 0)
+    assert made.step(0, 0) is not None
+    return made
+
+
+def run(made: Guidance, first: int, last: int, rates: FloatArray | None = None) -> Signal:
+    """The log of steps with y alone; `rates` None: p and q of y follow u_m at once."""
+    stamps, rows, y = [], [], np.zeros(4)
+    for k in range(first, last):
+        made.take_y(StampedVector(20 * MS * k, y if rates is None else rates), 20 * MS * k)
+        output = made.step(20 * MS * k, 20 * MS * k)
+        assert output is not None
+        stamps.append(20 * MS * k)
+        rows.append(output.log)
+        y = output.u_m[:4]
+    return Signal(np.array(stamps), made.names, np.array(rows))
+
+
+def test_a_stale_pose_levels_the_wings_by_dead_reckoning_then_stops_all_rates() -> None:
+    made = flying(hold=4.0)
+    signal = run(made, 1, 300)
+    mode, phi = signal["mode"], signal["state.phi"]
+    assert mode[8] == Mode.ENGAGED  # 0.18 s
+    assert mode[10] == Mode.DEAD_RECKONING
+    assert abs(math.degrees(phi[200])) < 1.0  # 4 s
+    assert mode[-1] == Mode.POSE_LOST
+    assert signal["u_m.p"][-1] == signal["u_m.q"][-1] == signal["u_m.r"][-1] == 0.0
+    made.take_pose(StampedVector(6000 * MS, np.array(LEVEL)), 6000 * MS)
+    made.take_y(StampedVector(6000 * MS, np.zeros(4)), 6000 * MS)
+    assert made.step(6000 * MS, 6000 * MS) is not None
+    state = made.state
+    assert state is not None
+    assert (state.lateral, state.target.phi) == (modes.Lateral.PHI, 0.0)
+    assert (state.vertical, state.target.altitude) == (Vertical.ALTITUDE, 100.0)
+
+
+def test_without_fresh_y_there_is_no_command_and_a_frozen_pose_is_refused() -> None:
+    made = flying()
+    assert made.step(400 * MS, 400 * MS) is None
+    with pytest.raises(ChannelError, match="sample: stamp 0 s before the last one"):
+        made.take_pose(StampedVector(0, np.array(LEVEL)), 400 * MS)
+
+
+def test_a_new_command_continues_the_climb_rate_and_bounds_the_slew_of_u_m() -> None:
+    made = flying()
+    made.take_target({"phi": 0.5, "climb": 2.0})
+    signal = run(made, 1, 100, np.zeros(4))
+    section = GuidanceParameters.validate_mapping(SECTION, "guidance")
+    for name, rate in zip(section.outputs, section.params().slew, strict=True):
+        assert np.abs(np.diff(signal[f"u_m.{name}"])).max() <= 0.02 * rate * (1.0 + 1e-9)
+    assert np.diff(signal["climb_c"]).max() <= 0.02 * section.acceleration * (1.0 + 1e-9)
+    made.take_target({"theta": 0.0})
+    made.take_target({"altitude": 150.0})  # of one instant: the last vertical command acts
+    assert run(made, 100, 101)["mode.vertical"][0] == Vertical.ALTITUDE
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"pitch": 0.1}, "target: found pitch, expected some of phi, heading"),
+        ({"phi": 0.1, "heading": 0.1}, "expected one lateral and one vertical command at most"),
+        ({"north": 0.0, "east": 0.0}, "expected north, east and radius of an orbit together"),
+        ({"phi": 1.0}, r"target.phi: found 1, expected -0.523599 to 0.523599"),
+        ({"V": 10.0}, "target.V: found 10, expected 20 to inf"),
+        ({"north": 0.0, "east": 0.0, "radius": -20.0}, "target.radius: found -20 m, expected at least 144 m either way"),
+        ({"leg": 0.0}, "target.leg: found no route, expected one"),
+    ],
+)
+def test_a_command_that_cannot_be_flown_is_refused_and_changes_nothing(values: dict[str, float], sentence: str) -> None:
+    made = flying()
+    with pytest.raises(ChannelError, match=sentence):
+        made.take_target(values)
+    assert run(made, 1, 2)["given"][0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("section", "sentence"),
+    [
+        ({"period": 15.0}, r"guidance.period: found 15.0 s, expected at least 24.5 s: max\(14 s"),
+        ({"outputs": ["q", "V", "p"]}, r"guidance.outputs: found q, V, p, expected q, V, p, r"),
+        ({"stall_speed": 24.0}, r"guidance.stall_speed: found 24.0 m/s, expected a floor of 1.15 V_s below 25 m/s"),
+        ({"program": program(bank=0.1)}, r"guidance.program.bank: found a channel, expected one of phi"),
+        ({"program": program(phi=0.9)}, r"guidance.program at 1 s.phi: found 0.9, expected -0.5"),
+        ({"program": {"phi": {"start": [1.0, 1.0], "value": [0.1, 0.2]}}}, "expected times in rising order"),
+        ({"route": {"north": [0.0], "east": [0.0, 1.0], "altitude": [0.0]}}, "guidance.route.east: found 2 values, expected 1"),
+        ({"pitch": [0.2, 0.1]}, "guidance.pitch: found .* expected the least before the largest"),
+        ({"lockstep": True}, "guidance.y_rate: found 0 Hz, expected the rate of y in lockstep"),
+    ],
+)
+def test_parameters_that_cannot_be_flown_are_refused(section: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        GuidanceParameters.validate_mapping(SECTION | section, "guidance")
+
+
+def test_the_numbers_that_are_left_out_follow_from_the_other_sections() -> None:
+    section = ROUTE.guidance
+    assert section is not None
+    assert (section.speed, section.natural_frequency) == (25.0, (4.0, 1.2, 5.0, 4.0))
+    assert section.throttle_authority == pytest.approx((3.0, 3.0), rel=1e-3)  # 6 m/s^2 a unit of thrust, +-0.5
+    params = section.params()
+    assert (params.attitude.k_phi, params.attitude.k_theta, params.limits.floor) == (1.25, 1.0, 20.0)
+    assert (params.vertical.climb, params.path.period) == (2.5, section.least_period())
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"aircraft": {"kinematics": "linear"}}, "aircraft.kinematics: found 'linear' beside guidance, expected euler"),
+        ({"reference_model": {"live": {}}}, "reference_model.live.speed: found none beside guidance"),
+        (
+            {"guidance": {"speed": 30.0, "route": None}},
+            "guidance.speed: found 30.0, expected 25.0, as the other sections have it",
+        ),
+        ({"guidance": {"rate": 40.0}}, r"guidance.rate: found 40 Hz, expected a whole fraction of the rate of pose \(50 Hz\)"),
+    ],
+)
+def test_sections_that_do_not_fit_guidance_are_refused(changes: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        ROUTE.vary(**changes)
+
+
+def test_a_linear_reference_is_refused() -> None:
+    names = ["q", "V", "p", "r"]
+    linear = {"states": names, "A_m": (-np.eye(4)).ravel().tolist(), "B_m": np.eye(4).ravel().tolist()}
+    with pytest.raises(ParameterError, match=r"reference_model.second_order: found linear, expected second_order"):
+        ROUTE.vary(reference_model={"second_order": None, "linear": linear, "live": {}})
+
+
+def test_an_airframe_of_one_plane_is_refused() -> None:
+    controller = {"outputs": ["p", "r"], "inputs": ["aileron", "rudder"]}
+    lateral = {"aircraft": {"airframe": "b747_lateral"}, "reference_model": {"outputs": ["p", "r"]}, "controller": controller}
+    sections = {name: getattr(ROUTE, name).model_copy(update=changes) for name, changes in lateral.items()}
+    with pytest.raises(ParameterError, match="guidance: found an aircraft without q, V, expected one with q, V, p, r"):
+        guidance_by_rule(sections["aircraft"], sections["reference_model"], sections["controller"])
+
+
+def test_a_scenario_with_guidance_is_restored_from_its_parameters(tmp_path: Any) -> None:
+    path = tmp_path / "again.yaml"
+    path.write_text(scenario_yaml(ROUTE), encoding="utf-8")
+    assert load_scenario(path).guidance == ROUTE.guidance
+    assert find_scenario("osprey_gust").guidance is None
+
+
+def test_every_step_of_a_guided_flight_has_a_command_from_t_0_on() -> None:
+    tape = simulate(calm(1.0))
+    assert tape["u_m"].stamp_ns.tolist() == [nanoseconds(0.02 * k) for k in range(51)]
+    assert tape["u_m"].names == ("q", "V", "p", "r", "phi", "theta")
