@@ -37,7 +37,7 @@ IMPORTS: dict[str, set[str]] = {
         "flight_core", "flight_log", "reference_model", "rise_di_controller",
     },
     "flight_analysis.report": {
-        "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core", "flight_log",
+        "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core", "flight_log", "guidance",
         "rise_di_controller",
     },
     "flight_campaign": {

@@ -12,7 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
-from flight_analysis.report import comparison, figures, plotting, tables
+from flight_analysis.report import comparison, figures, guided_figures, plotting, tables
 from flight_analysis.report.plotting import SampleStore, pack
 from flight_analysis.report.summary import INPUT_COLUMNS, RecordedFlight, display_units, format_value, parts_legend
 from flight_core.outcome import COMPLETED
@@ -113,6 +113,7 @@ def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Sec
     run, colour = (flight.tape, flight.period_ns), figures.PLANT
     spectrum = figures.spectrum_figure({"u": run}, {"u": colour}, context.units)
     return [
+        *_guidance_sections(flight, context),
         Section("Output y over the reference y_m", "", figures.tracking_figure(context)),
         Section(
             "Tracking error e = y - y_m",
@@ -139,6 +140,28 @@ def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Sec
             figures.tick_figure(context),
         ),
         Section("Timing of the ticks", "", figures.timing_figure({"": run}, {"": colour}), over_time=False),
+    ]
+
+
+def _guidance_sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Section]:
+    if flight.summary["guidance"] is None:
+        return []
+    speed, bounds = flight.scenario.aircraft.channels().speed, guided_figures.bounds_of(flight.scenario)
+    route, context = guided_figures.flown_route(flight.scenario, flight.tape), guided_figures.guided_context(context)
+    return [
+        Section(
+            "Ground track",
+            "Arrows: mean wind over a part of the flight, from the velocities over ground and through the air.",
+            guided_figures.track_figure(flight.tape, route, speed),
+            over_time=False,
+        ),
+        Section(
+            "Altitude and airspeed over their commands",
+            "Shaded: beyond the limits of the commands.",
+            guided_figures.vertical_figure(context, speed, bounds),
+        ),
+        Section("Attitude over its commands", "", guided_figures.attitude_figure(context, bounds)),
+        Section("Cross-track error", "positive to the right", guided_figures.cross_track_figure(context)),
     ]
 
 

@@ -27,6 +27,7 @@ from flight_analysis.metrics import (
     sign_switches,
     tick_metrics,
 )
+from flight_analysis.report.guided import UNITS, guidance_summary
 from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape
@@ -43,6 +44,12 @@ class DisplayUnit(NamedTuple):
 
 
 NO_UNIT = DisplayUnit("", 1.0)  # for a channel of unknown unit: its SI value without a unit
+
+
+QUANTITY_UNITS = {
+    name: DisplayUnit("deg", 180.0 / math.pi) if unit == "rad" else DisplayUnit(unit, 1.0) for name, unit in UNITS.items()
+}
+"""Units of the quantities that guidance holds."""
 
 
 def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
@@ -118,6 +125,7 @@ def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
         ],
         "ticks": None if ticks is None or not np.isfinite(ticks).all() else ticks._asdict(),
         "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
+        "guidance": guidance_summary(tape),
         "notes": list(tape.notes),
     }
     return {key: finite_or_null(value) for key, value in summary.items()}
@@ -146,6 +154,7 @@ def empty_summary(scenario: Scenario, outcome: str) -> dict[str, Any]:
         "transients": [],
         "ticks": None,
         "latency": None,
+        "guidance": None,
         "notes": [],
     }
 

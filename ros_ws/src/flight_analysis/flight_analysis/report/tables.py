@@ -8,16 +8,19 @@ from typing import Any, NamedTuple
 
 from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, SETTLING_BAND, SETTLING_DWELL, Windows
 from flight_analysis.report import figures
+from flight_analysis.report.guided import BANDS
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
     NOISE_FLOOR_COLUMN,
+    QUANTITY_UNITS,
     SATURATION_COLUMN,
     SETTLING_COLUMNS,
     SWITCH_COLUMN,
     Column,
     DisplayUnit,
     columns_of,
+    format_value,
     input_rows,
     parts_legend,
     slowest_settling,
@@ -33,6 +36,12 @@ ERROR_LEGEND = (
 )
 NOISE_FLOOR_LEGEND = ". noise floor: of y; a smaller error cannot be distinguished from noise or rounding"
 INPUT_LEGEND = "u about trim; rate: mean abs(u_dot), in the unit of the row per second"
+GUIDANCE_LEGEND = (
+    "a segment has the same modes, commands and leg of the route. overshoot: the largest error beyond the command;"
+    " settling: time until the error stays within "
+    + ", ".join(f"{band * QUANTITY_UNITS[name].factor:g} {QUANTITY_UNITS[name].unit} of {name}" for name, band in BANDS.items())
+    + f" for {SETTLING_DWELL:g} s; both where it begins outside"
+)
 SATURATION_LEGEND = "; saturated: ticks with saturation by magnitude / by rate"
 
 
@@ -92,6 +101,7 @@ def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], 
         _error_table(summary, units),
         Table("Inputs", inputs, input_rows(summary, units), INPUT_LEGEND + SATURATION_LEGEND),
         Table("Events", times, [(one.name, f"{one.start:.2f}", f"{one.stop:.2f}", one.extent) for one in event_list]),
+        _guidance_table(summary),
         _tick_table(summary),
     )
     return [table for table in tables if table.rows]
@@ -99,13 +109,33 @@ def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], 
 
 def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
     columns = columns_of((*ERROR_COLUMNS, NOISE_FLOOR_COLUMN, SWITCH_COLUMN), summary["errors"])
+    settling = [kind for kind in SETTLING_COLUMNS if any(kind in metrics for metrics in summary["errors"].values())]
     rows = [
-        [*row, *(slowest_settling(summary, channel, kind) for kind in SETTLING_COLUMNS)]
+        [*row, *(slowest_settling(summary, channel, kind) for kind in settling)]
         for channel, row in zip(summary["errors"], table_rows(summary["errors"], columns, units), strict=True)
     ]
     caption = f"Tracking error ({summary['error']})"
     legend = f"{parts_legend(summary)}. {ERROR_LEGEND}{NOISE_FLOOR_LEGEND}"
-    return Table(caption, (*columns, *SETTLING_COLUMNS.values()), rows, legend)
+    return Table(caption, (*columns, *(SETTLING_COLUMNS[kind] for kind in settling)), rows, legend)
+
+
+def _guidance_table(summary: Mapping[str, Any]) -> Table:
+    guidance = summary["guidance"] or {"segments": ()}
+    held = ("rms", "max", "overshoot", "settling")
+    columns = [Column("", head) for head in ("from (s)", "to (s)")]
+    for group in ("lateral", "vertical"):
+        columns += [Column(group, head) for head in ("held", *held[:-1], "settling (s)")]
+    columns += [Column("V (m/s)", head) for head in held[:2]]
+    rows = []
+    for one in guidance["segments"]:
+        name = one["lateral"]["quantity"] if one["leg"] is None else f"leg {one['leg']}"
+        row = [name, f"{one['start']:.1f}", f"{one['stop']:.1f}"]
+        for quantity in (one["lateral"], one["vertical"]):
+            unit, factor = QUANTITY_UNITS[quantity["quantity"]]
+            factors = (factor, factor, factor, 1.0)
+            row += [f"{quantity['quantity']} ({unit})", *map(format_value, (quantity[name] for name in held), factors)]
+        rows.append([*row, *(format_value(one["V"][name]) for name in held[:2])])
+    return Table("Guidance by segment", columns, rows, GUIDANCE_LEGEND if rows else "")
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:

@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of merit of a guided flight: its segments, by mode and leg, with the errors of what each of them holds."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight_analysis.metrics import SETTLING_DWELL, error_metrics, settling_time
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
+from guidance.modes import TARGETS, Lateral, Vertical
+
+UNITS: Mapping[str, str] = {
+    **dict.fromkeys(("phi", "theta", "heading", "course"), "rad"),
+    **dict.fromkeys(("xtrack", "altitude"), "m"),
+    **dict.fromkeys(("climb", "V"), "m/s"),
+}
+"""SI unit by quantity that guidance holds."""
+
+BANDS: Mapping[str, float] = {
+    **dict.fromkeys(("phi", "theta"), math.radians(1.0)),
+    **dict.fromkeys(("heading", "course"), math.radians(2.0)),
+    **dict.fromkeys(("xtrack", "altitude"), 5.0),
+    "climb": 0.5,
+    "V": 1.0,
+}
+"""Half-width of the settling band by quantity, rad, m, m/s."""
+
+
+class Held(NamedTuple):
+    """How well a quantity is held over a segment, in SI. A segment that begins outside the band has overshoot and settling."""
+
+    quantity: str
+    rms: float
+    max: float
+    overshoot: float | None  # largest error on the other side of the command
+    settling: float | None  # s from the start of the segment; None: not settled by its end
+
+
+class Segment(NamedTuple):
+    """A part of the flight with the same modes, commands and leg."""
+
+    start: float  # s
+    stop: float  # s
+    leg: int | None  # number of the leg of a route, from 1
+    lateral: Held
+    vertical: Held
+    V: Held
+
+
+def segments(tape: Tape) -> list[Segment]:
+    """The segments of a guided flight, from `guidance`. Commands less than SETTLING_DWELL apart begin one segment."""
+    t, errors = tape.time("guidance"), control_errors(tape)
+    log = tape["guidance"]
+    named = ["mode.lateral", "mode.vertical", "leg", *(f"target.{name}" for name in TARGETS)]
+    changes = np.any(np.diff(np.column_stack([log[name] for name in named]), axis=0) != 0.0, axis=1)
+    starts = [0]
+    for k in np.flatnonzero(changes) + 1:
+        if t[k] - t[starts[-1]] >= SETTLING_DWELL:
+            starts.append(int(k))
+    found = []
+    for first, after in zip(starts, [*starts[1:], len(t)], strict=True):
+        last = after - 1  # its modes and commands are those that the segment ends with
+        lateral, vertical = Lateral(int(log["mode.lateral"][last])), Vertical(int(log["mode.vertical"][last]))
+        on_path = "xtrack" if lateral in {Lateral.ORBIT, Lateral.ROUTE} else lateral.name.lower()
+        quantities = (on_path, vertical.name.lower(), "V")
+        held = [_held(name, t[first:after], errors[name][first:after]) for name in quantities]
+        leg = int(log["leg"][last]) + 1 if lateral is Lateral.ROUTE else None
+        found.append(Segment(float(t[first]), float(t[min(after, len(t) - 1)]), leg, *held))
+    return found
+
+
+def control_errors(tape: Tape) -> dict[str, FloatArray]:
+    """Error of each quantity that guidance can hold, measured less commanded, at the samples of `guidance`, shape (N,).
+
+    The cross-track error is that of the log, positive to the right. Angles are within half a turn.
+    """
+    log, pose = tape["guidance"], tape["guidance"].group("pose")
+    measured = {
+        "phi": pose["phi"],
+        "heading": pose["psi"],
+        "course": np.arctan2(pose["v_east"], pose["v_north"]),
+        "theta": pose["theta"],
+        "climb": pose["climb"],
+        "altitude": pose["altitude"],
+    }
+    errors = {name: values - log[f"target.{name}"] for name, values in measured.items()}
+    for name in (name for name in errors if UNITS[name] == "rad"):
+        errors[name] = np.remainder(errors[name] + math.pi, 2.0 * math.pi) - math.pi
+    # V of y is a deviation from the trim speed V0, and so is that of u_m: V_c - V0.
+    return errors | {"xtrack": log["xtrack"], "V": log["y.V"] - log["u_m.V"]}
+
+
+def _held(quantity: str, t: FloatArray, error: FloatArray) -> Held:
+    metrics, first = error_metrics(error), float(error[0])
+    if abs(first) <= BANDS[quantity]:
+        return Held(quantity, *metrics, None, None)
+    beyond = float(np.max(-error * math.copysign(1.0, first), initial=0.0))
+    return Held(quantity, *metrics, beyond, settling_time(t, error, BANDS[quantity], math.inf))
+
+
+def guidance_summary(tape: Tape) -> dict[str, Any] | None:
+    """The figures of a guided flight as `summary.json` holds them, SI; None for a flight without guidance."""
+    if "guidance" not in tape or len(tape["guidance"].stamp_ns) == 0:
+        return None
+    log = tape["guidance"]
+    limited = log.group("limited")
+    return {
+        "segments": [
+            one._asdict() | {name: getattr(one, name)._asdict() for name in ("lateral", "vertical", "V")}
+            for one in segments(tape)
+        ],
+        "bank": _largest(log["pose.phi"]),
+        "age_pose": _largest(log["age.pose"]),
+        "limited": {name: float(np.mean(limited[name] != 0.0)) for name in limited.names},
+    }
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    return float(np.max(np.abs(values)))

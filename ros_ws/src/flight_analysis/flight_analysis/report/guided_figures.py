@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of a guided flight: ground track, altitude, airspeed and attitude over their commands, cross-track error."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import plotly.graph_objects as go
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.metrics import mask_spans
+from flight_analysis.report.figures import END_STOP, ERROR, MODE_COLOURS, PLANT, REFERENCE, WIND
+from flight_analysis.report.plotting import INTERVAL_OPACITY, Curve, Interval, PlotContext, set_layout, time_series_figure
+from flight_analysis.report.summary import QUANTITY_UNITS
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
+from guidance.guidance import digest
+from guidance.modes import Lateral, Mode, Vertical
+from guidance.path import Arc, Route, course_of
+from rise_di_controller import guard
+
+TRACK_POINTS = 2400
+TRACK_HEIGHT = 560  # pixels
+WIND_ARROWS = 8
+ARROW_PIXELS = 45.0  # of the strongest wind
+LEAST_WIND = 0.3  # m/s, below which no arrow is drawn
+ARC_STEP = math.radians(5.0)
+MODE_SHADES = {Mode.DEAD_RECKONING: MODE_COLOURS[guard.Mode.HOLD], Mode.POSE_LOST: MODE_COLOURS[guard.Mode.RAMP]}
+
+Bounds = Mapping[str, tuple[float, float]]  # least and largest command by channel, SI; infinite without a limit
+
+
+def guided_context(context: PlotContext) -> PlotContext:
+    """The context with the units of what guidance holds, and the times at which pose was stale."""
+    t, mode = context.tape.time("guidance"), context.tape["guidance"]["mode"]
+    stale = [
+        Interval(f"guidance: {one.name.lower().replace('_', ' ')}", start, stop, colour, False)
+        for one, colour in MODE_SHADES.items()
+        for start, stop in mask_spans(t, mode == one)
+    ]
+    return context._replace(units=QUANTITY_UNITS, intervals=[*context.intervals, *stale])
+
+
+def bounds_of(scenario: Scenario) -> Bounds:
+    """Limits of the commands of guidance."""
+    if scenario.guidance is None:
+        return {}
+    limits = scenario.guidance.params().limits
+    return {
+        "V": (limits.floor, math.inf),
+        "phi": (-limits.bank, limits.bank),
+        "theta": (limits.least_pitch, limits.largest_pitch),
+    }
+
+
+def flown_route(scenario: Scenario, tape: Tape) -> Route | None:
+    """The route of the scenario, if the log says that it was flown."""
+    waypoints = scenario.guidance.waypoints() if scenario.guidance is not None else ()
+    if scenario.guidance is None or not waypoints:
+        return None
+    route = scenario.guidance.plan(waypoints)
+    return route if np.any(tape["guidance"]["route"] == digest(route)) else None
+
+
+def track_figure(tape: Tape, route: Route | None, speed: float) -> go.Figure:
+    """Ground track over the route with its fillets, equal axes, and arrows of the wind. `speed`: trim speed V0, m/s."""
+    pose = tape["guidance"].group("pose")
+    keep = np.unique(np.linspace(0, len(pose.stamp_ns) - 1, TRACK_POINTS).astype(int))
+    north, east = pose["north"][keep], pose["east"][keep]
+    figure = go.Figure()
+    if route is not None:
+        line = {"color": REFERENCE, "width": 6.0}
+        path_north, path_east = route_points(route)
+        figure.add_trace(go.Scatter(x=path_east, y=path_north, mode="lines", name="route", line=line, hoverinfo="skip"))
+    track = go.Scatter(
+        x=east.astype(np.float32), y=north.astype(np.float32), mode="lines", name="flown", line={"color": PLANT, "width": 1.4}
+    )
+    figure.add_trace(track.update(text=[f"t = {t:.1f} s" for t in tape.time("guidance")[keep]], hoverinfo="x+y+text"))
+    _add_wind(figure, tape, speed)
+    figure.update_xaxes(title_text="east (m)")
+    figure.update_yaxes(title_text="north (m)", scaleanchor="x", scaleratio=1.0)
+    return set_layout(figure, TRACK_HEIGHT, labels=16)
+
+
+def route_points(route: Route) -> tuple[list[float], list[float]]:
+    """North and east along a route, m: ends of lines, and points of arcs at most ARC_STEP apart."""
+    points = [route.legs[0].start] if route.legs and not isinstance(route.legs[0], Arc) else []
+    for leg in route.legs:
+        if not isinstance(leg, Arc):
+            points.append(leg.end)
+            continue
+        side = math.copysign(1.0, leg.radius)
+        begin = course_of(leg.centre, points[-1])
+        turn = 2.0 * math.pi
+        if leg.end is not None:
+            turn = side * (course_of(leg.centre, leg.end) - begin) % (2.0 * math.pi)
+        for angle in np.linspace(0.0, turn, 2 + int(turn / ARC_STEP)):
+            bearing = begin + side * float(angle)
+            points.append(
+                (leg.centre[0] + abs(leg.radius) * math.cos(bearing), leg.centre[1] + abs(leg.radius) * math.sin(bearing))
+            )
+    return [point[0] for point in points], [point[1] for point in points]
+
+
+def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
+    """Mean wind over equal parts of the flight, to the north and to the east, m/s, shape (parts, 2).
+
+    It is the velocity over ground less that through the air, V cos(gamma) along psi + beta, with V = V0 + V of y.
+    """
+    log = tape["guidance"]
+    airspeed, heading = speed + log["y.V"], log["pose.psi"] + log["pose.beta"]
+    level = np.sqrt(np.maximum(airspeed**2 - log["pose.climb"] ** 2, 0.0))
+    through_air = np.column_stack([level * np.cos(heading), level * np.sin(heading)])
+    wind = np.column_stack([log["pose.v_north"], log["pose.v_east"]]) - through_air
+    return np.array([part.mean(axis=0) for part in np.array_split(wind, min(parts, len(wind)))])
+
+
+def _add_wind(figure: go.Figure, tape: Tape, speed: float) -> None:
+    wind = mean_wind(tape, speed)
+    strength = np.hypot(wind[:, 0], wind[:, 1])
+    if (strongest := float(strength.max())) < LEAST_WIND:
+        return
+    pose = tape["guidance"].group("pose")
+    middles = [int(part[len(part) // 2]) for part in np.array_split(np.arange(len(pose.stamp_ns)), len(wind))]
+    for k, (to_north, to_east) in zip(middles, wind * (ARROW_PIXELS / strongest), strict=True):
+        arrow = {"x": pose["east"][k], "y": pose["north"][k], "ax": -to_east, "ay": to_north, "text": ""}  # ay points down
+        figure.add_annotation(**arrow, showarrow=True, arrowhead=2, arrowwidth=1.6, arrowcolor=WIND)
+    label = f"wind, the longest arrow {strongest:.2g} m/s"
+    figure.add_trace(go.Scatter(x=[None], y=[None], mode="lines", name=label, line={"color": WIND}))
+
+
+def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> go.Figure:
+    """Altitude and airspeed over their commands, with the limits of the commands. `speed`: trim speed V0, m/s."""
+    log = context.tape["guidance"]
+    commanded = np.where(log["mode.vertical"] == Vertical.ALTITUDE, log["target.altitude"], np.nan)
+    commands = {"altitude": commanded, "V": log["V_c"]}
+    return _over_commands(context, commands, {"altitude": log["pose.altitude"], "V": speed + log["y.V"]}, bounds)
+
+
+def attitude_figure(context: PlotContext, bounds: Bounds) -> go.Figure:
+    """Bank and pitch over their commands, with the limits of the commands."""
+    log = context.tape["guidance"]
+    names = ("phi", "theta")
+    return _over_commands(
+        context, {name: log[f"{name}_c"] for name in names}, {name: log[f"pose.{name}"] for name in names}, bounds
+    )
+
+
+def cross_track_figure(context: PlotContext) -> go.Figure | None:
+    """Cross-track error while a path is followed, by leg of the route; None for a flight without a path."""
+    log = context.tape["guidance"]
+    lateral = log["mode.lateral"]
+    on_path = np.isin(lateral, [Lateral.ORBIT, Lateral.ROUTE])
+    if not on_path.any():
+        return None
+    error = Curve(_signal(context, {"xtrack": np.where(on_path, log["xtrack"], np.nan)}), ERROR)
+    t, legs = context.tape.time("guidance"), np.where(lateral == Lateral.ROUTE, log["leg"], -1.0)
+    spans = [
+        Interval(f"leg {int(leg) + 1}", *span, END_STOP if leg % 2 else "#ffffff", True)
+        for leg in np.unique(legs[legs >= 0.0])
+        for span in mask_spans(t, legs == leg)
+    ]
+    return time_series_figure(context._replace(intervals=[*context.intervals, *spans]), {"": error})
+
+
+def _signal(context: PlotContext, channels: Mapping[str, FloatArray]) -> Signal:
+    return Signal(context.tape["guidance"].stamp_ns, tuple(channels), np.column_stack(list(channels.values())))
+
+
+def _over_commands(
+    context: PlotContext, commands: Mapping[str, FloatArray], flown: Mapping[str, FloatArray], bounds: Bounds
+) -> go.Figure:
+    curves = {
+        "command": Curve(_signal(context, commands), REFERENCE, 5.0),
+        "flown": Curve(_signal(context, flown), PLANT),
+    }
+    figure = time_series_figure(context, curves)
+    for row, name in enumerate(flown, start=1):
+        factor = context.units[name].factor
+        values = np.concatenate([flown[name], commands[name]]) * factor
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        lower, upper = (bound * factor for bound in bounds.get(name, (-math.inf, math.inf)))
+        low, high = min([low, *filter(math.isfinite, (lower,))]), max([high, *filter(math.isfinite, (upper,))])
+        margin = 0.06 * (high - low) or 1.0
+        view = (low - margin, high + margin)
+        for bound, edge in zip((lower, upper), view, strict=True):
+            if math.isfinite(bound):
+                shape = {"type": "rect", "x0": 0.0, "x1": context.end, "y0": bound, "y1": edge, "layer": "below"}
+                figure.add_shape(**shape, fillcolor=END_STOP, opacity=INTERVAL_OPACITY, line_width=0, row=row, col=1)
+        figure.update_yaxes(range=view, row=row, col=1)
+    return set_layout(figure, 150, labels=16)

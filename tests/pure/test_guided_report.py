@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of merit and plots of a guided flight: a log worked by hand, and the log of a flight."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from numpy.typing import ArrayLike
+from tests.recordings import EPOCH, signal
+
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.metrics import part_masks
+from flight_analysis.report import guided_figures
+from flight_analysis.report.figures import plot_context
+from flight_analysis.report.guided import guidance_summary, segments
+from flight_analysis.report.summary import RecordedFlight, summarise, transients
+from flight_analysis.report.tables import flight_tables
+from flight_bringup.scenarios import find_scenario
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
+from guidance import path
+from guidance.guidance import names
+from guidance.modes import Lateral, Mode, Vertical
+from guidance.path import Arc, Line, Route
+
+T = np.arange(0.0, 40.0, 0.02)  # s
+SPEED = 40.0  # m/s, trim
+
+
+def log(**channels: ArrayLike) -> Tape:
+    """A guided flight of 40 s to the north in steady level flight, except for these channels; `_` stands for a dot."""
+    given = {name.replace("__", "."): value for name, value in channels.items()}
+    level: dict[str, Any] = dict.fromkeys(names(("q", "V", "p", "r")), 0.0) | {
+        "mode": Mode.ENGAGED, "mode.lateral": Lateral.HEADING, "mode.vertical": Vertical.ALTITUDE,
+        "V_c": SPEED, "pose.v_north": SPEED, "pose.north": SPEED * T,
+    }  # fmt: skip
+    assert set(given) <= set(level)
+    return Tape({"guidance": signal((T * 1e3).tolist(), **level | given)}, EPOCH)
+
+
+def near(*values: Any) -> Any:
+    """A tuple of numbers, approximately."""
+    return pytest.approx(values)
+
+
+def after(instant: float, value: float) -> FloatArray:
+    return np.where(instant <= T, value, 0.0)
+
+
+def test_a_segment_ends_where_the_mode_the_command_or_the_leg_changes() -> None:
+    lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
+    found = segments(log(mode__lateral=lateral, leg=after(20.0, 1.0), target__altitude=after(30.0, 50.0)))
+    assert [(one.start, one.stop) for one in found] == [near(0.0, 10.0), near(10.0, 20.0), near(20.0, 30.0), near(30.0, 39.98)]
+    assert [one.leg for one in found] == [None, 1, 2, 2]
+    assert [one.lateral.quantity for one in found] == ["heading", "xtrack", "xtrack", "xtrack"]
+
+
+def test_commands_less_than_a_second_apart_begin_one_segment() -> None:
+    assert len(segments(log(target__heading=after(10.0, 0.5) + after(10.5, 0.1)))) == 2
+
+
+def test_a_step_has_overshoot_and_settling() -> None:
+    # 100 (1 - exp(-t/4) cos(t)) has its first maximum where tan(t) = -1/4, t = pi - atan(1/4) = 2.897 s. It is
+    # 100 exp(-0.724) cos(2.897) = -47.0 beyond the command.
+    t = np.maximum(T - 5.0, 0.0)
+    altitude = 100.0 * (1.0 - np.exp(-t / 4.0) * np.cos(t))
+    step = segments(log(target__altitude=after(5.0, 100.0), pose__altitude=altitude))[1].vertical
+    assert step.quantity == "altitude"
+    assert (step.max, step.overshoot) == pytest.approx((100.0, 47.0), abs=0.1)
+    error = 100.0 * np.exp(-t / 4.0) * np.cos(t)  # the closed form
+    last = T[np.flatnonzero(np.abs(error) * (T >= 5.0) > 5.0)[-1]]
+    assert step.settling == pytest.approx(last + 0.02 - 5.0, abs=1e-6)
+
+
+def test_what_begins_within_its_band_has_no_step() -> None:
+    held = segments(log(pose__altitude=3.0))[0].vertical
+    assert (held.rms, held.max) == near(3.0, 3.0)
+    assert (held.overshoot, held.settling) == (None, None)
+
+
+def test_a_heading_error_is_that_of_the_shorter_side() -> None:
+    held = segments(log(pose__psi=math.radians(-179.0), target__heading=math.radians(179.0)))[0].lateral
+    assert held.max == pytest.approx(math.radians(2.0))
+
+
+def test_the_summary_names_bank_age_and_limited_commands() -> None:
+    tape = log(pose__phi=after(10.0, -0.4), age__pose=after(39.0, 0.3), limited__bank=after(30.0, 1.0))
+    summary = guidance_summary(tape)
+    assert summary is not None
+    assert (summary["bank"], summary["age_pose"]) == (0.4, 0.3)
+    assert summary["limited"]["bank"] == pytest.approx(0.25)
+    assert summary["limited"]["slew"] == 0.0
+    assert guidance_summary(Tape({}, EPOCH)) is None
+    json.dumps(summary)
+
+
+def test_the_wind_follows_from_the_velocities_over_ground_and_through_the_air() -> None:
+    # To the east at 40 m/s through the air, climbing at 4 m/s, 3 m/s faster than trim, in a wind to (1, -6).
+    level = math.sqrt(43.0**2 - 4.0**2)
+    tape = log(
+        pose__psi=1.4, pose__beta=math.pi / 2.0 - 1.4, y__V=3.0, pose__climb=4.0, pose__v_north=1.0, pose__v_east=level - 6.0
+    )
+    assert guided_figures.mean_wind(tape, SPEED, parts=2) == pytest.approx(np.array([[1.0, -6.0]] * 2), abs=1e-9)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_drawn_route_lies_on_its_legs(side: float) -> None:
+    legs = path.route([(0.0, 0.0), (1000.0, 0.0), (1000.0, side * 1000.0)], 200.0, 100.0)
+    north, east = guided_figures.route_points(Route(legs, (0.0,) * 4, (SPEED,) * 4))
+    points = list(zip(north, east, strict=True))
+    assert points[:2] == [(0.0, 0.0), pytest.approx((800.0, 0.0))]
+    for point in points:
+        assert min(abs(path.error(leg, point).e) for leg in legs) < 1e-6
+    # The fillet turns 90 deg, and never the long way round.
+    assert max(math.dist(one, (1000.0, side * 1000.0)) for one in points) < 1500.0
+    assert math.dist(points[-1], (1000.0, side * 1000.0)) == pytest.approx(200.0)
+
+
+def context_of(tape: Tape) -> Any:
+    return guided_figures.guided_context(plot_context(tape, {}, {}))
+
+
+def curve(figure: go.Figure, name: str, row: int) -> FloatArray:
+    axis = "y" if row == 1 else f"y{row}"
+    (trace,) = (one for one in figure.data if one.name == name and one.yaxis == axis)
+    return np.asarray(trace.y, dtype=float)
+
+
+def test_the_ground_track_has_equal_axes_and_arrows_of_the_wind() -> None:
+    figure = guided_figures.track_figure(log(pose__v_east=5.0), None, SPEED)
+    assert (figure.layout.yaxis.scaleanchor, figure.layout.yaxis.scaleratio) == ("x", 1.0)
+    assert [trace.name for trace in figure.data] == ["flown", "wind, the longest arrow 5 m/s"]
+    arrows = figure.layout.annotations
+    assert len(arrows) == guided_figures.WIND_ARROWS
+    assert (arrows[0].ax, arrows[0].ay) == pytest.approx((-guided_figures.ARROW_PIXELS, 0.0), abs=1e-9)  # points to the east
+    assert not guided_figures.track_figure(log(), None, SPEED).layout.annotations
+
+
+def test_commands_and_limits_are_drawn_in_display_units() -> None:
+    tape = log(phi_c=after(10.0, math.radians(20.0)), mode__vertical=np.where(T < 20.0, Vertical.ALTITUDE, Vertical.CLIMB))
+    context, bounds = context_of(tape), {"V": (30.0, math.inf), "phi": (-0.5, 0.5)}
+    attitude = guided_figures.attitude_figure(context, bounds)
+    assert np.max(curve(attitude, "command", 1)) == pytest.approx(20.0)
+    assert sorted((shape.y0, shape.yref) for shape in attitude.layout.shapes) == [
+        (pytest.approx(-math.degrees(0.5)), "y"),
+        (pytest.approx(math.degrees(0.5)), "y"),
+    ]
+    vertical = guided_figures.vertical_figure(context, SPEED, bounds)
+    assert np.isnan(curve(vertical, "command", 1)[-1])  # no altitude is commanded
+    assert [(shape.y0, shape.y1 < 30.0, shape.yref) for shape in vertical.layout.shapes] == [(30.0, True, "y2")]
+    assert curve(vertical, "flown", 2)[0] == SPEED
+
+
+def test_the_cross_track_error_is_drawn_by_leg_where_a_path_is_followed() -> None:
+    assert guided_figures.cross_track_figure(context_of(log())) is None
+    lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
+    figure = guided_figures.cross_track_figure(context_of(log(mode__lateral=lateral, leg=after(20.0, 1.0), xtrack=7.0)))
+    assert figure is not None
+    assert [note.text for note in figure.layout.annotations] == ["leg 1", "leg 2"]
+    assert np.isnan(figure.data[0].y[0])
+    assert figure.data[0].y[-1] == 7.0
+
+
+def test_times_without_a_fresh_pose_are_shaded() -> None:
+    context = context_of(log(mode=np.where((T > 10.0) & (T < 20.0), Mode.DEAD_RECKONING, Mode.ENGAGED)))
+    (interval,) = context.intervals
+    assert (interval.label, interval.start, interval.stop) == (
+        "guidance: dead reckoning",
+        pytest.approx(10.02),
+        pytest.approx(20.0),
+    )
+
+
+@pytest.fixture(scope="module")
+def flight() -> RecordedFlight:
+    """The first seconds of the route of the osprey: a capture."""
+    scenario = find_scenario("osprey_route").vary(flight={"duration": 4.0})
+    tape = simulate(scenario)
+    return RecordedFlight("osprey_route", scenario, tape, summarise(scenario, tape, tape.outcome))
+
+
+def test_the_figures_of_a_flight_are_those_of_its_scenario(flight: RecordedFlight) -> None:
+    route = guided_figures.flown_route(flight.scenario, flight.tape)
+    assert route is not None
+    assert isinstance(route.legs[0], Line)
+    assert isinstance(route.legs[1], Arc)
+    bounds = guided_figures.bounds_of(flight.scenario)
+    assert bounds["V"] == (0.8 * 25.0, math.inf)  # by rule, without a stall speed
+    assert guided_figures.mean_wind(flight.tape, 25.0) == pytest.approx(np.array([[3.0, 0.0]] * 8), abs=1.0)  # less turbulence
+
+
+def test_a_guided_flight_has_captures_and_turns_in_place_of_commands(flight: RecordedFlight) -> None:
+    t = flight.tape.time("y")
+    assert set(part_masks(t, transients(flight.scenario, flight.tape))) == {"whole", "calm", "capture", "turn", "gust"}
+    tables = {table.caption: table for table in flight_tables(flight.summary, {}, [])}
+    assert [row[0] for row in tables["Guidance by segment"].rows] == ["leg 1"]
+    heads = [column.head for column in tables["Tracking error (true error)"].columns]
+    assert "turn" in heads
+    assert "command" not in heads
