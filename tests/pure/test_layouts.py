@@ -120,6 +120,28 @@ def test_every_curve_of_plotjuggler_is_a_channel_of_a_run(tape: Tape) -> None:
     assert Counter(curves) == Counter(CURVES)
 
 
+def test_a_guided_flight_has_a_map_and_what_guidance_holds() -> None:
+    scenario = find_scenario("osprey_route").vary(flight={"duration": 0.1})
+    log, channels = simulate(scenario)["guidance"], channels_of(scenario)
+    assert channels["guidance"] == log.names
+    layout = json.loads(foxglove(channels))
+    first, second, *others = layout["configById"]["Tab!rise_di"]["tabs"]
+    assert (first["title"], first["layout"], second["title"]) == ("map", "3D!map", "guidance")
+    assert [tab["title"] for tab in others] == list(TABS)
+    panel = layout["configById"]["3D!map"]
+    assert (panel["followTf"], panel["layers"]["grid"]["frameId"]) == ("map", "map")
+    assert set(panel["topics"]) == {"/odometry", "/path", "/markers"}
+    assert panel["cameraState"]["far"] > panel["cameraState"]["distance"] > panel["cameraState"]["near"]
+    plots = [layout["configById"][name] for name in leaves(second["layout"])]
+    paths = [path for plot in plots for path in plot["paths"]]
+    for path in paths:
+        index = int(path["value"].removeprefix("/guidance.position[").removesuffix("]"))
+        assert path["label"] == f"guidance: {log.names[index]}"
+    curves = ElementTree.fromstring(plotjuggler(channels)).iter("curve")
+    guided = [name for curve in curves if (name := curve.attrib["name"]).startswith("/guidance/")]
+    assert len(guided) == len(paths) == 12
+
+
 def test_every_splitter_of_plotjuggler_has_its_count() -> None:
     root = ElementTree.fromstring(XML)
     splitters = list(root.iter("DockSplitter"))

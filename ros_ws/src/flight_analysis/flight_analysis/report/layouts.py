@@ -13,10 +13,15 @@ from xml.etree import ElementTree
 
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
+from guidance import guidance
 from rise_di_controller import internals
 
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b")
 COLUMNS = 2
+MAP = "3D!map"
+"""The 3-D panel of a guided flight: route and aircraft in the frame `map`, ENU."""
+MAP_TOPICS = ("/odometry", "/path", "/markers")
+CAMERA_DISTANCE, GRID_SIZE = 3000.0, 10_000.0  # m
 
 
 class Plot(NamedTuple):
@@ -36,7 +41,8 @@ class Tab(NamedTuple):
 def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
     """The channels of each topic of a run, in their order."""
     controller = scenario.controller
-    return {
+    guided = {} if scenario.guidance is None else {"guidance": guidance.names(scenario.guidance.outputs)}
+    return guided | {
         "y": tuple(scenario.aircraft.channels().outputs),
         "y_m": scenario.reference_model.outputs,
         "u": controller.inputs,
@@ -46,7 +52,10 @@ def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
 
 
 def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
-    """The tabs: y over y_m and e by output, u with u_free, integral_e and Pi, state and timing of the controller, the wind."""
+    """The tabs: y over y_m and e by output, u with u_free, integral_e and Pi, state and timing of the controller, the wind.
+
+    A guided flight has one more, of what guidance commands and measures.
+    """
     outputs, inputs, wind = channels["y_m"], channels["u"], [name for name in channels["truth"] if name.startswith("gust.")]
 
     integrals = [f"{group}.{name}" for name in outputs for group in ("integral_e", "Pi")]
@@ -55,7 +64,19 @@ def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
     def log(title: str, *names: str) -> Plot:
         return Plot(title, tuple(("internals", name) for name in names))
 
+    def guided(title: str, *names: str) -> Plot:
+        return Plot(title, tuple(("guidance", name) for name in names))
+
+    held = (
+        guided("altitude: target, flown (m)", "target.altitude", "pose.altitude"),
+        guided("V about trim: command, flown (m/s)", "u_m.V", "y.V"),
+        guided("phi: command, flown (rad)", "phi_c", "pose.phi"),
+        guided("theta: command, flown (rad)", "theta_c", "pose.theta"),
+        guided("cross-track error (m)", "xtrack"),
+        guided("modes: lateral, vertical; leg", "mode.lateral", "mode.vertical", "leg"),
+    )
     return (
+        *([Tab("guidance", held)] if "guidance" in channels else []),
         Tab("tracking", tuple(Plot(f"{name}: y, y_m", (("y", name), ("y_m", name))) for name in outputs)),
         Tab("error", tuple(log(f"e {name}", f"e.{name}") for name in outputs)),
         Tab("input", tuple(log(f"u {name}: u_free, u", f"u_free.{name}", f"u.{name}") for name in inputs)),
@@ -79,7 +100,10 @@ def foxglove(channels: Mapping[str, Sequence[str]]) -> str:
     Paths are "/topic.position[index]". The time axis is log time: stamps are flight time, which in lockstep is far from it.
     """
     panels: dict[str, Any] = {}
-    tabs = []
+    tabs: list[dict[str, Any]] = []
+    if "guidance" in channels:
+        panels[MAP] = _foxglove_map()
+        tabs.append({"title": "map", "layout": MAP})
     for tab in tabs_of(channels):
         names = []
         for number, plot in enumerate(tab.plots):
@@ -116,6 +140,27 @@ def _foxglove_plot(plot: Plot, channels: Mapping[str, Sequence[str]]) -> dict[st
         "xAxisVal": "timestamp",
         "sidebarDimension": 240,
     }
+
+
+def _foxglove_map() -> dict[str, Any]:
+    return {
+        "cameraState": {
+            "distance": CAMERA_DISTANCE, "perspective": True, "phi": 45.0, "thetaOffset": 0.0, "fovy": 45.0,
+            "near": 1.0, "far": 100.0 * CAMERA_DISTANCE,
+            "target": [0.0, 0.0, 0.0], "targetOffset": [0.0, 0.0, 0.0], "targetOrientation": [0.0, 0.0, 0.0, 1.0],
+        },
+        "followMode": "follow-none",
+        "followTf": "map",
+        "scene": {},
+        "transforms": {},
+        "topics": {topic: {"visible": True} for topic in MAP_TOPICS},
+        "layers": {
+            "grid": {
+                "visible": True, "label": "Grid", "instanceId": "grid", "layerId": "foxglove.Grid", "frameId": "map",
+                "size": GRID_SIZE, "divisions": 10, "color": "#808080ff", "position": [0, 0, 0], "rotation": [0, 0, 0],
+            }
+        },
+    }  # fmt: skip
 
 
 def _mosaic(names: Sequence[str]) -> Any:
