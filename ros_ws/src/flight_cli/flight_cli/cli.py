@@ -24,6 +24,7 @@ COMMANDS = MappingProxyType(
         "report": "Write the report page of a recorded run again, or one that compares several.",
         "replay": "Compute every tick of a recorded flight again and compare it with the log bit by bit.",
         "play": "Publish the topics of a recorded flight again with their timing.",
+        "watch": "See a flight on a page, live while it is recorded, or again later.",
         "repair": "Rebuild the log of a run whose recorder was killed, or that is damaged.",
         "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a scenario.",
         "gains": "Select gains for an airframe, and check every condition on them.",

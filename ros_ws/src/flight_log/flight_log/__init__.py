@@ -10,6 +10,7 @@
 | `message_definitions` | finds the definition of a message type |
 | `provenance` | collects versions, revision, host and command |
 | `scan` | reads the records of an MCAP file that may be truncated or damaged |
+| `follow` | reads a log while it is written |
 | `repair` | rebuilds a truncated or damaged bag |
 | `stored_messages` | lists the messages of a bag as bytes, and its parameter changes |
 | `named_vectors` | decodes messages as named vectors |

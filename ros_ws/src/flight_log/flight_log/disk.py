@@ -29,18 +29,24 @@ def replace_text(path: Path, text: str) -> None:
     fresh.replace(path)
 
 
-def try_lock(stream: IO[bytes] | int) -> bool:
+def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
     """Lock a file until the stream is closed. False when another process, such as its recorder, holds the lock.
 
     A file system without locks always grants it.
     """
     try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(stream, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:
         return True
     return True
+
+
+def is_locked(path: Path) -> bool:
+    """Whether another process, such as its recorder, holds the lock of a file. Raises OSError when it cannot be opened."""
+    with path.open("rb") as stream:
+        return not try_lock(stream, fcntl.LOCK_SH)
 
 
 class ReservedFile:

@@ -27,6 +27,7 @@ STACK = (
     "flight_log",
     "flight_recorder",
     "flight_ros",
+    "flight_view",
     "guidance",
     "reference_model",
     "rise_di_controller",

@@ -87,7 +87,7 @@ class Scan:
             missing = sum(record.message_count for record in index if isinstance(record, Statistics))
             for opcode, content in self._frames(stream, size, index):
                 try:
-                    records = list(_decode(opcode, content))
+                    records = list(decode(opcode, content))
                 except DECODE_ERRORS:
                     self.damaged += 1
                     continue
@@ -112,7 +112,7 @@ class Scan:
         try:
             if crc not in (0, zlib.crc32(footer[: -CRC.size], zlib.crc32(content))):
                 raise McapError("an index whose bytes were changed")
-            index = list(_split(content))
+            index = list(split(content))
         except DECODE_ERRORS:
             self.damaged += 1
             return []
@@ -153,7 +153,7 @@ class Scan:
         self.complete = False
 
 
-def _split(data: bytes) -> Iterator[McapRecord]:
+def split(data: bytes) -> Iterator[McapRecord]:
     """The records in a sequence of bytes. Raises one of DECODE_ERRORS."""
     position = 0
     while position < len(data):
@@ -161,14 +161,14 @@ def _split(data: bytes) -> Iterator[McapRecord]:
         position += RECORD.size
         if position + length > len(data):
             raise McapError("a record longer than its container")
-        yield from _decode(opcode, data[position : position + length])
+        yield from decode(opcode, data[position : position + length])
         position += length
 
 
-def _decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
+def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
     """The record, or the records of a chunk. Raises one of DECODE_ERRORS."""
     if opcode == Opcode.CHUNK:
-        yield from _split(_decompress(Chunk.read(ReadDataStream(BytesIO(content)))))
+        yield from split(decompress(Chunk.read(ReadDataStream(BytesIO(content)))))
     elif opcode == Opcode.MESSAGE:
         channel, sequence, log_time, publish_time = MESSAGE.unpack_from(content)
         yield Message(channel, log_time, content[MESSAGE.size :], publish_time, sequence)
@@ -180,7 +180,7 @@ def _decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
         yield RECORD_READERS[opcode](ReadDataStream(BytesIO(content)))
 
 
-def _decompress(chunk: Chunk) -> bytes:
+def decompress(chunk: Chunk) -> bytes:
     """The bytes of a chunk's records, limited to the size that the chunk gives. Raises one of DECODE_ERRORS."""
     size = chunk.uncompressed_size
     if size > max(MAX_CHUNK_BYTES, len(chunk.data)):

@@ -82,7 +82,7 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
             continue
         if event.node.rpartition("/")[2] != node:
             continue
-        changes = {one.name: _value(one.value) for one in (*event.new_parameters, *event.changed_parameters)}
+        changes = {one.name: parameter_value(one.value) for one in (*event.new_parameters, *event.changed_parameters)}
         changes |= {one.name: None for one in event.deleted_parameters}
         values = {name: value for name, value in changes.items() if name.split(".")[0] in known}
         if values:
@@ -112,8 +112,9 @@ def engagements(run: Path) -> list[Engagement] | None:
     return found
 
 
-def _value(parameter_value: Any) -> Any:
+def parameter_value(message: Any) -> Any:
+    """The value in a rcl_interfaces/msg/ParameterValue; None where it is not set."""
     # After the field "type" of rcl_interfaces/msg/ParameterValue there is one field for each type, in their order from 1 on.
-    kind, names = parameter_value.type, [field.name for field in fields(parameter_value)]
-    value: Any = getattr(parameter_value, names[kind]) if 0 < kind < len(names) else None
+    kind, names = message.type, [field.name for field in fields(message)]
+    value: Any = getattr(message, names[kind]) if 0 < kind < len(names) else None
     return value.tolist() if hasattr(value, "tolist") else value

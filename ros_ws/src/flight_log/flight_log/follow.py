@@ -1,0 +1,209 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Reads a log while it is written: each call continues where the last one ended. A finished log is read in the same way.
+
+A record is read once it is whole, so that a chunk in progress is never read. The message index behind each chunk gives the
+places of its messages: those of other topics cost nothing.
+"""
+
+import math
+import os
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
+
+from flight_core.rates import NANOSECONDS
+from flight_log.named_vectors import stamp_of
+from flight_log.rosbag2_metadata import bag_files
+from flight_log.scan import DECODE_ERRORS, MAX_CHUNK_BYTES, MESSAGE, RECORD, decode, decompress, split
+
+MESSAGE_INDEX = struct.Struct(
+    "<HI"
+)  # channel and size, before pairs of log time and offset (MCAP specification, Message Index)
+BODY = RECORD.size + MESSAGE.size  # bytes before the data of a message
+SENT_AT = BODY - 8  # of the publish time
+ENDS = (Opcode.DATA_END, Opcode.FOOTER)
+
+
+class Messages(NamedTuple):
+    """Messages of one topic in the order of the log."""
+
+    topic: str  # in full
+    type_name: str
+    sent_ns: list[int]
+    data: list[bytes]  # CDR
+
+
+@dataclass
+class _Channel:
+    topic: str
+    type_name: str
+    rate: float  # highest rate that is wanted, Hz; 0 for none, infinite for all messages
+    step: int = 0  # every step-th message is read; 0 until two messages gave their distance
+    skip: int = 0  # messages before the next one that is read
+
+
+class Follower:
+    """Follows the log of a run: the folder of a bag, which may still lack its file, or one MCAP file.
+
+    `rate_of(topic, type_name)` is the highest rate at which messages of a topic are wanted, Hz: infinite for all, 0 for none.
+    """
+
+    def __init__(self, run: Path, rate_of: Callable[[str, str], float]) -> None:
+        self.run = run
+        self.damaged = 0  # records that could not be read
+        self.complete = False  # the end of the data has been read
+        self.fault = ""  # why nothing more of the log can be read
+        self._rate_of = rate_of
+        self._read_files: list[Path] = []
+        self._begin_file()
+
+    def _begin_file(self) -> None:
+        self._position = 0
+        self._schemas: dict[int, str] = {}
+        self._channels: dict[int, _Channel] = {}
+        self._chunk = b""  # the last chunk
+        self._indexed = True  # at least one message index of it has been read
+
+    @property
+    def path(self) -> Path | None:
+        """The file that is read now; None while there is none. Raises ParameterError for a folder with several bags."""
+        return next((file for file in bag_files(self.run) if file not in self._read_files), None)
+
+    def read(self) -> Iterator[Messages | Attachment | Metadata]:
+        """All that was written since the last call. A caller may stop the iteration: the next call continues.
+
+        Raises OSError when the file cannot be read, ParameterError for a folder with several bags.
+        """
+        while not self.fault and (path := self.path) is not None:
+            with path.open("rb") as stream:
+                for opcode, content in self._records(stream):
+                    if opcode in ENDS:
+                        break
+                    yield from self._decoded(opcode, content)
+                else:
+                    return
+            yield from self._decoded(Opcode.DATA_END, b"")
+            self.complete = True
+            self._read_files.append(path)
+            self._begin_file()
+
+    def _records(self, stream: IO[bytes]) -> Iterator[tuple[int, bytes]]:
+        """Opcode and content of each whole record behind the position, which moves on before each."""
+        size = os.fstat(stream.fileno()).st_size
+        if self._position == 0 and size >= len(MCAP0_MAGIC):
+            if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                self.fault = f"{stream.name} does not begin as an MCAP file"
+                return
+            self.complete, self._position = False, len(MCAP0_MAGIC)
+        stream.seek(self._position)
+        while 0 < self._position <= size - RECORD.size:
+            opcode, length = RECORD.unpack(stream.read(RECORD.size))
+            if length > 2 * MAX_CHUNK_BYTES:
+                self.fault = f"a record of {length} bytes at byte {self._position}"
+                return
+            if self._position + RECORD.size + length > size:
+                return
+            self._position += RECORD.size + length
+            yield opcode, stream.read(length)
+
+    def _decoded(self, opcode: int, content: bytes) -> Iterator[Messages | Attachment | Metadata]:
+        try:
+            if opcode == Opcode.MESSAGE_INDEX:
+                yield from self._indexed_messages(content)
+                return
+            yield from self._walk_unindexed()
+            if opcode == Opcode.CHUNK:
+                self._chunk = decompress(Chunk.read(ReadDataStream(BytesIO(content))))
+                self._indexed = False
+                return
+            for record in decode(opcode, content):
+                yield from self._whole(record)
+        except DECODE_ERRORS:
+            self.damaged += 1
+            self._chunk, self._indexed = b"", True
+
+    def _indexed_messages(self, content: bytes) -> Iterator[Messages]:
+        """The messages of one channel in the last chunk. Raises one of DECODE_ERRORS."""
+        identity, size = MESSAGE_INDEX.unpack_from(content)
+        if len(content) != MESSAGE_INDEX.size + size or size % 16:
+            raise McapError("a message index of a wrong size")
+        if not self._chunk:
+            return
+        self._indexed = True
+        if identity not in self._channels:
+            for record in split(self._chunk):
+                self._learn(record)
+        if (channel := self._channels.get(identity)) is None:
+            raise McapError("messages without their channel")
+        if size == 0 or channel.rate <= 0.0:
+            return
+        offsets = np.frombuffer(content, "<u8", offset=MESSAGE_INDEX.size)[1::2]
+        first, last = (self._message_at(int(place))[1] for place in (offsets[0], offsets[-1]))
+        sent_ns, data = [], []
+        for place in offsets[_every(channel, len(offsets), first, last)].tolist():
+            sent, body = self._message_at(place)
+            sent_ns.append(sent)
+            data.append(body)
+        if data:
+            yield Messages(channel.topic, channel.type_name, sent_ns, data)
+
+    def _message_at(self, place: int) -> tuple[int, bytes]:
+        """Publish time in ns and data of a message of the last chunk. Raises one of DECODE_ERRORS."""
+        if place + BODY > len(self._chunk):
+            raise McapError("a message index beyond its chunk")
+        opcode, length = RECORD.unpack_from(self._chunk, place)
+        if opcode != Opcode.MESSAGE or place + RECORD.size + length > len(self._chunk):
+            raise McapError("a message index without its message")
+        sent_ns = int.from_bytes(self._chunk[place + SENT_AT : place + BODY], "little")
+        return sent_ns, self._chunk[place + BODY : place + RECORD.size + length]
+
+    def _walk_unindexed(self) -> Iterator[Messages | Attachment | Metadata]:
+        """The messages of a chunk without a message index. Raises one of DECODE_ERRORS."""
+        if not self._indexed:
+            self._indexed = True
+            for record in split(self._chunk):
+                yield from self._whole(record)
+
+    def _whole(self, record: object) -> Iterator[Messages | Attachment | Metadata]:
+        """A record outside a chunk, or of a chunk without an index."""
+        if isinstance(record, Message):
+            channel = self._channels.get(record.channel_id)
+            if channel is not None and channel.rate > 0.0:
+                yield Messages(channel.topic, channel.type_name, [record.publish_time], [record.data])
+        elif isinstance(record, Attachment | Metadata):
+            yield record
+        else:
+            self._learn(record)
+
+    def _learn(self, record: object) -> None:
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record.name
+        elif isinstance(record, Channel):
+            type_name = self._schemas.get(record.schema_id, "")
+            if record.id not in self._channels:
+                self._channels[record.id] = _Channel(record.topic, type_name, self._rate_of(record.topic, type_name))
+
+
+def _every(channel: _Channel, count: int, first: bytes, last: bytes) -> slice:
+    """Which of `count` messages of a channel are read: every step-th, as evenly over the chunks as within one."""
+    if channel.rate == math.inf:
+        return slice(None)
+    if channel.step == 0:
+        span_ns = stamp_of(last) - stamp_of(first)
+        if count > 1 and span_ns > 0:
+            channel.step = max(1, math.floor(NANOSECONDS / channel.rate * (count - 1) / span_ns + 0.01))
+    step = channel.step or 1
+    chosen = slice(channel.skip, None, step)
+    channel.skip = (channel.skip - count) % step
+    return chosen

@@ -1,0 +1,278 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Follows the log of a run, live or recorded: samples by topic, events, and the state of the recording."""
+
+import math
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.records import Attachment, Metadata
+from numpy.typing import NDArray
+from rosbags.serde.errors import SerdeError
+
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.metrics import settling_bands
+from flight_analysis.report.summary import display_units, pulse_edges
+from flight_core.parameters import ParameterError, printable
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal, Tape
+from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
+from flight_log.disk import is_locked
+from flight_log.follow import Follower, Messages
+from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, typestore
+from flight_log.stored_messages import ENGAGEMENT, KEY_VALUE, PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
+from flight_view.series import Series
+from rise_di_controller.guard import Mode
+
+SLOW, FAST = 50.0, 100.0  # Hz
+RATES = {"internals": math.inf, "guidance": SLOW, "pose": SLOW, "truth": SLOW, "u": FAST, "y": FAST, "y_m": FAST}
+"""Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples would be hidden."""
+
+GROUPS = {
+    "internals": ("mode", "late", "y", "y_m", "e", "u_free", "u", "limited", "Pi", "integral_e"),
+    "truth": ("actuator", "gust"),
+}
+"""Groups of channels that are kept; of the other topics all."""
+
+LOG, LOG_TYPE, WARN = "/rosout", "rcl_interfaces/msg/Log", 30  # rcl_interfaces/msg/Log: WARN=30
+MAX_EVENTS, MAX_NOTES, MAX_CHANNELS = 5000, 50, 200
+MAX_TEXT = 400  # characters of a text from the log
+SILENT = 1.0  # s without a sample after which the state is "no data"
+
+
+class Event(NamedTuple):
+    """An event of the flight. `stamp_ns` as in the samples, or by the clock of the host."""
+
+    stamp_ns: int
+    kind: str  # "mode", "warning", "error", "parameter" or "bridge"
+    text: str
+
+
+@dataclass
+class _Topic:
+    name: str  # without the namespace
+    decode: Decoder
+    names: tuple[str, ...] = ()  # of all channels
+    columns: NDArray[np.intp] | None = None  # those of the kept channels
+
+
+class Flight:
+    """A flight in its log. `update` reads what was written meanwhile."""
+
+    def __init__(self, run: Path, now: Callable[[], float] = time.monotonic) -> None:
+        self.run = run
+        self.name = run.stem if run.is_file() else run.resolve().name
+        self.samples: dict[str, Series] = {}  # by topic
+        self.events: list[Event] = []
+        self.scenario: Scenario | None = None
+        self.notes: list[str] = []
+        self.bands: dict[str, float] = {}  # half-widths of the settling bands, SI
+        self._follower = Follower(run, self._rate_of)
+        self._topics: dict[str, _Topic] = {}  # by full name
+        self._namespace: str | None = None
+        self._unreadable = 0
+        self._start_ns: int | None = None  # by `truth`
+        self._first_ns: int | None = None
+        self._mode = -1
+        self._banded = 0  # rows of internals that the bands are of
+        self._now = now
+        self._changed = now()
+        self._behind = False  # there is more to read at once
+
+    @property
+    def start_ns(self) -> int:
+        """Stamp of flight time 0: by `truth`, else the earliest stamp."""
+        return self._start_ns if self._start_ns is not None else self._first_ns or 0
+
+    @property
+    def end(self) -> float:
+        """Flight time of the newest sample, s; 0 without samples."""
+        newest = [int(samples.stamp_ns[-1]) for samples in self.samples.values() if samples.count]
+        return (max(newest) - self.start_ns) / NANOSECONDS if newest else 0.0
+
+    def state(self) -> str:
+        """What the recording does: "waiting", "reading" what is there, "recording", "no data", "interrupted" or "ended"."""
+        if self._behind:
+            return "reading"
+        if self._follower.complete:
+            return "ended"
+        if self._now() - self._changed <= SILENT:
+            return "recording" if self.samples else "waiting"
+        path = self._follower.path
+        if path is None:
+            return "waiting"
+        return "no data" if is_locked(path) else "interrupted"
+
+    def faults(self) -> list[str]:
+        """Sentences on what the log lacks."""
+        follower = self._follower
+        refused = {name: samples.refused for name, samples in self.samples.items() if samples.refused}
+        return [
+            *self.notes,
+            *([f"the log cannot be read further: {_text(follower.fault)}"] if follower.fault else []),
+            *([f"{follower.damaged} damaged parts of the log are left out"] if follower.damaged else []),
+            *([f"{self._unreadable} samples are unreadable"] if self._unreadable else []),
+            *(f"{name}: {count} samples out of order are left out" for name, count in refused.items()),
+        ]
+
+    def update(self, budget: float = math.inf) -> bool:
+        """Read for at most about `budget` s. Whether there was anything to read.
+
+        Raises ParameterError for a folder with several bags, OSError where the log cannot be read.
+        """
+        deadline, found, self._behind = time.monotonic() + budget, False, False
+        for record in self._follower.read():
+            found = True
+            if isinstance(record, Messages):
+                self._take(record)
+            else:
+                self._take_record(record)
+            if time.monotonic() > deadline:
+                self._behind = True
+                break
+        if found:
+            self._changed = self._now()
+            self._update_bands()
+        return found
+
+    def _rate_of(self, topic: str, type_name: str) -> float:
+        if (topic, type_name) in ((LOG, LOG_TYPE), (PARAMETER_EVENTS, PARAMETER_EVENT)):
+            return math.inf
+        if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
+            return math.inf
+        namespace, _, name = topic.rpartition("/")
+        if type_name != JOINT_STATE or name not in RATES:
+            return 0.0
+        if self._namespace is None:
+            self._namespace = namespace
+        if namespace != self._namespace:
+            self._note(f"another aircraft in the namespace {namespace or '/'} is not shown")
+            return 0.0
+        return RATES[name]
+
+    def _note(self, sentence: str) -> None:
+        if (line := _text(sentence)) not in self.notes and len(self.notes) < MAX_NOTES:
+            self.notes.append(line)
+
+    def _take_record(self, record: Attachment | Metadata) -> None:
+        if isinstance(record, Metadata):
+            if record.name == LOST_MESSAGES:
+                for topic, count in record.metadata.items():
+                    self._note(f"{topic}: the recorder lost {count} messages")
+        elif record.media_type == SCENARIO_MEDIA_TYPE and self.scenario is None:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / "scenario.yaml"
+                path.write_bytes(record.data)
+                try:
+                    scenario = load_scenario(path)
+                    display_units(scenario)  # reads the airframe, which may be a file of another machine
+                except ParameterError as error:
+                    self._note(f"units, limits and commands are unknown: {error}")
+                else:
+                    self.scenario = scenario
+
+    def _take(self, messages: Messages) -> None:
+        if messages.type_name != JOINT_STATE:
+            self._take_events(messages)
+            return
+        topic = self._topics.get(messages.topic)
+        if topic is None:
+            if (decode := decoder(messages.topic, messages.type_name)) is None:
+                return
+            topic = self._topics[messages.topic] = _Topic(messages.topic.rpartition("/")[2], decode)
+        decoded = topic.decode(messages.data)
+        self._unreadable += decoded.unreadable
+        for samples in decoded.samples:
+            self._take_samples(topic, samples)
+
+    def _take_samples(self, topic: _Topic, decoded: Samples) -> None:
+        names, stamp_ns, values = decoded
+        if topic.columns is None:
+            kept = GROUPS.get(topic.name)
+            chosen = [i for i, name in enumerate(names) if kept is None or name.partition(".")[0] in kept]
+            if len(chosen) > MAX_CHANNELS:
+                self._note(f"{topic.name}: {len(chosen) - MAX_CHANNELS} of its channels are not shown")
+            topic.names, topic.columns = names, np.array(chosen[:MAX_CHANNELS], dtype=np.intp)
+            self.samples[topic.name] = Series(tuple(_text(names[i]) for i in topic.columns))
+        samples = self.samples[topic.name]
+        if names != topic.names or values.shape[1] != len(names):
+            self._unreadable += len(stamp_ns)
+            return
+        earliest = int(stamp_ns.min())
+        self._first_ns = earliest if self._first_ns is None else min(self._first_ns, earliest)
+        if topic.name == "truth" and "t" in names and self._start_ns is None:
+            self._start_ns = flight_start_ns(int(stamp_ns[0]), float(values[0, names.index("t")]))
+        if topic.name == "internals" and "mode" in names:
+            self._take_modes(stamp_ns, values[:, names.index("mode")])
+        samples.append(stamp_ns, values[:, topic.columns])
+
+    def _take_modes(self, stamp_ns: NDArray[np.int64], modes: NDArray[np.float64]) -> None:
+        changes = np.flatnonzero(np.diff(modes, prepend=self._mode))
+        for k in changes.tolist():
+            number = modes[k]
+            known = number in set(Mode)
+            self._add_event(Event(int(stamp_ns[k]), "mode", Mode(int(number)).name if known else f"mode {number:g}"))
+        self._mode = modes[-1]
+
+    def _take_events(self, messages: Messages) -> None:
+        store = typestore()
+        for sent_ns, data in zip(messages.sent_ns, messages.data, strict=True):
+            try:
+                message: Any = store.deserialize_cdr(data, messages.type_name)
+            except SerdeError:
+                self._unreadable += 1
+                continue
+            if messages.type_name == LOG_TYPE:
+                if message.level >= WARN:
+                    kind = "warning" if message.level == WARN else "error"
+                    self._add_event(Event(sent_ns, kind, f"{message.name}: {message.msg}"))
+            elif messages.type_name == PARAMETER_EVENT:
+                changed = {one.name: parameter_value(one.value) for one in message.changed_parameters}
+                text = ", ".join(f"{name} = {value}" for name, value in changed.items())
+                if text:
+                    self._add_event(Event(sent_ns, "parameter", f"{message.node.rpartition('/')[2]}: {text}"))
+            else:
+                self._add_event(Event(sent_ns, "bridge", f"{message.key} {message.value}".strip()))
+
+    def _add_event(self, event: Event) -> None:
+        if len(self.events) < MAX_EVENTS:
+            self.events.append(event._replace(text=_text(event.text)))
+        else:
+            self._note(f"events after the first {MAX_EVENTS} are left out")
+
+    def _update_bands(self) -> None:
+        """The settling bands, again whenever the ticks have grown by a tenth."""
+        samples = self.samples.get("internals")
+        if samples is None or samples.count < 1.1 * self._banded + 2:
+            return
+        ticks = Signal(samples.stamp_ns, samples.names, samples.values.astype(float))
+        if (y := ticks.group("y")).names and (y_m := ticks.group("y_m")).names == y.names:
+            self.bands = settling_bands(Tape({"y": y, "y_m": y_m}))
+        self._banded = samples.count
+
+
+def _text(text: str) -> str:
+    """A text from the log: printable and of bounded length."""
+    return printable(text)[:MAX_TEXT]
+
+
+def description(flight: Flight) -> dict[str, Any]:
+    """What the page shows beside the samples: units, limits, gusts and commands of the scenario. Ready for JSON."""
+    described: dict[str, Any] = {"name": flight.name, "modes": {str(int(mode)): mode.name for mode in Mode}}
+    if (scenario := flight.scenario) is None:
+        return described
+    controller = scenario.controller
+    bounds = zip(controller.inputs, controller.lower or (), controller.upper or (), strict=False)
+    return described | {
+        "scenario": controller.summary(),
+        "duration": scenario.flight.duration,
+        "units": {name: unit._asdict() for name, unit in display_units(scenario).items()},
+        "limits": {name: [one if math.isfinite(one) else None for one in pair] for name, *pair in bounds},
+        "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
+        "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],
+    }

@@ -1,0 +1,277 @@
+// Charts over time on canvases: lines decimated to the minimum and maximum of each pixel, bands, limits, one cursor.
+import {indexAt} from "./data.js";
+
+const LEFT = 58, RIGHT = 10, TOP = 17, BOTTOM = 4;
+const LIMIT_VIEW_RATIO = 3; // a limit is in view where it is at most this many times the largest value
+
+export const MODE_COLOURS = {0: "#b0b0b0", 1: "#2f9e6e", 2: "#f2c230", 3: "#ef7d17", 4: "#8a63b8", 5: "#5f6b73"};
+
+// A canvas at the resolution of the screen: its context, and its width and height in CSS pixels.
+export function prepared(canvas) {
+  const scale = devicePixelRatio || 1, {clientWidth: width, clientHeight: height} = canvas;
+  if (canvas.width !== Math.round(width * scale) || canvas.height !== Math.round(height * scale)) {
+    canvas.width = Math.round(width * scale);
+    canvas.height = Math.round(height * scale);
+  }
+  const ctx = canvas.getContext("2d");
+  ctx.setTransform(scale, 0, 0, scale, 0, 0);
+  ctx.clearRect(0, 0, width, height);
+  return {ctx, width, height};
+}
+
+// Ticks at multiples of 1, 2 or 5 times a power of ten, at most `most` of them.
+export function ticks(low, high, most) {
+  const raw = (high - low) / most, power = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 5, 10].map(digit => digit * power).find(one => one >= raw * 0.999);
+  const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9)), found = [];
+  for (let k = Math.ceil(low / step); k * step <= high; k++) found.push({value: k * step, text: (k * step).toFixed(digits)});
+  return found;
+}
+
+// Rows of a series to draw between two times: all, or the rows of the minimum and the maximum of each of `bins` bins.
+export function rows(series, column, [from, to], bins) {
+  const first = Math.max(indexAt(series.t, series.count, from), 0), last = Math.min(indexAt(series.t, series.count, to) + 2, series.count);
+  const width = Math.ceil((last - first) / bins), found = [];
+  if (width <= 2) {
+    for (let k = first; k < last; k++) found.push(k);
+    return found;
+  }
+  for (let begin = first; begin < last; begin += width) {
+    let low = begin, high = begin;
+    for (let k = begin; k < Math.min(begin + width, last); k++) {
+      if (!(column[k] >= column[low])) low = k;
+      if (!(column[k] <= column[high])) high = k;
+    }
+    found.push(Math.min(low, high));
+    if (low !== high) found.push(Math.max(low, high));
+  }
+  return found;
+}
+
+function timed(flight, name) { // topics of the controller where it has engaged, else those of the aircraft
+  const internals = flight.get("internals");
+  return internals && internals.count && internals.column(name) ? ["internals", name] : [name.split(".")[0], name.split(".").slice(1).join(".")];
+}
+
+// The charts of a flight, by what its log holds; `ghost` is the second flight or null.
+export function chartsOf(flight, ghost) {
+  const {units, limits} = flight.info, charts = [];
+  const unit = name => units[name] ?? {unit: "", factor: 1};
+  const line = (topic, channel, label, colour, width, more = {}) => ({flight, topic, channel, label, colour, width, factor: 1, ...more});
+  const names = group => flight.get("internals")?.group(group) ?? [];
+  const outputs = names("y").length ? names("y") : flight.get("y")?.channels ?? [];
+  for (const name of outputs) {
+    const factor = unit(name).factor;
+    const lines = [
+      line(...timed(flight, `y_m.${name}`), "y_m", "--reference", 4, {factor}),
+      line(...timed(flight, `y.${name}`), "y", "--plant", 1.4, {factor}),
+    ];
+    if (ghost) lines.splice(1, 0, line(...timed(ghost, `y.${name}`), "y of the ghost", "--ghost", 1.2, {factor, flight: ghost, dash: [5, 3]}));
+    charts.push({title: `${name}: y over y_m`, unit: unit(name).unit, lines});
+  }
+  for (const name of names("e")) {
+    const {factor, unit: text} = unit(name), band = flight.head.bands[name];
+    const lines = [line("internals", `e.${name}`, "e", "--error", 1.2, {factor})];
+    if (ghost) lines.unshift(line("internals", `e.${name}`, "e of the ghost", "--ghost", 1, {factor, flight: ghost, dash: [5, 3]}));
+    charts.push({title: `${name}: error e`, unit: text, lines, band: band ? band * factor : undefined});
+  }
+  for (const name of names("u").length ? names("u") : flight.get("u")?.channels ?? []) {
+    const {factor, unit: text} = unit(name), lines = [];
+    if (names("u_free").includes(name)) lines.push(line("internals", `u_free.${name}`, "before limits", "--free", 1, {factor}));
+    lines.push(line(...timed(flight, `u.${name}`), "u", "--reference", 2.6, {factor, steps: true}));
+    if (flight.get("truth")?.channels.includes(`actuator.${name}`)) lines.push(line("truth", `actuator.${name}`, "actuator", "--plant", 1.2, {factor}));
+    const bounds = (limits[name] ?? []).filter(bound => bound !== null).map(bound => bound * factor);
+    charts.push({title: name, unit: text, lines, limits: bounds, saturation: `limited.${name}`});
+  }
+  const winds = flight.get("truth")?.group("gust") ?? [];
+  if (winds.length) {
+    const colours = ["--plant", "--ghost", "--error"];
+    charts.push({title: "wind", unit: "m/s", lines: winds.map((name, k) => line("truth", `gust.${name}`, name, colours[k % 3], 1.2))});
+  }
+  charts.push(...guidanceCharts(flight, line));
+  if (flight.get("pose")?.channels.includes("altitude")) {
+    const lines = [line("pose", "altitude", "altitude", "--plant", 1.4)];
+    if (ghost) lines.unshift(line("pose", "altitude", "of the ghost", "--ghost", 1.2, {flight: ghost, dash: [5, 3]}));
+    charts.push({title: "altitude", unit: "m", lines});
+  }
+  if (flight.get("internals")?.column("late")) {
+    charts.push({title: "ticks: lateness", unit: "ms", lines: [line("internals", "late", "late", "--plant", 1, {factor: 1e3})]});
+  }
+  return charts;
+}
+
+function guidanceCharts(flight, line) { // attitude over its command, and the distance from the path, of a guided flight
+  const guidance = flight.get("guidance");
+  if (!guidance) return [];
+  const degrees = 180 / Math.PI, charts = [];
+  for (const name of ["phi", "theta"]) {
+    if (!guidance.channels.includes(`${name}_c`)) continue;
+    const lines = [line("guidance", `${name}_c`, "command", "--reference", 4, {factor: degrees})];
+    if (flight.get("pose")?.channels.includes(name)) lines.push(line("pose", name, name, "--plant", 1.4, {factor: degrees}));
+    charts.push({title: `${name} over its command`, unit: "deg", lines});
+  }
+  if (guidance.channels.includes("xtrack")) charts.push({title: "cross-track", unit: "m", lines: [line("guidance", "xtrack", "cross-track", "--error", 1.2)]});
+  return charts;
+}
+
+function extent(chart, view, bins) { // the decimated lines, and the least and largest value in view
+  let low = Infinity, high = -Infinity;
+  const drawn = [];
+  for (const line of chart.lines) {
+    const series = line.flight.get(line.topic), column = series?.column(line.channel);
+    if (!column || !series.count) continue;
+    const chosen = rows(series, column, view, bins);
+    for (const k of chosen) {
+      const value = column[k] * line.factor;
+      if (series.t[k] >= view[0] - 1 && Number.isFinite(value)) { low = Math.min(low, value); high = Math.max(high, value); }
+    }
+    drawn.push({line, series, column, chosen});
+  }
+  if (low > high) [low, high] = [-1, 1];
+  const largest = Math.max(Math.abs(low), Math.abs(high));
+  for (const bound of chart.limits ?? []) {
+    if (Math.abs(bound) <= LIMIT_VIEW_RATIO * largest) { low = Math.min(low, bound); high = Math.max(high, bound); }
+  }
+  if (chart.band && chart.band <= 3 * largest) { low = Math.min(low, -chart.band); high = Math.max(high, chart.band); }
+  const pad = Math.max((high - low) * 0.08, Math.abs(high) * 1e-3, 1e-9);
+  return {drawn, low: low - pad, high: high + pad};
+}
+
+export const timeAt = (canvas, x, [from, to]) => from + ((x - LEFT) / (canvas.clientWidth - LEFT - RIGHT)) * (to - from);
+
+// Draw one chart. `flight` gives the gusts; `selection` is a pair of times or null.
+export function drawChart(canvas, chart, flight, view, cursor, selection, colour) {
+  const {ctx, width, height} = prepared(canvas), [from, to] = view, right = width - RIGHT, bottom = height - BOTTOM;
+  const {drawn, low, high} = extent(chart, view, right - LEFT);
+  const x = t => LEFT + ((t - from) / (to - from)) * (right - LEFT), y = value => bottom - ((value - low) / (high - low)) * (bottom - TOP);
+  ctx.font = "11px system-ui, sans-serif";
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(LEFT, TOP, right - LEFT, bottom - TOP);
+  ctx.clip();
+  ctx.fillStyle = colour("--gust");
+  for (const [, start, stop] of flight.info.gusts) ctx.fillRect(x(start), TOP, x(stop) - x(start), bottom - TOP);
+  if (chart.band) {
+    ctx.fillStyle = colour("--band");
+    ctx.fillRect(LEFT, y(chart.band), right - LEFT, y(-chart.band) - y(chart.band));
+  }
+  ctx.strokeStyle = colour("--line");
+  ctx.lineWidth = 1;
+  const marks = ticks(low, high, 4);
+  for (const {value} of marks) stroke(ctx, [[LEFT, y(value)], [right, y(value)]]);
+  for (const {value} of ticks(from, to, Math.max(width / 110, 2))) stroke(ctx, [[x(value), TOP], [x(value), bottom]]);
+  ctx.strokeStyle = colour("--limit");
+  ctx.setLineDash([6, 4]);
+  for (const bound of chart.limits ?? []) stroke(ctx, [[LEFT, y(bound)], [right, y(bound)]]);
+  for (const {line, series, column, chosen} of drawn) {
+    ctx.strokeStyle = colour(line.colour);
+    ctx.lineWidth = line.width;
+    ctx.lineJoin = "round";
+    ctx.setLineDash(line.dash ?? []);
+    ctx.beginPath();
+    let pen = false;
+    for (const k of chosen) {
+      const value = column[k] * line.factor;
+      if (!Number.isFinite(value)) { pen = false; continue; }
+      if (pen && line.steps) ctx.lineTo(x(series.t[k]), y(column[k - 1] * line.factor));
+      if (pen) ctx.lineTo(x(series.t[k]), y(value)); else ctx.moveTo(x(series.t[k]), y(value));
+      pen = true;
+    }
+    ctx.stroke();
+  }
+  ctx.setLineDash([]);
+  drawSaturation(ctx, chart, flight, view, x);
+  if (selection) {
+    ctx.fillStyle = colour("--gust");
+    ctx.fillRect(x(selection[0]), TOP, x(selection[1]) - x(selection[0]), bottom - TOP);
+  }
+  ctx.strokeStyle = colour("--ink");
+  ctx.lineWidth = 1;
+  stroke(ctx, [[x(cursor), TOP], [x(cursor), bottom]]);
+  ctx.restore();
+  ctx.fillStyle = colour("--quiet");
+  ctx.textAlign = "right";
+  ctx.textBaseline = "middle";
+  for (const {value, text} of marks) ctx.fillText(text, LEFT - 5, y(value));
+  drawTitle(ctx, chart, drawn, cursor, right, colour);
+}
+
+function stroke(ctx, points) {
+  ctx.beginPath();
+  points.forEach(([x, y], k) => (k ? ctx.lineTo(x, y) : ctx.moveTo(x, y)));
+  ctx.stroke();
+}
+
+function drawSaturation(ctx, chart, flight, view, x) { // marks where the controller saturated the input
+  const series = flight.get("internals"), column = chart.saturation && series?.column(chart.saturation);
+  if (!column) return;
+  for (const k of rows(series, column, view, 2000)) {
+    if (!(column[k] > 0)) continue;
+    ctx.fillStyle = column[k] === 1 ? "#d62728" : "#8a63b8";
+    ctx.fillRect(x(series.t[k]) - 0.5, TOP, 2, 4);
+  }
+}
+
+function drawTitle(ctx, chart, drawn, cursor, right, colour) { // the title, and the value of each line at the cursor
+  ctx.textAlign = "left";
+  ctx.textBaseline = "alphabetic";
+  ctx.fillStyle = colour("--ink");
+  ctx.font = "600 11px system-ui, sans-serif";
+  const title = chart.unit ? `${chart.title} (${chart.unit})` : chart.title;
+  ctx.fillText(title, LEFT, TOP - 5);
+  ctx.font = "11px system-ui, sans-serif";
+  ctx.textAlign = "right";
+  let place = right;
+  for (const {line, series} of [...drawn].reverse()) {
+    const value = series.at(line.channel, cursor) * line.factor;
+    const text = `${line.label} ${Number.isFinite(value) ? value.toPrecision(4) : "-"}`, size = ctx.measureText(text).width;
+    if (place - size < LEFT + 170) break;
+    ctx.fillStyle = colour("--ink");
+    ctx.fillText(text, place, TOP - 5);
+    ctx.fillStyle = colour(line.colour);
+    ctx.fillRect(place - size - 12, TOP - 10, 8, 4);
+    place -= size + 22;
+  }
+}
+
+// The timeline: the mode of the controller over the whole flight, gusts, events, the view and the cursor.
+export function drawTimeline(canvas, flight, [from, to], view, cursor, colour) {
+  const {ctx, width, height} = prepared(canvas), x = t => LEFT / 6 + ((t - from) / (to - from)) * (width - LEFT / 3);
+  const strip = height - 22;
+  const internals = flight.get("internals"), modes = internals?.column("mode");
+  ctx.fillStyle = colour("--panel");
+  ctx.fillRect(x(from), 4, x(to) - x(from), strip);
+  if (modes) {
+    const chosen = rows(internals, modes, [from, to], width);
+    for (let first = 0, k = 1; k <= chosen.length; k++) {
+      if (k < chosen.length && modes[chosen[k]] === modes[chosen[first]]) continue;
+      const start = x(internals.t[chosen[first]]), stop = x(internals.t[chosen[Math.min(k, chosen.length - 1)]]);
+      ctx.fillStyle = MODE_COLOURS[modes[chosen[first]]] ?? "#d62728";
+      ctx.fillRect(start, 4, Math.max(stop - start, 1.5), strip);
+      first = k;
+    }
+  }
+  ctx.fillStyle = colour("--gust");
+  for (const [, start, stop] of flight.info.gusts) if (start < to) ctx.fillRect(x(start), 4, Math.max(x(Math.min(stop, to)) - x(start), 2), strip);
+  ctx.fillStyle = colour("--ink");
+  for (const [, start] of flight.info.commands) if (start < to) ctx.fillRect(x(start), 4 + strip - 5, 1.5, 5);
+  for (const {t, kind} of flight.events) {
+    if (t < from || t > to) continue;
+    ctx.fillStyle = kind === "error" ? colour("--bad") : kind === "warning" ? colour("--warn") : colour("--ink");
+    ctx.fillRect(x(t) - 0.75, 1, 1.5, 7);
+  }
+  ctx.strokeStyle = colour("--ink");
+  ctx.lineWidth = 1;
+  ctx.strokeRect(x(Math.max(view[0], from)), 3.5, x(Math.min(view[1], to)) - x(Math.max(view[0], from)), strip + 1);
+  ctx.fillStyle = colour("--ink");
+  ctx.fillRect(x(cursor) - 1, 0, 2, strip + 8);
+  ctx.fillStyle = colour("--quiet");
+  ctx.font = "11px system-ui, sans-serif";
+  ctx.textBaseline = "alphabetic";
+  for (const {value, text} of ticks(from, to, Math.max(width / 90, 2))) {
+    ctx.textAlign = x(value) < 12 ? "left" : x(value) > width - 12 ? "right" : "center";
+    ctx.fillText(`${text} s`, x(value), height - 4);
+  }
+}
+
+export const timelineTime = (canvas, px, [from, to]) => from + ((px - LEFT / 6) / (canvas.clientWidth - LEFT / 3)) * (to - from);

@@ -1,0 +1,114 @@
+// The samples of a flight: fetched from the server, kept in typed arrays by topic and channel.
+
+// Index of the last of the first `count` times that is not after `t`; -1 before the first one.
+export function indexAt(times, count, t) {
+  let low = 0, high = count;
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (times[middle] <= t) low = middle + 1; else high = middle;
+  }
+  return low - 1;
+}
+
+function grown(array, size) {
+  const larger = new array.constructor(Math.max(size, 2 * array.length));
+  larger.set(array);
+  return larger;
+}
+
+export class Series { // the rows of one topic
+  constructor(channels) {
+    this.channels = channels;
+    this.count = 0;
+    this.t = new Float64Array(1024); // s
+    this.columns = channels.map(() => new Float32Array(1024));
+  }
+
+  append(t, columns) {
+    const end = this.count + t.length;
+    if (end > this.t.length) {
+      this.t = grown(this.t, end);
+      this.columns = this.columns.map(column => grown(column, end));
+    }
+    this.t.set(t, this.count);
+    columns.forEach((column, k) => this.columns[k].set(column, this.count));
+    this.count = end;
+  }
+
+  column(channel) { // undefined without such a channel
+    return this.columns[this.channels.indexOf(channel)];
+  }
+
+  at(channel, t) { // the newest value at a time; NaN without one
+    const row = indexAt(this.t, this.count, t), column = this.column(channel);
+    return column && row >= 0 ? column[row] : NaN;
+  }
+
+  group(prefix) { // names of the channels "prefix.name"
+    return this.channels.filter(channel => channel.startsWith(prefix + ".")).map(channel => channel.slice(prefix.length + 1));
+  }
+}
+
+// An answer of the server (server.py, answer): its head, and the time and the columns of each topic in the head.
+export function decode(buffer) {
+  const size = new DataView(buffer).getUint32(0, true);
+  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, size)));
+  let place = 4 + size;
+  for (const topic of head.topics) {
+    topic.t = new Float64Array(buffer, place, topic.count);
+    place += 8 * topic.count;
+    topic.columns = topic.channels.map((_, k) => new Float32Array(buffer, place + 4 * k * topic.count, topic.count));
+    place += Math.ceil((4 * topic.count * topic.channels.length) / 8) * 8;
+  }
+  return head;
+}
+
+export class Flight { // one flight of the server
+  constructor(number) {
+    this.number = number;
+    this.info = {name: "", modes: {}, units: {}, limits: {}, gusts: [], commands: []};
+    this.head = {state: "", faults: [], bands: {}, described: "", ghost: false};
+    this.clear("");
+  }
+
+  clear(epoch) {
+    this.epoch = epoch;
+    this.series = new Map();
+    this.events = [];
+    this.begin = Infinity;
+    this.end = -Infinity;
+  }
+
+  query() {
+    const known = {epoch: this.epoch, state: this.head.state, described: this.head.described, events: this.events.length};
+    for (const [name, series] of this.series) known[name] = series.count;
+    return new URLSearchParams(known);
+  }
+
+  take(head) { // true when samples came
+    if (head.epoch !== this.epoch) this.clear(head.epoch);
+    for (const {name, channels, first, t, columns} of head.topics) {
+      if (first === 0) this.series.set(name, new Series(channels));
+      const series = this.series.get(name);
+      if (series === undefined || series.count !== first) continue;
+      series.append(t, columns);
+      this.begin = Math.min(this.begin, t[0]);
+      this.end = Math.max(this.end, t[t.length - 1]);
+    }
+    if (head.first_event === this.events.length) this.events.push(...head.events.map(([t, kind, text]) => ({t, kind, text})));
+    if (head.flight) this.info = {...this.info, ...head.flight};
+    const {state, faults, bands, described, ghost} = head;
+    this.head = {state, faults, bands, described, ghost};
+    return head.topics.length > 0;
+  }
+
+  async poll() { // one request; true when samples came
+    const response = await fetch(`data/${this.number}?${this.query()}`);
+    if (!response.ok) throw new Error(await response.text());
+    return this.take(decode(await response.arrayBuffer()));
+  }
+
+  get(topic) {
+    return this.series.get(topic);
+  }
+}

@@ -1,0 +1,310 @@
+// The page: asks the server for news, keeps the time and the view, draws what has changed.
+import {Flight, indexAt} from "./data.js";
+import {chartsOf, drawChart, drawTimeline, MODE_COLOURS, timeAt, timelineTime} from "./charts.js";
+import {drawHorizon, poseAt, Scene} from "./scene.js";
+
+const SPEEDS = [0.1, 0.2, 0.5, 1, 2, 5, 10];
+const WINDOW = 20; // s
+const SILENT = 1000; // ms without a sample after which a recording says "no data"
+const RETRY = 500; // ms between two requests to a server that does not answer
+const BADGES = {CONNECTING: "", WAITING: "warn", READING: "", LIVE: "good", "NO DATA": "bad", "NO SERVER": "bad", INTERRUPTED: "warn", ENDED: ""};
+
+const $ = id => document.getElementById(id);
+const flight = new Flight(0);
+let ghost = null, charts = [], chartKey = "", colours = {}, dirty = true, shownEvents = -1;
+const clock = {t: 0, playing: false, speed: 1, live: true, started: false};
+const view = {kind: "window", from: 0, to: WINDOW};
+const link = {serving: false, samples: 0}; // the server answers; when, in ms, the last answer with samples came
+const scene = new Scene($("scene"), redraw);
+
+// ---- Colours of the scheme
+
+const colour = name => (colours[name] ??= getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { colours = {}; redraw(); });
+
+function redraw() {
+  dirty = true;
+}
+
+// ---- Samples
+
+async function follow(one) {
+  for (;;) {
+    try {
+      const came = await one.poll();
+      if (one === flight) {
+        link.serving = true;
+        if (came) link.samples = performance.now();
+      }
+      taken();
+    } catch (error) {
+      if (one === flight) link.serving = false;
+      if (!(error instanceof TypeError)) console.warn(error.message);
+      await new Promise(resume => setTimeout(resume, RETRY));
+    }
+    redraw();
+    await drawn(); // nothing queues: the next answer is asked for once this one is on the screen
+  }
+}
+
+const drawn = () => Promise.race([new Promise(requestAnimationFrame), new Promise(resume => setTimeout(resume, RETRY))]);
+
+function taken() { // a recording is followed at its end; a log that has ended starts at its beginning
+  const recording = ["recording", "no data"].includes(flight.head.state);
+  if (!clock.started && flight.end > -Infinity) {
+    clock.started = flight.head.state !== "reading";
+    clock.live = recording;
+    view.kind = recording ? "window" : "whole";
+    if (!recording) clock.t = begin();
+  }
+  if (clock.live) {
+    clock.t = end();
+    clock.live = recording;
+  }
+  if (flight.head.ghost && !ghost) {
+    ghost = new Flight(1);
+    follow(ghost);
+  }
+}
+
+const begin = () => (flight.begin < Infinity ? flight.begin : 0);
+const end = () => (flight.end > -Infinity ? flight.end : WINDOW);
+
+function status() {
+  const {state} = flight.head;
+  if (!link.serving) return link.samples || state ? "NO SERVER" : "CONNECTING";
+  if (state === "ended") return "ENDED";
+  if (state === "interrupted") return "INTERRUPTED";
+  if (state === "waiting" || state === "reading") return state.toUpperCase();
+  return state === "no data" || performance.now() - link.samples > SILENT ? "NO DATA" : "LIVE";
+}
+
+// ---- Time
+
+function seek(t) {
+  clock.t = Math.min(Math.max(t, begin()), end());
+  clock.live = clock.t >= end() && flight.head.state === "recording";
+  if (clock.live) clock.playing = false;
+  redraw();
+}
+
+function step(direction, big) {
+  clock.playing = false;
+  const ticks = flight.get("internals") ?? flight.get("y") ?? flight.get("pose");
+  if (big || !ticks) return seek(clock.t + direction);
+  const row = Math.min(Math.max(indexAt(ticks.t, ticks.count, clock.t) + direction, 0), ticks.count - 1);
+  seek(ticks.t[row]);
+}
+
+const instants = () => [...flight.events.map(({t}) => t), ...flight.info.gusts.map(gust => gust[1]), ...flight.info.commands.map(command => command[1])]
+  .filter(t => t >= begin() && t <= end()).sort((a, b) => a - b);
+
+function jump(direction) {
+  const times = instants(), found = direction > 0 ? times.find(t => t > clock.t + 1e-6) : times.reverse().find(t => t < clock.t - 1e-6);
+  if (found !== undefined) { clock.playing = false; seek(found); }
+}
+
+function play() {
+  if (clock.t >= end() && !clock.live) clock.t = begin();
+  clock.playing = clock.live ? false : !clock.playing;
+  clock.live = false;
+  redraw();
+}
+
+function live() {
+  clock.live = true;
+  clock.playing = false;
+  clock.t = end();
+  view.kind = "window";
+  redraw();
+}
+
+function setSpeed(index) {
+  clock.speed = SPEEDS[Math.min(Math.max(index, 0), SPEEDS.length - 1)];
+  $("speed").value = clock.speed;
+  redraw();
+}
+
+function setView(kind) {
+  view.kind = kind;
+  redraw();
+}
+
+function currentView() {
+  if (view.kind === "zoom") return [view.from, view.to];
+  if (view.kind === "whole") return [begin(), Math.max(end(), begin() + 1)];
+  const to = clock.live ? clock.t : Math.min(clock.t + WINDOW / 4, Math.max(end(), clock.t));
+  return [to - WINDOW, to];
+}
+
+// ---- Charts
+
+function arrange() { // one canvas for each chart, when what the log holds has changed
+  const found = chartsOf(flight, ghost), key = found.map(chart => `${chart.title} ${chart.unit}`).join("\n");
+  charts = found.map((chart, k) => ({...chart, canvas: charts[k]?.canvas}));
+  if (key === chartKey) return;
+  chartKey = key;
+  $("charts").replaceChildren(...charts.map(chart => {
+    chart.canvas = document.createElement("canvas");
+    chart.canvas.setAttribute("role", "img");
+    chart.canvas.setAttribute("aria-label", chart.title);
+    listen(chart.canvas);
+    return chart.canvas;
+  }));
+}
+
+let selection = null;
+function listen(canvas) { // a click seeks, a drag zooms all charts, a double click zooms out, the wheel zooms about the pointer
+  let start = null;
+  const at = event => timeAt(canvas, event.clientX - canvas.getBoundingClientRect().left, currentView());
+  canvas.addEventListener("pointerdown", event => { start = [event.clientX, at(event)]; canvas.setPointerCapture(event.pointerId); });
+  canvas.addEventListener("pointermove", event => {
+    if (start && Math.abs(event.clientX - start[0]) > 4) { selection = [start[1], at(event)].sort((a, b) => a - b); redraw(); }
+  });
+  canvas.addEventListener("pointerup", event => {
+    if (selection) zoom(...selection);
+    else if (start) { clock.playing = false; seek(at(event)); }
+    start = selection = null;
+  });
+  canvas.addEventListener("pointercancel", () => { start = selection = null; });
+  canvas.addEventListener("dblclick", () => setView(clock.live ? "window" : "whole"));
+  canvas.addEventListener("wheel", event => {
+    if (!event.ctrlKey) return; // the wheel alone scrolls the page
+    event.preventDefault();
+    const [from, to] = currentView(), centre = at(event), factor = Math.exp(event.deltaY * 0.002);
+    zoom(centre - (centre - from) * factor, centre + (to - centre) * factor);
+  }, {passive: false});
+}
+
+function zoom(from, to) {
+  if (to - from < 1e-3) return;
+  Object.assign(view, {kind: "zoom", from, to});
+  redraw();
+}
+
+// ---- Drawing
+
+function text(node, content) {
+  if (node.textContent !== content) node.textContent = content;
+}
+
+function drawState() {
+  const now = status(), badge = $("state"), {faults} = flight.head;
+  text(badge, now);
+  badge.className = `badge ${BADGES[now]}`;
+  text($("name"), ghost ? `${flight.info.name} and ghost ${ghost.info.name}` : flight.info.name);
+  document.title = `${now === "ENDED" ? "" : `${now}: `}${flight.info.name}`;
+  const mode = flight.get("internals")?.at("mode", clock.t);
+  text($("mode"), Number.isFinite(mode) ? flight.info.modes[mode] ?? `mode ${mode}` : "");
+  $("mode").style.background = MODE_COLOURS[mode] ?? "";
+  text($("time"), `t = ${clock.t.toFixed(2)} s`);
+  const sentences = [...faults, ...(ghost?.head.faults ?? []).map(one => `ghost: ${one}`)];
+  $("notes").hidden = sentences.length === 0;
+  if (list($("notes").lastElementChild, sentences)) text($("notes").firstElementChild, `${sentences.length} notes on the log`);
+  for (const [id, on] of [["live", clock.live], ["window", view.kind === "window"], ["whole", view.kind === "whole"]]) $(id).setAttribute("aria-pressed", on);
+  for (const button of $("cameras").children) button.setAttribute("aria-pressed", button.dataset.camera === scene.mode);
+  text($("play"), clock.playing ? "Pause" : "Play");
+  text($("legend"), scene.legend ?? "");
+  drawReadouts();
+  drawEvents();
+}
+
+function list(node, lines) {
+  if (node.dataset.shown === lines.join("\n")) return false;
+  node.dataset.shown = lines.join("\n");
+  node.replaceChildren(...lines.map(line => Object.assign(document.createElement("li"), {textContent: line})));
+  return true;
+}
+
+function drawReadouts() {
+  const pose = poseAt(flight, clock.t), degrees = 180 / Math.PI, guidance = flight.get("guidance");
+  const shown = (value, digits, unit) => (Number.isFinite(value) ? `${value.toFixed(digits)} ${unit}` : "-");
+  const heading = pose && Number.isFinite(pose.psi) ? `${((pose.psi * degrees + 360) % 360).toFixed(0).padStart(3, "0")} deg` : "-";
+  const values = {
+    heading, roll: shown(pose?.phi * degrees, 1, "deg"), pitch: shown(pose?.theta * degrees, 1, "deg"), altitude: shown(pose?.altitude, 1, "m"),
+    "ground speed": shown(pose?.speed, 1, "m/s"), climb: shown(pose?.climb, 1, "m/s"),
+  };
+  for (const name of guidance?.channels ?? []) if (/^(mode|leg|xtrack)/.test(name)) values[name] = shown(guidance.at(name, clock.t), name === "xtrack" ? 1 : 0, "");
+  const node = $("readouts"), names = Object.keys(values);
+  if (node.children.length !== 2 * names.length) {
+    node.replaceChildren(...names.flatMap(name => [Object.assign(document.createElement("dt"), {textContent: name}), document.createElement("dd")]));
+  }
+  Object.values(values).forEach((value, k) => text(node.children[2 * k + 1], value));
+}
+
+function drawEvents() { // newest last; the last one before the cursor is marked
+  const {events} = flight, node = $("events");
+  if (shownEvents > events.length) { node.replaceChildren(); shownEvents = 0; }
+  for (const {t, kind, text: content} of events.slice(Math.max(shownEvents, 0))) {
+    const item = document.createElement("li");
+    item.className = kind;
+    item.textContent = `${t.toFixed(2)} s  ${kind}: ${content}`;
+    item.addEventListener("click", () => seek(t));
+    node.append(item);
+    node.scrollTop = node.scrollHeight;
+  }
+  shownEvents = events.length;
+  const past = events.findLastIndex(({t}) => t <= clock.t + 1e-9);
+  node.querySelector(".now")?.classList.remove("now");
+  node.children[past]?.classList.add("now");
+}
+
+let before = 0, second = 0;
+function frame(now) {
+  const elapsed = Math.min(now - before, 250) / 1e3;
+  before = now;
+  if (clock.playing) {
+    clock.t += elapsed * clock.speed;
+    if (clock.t >= end()) { clock.t = end(); clock.playing = false; }
+    dirty = true;
+  }
+  if (Math.floor(now / 250) !== second) { second = Math.floor(now / 250); drawState(); } // states change without samples, too
+  if (dirty) {
+    dirty = false;
+    arrange();
+    drawState();
+    scene.draw(flight, ghost, clock.t, colour);
+    drawHorizon($("horizon"), poseAt(flight, clock.t), colour);
+    const shown = currentView();
+    for (const chart of charts) {
+      const {top, bottom} = chart.canvas.getBoundingClientRect();
+      if (bottom > 0 && top < innerHeight) drawChart(chart.canvas, chart, flight, shown, clock.t, selection, colour);
+    }
+    drawTimeline($("timeline"), flight, [begin(), Math.max(end(), begin() + 1)], shown, clock.t, colour);
+    document.body.dataset.drawn = Number(document.body.dataset.drawn ?? 0) + 1;
+  }
+  requestAnimationFrame(frame);
+}
+
+// ---- Controls
+
+const ACTIONS = {
+  " ": play, l: live, w: () => setView("window"), a: () => setView("whole"), "[": () => jump(-1), "]": () => jump(1),
+  ArrowLeft: event => step(-1, event.shiftKey), ArrowRight: event => step(1, event.shiftKey),
+  Home: () => seek(begin()), End: () => seek(end()), "-": () => setSpeed(SPEEDS.indexOf(clock.speed) - 1), "+": () => setSpeed(SPEEDS.indexOf(clock.speed) + 1),
+  c: () => { scene.mode = {chase: "orbit", orbit: "map", map: "chase"}[scene.mode]; redraw(); },
+};
+
+function start() {
+  $("speed").append(...SPEEDS.map(speed => new Option(`${speed}x`, speed, false, speed === 1)));
+  $("speed").addEventListener("change", () => setSpeed(SPEEDS.indexOf(Number($("speed").value))));
+  for (const [id, action] of [["play", play], ["back", event => step(-1, event.shiftKey)], ["forth", event => step(1, event.shiftKey)],
+    ["previous", () => jump(-1)], ["next", () => jump(1)], ["live", live], ["window", () => setView("window")], ["whole", () => setView("whole")]]) {
+    $(id).addEventListener("click", action);
+  }
+  $("cameras").addEventListener("click", ({target}) => { if (target.dataset.camera) { scene.mode = target.dataset.camera; redraw(); } });
+  addEventListener("keydown", event => {
+    const action = ACTIONS[event.key];
+    if (!action || event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select") || (event.key === " " && event.target.closest("button"))) return;
+    event.preventDefault();
+    action(event);
+  });
+  const timeline = $("timeline"), to = event => timelineTime(timeline, event.clientX - timeline.getBoundingClientRect().left, [begin(), Math.max(end(), begin() + 1)]);
+  timeline.addEventListener("pointerdown", event => { timeline.setPointerCapture(event.pointerId); clock.playing = false; seek(to(event)); });
+  timeline.addEventListener("pointermove", event => { if (event.buttons) seek(to(event)); });
+  for (const kind of ["resize", "scroll"]) addEventListener(kind, redraw, {passive: true});
+  follow(flight);
+  requestAnimationFrame(frame);
+}
+
+start();

@@ -1,0 +1,245 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Serves the page and the samples of one or two flights to browsers on this host, over HTTP.
+
+A browser asks for what is new, and draws the answer before it asks again: nothing queues for a slow one. Only GET is answered,
+for a fixed list of names. The Host header has to name this host, against DNS rebinding. The token of the address is kept in a
+cookie, against other users of this host.
+"""
+
+import asyncio
+import hmac
+import json
+import socket
+import struct
+import time
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tornado.httpserver import HTTPServer
+from tornado.iostream import IOStream
+from tornado.web import Application, HTTPError, RequestHandler
+
+from flight_analysis.report.summary import finite_or_null
+from flight_core.rates import NANOSECONDS
+from flight_view.flight import Flight, description
+
+ADDRESS = "127.0.0.1"
+PAGE = Path(__file__).parent / "page"
+TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
+FILES = {path.name: path for path in sorted(PAGE.iterdir()) if path.suffix in TYPES}
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:;"
+    " base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+MAX_CONNECTIONS = 64  # a browser holds up to six
+REQUEST_TIMEOUT = 10.0  # s, for a request to arrive in full, and for the next one to begin
+MAX_REQUEST_BYTES = 8192
+MAX_WAIT = 2.0  # s that a request for samples waits for new ones
+MAX_ROWS = 10_000  # of a topic in one answer
+POLL_PERIOD = 0.04  # s; the recorder closes a chunk each 0.1 s
+STATE_PERIOD = 0.25  # s, between two looks at the state of the recording
+BUDGET = 0.05  # s of reading between two answers
+
+
+class Server:
+    """The server of one or two flights, and the task that follows their logs."""
+
+    def __init__(self, flights: Sequence[Flight], token: str) -> None:
+        self.flights = flights
+        self.token = token
+        self.port = 0
+        self._news = asyncio.Event()
+        self._http = _LimitedServer(
+            Application(
+                [(r"/(|[a-z]+\.[a-z]+)", _File), (r"/data/([01])", _Data)],
+                default_handler_class=_Handler,
+                log_function=lambda handler: None,
+                flight_server=self,
+            ),
+            idle_connection_timeout=REQUEST_TIMEOUT,
+            body_timeout=REQUEST_TIMEOUT,
+            max_header_size=MAX_REQUEST_BYTES,
+            max_body_size=MAX_REQUEST_BYTES,
+        )
+
+    def listen(self, port: int) -> None:
+        """Listen on this host alone; port 0 takes any free one. Raises OSError where the port is taken."""
+        listener = socket.create_server((ADDRESS, port), backlog=MAX_CONNECTIONS)
+        listener.setblocking(False)
+        self.port = listener.getsockname()[1]
+        self._http.add_socket(listener)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._http.stop()
+
+    def accepts(self, host: str) -> bool:
+        """Whether a Host header names this server, exactly."""
+        return host in {f"{name}:{self.port}" for name in (ADDRESS, "localhost", "[::1]")}
+
+    async def follow(self) -> None:
+        """Read the logs until cancelled. Raises as `Flight.update` does."""
+        while True:
+            found = [flight.update(BUDGET) for flight in self.flights]
+            if any(found):
+                self._news.set()
+                self._news.clear()
+            await asyncio.sleep(0.0 if any(found) else POLL_PERIOD)
+
+    async def news(self, flight: Flight, known: Mapping[str, str]) -> bytes:
+        """The answer to a browser that knows so many rows of each topic; waits up to MAX_WAIT s for something new."""
+        deadline = time.monotonic() + MAX_WAIT
+        while not has_news(flight, known) and (rest := deadline - time.monotonic()) > 0.0:
+            try:
+                await asyncio.wait_for(self._news.wait(), min(rest, STATE_PERIOD))
+            except TimeoutError:
+                continue
+        return answer(flight, known, ghost=len(self.flights) > 1)
+
+
+def _epoch(flight: Flight) -> str:
+    """Changes when rows that a browser knows have changed: by thinning, or with the instant of flight time 0."""
+    return f"{flight.start_ns}.{sum(samples.thinned for samples in flight.samples.values())}"
+
+
+def _first_rows(flight: Flight, known: Mapping[str, str]) -> dict[str, int]:
+    """The first row of each topic that a browser does not know."""
+    same = known.get("epoch") == _epoch(flight)
+    rows = {name: known.get(name, "") if same else "" for name in (*flight.samples, "events")}
+    return {name: int(text) if text.isascii() and text.isdigit() else 0 for name, text in rows.items()}
+
+
+def has_news(flight: Flight, known: Mapping[str, str]) -> bool:
+    """Whether a browser lacks a row, an event, or the state."""
+    first = _first_rows(flight, known)
+    return (
+        known.get("epoch") != _epoch(flight)
+        or known.get("state") != flight.state()
+        or any(samples.count > first[name] for name, samples in flight.samples.items())
+        or len(flight.events) > first["events"]
+    )
+
+
+def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False) -> bytes:
+    """What a browser lacks: the length of a head as uint32, the head as JSON, then columns for each topic of it.
+
+    Little endian; the head ends at a multiple of 8 bytes. Columns of a topic with `count` rows: flight time in s as float64,
+    then each channel as float32, filled up to a multiple of 8 bytes. At most MAX_ROWS rows of a topic.
+    """
+    first = _first_rows(flight, known)
+    topics, columns = [], []
+    for name, samples in flight.samples.items():
+        rows = slice(first[name], min(samples.count, first[name] + MAX_ROWS))
+        t = (samples.stamp_ns[rows] - flight.start_ns) / NANOSECONDS
+        if len(t):
+            topics.append({"name": name, "channels": samples.names, "first": rows.start, "count": len(t)})
+            values = np.ascontiguousarray(samples.values[rows].T, dtype="<f4").tobytes()
+            columns += [t.astype("<f8").tobytes(), values, bytes(-len(values) % 8)]
+    events = [[(one.stamp_ns - flight.start_ns) / NANOSECONDS, one.kind, one.text] for one in flight.events[first["events"] :]]
+    head: dict[str, Any] = {
+        "epoch": _epoch(flight),
+        "state": flight.state(),
+        "ghost": ghost,
+        "faults": flight.faults(),
+        "bands": finite_or_null(flight.bands),
+        "topics": topics,
+        "first_event": first["events"],
+        "events": events,
+        "described": flight.scenario is not None,
+    }
+    if known.get("described") != str(head["described"]).lower():
+        head["flight"] = description(flight)
+    text = json.dumps(head, allow_nan=False).encode()
+    text += b" " * (-(len(text) + 4) % 8)
+    return b"".join([struct.pack("<I", len(text)), text, *columns])
+
+
+class _LimitedServer(HTTPServer):
+    """Accepts at most MAX_CONNECTIONS connections."""
+
+    def initialize(self, *args: Any, **kwargs: Any) -> None:
+        super().initialize(*args, **kwargs)
+        self._count = 0
+
+    def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
+        if self._count >= MAX_CONNECTIONS:
+            stream.close()
+            return
+        self._count += 1
+        super().handle_stream(stream, address)
+
+    def on_close(self, server_conn: object) -> None:
+        self._count -= 1
+        super().on_close(server_conn)
+
+
+class _Handler(RequestHandler):
+    """Checks each request: its Host header, its token. By itself it answers that there is nothing of that name."""
+
+    @property
+    def server(self) -> Server:
+        return self.settings["flight_server"]  # type: ignore[no-any-return]
+
+    @property
+    def cookie(self) -> str:
+        return f"rise_di_{self.server.port}"  # browsers send a cookie to all ports of a host
+
+    def set_default_headers(self) -> None:
+        self.clear_header("Server")
+        for name, value in HEADERS.items():
+            self.set_header(name, value)
+
+    def prepare(self) -> None:
+        if not self.server.accepts(self.request.host):
+            raise HTTPError(HTTPStatus.FORBIDDEN)
+        given = self.get_query_argument("token", "") or self.get_cookie(self.cookie) or ""
+        if not hmac.compare_digest(given.encode(), self.server.token.encode()):
+            raise HTTPError(HTTPStatus.UNAUTHORIZED, reason="Open the whole address that rise-di watch printed")
+
+    def get(self, *_: str) -> Any:
+        raise HTTPError(HTTPStatus.NOT_FOUND)
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.finish(f"{status_code}: {self._reason}\n")
+
+    def log_exception(self, *args: Any) -> None:
+        if not isinstance(args[1], HTTPError):
+            super().log_exception(*args)
+
+
+class _File(_Handler):
+    """The page and its files."""
+
+    def get(self, *names: str) -> None:
+        if self.get_query_argument("token", None) is not None:
+            self.set_cookie(self.cookie, self.server.token, httponly=True, samesite="Strict")
+            self.redirect("/", status=HTTPStatus.SEE_OTHER)
+            return
+        name = names[0] or "index.html"
+        if name not in FILES:
+            raise HTTPError(HTTPStatus.NOT_FOUND)
+        self.set_header("Content-Type", f"{TYPES[FILES[name].suffix]}; charset=utf-8")
+        self.finish(FILES[name].read_bytes())
+
+
+class _Data(_Handler):
+    """The samples of a flight; the query holds how many rows of each topic the browser knows."""
+
+    async def get(self, *names: str) -> None:
+        number = int(names[0])
+        if number >= len(self.server.flights):
+            raise HTTPError(HTTPStatus.NOT_FOUND)
+        known = {name: values[-1].decode("ascii", "replace") for name, values in self.request.query_arguments.items()}
+        content = await self.server.news(self.server.flights[number], known)
+        self.set_header("Content-Type", "application/octet-stream")
+        await self.finish(content)

@@ -1,0 +1,72 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Finds the run to watch and serves it until SIGINT or SIGTERM."""
+
+import asyncio
+import os
+import secrets
+import signal
+import socket
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from flight_core.files import is_folder
+from flight_core.parameters import ParameterError, require
+from flight_log.disk import is_locked
+from flight_log.rosbag2_metadata import bag_files
+from flight_view.flight import Flight
+from flight_view.server import ADDRESS, Server
+
+DEFAULT_PORT = 8077
+NICE = 10  # the flight goes first
+
+
+def newest_run(runs: Path) -> Path:
+    """The newest run that is being recorded, else the last one that was flown. Raises ParameterError without either."""
+    folders = sorted((one for one in runs.iterdir() if is_folder(one)), reverse=True) if is_folder(runs) else []
+    for folder in folders:
+        with suppress(ParameterError, OSError):
+            if any(is_locked(file) for file in bag_files(folder)):
+                return folder
+    latest = runs / "latest"
+    require(is_folder(latest), str(runs), "no run", "the runs of `rise-di fly`, or a RUN by its name")
+    return latest.resolve()
+
+
+def require_log(run: Path) -> None:
+    """Raise ParameterError unless a run has a log."""
+    require(bool(bag_files(run)), str(run), "no .mcap file", "the folder of a run or an MCAP file")
+
+
+def serve(runs: Sequence[Path], port: int, announce: Callable[[str], None]) -> None:
+    """Serve a run, and a second one as its ghost, until SIGINT or SIGTERM. `announce` gets lines for the user.
+
+    Raises ParameterError where the port is taken, or a log cannot be read.
+    """
+    with suppress(OSError):
+        os.nice(NICE)
+    asyncio.run(_serve(runs, port, announce))
+
+
+async def _serve(runs: Sequence[Path], port: int, announce: Callable[[str], None]) -> None:
+    server = Server([Flight(run) for run in runs], secrets.token_urlsafe(16))
+    try:
+        server.listen(port)
+    except (OSError, OverflowError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ParameterError(f"--port: {port} cannot be used ({reason}), expected a free port of this host") from None
+    announce(f"http://{ADDRESS}:{server.port}/?token={server.token}")
+    announce(f"from another machine first: ssh -L {server.port}:{ADDRESS}:{server.port} {socket.gethostname()}")
+    follow = asyncio.ensure_future(server.follow())
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):  # also when a shell started this in the background, with SIGINT ignored
+        loop.add_signal_handler(number, follow.cancel)
+    try:
+        await follow
+    except asyncio.CancelledError:
+        pass
+    except OSError as error:
+        raise ParameterError(f"{error.filename}: cannot be read ({error.strerror}), expected the log of a flight") from None
+    finally:
+        server.close()

@@ -1,0 +1,153 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Following a log that grows: the same values as reading it whole, in pieces of any size, also when it is hostile."""
+
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Metadata
+from mcap.writer import MCAP0_MAGIC, IndexType, Writer
+from numpy.typing import NDArray
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from tests.conftest import REPOSITORY
+from tests.joint_states import JOINT_STATE, STORE, vector
+
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
+from flight_log.disk import is_locked, try_lock
+from flight_log.follow import Follower, Messages
+from flight_log.named_vectors import decoder
+from flight_log.scan import RECORD
+
+CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())
+
+
+def all_of(topic: str, type_name: str) -> float:
+    return math.inf
+
+
+def vectors(found: list[Messages], topic: str) -> tuple[NDArray[np.int64], FloatArray]:
+    """Stamps and values of a topic."""
+    decode = decoder(topic, JOINT_STATE)
+    assert decode is not None
+    parts = [part for one in found if one.topic == topic for part in decode(one.data).samples]
+    return np.concatenate([one.stamp_ns for one in parts]), np.concatenate([one.values for one in parts])
+
+
+@pytest.mark.parametrize("piece", [997, 65_536, 10_000_000])
+def test_a_log_that_grows_in_pieces_gives_what_the_whole_log_holds(
+    piece: int, recorded: Path, tape: Tape, tmp_path: Path
+) -> None:
+    content = (recorded / "run_0.mcap").read_bytes()
+    follower = Follower(tmp_path, all_of)
+    assert list(follower.read()) == []  # the recorder has not begun
+    found: list[Messages | Attachment | Metadata] = []
+    path = tmp_path / "run_0.mcap"
+    for start in range(0, len(content), piece):
+        with path.open("ab") as stream:
+            stream.write(content[start : start + piece])
+        found += follower.read()
+    assert (follower.complete, follower.damaged, follower.fault) == (True, 0, "")
+    messages = [one for one in found if isinstance(one, Messages)]
+    for name, signal in tape.signals.items():
+        stamps, values = vectors(messages, f"/{name}")
+        assert stamps.tolist() == signal.stamp_ns.tolist()
+        assert values.tobytes() == signal.values.tobytes()
+    assert next(one.name for one in found if isinstance(one, Attachment)) == "osprey_gust.yaml"
+    assert "rise_di_host" in [one.name for one in found if isinstance(one, Metadata)]
+
+
+def test_an_iteration_that_is_left_is_continued(recorded: Path) -> None:
+    whole, follower = list(Follower(recorded, all_of).read()), Follower(recorded, all_of)
+    assert [next(iter(follower.read())) for _ in whole] == whole
+
+
+def test_a_topic_is_thinned_to_its_rate_at_even_distances(recorded: Path, tape: Tape) -> None:
+    follower = Follower(recorded, lambda topic, _: 100.0 if topic == "/y" else 0.0)  # y is sent at 500 Hz
+    stamps, _ = vectors([one for one in follower.read() if isinstance(one, Messages)], "/y")
+    assert stamps.tolist() == tape["y"].stamp_ns[::5].tolist()
+    assert set(np.diff(stamps).tolist()) == {10_000_000}
+
+
+@pytest.mark.parametrize("options", [{"index_types": IndexType.NONE}, {"use_chunking": False}])
+def test_logs_without_message_indexes_or_chunks_are_read(options: dict[str, object], tmp_path: Path) -> None:
+    path, sent = tmp_path / "foreign.mcap", [vector(k, ["q"], [k / 7.0]) for k in range(50)]
+    writer = Writer(str(path), chunk_size=2000, **options)  # type: ignore[arg-type]
+    writer.start(profile="ros2", library="test")
+    channel = writer.register_channel("/y", "cdr", writer.register_schema(JOINT_STATE, "ros2msg", b""))
+    for k, data in enumerate(sent):
+        writer.add_message(channel, k, data, k)
+    writer.finish()  # type: ignore[no-untyped-call]
+    found = [data for one in Follower(path, all_of).read() if isinstance(one, Messages) for data in one.data]
+    assert found == sent
+
+
+def test_all_files_of_a_split_bag_are_read_in_order(tmp_path: Path) -> None:
+    run = tmp_path / "split"
+    with RosbagsWriter(run, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/y", JOINT_STATE, typestore=STORE)
+        writer.write(connection, 1, vector(1, ["q"], [1.0]))
+    first = run / "split.mcap"
+    content = first.read_bytes()
+    for number in (10, 2):
+        (run / f"split_{number}.mcap").write_bytes(content)
+    first.unlink()
+    follower = Follower(run, all_of)
+    assert len([one for one in follower.read() if isinstance(one, Messages)]) == 2
+    assert follower.complete
+    assert follower.path is None
+
+
+@pytest.mark.parametrize("case", CORPUS, ids=lambda path: path.name)
+def test_a_hostile_log_ends_without_an_exception_and_without_much_memory(case: Path) -> None:
+    follower = Follower(case, all_of)
+    for one in follower.read():
+        assert not isinstance(one, Messages) or sum(map(len, one.data)) < 1 << 25
+    assert list(follower.read()) == []
+
+
+def test_an_endless_record_is_a_fault_and_a_chunk_in_progress_is_awaited(recorded: Path, tmp_path: Path) -> None:
+    path = tmp_path / "endless.mcap"
+    path.write_bytes(MCAP0_MAGIC + RECORD.pack(Opcode.CHUNK, 1 << 60) + bytes(100))
+    follower = Follower(path, all_of)
+    assert list(follower.read()) == []
+    assert follower.fault == f"a record of {1 << 60} bytes at byte 8"
+    path.write_bytes(MCAP0_MAGIC + RECORD.pack(Opcode.CHUNK, 1 << 20) + bytes(100))
+    follower = Follower(path, all_of)
+    assert list(follower.read()) == []
+    assert (follower.fault, follower.damaged, follower.complete) == ("", 0, False)
+    path.write_bytes(b"PK\x03\x04 is no log")
+    follower = Follower(path, all_of)
+    assert list(follower.read()) == []
+    assert follower.fault.endswith("does not begin as an MCAP file")
+
+
+def test_an_index_that_points_outside_its_messages_counts_as_damage(recorded: Path, tmp_path: Path) -> None:
+    content = bytearray((recorded / "run_0.mcap").read_bytes())
+    place, changed = 8, 0
+    while content[place] != Opcode.DATA_END:
+        opcode, length = RECORD.unpack_from(content, place)
+        if opcode == Opcode.MESSAGE_INDEX and changed < 2:
+            struct.pack_into("<Q", content, place + RECORD.size + 6 + 8, (7, 1 << 50)[changed])
+            changed += 1
+        place += RECORD.size + length
+    path = tmp_path / "run_0.mcap"
+    path.write_bytes(content)
+    follower = Follower(path, all_of)
+    assert len(list(follower.read())) > 10
+    assert (follower.complete, follower.damaged) == (True, 1)  # the rest of that chunk is left out
+
+
+def test_a_file_is_locked_as_long_as_its_recorder_holds_it(tmp_path: Path) -> None:
+    path = tmp_path / "run_0.mcap"
+    path.write_bytes(b"")
+    assert not is_locked(path)
+    with path.open("rb") as stream:
+        assert try_lock(stream)
+        assert is_locked(path)
+    assert not is_locked(path)

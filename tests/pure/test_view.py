@@ -1,0 +1,394 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The live page without a browser: a followed flight, what the server answers, and clients that it refuses."""
+
+import asyncio
+import json
+import socket
+import struct
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tests.conftest import REPOSITORY
+from tests.joint_states import JOINT_STATE, vector
+from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPResponse
+
+from flight_core.parameters import ParameterError
+from flight_core.tape import Tape
+from flight_log.bag import BagWriter
+from flight_log.disk import try_lock
+from flight_view import server as http
+from flight_view.flight import MAX_TEXT, Flight, description
+from flight_view.series import Series
+from flight_view.server import FILES, Server, answer
+from flight_view.watch import newest_run, require_log
+
+TOKEN = "a-token"  # noqa: S105 - of a test
+CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())
+
+
+def decoded(content: bytes) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.float64], NDArray[np.float32]]]]:
+    """Head of an answer, and times (N,) and values (N, k) of its topics."""
+    (size,) = struct.unpack_from("<I", content)
+    head, place = json.loads(content[4 : 4 + size]), 4 + size
+    columns = {}
+    for topic in head["topics"]:
+        count, k = topic["count"], len(topic["channels"])
+        t = np.frombuffer(content, "<f8", count, place)
+        place += 8 * count
+        columns[topic["name"]] = t, np.frombuffer(content, "<f4", count * k, place).reshape(k, count).T
+        place += -(-4 * count * k // 8) * 8
+    assert place == len(content)
+    return head, columns
+
+
+def followed(flight: Flight) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.float64], NDArray[np.float32]]]]:
+    """All that a browser gets, request by request."""
+    known: dict[str, str] = {}
+    parts: dict[str, list[tuple[NDArray[np.float64], NDArray[np.float32]]]] = {}
+    while True:
+        head, columns = decoded(answer(flight, known))
+        for name, part in columns.items():
+            parts.setdefault(name, []).append(part)
+        rows = {name: str(sum(len(t) for t, _ in pieces)) for name, pieces in parts.items()}
+        known = {"epoch": head["epoch"], "state": head["state"], "described": "true", **rows}
+        if not columns:
+            return head, {name: tuple(map(np.concatenate, zip(*pieces, strict=True))) for name, pieces in parts.items()}  # type: ignore[misc]
+
+
+def test_a_page_gets_the_ticks_of_the_flight_to_the_value(recorded: Path, tape: Tape) -> None:
+    flight = Flight(recorded)
+    assert flight.update()
+    _, columns = followed(flight)
+    t, values = columns["internals"]
+    names = flight.samples["internals"].names
+    assert t.tolist() == tape.time("internals").tolist()
+    for k, name in enumerate(names):
+        assert values[:, k].tolist() == tape["internals"][name].astype(np.float32).tolist()
+    assert {"mode", "late", "y.q", "y_m.q", "e.q", "u.elevator", "limited.elevator"} <= set(names)
+    t, values = columns["pose"]
+    assert t.tolist() == tape.time("pose").tolist()
+    assert values.tolist() == tape["pose"].values.astype(np.float32).tolist()
+    assert np.diff(columns["truth"][0]) == pytest.approx(0.02)  # 50 Hz of 500
+
+
+@pytest.mark.parametrize("piece", [1009, 30_000])
+def test_a_flight_that_is_followed_equals_one_that_is_replayed(piece: int, recorded: Path, tmp_path: Path) -> None:
+    content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
+    live, late = Flight(tmp_path), Flight(recorded)
+    late.update()
+    for start in range(0, len(content), piece):
+        with path.open("ab") as stream:
+            stream.write(content[start : start + piece])
+        live.update()
+    (one, columns), (other, columns_late) = followed(live), followed(late)
+    assert one | {"epoch": ""} == other | {"epoch": ""}
+    assert columns.keys() == columns_late.keys()
+    for name, (t, values) in columns.items():
+        assert t.tobytes() == columns_late[name][0].tobytes()
+        assert values.tobytes() == columns_late[name][1].tobytes()
+    assert (live.state(), late.state()) == ("ended", "ended")
+
+
+def test_the_description_has_units_limits_gusts_and_commands_of_the_scenario(recorded: Path) -> None:
+    flight = Flight(recorded)
+    flight.update()
+    shown = description(flight)
+    assert shown["units"]["q"] == {"unit": "mrad/s", "factor": 1000.0}
+    assert shown["modes"]["1"] == "ENGAGED"
+    assert [name for name, *_ in shown["gusts"]] == ["vertical", "lateral"]
+    assert shown["commands"][0][1] > 0.0
+    json.dumps(shown, allow_nan=False)
+    assert [(one.kind, one.text) for one in flight.events] == [("mode", "ENGAGED")]
+    assert set(flight.bands) == {"q", "V", "p", "r"}
+
+
+def test_the_state_tells_a_slow_recorder_from_a_killed_one(recorded: Path, tmp_path: Path) -> None:
+    now, path = 0.0, tmp_path / "run_0.mcap"
+    flight = Flight(tmp_path, now=lambda: now)
+    flight.update()
+    assert flight.state() == "waiting"
+    content = (recorded / "run_0.mcap").read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    flight.update()
+    assert flight.state() == "recording"
+    now = 1.5
+    with path.open("rb") as recorder:
+        assert try_lock(recorder)
+        assert flight.state() == "no data"
+    assert flight.state() == "interrupted"
+    path.write_bytes(content)
+    flight.update()
+    assert flight.state() == "ended"
+
+
+def test_long_logs_are_read_in_slices(recorded: Path) -> None:
+    flight, slices = Flight(recorded), 0
+    while flight.update(budget=0.0):
+        slices += 1
+        assert flight.state() in {"reading", "ended"}
+    assert slices > 10
+    whole = Flight(recorded)
+    whole.update()
+    assert followed(flight)[1]["internals"][1].tobytes() == followed(whole)[1]["internals"][1].tobytes()
+
+
+def test_samples_beyond_the_limit_become_coarser_and_keep_their_peaks() -> None:
+    samples, values = Series(("a", "b"), max_rows=400), np.zeros((1000, 2))
+    values[123, 0], values[457, 1] = 9.0, -7.0
+    for start in range(0, 1000, 30):
+        stamps = np.arange(start, min(start + 30, 1000), dtype=np.int64)
+        samples.append(stamps, values[start : start + 30])
+    assert samples.count <= 400
+    assert samples.thinned > 0
+    assert (samples.values.max(), samples.values.min()) == (9.0, -7.0)
+    assert (np.diff(samples.stamp_ns) > 0).all()
+    assert samples.stamp_ns[[0, -1]].tolist() == [0, 999]
+    samples.append(np.array([998, 1000, 1001], dtype=np.int64), np.ones((3, 2)))
+    assert (samples.refused, int(samples.stamp_ns[-1])) == (1, 1001)
+
+
+def test_a_browser_gets_thinned_samples_again_from_the_start(recorded: Path) -> None:
+    flight = Flight(recorded)
+    flight.update()
+    head, _ = decoded(answer(flight, {}))
+    known = {"epoch": head["epoch"], "internals": "50", "y": "not a number", "u": "-3"}
+    topics = {topic["name"]: topic["first"] for topic in decoded(answer(flight, known))[0]["topics"]}
+    assert (topics["internals"], topics["y"], topics["u"]) == (50, 0, 0)
+    flight.samples["internals"].thinned += 1
+    topics = {topic["name"]: topic["first"] for topic in decoded(answer(flight, known))[0]["topics"]}
+    assert topics["internals"] == 0
+
+
+@pytest.mark.parametrize("case", CORPUS, ids=lambda path: path.name)
+def test_a_hostile_log_is_shown_as_far_as_it_goes(case: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run_0.mcap"
+    path.write_bytes(case.read_bytes())
+    flight = Flight(path)
+    with np.errstate(all="ignore"):
+        flight.update()
+        head, _ = decoded(answer(flight, {}))
+    assert all(sentence.isprintable() for sentence in head["faults"])
+
+
+def test_names_and_texts_of_a_log_are_bounded_and_printable(tmp_path: Path) -> None:
+    hostile = "<img src=x onerror=alert(1)>\x1b[2J" + "a" * 5000
+    with BagWriter(tmp_path / "run") as bag:
+        y = bag.add_topic("/y", JOINT_STATE, "")
+        other = bag.add_topic("/other/y", JOINT_STATE, "")
+        for k in range(3):
+            bag.write(y, k, k, k, vector(k, [hostile], [float("nan")]))
+            bag.write(other, k, k, k, vector(k, ["q"], [1.0]))
+    flight = Flight(tmp_path / "run")
+    flight.update()
+    head, _ = decoded(answer(flight, {}))
+    assert head["topics"][0]["channels"][0].startswith("<img src=x onerror=alert(1)>\\x1b[2J")
+    assert head["faults"] == ["another aircraft in the namespace /other is not shown"]
+    assert max(map(len, head["topics"][0]["channels"])) <= MAX_TEXT
+
+
+# The server
+
+
+@asynccontextmanager
+async def serving(*runs: Path) -> AsyncIterator[Server]:
+    server = Server([Flight(run) for run in runs], TOKEN)
+    server.listen(0)
+    task = asyncio.ensure_future(server.follow())
+    try:
+        yield server
+    finally:
+        task.cancel()
+        server.close()
+
+
+def against(*runs: Path) -> Callable[[Callable[[Server], Coroutine[Any, Any, None]]], None]:
+    """Run a coroutine against a server of these runs."""
+
+    def start(client: Callable[[Server], Coroutine[Any, Any, None]]) -> None:
+        async def both() -> None:
+            async with serving(*runs) as server:
+                await asyncio.wait_for(client(server), 60.0)
+
+        asyncio.run(both())
+
+    return start
+
+
+async def get(server: Server, path: str, method: str = "GET", token: str = TOKEN, **headers: str) -> HTTPResponse:
+    given = {"Cookie": f"rise_di_{server.port}={token}"} if token else {}
+    return await AsyncHTTPClient(force_instance=True).fetch(
+        f"http://127.0.0.1:{server.port}{path}",
+        method=method,
+        headers=given | headers,
+        body=b"" if method in {"POST", "PUT", "PATCH"} else None,
+        follow_redirects=False,
+        raise_error=False,
+        request_timeout=20.0,
+    )
+
+
+def test_the_page_is_served_with_a_token_alone_and_asks_no_other_host(recorded: Path) -> None:
+    async def client(server: Server) -> None:
+        login = await get(server, f"/?token={TOKEN}", token="")
+        assert (login.code, login.headers["Location"]) == (303, "/")
+        cookie = login.headers["Set-Cookie"]
+        assert "HttpOnly" in cookie
+        assert "SameSite=Strict" in cookie
+        page = await get(server, "/")
+        assert page.code == 200
+        assert page.headers["Content-Security-Policy"].startswith("default-src 'none'")
+        assert "frame-ancestors 'none'" in page.headers["Content-Security-Policy"]
+        assert page.headers["X-Content-Type-Options"] == "nosniff"
+        assert page.headers["Referrer-Policy"] == "no-referrer"
+        assert "Server" not in page.headers
+        for name in FILES:
+            assert (await get(server, f"/{name}")).body == FILES[name].read_bytes()
+        head, _ = decoded((await get(server, "/data/0")).body)
+        assert (head["flight"]["name"], head["ghost"]) == ("run", False)
+        assert (await get(server, "/data/1")).code == 404
+
+    against(recorded)(client)
+    for path in FILES.values():
+        text = path.read_text(encoding="utf-8")
+        assert "://" not in text
+        assert "innerHTML" not in text
+
+
+@pytest.mark.parametrize(
+    ("path", "method", "headers", "expected"),
+    [
+        ("/", "GET", {"Host": "evil.example"}, 403),
+        ("/", "GET", {"Host": "127.0.0.1.evil.example"}, 403),
+        ("/", "GET", {"Host": "127.0.0.1:1"}, 403),
+        ("/data/0", "GET", {"Host": "localhost"}, 403),
+        ("/../../../etc/passwd", "GET", {}, 404),
+        ("/..%2f..%2fetc%2fpasswd", "GET", {}, 404),
+        ("/server.py", "GET", {}, 404),
+        ("/data/2", "GET", {}, 404),
+        ("/", "POST", {}, 405),
+        ("/data/0", "PUT", {}, 405),
+        ("/data/0", "DELETE", {}, 405),
+        ("/nothing", "PATCH", {}, 405),
+        ("/", "OPTIONS", {}, 405),
+        ("/", "HEAD", {}, 405),
+    ],
+)
+def test_a_foreign_host_another_path_and_another_method_are_refused(
+    path: str, method: str, headers: dict[str, str], expected: int, recorded: Path
+) -> None:
+    async def client(server: Server) -> None:
+        assert (await get(server, path, method, **headers)).code == expected
+
+    against(recorded)(client)
+
+
+@pytest.mark.parametrize("path", ["/", "/view.js", "/data/0", "/nothing", "/?token=another", "/data/0?token=\xff"])
+def test_nothing_is_served_without_the_token(path: str, recorded: Path) -> None:
+    async def client(server: Server) -> None:
+        for token in ("", "another"):
+            response = await get(server, path.replace("\xff", "%ff"), token=token)
+            assert response.code in {400, 401}
+            assert b"rise-di watch" in response.body or response.code == 400
+
+    against(recorded)(client)
+
+
+def test_connections_beyond_the_limit_are_closed_and_free_ones_serve_again(recorded: Path) -> None:
+    async def client(server: Server) -> None:
+        idle = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(http.MAX_CONNECTIONS)]
+        for _ in range(200):
+            reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+            assert await reader.read() == b""  # closed at once
+            writer.close()
+        for _, writer in idle:
+            writer.close()
+        while True:
+            try:
+                assert (await get(server, "/")).code == 200
+            except (HTTPClientError, OSError):  # the server has not noticed yet
+                continue
+            break
+
+    against(recorded)(client)
+
+
+def test_a_request_that_arrives_slowly_or_is_too_long_is_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.3)
+
+    async def client(server: Server) -> None:
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+
+        async def drip() -> None:
+            for byte in b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 10_000:
+                writer.write(bytes([byte]))
+                await asyncio.sleep(0.05)
+
+        slow = asyncio.ensure_future(drip())
+        assert await reader.read() == b""
+        slow.cancel()
+        writer.close()
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        writer.write(b"GET /" + b"a" * (2 * http.MAX_REQUEST_BYTES) + b" HTTP/1.1\r\n")
+        assert (await reader.read())[:12] in {b"", b"HTTP/1.1 400"}
+        writer.close()
+
+    against(recorded)(client)
+
+
+def test_a_browser_that_knows_all_waits_for_news_and_gets_the_next_samples(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
+    path.write_bytes(content[: len(content) // 2])
+
+    async def client(server: Server) -> None:
+        rows: dict[str, int] = {}
+        head: dict[str, Any] = {}
+        while head.get("state") != "ended":
+            known = {"epoch": head.get("epoch", ""), "state": head.get("state", ""), **rows}
+            query = "&".join(f"{name}={value}" for name, value in known.items())
+            head, columns = decoded((await get(server, f"/data/0?{query}")).body)
+            for name, (t, _) in columns.items():
+                rows[name] = rows.get(name, 0) + len(t)
+            path.write_bytes(content)
+        assert rows == {name: samples.count for name, samples in server.flights[0].samples.items()}
+
+    against(tmp_path)(client)
+
+
+def test_the_server_listens_on_this_host_alone(recorded: Path) -> None:
+    async def client(server: Server) -> None:
+        with socket.socket() as other:
+            other.settimeout(5.0)
+            assert other.connect_ex(("127.0.0.2", server.port)) != 0
+        with pytest.raises(OSError, match="in use"):
+            Server([], TOKEN).listen(server.port)
+
+    against(recorded)(client)
+
+
+# Which run
+
+
+def test_the_run_that_is_recorded_is_chosen_else_the_last_one(recorded: Path, tmp_path: Path) -> None:
+    for name in ("20260101T000000Z-a", "20260102T000000Z-b", "20260103T000000Z-c"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run_0.mcap").write_bytes(b"")
+    (tmp_path / "latest").symlink_to("20260101T000000Z-a")
+    assert newest_run(tmp_path).name == "20260101T000000Z-a"
+    with (tmp_path / "20260102T000000Z-b" / "run_0.mcap").open("rb") as recorder:
+        assert try_lock(recorder)
+        assert newest_run(tmp_path).name == "20260102T000000Z-b"
+
+
+def test_no_run_and_no_log_are_sentences(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="found no run, expected"):
+        newest_run(tmp_path / "nowhere")
+    with pytest.raises(ParameterError, match=r"found no \.mcap file, expected the folder of a run or an MCAP file"):
+        require_log(tmp_path)
