@@ -5,6 +5,7 @@
 The node and the loop in one process both use this simulator, for every kind of aircraft.
 """
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -63,8 +64,8 @@ class StateSpaceModel:
         states = list(airframe.states)
         self._places = [states.index(name) if name in states else None for name in POSE_STATES]
         self._speed, self._euler = airframe.speed, parameters.kinematics == "euler"
-        self._psi, self._position = 0.0, np.zeros(3)  # north, east, altitude
-        self._psi_dot, self._velocity = self._heading_rate(), self._air_velocity()
+        self._psi, self._position = 0.0, [0.0, 0.0, 0.0]  # north, east, altitude
+        self._psi_dot, self._velocity = self._heading_rate(self._states()), self._air_velocity(self._states())
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """See FlightDynamicsModel."""
@@ -76,10 +77,11 @@ class StateSpaceModel:
         forced = Forcing(*(part[2 * begin : 2 * (begin + steps) + 1] for part in self._block))
         self._state = plant.advance(t_ns, self._state, u, duration_ns, self._plant, forced)
         half, psi_dot, velocity = seconds(duration_ns) / 2.0, self._psi_dot, self._velocity
-        self._psi_dot = self._heading_rate()
+        states = self._states()
+        self._psi_dot = self._heading_rate(states)
         self._psi += half * (psi_dot + self._psi_dot)
-        self._velocity = self._air_velocity()
-        self._position = self._position + half * (velocity + self._velocity)
+        self._velocity = self._air_velocity(states)
+        self._position = [x + half * (v + w) for x, v, w in zip(self._position, velocity, self._velocity, strict=True)]
 
     def pose(self) -> FloatArray:
         """See FlightDynamicsModel."""
@@ -92,15 +94,15 @@ class StateSpaceModel:
         x = self._state.x.tolist()
         return [0.0 if place is None else x[place] for place in self._places]
 
-    def _heading_rate(self) -> float:
-        """psi_dot in rad/s; r with the linear kinematics."""
-        *_, phi, theta, q, r = self._states()
+    def _heading_rate(self, states: Sequence[float]) -> float:
+        """psi_dot in rad/s from the POSE_STATES; r with the linear kinematics."""
+        *_, phi, theta, q, r = states
         return pose.psi_dot(phi, theta, q, r) if self._euler else r
 
-    def _air_velocity(self) -> FloatArray:
-        """Velocity relative to the air mass: north, east, up, shape (3,), m/s."""
-        V, alpha, beta, phi, theta, *_ = self._states()
-        return np.array(pose.velocity(self._speed + V, alpha, beta, phi, theta, self._psi))
+    def _air_velocity(self, states: Sequence[float]) -> tuple[float, float, float]:
+        """Velocity relative to the air mass: north, east, up, m/s."""
+        V, alpha, beta, phi, theta, *_ = states
+        return pose.velocity(self._speed + V, alpha, beta, phi, theta, self._psi)
 
     def y(self) -> FloatArray:
         """See FlightDynamicsModel."""

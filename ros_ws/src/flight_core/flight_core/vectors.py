@@ -67,7 +67,7 @@ def select(wanted: Sequence[str], names: Sequence[str], values: Sequence[float] 
     """
     if len(names) != len(values):
         raise ChannelError("length", f"{len(names)} names for {len(values)} values")
-    if list(names) == list(wanted):
+    if names is wanted or list(names) == list(wanted):
         selected = np.array(values, dtype=np.float64)
     else:
         for name in wanted:
