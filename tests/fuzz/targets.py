@@ -26,7 +26,6 @@ from flight_analysis.closed_loop.scenario import load_scenario
 from flight_bringup.scenarios import share
 from flight_core.parameters import ParameterError
 from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
-from flight_log.latency import latency
 from flight_log.named_vectors import decoder
 from flight_log.playback import read_playback
 from flight_log.repair import repair
@@ -61,7 +60,6 @@ def mcap(data: bytes, folder: Path) -> None:
     run = write_run(folder, data)
     file = run / "run_0.mcap"
     rejected(lambda: read_run(file))
-    rejected(lambda: latency(file))
     rejected(lambda: read_playback(file))
     rejected(lambda: _replay(file))
     if not rejected(lambda: repair(run)) and any(one.damaged for one in repair(run).files):
@@ -127,7 +125,6 @@ def message(data: bytes, folder: Path) -> None:
         decode(messages)
     run = write_run(folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)]))
     rejected(lambda: read_run(run))
-    rejected(lambda: latency(run))
     rejected(lambda: read_playback(run))
     rejected(lambda: parameter_changes(run, "controller", RiseDiParameters.model_fields))
 

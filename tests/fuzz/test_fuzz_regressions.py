@@ -19,7 +19,6 @@ from flight_analysis.report.html import script_json
 from flight_analysis.report.run_folder import read_flight
 from flight_core.files import parse_yaml
 from flight_core.parameters import MAX_SENTENCE_LENGTH, ParameterError
-from flight_log.latency import latency
 from flight_log.playback import read_playback
 from flight_log.repair import repair
 from flight_log.rosbag2_metadata import METADATA, read_bag_metadata
@@ -94,8 +93,8 @@ def test_with_an_invalid_flight_time_the_first_sample_is_at_0(t: float, tmp_path
 
 
 def test_a_truncated_u_or_one_of_another_type_has_no_latency(tmp_path: Path) -> None:
-    assert latency(write_run(tmp_path, log([*Y, ("/u", JOINT_STATE, b"\x00\x01")]))) is None
-    assert latency(write_run(tmp_path, log([*Y, ("/u", "std_msgs/msg/String", b"\x00\x01\x00\x00")]))) is None
+    assert read_run(write_run(tmp_path, log([*Y, ("/u", JOINT_STATE, b"\x00\x01")]))).latency is None
+    assert read_run(write_run(tmp_path, log([*Y, ("/u", "std_msgs/msg/String", b"\x00\x01\x00\x00")]))).latency is None
 
 
 def test_invalid_topic_names_are_rejected(tmp_path: Path) -> None:

@@ -22,10 +22,10 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_log.bag import BagWriter, LogAttachments
+from flight_log.engagements import Engagement
 from flight_log.message_definitions import definition
 from flight_log.named_vectors import decoder
 from flight_log.scan import Scan
-from flight_log.stored_messages import Engagement, engagements
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 
@@ -317,13 +317,12 @@ def test_other_types_have_no_decoder_and_malformed_messages_are_counted() -> Non
 
 def test_the_engagements_of_a_log_begin_with_the_phase_engaged_and_end_with_their_reason(tmp_path: Path) -> None:
     """Reports come at each change and once a second. The messages are written by the library rosbags."""
-    assert engagements(tmp_path) is None
     kind = "diagnostic_msgs/msg/KeyValue"
     bag = BagWriter(tmp_path / "run")
     other = bag.add_topic("/y", JOINT_STATE, "")
-    bag.write(other, 1, 1, 1, b"")
+    bag.write(other, 1, 1, 1, SAMPLES[0])
     bag.flush()
-    assert engagements(tmp_path / "run") is None
+    assert read_run(tmp_path / "run").engagements is None
     channel = bag.add_topic("/plane/bridge/engagement", kind, "")
     reports = ["DISENGAGED", "ENGAGED", "ENGAGED", "RELEASE lost", "DISENGAGED lost", "ENGAGING mode", "ENGAGED", "ENGAGED"]
     for number, report in enumerate(reports):
@@ -331,4 +330,7 @@ def test_the_engagements_of_a_log_begin_with_the_phase_engaged_and_end_with_thei
         data = bytes(STORE.serialize_cdr(STORE.types[kind](key=key, value=value), kind))
         bag.write(channel, number, 10 * number, number, data)
     bag.close()
-    assert engagements(tmp_path / "run") == [Engagement(10, 30, "lost"), Engagement(60, None, "")]  # when they were sent
+    assert read_run(tmp_path / "run").engagements == [
+        Engagement(10, 30, "lost"),
+        Engagement(60, None, ""),
+    ]  # when they were sent

@@ -17,7 +17,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_cli.report import report
 from flight_core.parameters import ParameterError
 from flight_log.bag import BagWriter
-from flight_log.latency import latency
+from flight_log.tape_reader import read_run
 
 
 @pytest.fixture(scope="module")
@@ -87,11 +87,11 @@ def test_latency_is_the_time_between_the_sending_of_y_and_of_its_u(tmp_path: Pat
             channel = bag.add_topic(topic, JOINT_STATE, "")
             for stamp, at in instants.items():
                 bag.write(channel, EPOCH + 99 * MS, EPOCH + at * MS, 1, vector(EPOCH + stamp * MS, ["q"], [1.0]))
-    latencies = latency(tmp_path / "run")
+    latencies = read_run(tmp_path / "run").latency
     assert latencies is not None
     assert (latencies.stamp_ns - EPOCH).tolist() == [0, 20 * MS]
     assert latencies["y_to_u"].tolist() == [2e-3, 5e-3]
 
 
 def test_a_flight_in_one_process_has_no_latency(runs: list[Path]) -> None:
-    assert latency(runs[0]) is None
+    assert read_run(runs[0]).latency is None

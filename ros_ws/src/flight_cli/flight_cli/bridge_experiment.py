@@ -32,7 +32,6 @@ from flight_bringup.graph import find_autopilot
 from flight_cli.output import CLOCK_COLUMNS, display_path, new_table, progress_bar, write_text
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Tape
-from flight_log.stored_messages import engagements
 from flight_log.tape_reader import read_run
 
 
@@ -126,7 +125,8 @@ def _announce(console: Console, planned: Experiment, duration: float) -> None:
 
 def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]]]:
     """The tape of a run and its engaged spans, ns. Raises ParameterError for a log without an engagement."""
-    tape, flown = read_run(run).tape, engagements(run)
+    recorded = read_run(run)
+    tape, flown = recorded.tape, recorded.engagements
     for topic in ("y", "u", "bridge/would_send"):
         require(topic in tape, str(run), f"no {topic}", "a log of a flight with a bridge")
     if not flown:

@@ -10,7 +10,6 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from flight_analysis.design.sign_check import require_signs
 from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import find_autopilot, require_limits
@@ -50,6 +49,8 @@ def fly(
     stepping = lockstep or one_process or chosen.flight.lockstep
     autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
     if autopilot is not None:
+        from flight_analysis.design.sign_check import require_signs  # noqa: PLC0415 - loads SciPy, which few flights need
+
         require_signs(autopilot.channel_map, chosen)
         require_limits(autopilot, chosen)
     require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")

@@ -68,6 +68,35 @@ def flight_start_ns(stamp_ns: int, t: float) -> int | None:
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 
 
+def encoded(frame_id: str, samples: Samples) -> NDArray[np.uint8]:
+    """The samples as serialised sensor_msgs/JointState, one in each row, with empty velocity and effort.
+
+    The first is serialised by its definition. The others differ from it in stamp and values only.
+    """
+    store = typestore()
+    types: dict[str, Any] = store.types
+    header, time = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
+    empty, marks = np.zeros(0), _marks(len(samples.names))
+    message = types[JOINT_STATE](header(time(sec=0, nanosec=0), frame_id), list(samples.names), marks, empty, empty)
+    template = bytes(store.serialize_cdr(message, JOINT_STATE))
+    rows = np.tile(np.frombuffer(template, dtype=np.uint8), (len(samples.stamp_ns), 1))
+    seconds, nanoseconds = np.divmod(samples.stamp_ns, NANOSECONDS)
+    rows[:, STAMP] = np.stack([seconds, nanoseconds], axis=1).astype("<u4").view(np.uint8)
+    rows[:, _position(template, marks)] = np.ascontiguousarray(samples.values, dtype="<f8").view(np.uint8)
+    return rows
+
+
+def _marks(k: int) -> FloatArray:
+    """Values that no string holds."""
+    return np.asarray(-np.arange(1.0, k + 1.0) * np.pi)
+
+
+def _position(marked: bytes, marks: FloatArray) -> slice:
+    """The place of the values in a message that was serialised with marks."""
+    start = marked.index(marks.tobytes())
+    return slice(start, start + marks.nbytes)
+
+
 class _JointStateDecoder:
     """sensor_msgs/JointState with names and positions."""
 
@@ -123,12 +152,12 @@ class _JointStateDecoder:
         k = len(one.name)
         if k == 0 or len(one.position) != k or len(one.velocity) or len(one.effort) or message[:4] != b"\x00\x01\x00\x00":
             return
-        marks: FloatArray = -np.arange(1.0, k + 1.0) * np.pi
+        marks = _marks(k)
         marked = bytes(self._store.serialize_cdr(type(one)(one.header, one.name, marks, one.velocity, one.effort), JOINT_STATE))
-        start = marked.index(marks.tobytes())
-        if len(marked) != len(message) or message[start : start + 8 * k] != one.position.tobytes():
+        values = _position(marked, marks)
+        if len(marked) != len(message) or message[values] != one.position.tobytes():
             return
-        self._names, self._values = tuple(one.name), slice(start, start + 8 * k)
+        self._names, self._values = tuple(one.name), values
         self._template = np.frombuffer(message, dtype=np.uint8)
         self._is_constant = np.ones(len(message), dtype=np.bool_)
         self._is_constant[STAMP] = self._is_constant[self._values] = False

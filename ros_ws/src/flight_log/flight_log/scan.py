@@ -159,10 +159,15 @@ def split(data: bytes) -> Iterator[McapRecord]:
     while position < len(data):
         opcode, length = RECORD.unpack_from(data, position)
         position += RECORD.size
-        if position + length > len(data):
+        end = position + length
+        if end > len(data):
             raise McapError("a record longer than its container")
-        yield from decode(opcode, data[position : position + length])
-        position += length
+        if opcode == Opcode.MESSAGE and length >= MESSAGE.size:  # here, for nearly all records are messages
+            channel, sequence, log_time, publish_time = MESSAGE.unpack_from(data, position)
+            yield Message(channel, log_time, data[position + MESSAGE.size : end], publish_time, sequence)
+        else:
+            yield from decode(opcode, data[position:end])
+        position = end
 
 
 def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:

@@ -20,18 +20,6 @@ PARAMETER_EVENTS = "/parameter_events"
 PARAMETER_EVENT = "rcl_interfaces/msg/ParameterEvent"
 
 
-ENGAGEMENT, KEY_VALUE = "/bridge/engagement", "diagnostic_msgs/msg/KeyValue"
-ENGAGED = "ENGAGED"  # the key of a report
-
-
-class Engagement(NamedTuple):
-    """A time in which an autopilot was flown. Times in ns of the system clock."""
-
-    start_ns: int
-    stop_ns: int | None  # None where the log ends before
-    reason: str  # of its end
-
-
 class StoredMessage(NamedTuple):
     """One message. Times in ns of the recorder's clock."""
 
@@ -88,28 +76,6 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
         if values:
             events.append((event.stamp.sec * NANOSECONDS + event.stamp.nanosec, values))
     return [values for _, values in sorted(events, key=lambda one: one[0])]
-
-
-def engagements(run: Path) -> list[Engagement] | None:
-    """The engagements of a bridge on `bridge/engagement`, in order; None for a flight without a bridge, or no bag of MCAP."""
-    if not bag_files(run):
-        return None
-    store = typestore()
-    found: list[Engagement] | None = None
-    for stored in stored_messages(run):
-        if not stored.topic.endswith(ENGAGEMENT) or stored.type_name != KEY_VALUE:
-            continue
-        try:
-            report: Any = store.deserialize_cdr(stored.data, KEY_VALUE)
-        except SerdeError:
-            continue
-        found = found or []
-        is_open = bool(found) and found[-1].stop_ns is None
-        if report.key == ENGAGED and not is_open:
-            found.append(Engagement(stored.sent_ns, None, ""))
-        elif report.key != ENGAGED and is_open:
-            found[-1] = found[-1]._replace(stop_ns=stored.sent_ns, reason=report.value)
-    return found
 
 
 def parameter_value(message: Any) -> Any:

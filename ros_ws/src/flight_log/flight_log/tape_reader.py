@@ -3,7 +3,7 @@
 """Reads a bag as a Tape, without ROS: bags of this stack and of `ros2 bag record`, also truncated ones."""
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,10 @@ from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
-from flight_log.named_vectors import Decoder, decoder, flight_start_ns
+from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
+from flight_log.latency import TOPICS as TIMED_TOPICS
+from flight_log.latency import latency
+from flight_log.named_vectors import STAMP, Decoder, decoder, flight_start_ns, stamp_of
 from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
 from flight_log.scan import Scan
 
@@ -37,12 +40,18 @@ class StoredFile(NamedTuple):
 
 
 class RecordedRun(NamedTuple):
-    """The content of a log. `metadata` holds its named sets of strings, `attachments` all files except the scenario."""
+    """The content of a log. `metadata` holds its named sets of strings, `attachments` all files except the scenario.
+
+    `latency` is that of the loop from y to u, `engagements` are those of a bridge; None for a log without them, or one that
+    is no bag of MCAP files.
+    """
 
     tape: Tape
     scenario: StoredFile | None
     metadata: Mapping[str, Mapping[str, str]] = {}
     attachments: tuple[StoredFile, ...] = ()
+    latency: Signal | None = None
+    engagements: list[Engagement] | None = None
 
 
 def read_run(run: Path, namespace: str | None = None) -> RecordedRun:
@@ -62,7 +71,8 @@ def read_run(run: Path, namespace: str | None = None) -> RecordedRun:
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
     notes = [*log.notes_at(end), *(note for topic, name in names.items() if (note := log.topics[topic].note(name)))]
     tape = Tape(signals, start_ns, tuple(map(printable, notes)))
-    return RecordedRun(tape, log.scenario, log.metadata, tuple(log.attachments))
+    engaged = engagements(log.reports)
+    return RecordedRun(tape, log.scenario, log.metadata, tuple(log.attachments), latency(log.sent), engaged)
 
 
 def _names_of_one_aircraft(topics: Collection[str], namespace: str | None, where: str) -> dict[str, str]:
@@ -137,6 +147,25 @@ class _Log:
         self.truncated: list[str] = []  # names of the truncated files
         self.last_ns = 0  # log time of the last message
         self.known_end_ns = 0  # the latest log time in any index or metadata
+        self.sent: dict[str, dict[int, int]] = {}  # of y and u by full topic name: times of sending by stamp, ns
+        self.reports: list[tuple[int, bytes]] = []  # of a bridge: time of sending, ns, and message
+
+    def reader_of(self, topic: str, type_name: str) -> Callable[[Message], None] | None:
+        """What takes the messages of a topic; None for a topic that plays no part."""
+        samples = self.samples_of(topic, type_name)
+        if samples is not None and topic.rpartition("/")[2] in TIMED_TOPICS:
+
+            def take(message: Message) -> None:
+                samples.add(message.data)
+                if len(message.data) >= STAMP.stop:
+                    self.sent.setdefault(topic, {})[stamp_of(message.data)] = message.publish_time
+
+            return take
+        if samples is not None:
+            return lambda message: samples.add(message.data)
+        if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
+            return lambda message: self.reports.append((message.publish_time, message.data))
+        return None
 
     def samples_of(self, topic: str, type_name: str) -> _TopicSamples | None:
         """The samples of a topic; None for a type without named vectors."""
@@ -192,19 +221,19 @@ def _bag_metadata(run: Path, log: _Log) -> Mapping[str, Any]:
 
 def _read_mcap(file: Path, log: _Log) -> None:
     schemas: dict[int, str] = {}
-    channels: dict[int, _TopicSamples] = {}
+    channels: dict[int, Callable[[Message], None]] = {}
     scan = Scan(file)
     try:
         for record in scan.records():
             if isinstance(record, Message):
                 log.last_ns = max(log.last_ns, record.log_time)
-                if record.channel_id in channels:
-                    channels[record.channel_id].add(record.data)
+                if (take := channels.get(record.channel_id)) is not None:
+                    take(record)
             elif isinstance(record, Schema):
                 schemas[record.id] = record.name
             elif isinstance(record, Channel):
-                if (samples := log.samples_of(record.topic, schemas.get(record.schema_id, ""))) is not None:
-                    channels[record.id] = samples
+                if (take := log.reader_of(record.topic, schemas.get(record.schema_id, ""))) is not None:
+                    channels[record.id] = take
             else:
                 log.add(record)
     except OSError as error:

@@ -23,9 +23,10 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.disk import is_locked
+from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
 from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, typestore
-from flight_log.stored_messages import ENGAGEMENT, KEY_VALUE, PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
+from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_view.series import Series
 from rise_di_controller.guard import Mode
 

@@ -17,7 +17,6 @@ from flight_analysis.design.response_identification import MIN_RATIO, Response, 
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
-from flight_log.stored_messages import engagements
 from flight_log.tape_reader import read_run
 from rise_di_controller.decomposition import signs
 
@@ -78,7 +77,7 @@ def recorded_response(bag: Path, outputs: tuple[str, ...], inputs: tuple[str, ..
     tape = recorded.tape
     for topic in ("y", "u"):
         require(topic in tape, str(bag), f"no {topic}", "a log with y and u")
-    flown = engagements(bag)
+    flown = recorded.engagements
     if flown is None:
         require("bridge/would_send" not in tape, str(bag), "no engagement of its bridge", "a flight with an engaged bridge")
         spans = None

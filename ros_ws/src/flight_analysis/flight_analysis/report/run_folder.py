@@ -22,10 +22,9 @@ from flight_core.parameters import ParameterError, printable
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_log.bag import LogAttachments
-from flight_log.latency import latency
+from flight_log.engagements import Engagement
 from flight_log.provenance import provenance
 from flight_log.rosbag2_metadata import bag_files
-from flight_log.stored_messages import Engagement, engagements
 from flight_log.tape_reader import RecordedRun, read_run
 
 SUMMARY, REPORT = "summary.json", "report.html"
@@ -81,10 +80,9 @@ def read_flight(run: Path, outcome: str | None = None) -> RecordedFlight:
     """
     recorded = read_run(run)
     folder, scenario = _folder(run), _extract_scenario(recorded, run)
-    latencies = latency(run)
-    signals = recorded.tape.signals if latencies is None else {**recorded.tape.signals, "latency": latencies}
+    signals = recorded.tape.signals if recorded.latency is None else {**recorded.tape.signals, "latency": recorded.latency}
     tape = _until_last_input(replace(recorded.tape, signals=signals))
-    flown = engagements(run)
+    flown = recorded.engagements
     if outcome == COMPLETED and "internals" not in tape and flown is None:
         outcome = "the controller never engaged"
     name = folder.name if run.is_dir() else run.stem

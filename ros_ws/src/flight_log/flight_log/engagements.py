@@ -1,0 +1,39 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The engagements of a bridge in a log, by the reports of the bridge on `bridge/engagement`."""
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from rosbags.serde.errors import SerdeError
+
+from flight_log.named_vectors import typestore
+
+ENGAGEMENT, KEY_VALUE = "/bridge/engagement", "diagnostic_msgs/msg/KeyValue"
+ENGAGED = "ENGAGED"  # the key of a report
+
+
+class Engagement(NamedTuple):
+    """A time in which an autopilot was flown. Times in ns of the system clock."""
+
+    start_ns: int
+    stop_ns: int | None  # None where the log ends before
+    reason: str  # of its end
+
+
+def engagements(reports: Iterable[tuple[int, bytes]]) -> list[Engagement] | None:
+    """The engagements, in order, from the times of sending and the messages of the reports; None without a report."""
+    store = typestore()
+    found: list[Engagement] | None = None
+    for sent_ns, data in reports:
+        try:
+            report: Any = store.deserialize_cdr(data, KEY_VALUE)
+        except SerdeError:
+            continue
+        found = found or []
+        is_open = bool(found) and found[-1].stop_ns is None
+        if report.key == ENGAGED and not is_open:
+            found.append(Engagement(sent_ns, None, ""))
+        elif report.key != ENGAGED and is_open:
+            found[-1] = found[-1]._replace(stop_ns=sent_ns, reason=report.value)
+    return found
