@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report page in a browser: it draws without errors and fast, in light and dark, and a zoom shows all samples."""
+"""The report page in a browser: it draws without errors, in light and dark, and a zoom shows all samples."""
 
 import base64
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +21,6 @@ from flight_core.tape import Signal, Tape
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 DRAWN = "Number(document.body?.dataset.drawn ?? 0)"  # counts the views of all figures
 PLOTS = "[...document.querySelectorAll('figure > div')]"
-MAX_DRAW_TIME = 2.0  # s until all figures are drawn; measured 0.9 s, twice that beside four other tests
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +96,7 @@ def test_a_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, 
         assert inside == pytest.approx(np.arange(51) * 0.002 + 2.0, abs=1e-9)  # 500 Hz
     t = servo.tape.time("y")
     x, values = curve(browser, 0, "y", row=2)
-    assert values == pytest.approx(np.interp(x, t, y["V"]), rel=1e-6)  # float32
+    assert values == pytest.approx(np.interp(x, t, y["V"]), rel=2.0**-15.9)  # plotting.MANTISSA, and float32
     assert browser.run(f"{PLOTS}.slice(0, 3).map(plot => plot._fullLayout.xaxis4.range)") == [[2.0, 2.1]] * 3
     zoom(browser, 0.0, 7.0, plot=2)
     again, _ = curve(browser, 0, "y")
@@ -161,21 +159,19 @@ def test_no_table_is_wider_than_the_page(browser: Browser, page: Path) -> None:
     assert browser.run("[...document.querySelectorAll('.tables > div')].every(table => table.scrollWidth <= table.clientWidth)")
 
 
-def test_ten_minutes_at_500_hz_are_drawn_in_time(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
-    # White noise in y, u and the truth hardly compresses. The best of three loads, for other processes share the host.
+def test_ten_minutes_at_500_hz_are_decimated_and_a_zoom_shows_every_sample(
+    browser: Browser, tmp_path: Path, servo: RecordedFlight
+) -> None:
+    # White noise in y, u and the truth hardly compresses.
     count, random, signals = 300_001, np.random.default_rng(1), {}
     for topic in ("y", "y_m", "u", "truth"):
         names = servo.tape[topic].names
         signals[topic] = Signal(np.arange(count) * 2_000_000, names, random.standard_normal((count, len(names))))
     path = tmp_path / "long.html"
     write_page(path, [recorded("long", servo.scenario, Tape(signals))])
-    times = []
-    for _ in range(3):
-        open_page(browser, path)
-        times.append(browser.run("performance.getEntriesByName('figure').at(-1).startTime / 1e3"))
-    assert min(times) < MAX_DRAW_TIME
-    begin = time.monotonic()
+    open_page(browser, path)
+    x, _ = curve(browser, 0, "y")
+    assert len(x) < 5000
     zoom(browser, 300.0, 300.2)
-    assert time.monotonic() - begin < 2.0 * MAX_DRAW_TIME
     x, _ = curve(browser, 0, "y")
     assert len([t for t in x if 300.0 <= t <= 300.2]) == 101

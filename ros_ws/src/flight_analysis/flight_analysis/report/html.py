@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import plotly.graph_objects as go
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 
 from flight_analysis.report import comparison, figures, guided_figures, plotting, tables
 from flight_analysis.report.plotting import SampleStore, pack
@@ -175,7 +174,7 @@ def page_html(page: Page) -> str:
         page=page,
         completed=COMPLETED,
         dark=plotting.DARK | figures.DARK | comparison.DARK,
-        library=pack(get_plotlyjs().encode()),
+        library=pack((HERE / "vendor" / "plotly-basic.min.js").read_bytes()),
         script=Markup((HERE / "page.js").read_text(encoding="utf-8")),  # noqa: S704 - our own file
     )
 

@@ -17,10 +17,13 @@ async function unpack(id, width = 1) {
   const packed = await fetch("data:;base64," + document.getElementById(id).textContent);
   const stream = packed.body.pipeThrough(new DecompressionStream("deflate"));
   const shuffled = new Uint8Array(await new Response(stream).arrayBuffer());
-  const count = shuffled.length / width, bytes = new Uint8Array(shuffled.length);
-  for (let byte = 0; byte < width; byte++)
-    for (let k = 0; k < count; k++) bytes[k * width + byte] = shuffled[byte * count + k];
-  return bytes.buffer;
+  if (width === 1) return shuffled.buffer;
+  const count = shuffled.length / width, lanes = width / 4, words = new Uint32Array(count * lanes);
+  for (let lane = 0; lane < lanes; lane++) {
+    const [a, b, c, d] = [0, 1, 2, 3].map(byte => shuffled.subarray((4 * lane + byte) * count));
+    for (let k = 0; k < count; k++) words[k * lanes + lane] = a[k] | b[k] << 8 | c[k] << 16 | d[k] << 24;
+  }
+  return words.buffer;
 }
 
 async function unpackTimes(id) { // steps in ns -> s
@@ -64,11 +67,12 @@ function view(t, v, [from, to], most) {
   return {x: indices.map(k => t[k]), y: indices.map(k => v[k])};
 }
 
-async function views(data) { // of the decimated traces, by index
-  const margin = MARGIN * (range[1] - range[0]), wide = [range[0] - margin, range[1] + margin], decimated = new Map();
-  for (const [index, {meta}] of data.entries())
-    if (meta) decimated.set(index, view(await samples(meta.t), await samples(meta.v), wide, meta.most));
-  return decimated;
+async function views(data) { // of the traces that the page decimates, by index
+  const [from, to] = range ?? [-Infinity, Infinity], margin = range ? MARGIN * (to - from) : 0;
+  const wide = [from - margin, to + margin];
+  const long = [...data.entries()].filter(([, {meta}]) => meta);
+  return new Map(await Promise.all(long.map(
+    async ([index, {meta}]) => [index, view(await samples(meta.t), await samples(meta.v), wide, meta.most)])));
 }
 
 // ---- Drawing
@@ -83,10 +87,8 @@ function specification(figure, style) {
 
 async function draw(figure, style) {
   const {data, layout} = specification(figure, style);
-  if (range && figure.inTime) {
-    for (const [index, {x, y}] of await views(data)) Object.assign(data[index], {x, y});
-    for (const axis of axes(layout)) layout[axis].range = [...range];
-  }
+  for (const [index, {x, y}] of await views(data)) Object.assign(data[index], {x, y});
+  if (range && figure.inTime) for (const axis of axes(layout)) layout[axis].range = [...range];
   await Plotly.newPlot(figure.plot, data, layout, {displaylogo: false, responsive: true, doubleClick: "reset"});
   if (figure.inTime) figure.plot.on("plotly_relayout", change => moved(figure, change));
 }

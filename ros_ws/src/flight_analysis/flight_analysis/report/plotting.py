@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Time-series figures in plotly: one subplot per channel, shaded intervals over all subplots, decimated curves.
+"""Time-series figures in plotly: one subplot per channel, shaded intervals over all subplots.
 
-All figures of a page share the time axis and the margins, so their subplots line up. A figure holds the decimated curves of
-the whole flight. `SampleStore` holds all samples of a decimated curve, and the page draws from them when it is zoomed.
+All figures of a page share the time axis and the margins, so their subplots line up. A figure holds curves of few samples
+itself. `SampleStore` holds all samples of a longer one: the page decimates them to what the view can show.
 """
 
 import base64
@@ -23,6 +23,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
 MAX_POINTS = 2400  # of a curve over the page's width: above the smallest and the largest value of each pixel
+MANTISSA = 16  # bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4 digits of a hover
 MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
 INTERVAL_OPACITY = 0.25
 LABEL_WIDTH = 0.08  # width of the label of an interval, as a fraction of the flight's duration
@@ -33,7 +34,7 @@ DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
 
 
 class SampleStore:
-    """All samples of the decimated curves of a page, packed. Equal arrays are stored once, under a hash of their content."""
+    """All samples of the long curves of a page, packed. Equal arrays are stored once, under a hash of their content."""
 
     def __init__(self) -> None:
         self.packed: dict[str, str] = {}
@@ -43,8 +44,10 @@ class SampleStore:
         return self._add("t", np.diff(t_ns, prepend=np.int64(0)).astype("<f8"))
 
     def values(self, values: FloatArray) -> str:
-        """Store values as float32."""
-        return self._add("v", values.astype("<f4"))
+        """Store values as float32, rounded to MANTISSA bits: noise does not compress, and a pixel shows fewer digits."""
+        spare = 24 - MANTISSA
+        bits = values.astype("<f4").view("<u4")
+        return self._add("v", bits + (1 << spare - 1) >> spare << spare)
 
     def _add(self, kind: str, array: NDArray[Any]) -> str:
         name = kind + blake2b(array.tobytes(), digest_size=8).hexdigest()
@@ -91,23 +94,6 @@ class Curve(NamedTuple):
     width: float = 1.4
     steps: bool = False  # each value is held until the next sample, like u
     faint: bool = False
-
-
-def decimate(values: FloatArray, most: int = MAX_POINTS) -> NDArray[np.int64]:
-    """Indices of the samples to draw of values of shape (N,): all up to `most`, else the minimum and maximum of each bin.
-
-    There are at most most / 2 bins of equal width. Each NaN, which breaks the curve, is kept too.
-    """
-    if len(values) <= most:
-        return np.arange(len(values))
-    width = -(-len(values) // (most // 2))
-    padded = np.pad(values, (0, -len(values) % width), mode="edge").reshape(-1, width)
-    missing = np.isnan(padded)
-    lowest = np.where(missing, np.inf, padded).argmin(axis=1)
-    highest = np.where(missing, -np.inf, padded).argmax(axis=1)
-    starts = np.arange(len(padded)) * width
-    indices = np.concatenate([starts + lowest, starts + highest, np.flatnonzero(np.isnan(values))])
-    return np.unique(np.minimum(indices, len(values) - 1))
 
 
 def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, columns: int = 1, height: int = 150) -> go.Figure:
@@ -184,17 +170,14 @@ def add_line(
 
 def _trace(context: PlotContext, curve: Curve, channel: str, factor: float, most: int) -> go.Scatter:
     t_ns, values = _break_at_gaps(curve.signal.stamp_ns - context.tape.start_ns, curve.signal[channel] * factor, curve.steps)
-    keep = decimate(values, most)
     style = {"color": curve.colour, "width": curve.width, "shape": "hv" if curve.steps else "linear"}
     trace = go.Scatter(
-        x=(t_ns[keep] / NANOSECONDS).astype(np.float32),  # finer than a pixel, and half the size of float64
-        y=values[keep].astype(np.float32),
         mode="lines",
         line=style | {"simplify": False},  # plotly's simplification cuts off peaks
         opacity=0.35 if curve.faint else None,
     )
-    if len(keep) == len(values):
-        return trace
+    if len(values) <= most:
+        return trace.update(x=t_ns / NANOSECONDS, y=values)
     return trace.update(meta={"t": context.samples.times(t_ns), "v": context.samples.values(values), "most": most})
 
 
