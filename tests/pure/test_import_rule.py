@@ -59,8 +59,12 @@ IMPORTS: dict[str, set[str]] = {
 }  # fmt: skip
 """Which units of the stack a unit imports; nodes, executables and clients import flight_ros beside these."""
 
-CLIENTS = {"flight_bringup": {"flight_ros", "rise_di_controller"}, "flight_cli": {"flight_ros"}}
-"""What the clients of a unit import further."""
+CLIENTS = {
+    "flight_bringup": {"flight_ros", "rise_di_controller"},
+    "flight_cli": {"flight_ros"},
+    "guidance": {"rise_di_controller"},
+}
+"""What nodes and clients of a unit import further."""
 
 
 def imported_modules(path: Path) -> set[str]:
@@ -154,7 +158,7 @@ def test_the_command_line_shows_its_help_without_loading_what_commands_need() ->
     assert not modules_loaded_by("from flight_cli.cli import application\napplication([])") & heavy
 
 
-NODES = ["rise_di_controller", "reference_model", "autopilot_bridge", "flight_recorder", "aircraft_sim"]
+NODES = ["rise_di_controller", "reference_model", "guidance", "autopilot_bridge", "flight_recorder", "aircraft_sim"]
 
 
 @pytest.mark.parametrize("node", NODES)

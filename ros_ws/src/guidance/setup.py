@@ -12,4 +12,5 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/guidance"]),
         ("share/guidance", ["package.xml"]),
     ],
+    entry_points={"console_scripts": ["guidance = guidance.main:main"]},
 )

@@ -28,10 +28,11 @@ class NodeSpec(NamedTuple):
 RECORDER = NodeSpec("flight_recorder", "recorder")
 AIRCRAFT = NodeSpec("aircraft_sim", "aircraft")
 REFERENCE_MODEL = NodeSpec("reference_model", "reference_model")
+GUIDANCE = NodeSpec("guidance", "guidance")
 CONTROLLER = NodeSpec("rise_di_controller", "controller")
 BRIDGE = NodeSpec("autopilot_bridge", "bridge")
 
-# All four nodes in one process, for lockstep. Each reads its own section of the scenario.
+# All nodes in one process, for lockstep. Each reads its own section of the scenario.
 ONE_PROCESS = NodeSpec("flight_bringup", "one_process")
 
 # The second stage starts once every node of the first is ready: the log then holds the whole flight, and the aircraft always
@@ -42,11 +43,14 @@ SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
 POSE, WOULD_SEND, ENGAGEMENT = "pose", "bridge/would_send", "bridge/engagement"
 
+GUIDANCE_VIEWS = ("odometry", "path", "markers")
+
 # The bridge also publishes the messages of its channel map.
 PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
     {
         AIRCRAFT: ("y", POSE, "truth"),
         REFERENCE_MODEL: ("y_m",),
+        GUIDANCE: ("u_m", "guidance", *GUIDANCE_VIEWS),
         CONTROLLER: ("u", "internals"),
         BRIDGE: ("y", POSE, WOULD_SEND, ENGAGEMENT),
         RECORDER: ("recorded",),
@@ -92,6 +96,12 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
         require(high <= row.upper, f"{key}.upper", f"{high:g}", f"at most {row.upper:g}, the upper limit {of_map}")
 
 
+def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
+    """The second stage of a scenario: aircraft or bridge, the reference model, and guidance where the scenario has it."""
+    stage = SECOND_STAGE_WITH_BRIDGE if bridge else SECOND_STAGE
+    return stage if scenario.guidance is None else (*stage, GUIDANCE)
+
+
 def start_lead(startup: float) -> float:
     """Time from the start of the second stage to t = 0, s, given the time until the first stage was ready.
 
@@ -105,14 +115,19 @@ def parameter_overrides(
 ) -> ParameterOverrides:
     """The parameters of a process beside its section of the scenario file; "node:name" where it holds several nodes.
 
-    Real time: the nodes with a t = 0 get its instant. Lockstep: the aircraft gets the rate of u and the duration, the
-    controller the rate of y. The recorder gets the files to attach to the log; this function writes them into the folder of the
-    run. With an autopilot the bridge gets the channel map, and the recorder the topics of the autopilot.
+    Real time: the nodes with a t = 0 get its instant. Lockstep: the aircraft gets the rate of u and the duration, controller
+    and guidance the rate of y, the reference model that of u_m. Guidance gets the numbers that follow from other sections. The
+    recorder gets the files to attach to the log; this function writes them into the folder of the run. With an autopilot the
+    bridge gets the channel map, and the recorder the topics of the autopilot.
     """
     if spec is BRIDGE:
         return {} if autopilot is None else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
     one_process = spec is ONE_PROCESS
-    overrides: dict[NodeSpec, ParameterOverrides] = {node: {"lockstep": lockstep} for node in (*FIRST_STAGE, *SECOND_STAGE)}
+    guidance, stages = scenario.guidance, (*FIRST_STAGE, *second_stage(scenario))
+    overrides: dict[NodeSpec, ParameterOverrides] = {node: {"lockstep": lockstep} for node in stages}
+    if guidance is not None:
+        overrides[GUIDANCE] |= {name: list(value) if isinstance(value, tuple) else value for name, value in guidance.by_rule()}
+        overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *GUIDANCE_VIEWS]
     overrides[RECORDER]["directory"] = str(run)
     if lockstep:
         overrides[AIRCRAFT] |= {
@@ -121,9 +136,13 @@ def parameter_overrides(
             "recorded": not one_process,  # a recorder in the same process never lags
         }
         overrides[CONTROLLER]["y_rate"] = scenario.aircraft.rate
+        if guidance is not None:
+            overrides[GUIDANCE]["y_rate"] = scenario.aircraft.rate
+            overrides[REFERENCE_MODEL]["u_m_rate"] = guidance.rate
     if spec in (RECORDER, ONE_PROCESS):
         if autopilot is not None:
-            overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *autopilot.topics]
+            further = () if guidance is None else GUIDANCE_VIEWS
+            overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *further, *autopilot.topics]
         maps = () if autopilot is None else (autopilot.map_path,)
         files = attachments_for(scenario, run, {node.executable: values for node, values in overrides.items()}, maps)
         overrides[RECORDER] |= {
@@ -133,7 +152,7 @@ def parameter_overrides(
         }
     if one_process:
         return {f"{node.executable}:{name}": value for node, values in overrides.items() for name, value in values.items()}
-    return overrides[spec] | ({"start_time": start_time} if spec in SECOND_STAGE and not lockstep else {})
+    return overrides[spec] | ({"start_time": start_time} if spec in (*SECOND_STAGE, GUIDANCE) and not lockstep else {})
 
 
 def replayed_topics(

@@ -1,15 +1,19 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The four nodes of a flight in one process, in lockstep over the same topics."""
+"""The nodes of a flight in one process, in lockstep over the same topics; guidance where it is given parameters."""
+
+import sys
 
 from flight_ros.startup import start_nodes
 
 
 def main() -> None:
     """Run them."""
+    guided = any(word.startswith("guidance:") for word in sys.argv)
     start_nodes(
         "aircraft_sim.node:AircraftNode",
         "reference_model.node:ReferenceModelNode",
+        *(["guidance.node:GuidanceNode"] if guided else []),
         "rise_di_controller.node:ControllerNode",
         "flight_recorder.node:RecorderNode",
     )

@@ -23,11 +23,10 @@ from flight_bringup.graph import (
     FIRST_STAGE,
     ONE_PROCESS,
     RECORDER,
-    SECOND_STAGE,
-    SECOND_STAGE_WITH_BRIDGE,
     Autopilot,
     NodeSpec,
     parameter_overrides,
+    second_stage,
     start_lead,
 )
 from flight_core.parameters import ParameterError
@@ -118,7 +117,7 @@ class FlightProcesses:
         self._scenario, self._run, self._monitor = scenario, run, monitor
         self._lockstep, self._autopilot = lockstep, autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
-        self._second: tuple[NodeSpec, ...] = SECOND_STAGE if autopilot is None else SECOND_STAGE_WITH_BRIDGE
+        self._second = second_stage(scenario, bridge=autopilot is not None)
         if one_process:
             self._first, self._second = (), (ONE_PROCESS,)
         self.processes: list[NodeProcess] = []

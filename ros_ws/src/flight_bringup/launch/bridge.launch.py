@@ -22,11 +22,11 @@ from flight_analysis.report.run_folder import new_run
 from flight_bringup.graph import (
     CONTROLLER,
     FIRST_STAGE,
-    SECOND_STAGE_WITH_BRIDGE,
     NodeSpec,
     find_autopilot,
     parameter_overrides,
     require_limits,
+    second_stage,
 )
 from flight_bringup.launch.stages import (
     argument,
@@ -75,8 +75,8 @@ def _fly(context: LaunchContext) -> list[Action]:
         overrides = parameter_overrides(spec, scenario, run, start_time, lockstep=False, autopilot=autopilot)
         return flight_node(spec, scenario, overrides)
 
-    def second_stage(lead: float, start_time: float) -> Sequence[Action]:
+    def follow(lead: float, start_time: float) -> Sequence[Action]:
         end = [TimerAction(period=lead + scenario.flight.duration, actions=complete(run))] if duration else []
-        return [*end, *(node(spec, start_time) for spec in SECOND_STAGE_WITH_BRIDGE)]
+        return [*end, *(node(spec, start_time) for spec in second_stage(scenario, bridge=True))]
 
-    return start_in_stages(context, {spec: node(spec) for spec in (FIRST_STAGE if recorded else (CONTROLLER,))}, second_stage)
+    return start_in_stages(context, {spec: node(spec) for spec in (FIRST_STAGE if recorded else (CONTROLLER,))}, follow)

@@ -16,7 +16,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, TimerAction
 from launch_ros.actions import Node
 
 from flight_analysis.report.run_folder import new_run
-from flight_bringup.graph import AIRCRAFT, FIRST_STAGE, SECOND_STAGE, NodeSpec, parameter_overrides
+from flight_bringup.graph import AIRCRAFT, FIRST_STAGE, NodeSpec, parameter_overrides, second_stage
 from flight_bringup.launch.stages import (
     BOOLEAN,
     argument,
@@ -62,11 +62,11 @@ def _fly(context: LaunchContext) -> list[Action]:
     def node(spec: NodeSpec, start_time: float = math.inf) -> Node:
         return flight_node(spec, scenario, parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep))
 
-    def second_stage(lead: float, start_time: float) -> Sequence[Action]:
+    def follow(lead: float, start_time: float) -> Sequence[Action]:
         if lockstep:
             end: Action = on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))
         else:
             end = TimerAction(period=lead + scenario.flight.duration, actions=complete(run))
-        return [end, *(node(spec, start_time) for spec in SECOND_STAGE)]
+        return [end, *(node(spec, start_time) for spec in second_stage(scenario))]
 
-    return start_in_stages(context, {spec: node(spec) for spec in FIRST_STAGE}, second_stage)
+    return start_in_stages(context, {spec: node(spec) for spec in FIRST_STAGE}, follow)

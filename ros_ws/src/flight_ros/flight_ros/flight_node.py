@@ -25,7 +25,7 @@ from flight_core.parameters import KeyedParameters, NodeParameters, ParameterErr
 from flight_core.rates import NANOSECONDS, seconds
 from flight_ros.endpoints import mismatch, type_name
 from flight_ros.liveliness import LivelinessMonitor
-from flight_ros.messages import Decoder, Encoder
+from flight_ros.messages import Decoder, Encoder, NamedDecoder
 from flight_ros.parameters import changed, read_parameters
 from flight_ros.publisher_lock import SENDER
 from flight_ros.rclpy_private import raw_publish
@@ -134,6 +134,10 @@ class FlightNode(Node, Generic[P]):
     def decoder(self, topic: Topic, wanted: Sequence[str]) -> Decoder:
         """Decoder of the messages of a topic. If the node has a key, only authentic messages are accepted, each once."""
         return Decoder(wanted, self._authenticator(topic))
+
+    def named_decoder(self, topic: Topic) -> NamedDecoder:
+        """As `decoder`, of a topic whose channels vary."""
+        return NamedDecoder(self._authenticator(topic))
 
     def _authenticator(self, topic: Topic) -> MessageAuthenticator | None:
         return (

@@ -15,7 +15,7 @@ from flight_ros.topics import LIVELINESS
 SHUTDOWN_GRACE_NS = 600_000_000
 """A peer that shuts down may do so because it lost another one. A busy process may notice that loss this much later."""
 
-ROLES = ("aircraft", "reference_model", "controller", "recorder")
+ROLES = ("aircraft", "reference_model", "guidance", "controller", "recorder")
 
 
 class LivelinessMonitor:

@@ -10,6 +10,7 @@ middleware leaves uninitialised memory between two strings.
 import math
 import struct
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -139,6 +140,33 @@ class Decoder:
         self._sender = _instance(message.header.frame_id)
         self._order = [self._names.index(name) for name in self._wanted]
         self._fixed = self._fixed_part(raw)
+
+
+class NamedSample(NamedTuple):
+    """A sample with all of its channels."""
+
+    stamp_ns: int
+    channels: dict[str, float]
+    sender: str
+
+
+class NamedDecoder:
+    """Decodes all channels of the messages of a topic whose channels vary; several times slower than Decoder."""
+
+    def __init__(self, authenticator: MessageAuthenticator | None = None) -> None:
+        self._authenticator = authenticator
+
+    def decode(self, raw: bytes) -> NamedSample:
+        """The sample. Raises ChannelError for an invalid message."""
+        if self._authenticator is not None:
+            self._authenticator.check(raw)
+        message = _message(raw)
+        sample, names = from_message(message, message.name), list(message.name)
+        if len(set(names)) < len(names):
+            raise ChannelError("name", f"each channel expected once among {', '.join(names)}")
+        if self._authenticator is not None:
+            self._authenticator.accept(sample.stamp_ns)
+        return NamedSample(sample.stamp_ns, dict(zip(names, sample.value.tolist(), strict=True)), sample.sender)
 
 
 def _instance(frame_id: str) -> str:

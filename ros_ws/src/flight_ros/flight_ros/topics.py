@@ -7,10 +7,12 @@ from typing import NamedTuple
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, KeyValue
+from nav_msgs.msg import Odometry, Path
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from visualization_msgs.msg import MarkerArray
 
 from flight_core.rates import NANOSECONDS
 
@@ -69,6 +71,10 @@ Y_M = Topic("y_m", JointState)
 U = Topic("u", JointState)
 POSE = Topic("pose", JointState)  # phi, theta, psi, north, east, altitude, v_north, v_east, climb: those that are known
 U_M = Topic("u_m", JointState, foreign=True)
+TARGET = Topic("target", JointState, foreign=True)  # what to hold: channels of guidance.modes.Target
+ROUTE = Topic("route", Path, foreign=True)  # waypoints in the frame map: east, north, altitude
+GUIDANCE = Topic("guidance", JointState)
+ODOMETRY, PATH, MARKERS = Topic("odometry", Odometry), Topic("path", Path), Topic("markers", MarkerArray)
 INTERNALS = Topic("internals", JointState)
 TRUTH = Topic("truth", JointState)
 DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, foreign=True)
@@ -77,4 +83,4 @@ RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the l
 ENGAGEMENT = Topic("bridge/engagement", KeyValue)  # key: the phase of the bridge; value: why it is not engaged
 NODE_STATE = Topic("node_state", KeyValue)  # key: the process, "/controller#4711"; value: a NodeState
 
-FLIGHT = (Y, Y_M, U, U_M, POSE, INTERNALS, TRUTH, DIAGNOSTICS)
+FLIGHT = (Y, Y_M, U, U_M, POSE, GUIDANCE, TARGET, ROUTE, INTERNALS, TRUTH, DIAGNOSTICS)

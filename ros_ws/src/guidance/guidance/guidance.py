@@ -126,7 +126,7 @@ class Guidance:
         self._y: StampedVector | None = None
         self._given: dict[str, float] = {} if self.route is None else {"leg": 0.0}
         self._state: GuidanceState | None = None
-        self._engaged, self._begin = True, Begin.HOLD
+        self._engaged, self._paused, self._begin = True, False, Begin.HOLD
 
     @property
     def mode(self) -> Mode:
@@ -184,10 +184,24 @@ class Guidance:
         return True
 
     def engage(self, *, engaged: bool) -> None:
-        """Engage, with the heading, the altitude and the airspeed of then; or publish no u_m."""
+        """Engage, with the heading, the altitude and the airspeed of then; or command nothing."""
         if engaged and not self._engaged:
             self._begin = Begin.HOLD
         self._engaged = engaged
+
+    def pause(self, *, paused: bool, forget: bool) -> None:
+        """Command nothing while the controller does not fly. `forget`: then hold what is measured, else go on as before."""
+        self._paused = paused
+        if forget:
+            self._begin = Begin.HOLD
+
+    def pose(self) -> dict[str, float]:
+        """The last pose by channel; empty before the first one."""
+        return {} if self._pose is None else dict(zip(POSE, self._pose.value.tolist(), strict=True))
+
+    def y(self) -> dict[str, float]:
+        """The last y by channel; empty before the first one."""
+        return {} if self._y is None else dict(zip(self._params.outputs, self._y.value.tolist(), strict=True))
 
     def ages(self, now_ns: int) -> dict[str, float]:
         """Ages of the last y and pose, s, of those that were received."""
@@ -202,7 +216,8 @@ class Guidance:
         while self._program and self._program[0][0] <= t_ns:
             self.take_target(self._program.popleft()[1])
         y, pose = self._y, self._pose
-        if pose is None or y is None or now_ns - y.stamp_ns > self._params.max_age_ns or not self._engaged:
+        flies = self._engaged and not self._paused
+        if pose is None or y is None or now_ns - y.stamp_ns > self._params.max_age_ns or not flies:
             self._begin = max(self._begin, Begin.AGAIN)
             return None
         age_ns = now_ns - pose.stamp_ns

@@ -5,7 +5,7 @@
 import math
 from collections.abc import Sequence
 from itertools import repeat, starmap
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -33,6 +33,7 @@ from guidance.route_file import Waypoint
 from guidance.vertical import VerticalParams
 
 OUTPUTS = ("q", "V", "p", "r")
+BY_RULE = ("outputs", "natural_frequency", "speed", "throttle_authority")
 FLOOR_FRACTION = 0.8
 """Speed floor over the trim speed where no stall speed is known."""
 
@@ -142,6 +143,10 @@ class GuidanceParameters(KeyedParameters):
         if self.route is not None:
             self.plan(self.waypoints())
         return self
+
+    def by_rule(self) -> list[tuple[str, Any]]:
+        """Parameters that follow from the other sections of a scenario, in which they may be left out."""
+        return [(name, getattr(self, name)) for name in BY_RULE if getattr(self, name)]
 
     def _floor(self) -> float:
         return FLOOR_FRACTION * self.speed if self.stall_speed is None else protection.speed_floor(self.stall_speed)

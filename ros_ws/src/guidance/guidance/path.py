@@ -89,6 +89,16 @@ def to_go(leg: Leg, position: Point) -> float:
     return leg.radius * math.remainder(turn, 2.0 * math.pi)
 
 
+def outline(leg: Leg, start: Point) -> list[Point]:
+    """Points along a leg from its start, for drawing: at most 10 deg apart on an arc; an orbit is a full turn."""
+    if isinstance(leg, Line):
+        return [leg.start, leg.end]
+    side, first = math.copysign(1.0, leg.radius), course_of(leg.centre, start)
+    turn = 2.0 * math.pi if leg.end is None else side * (course_of(leg.centre, leg.end) - first) % (2.0 * math.pi)
+    count = math.ceil(turn / math.radians(10.0)) + 1
+    return [_along(leg.centre, first + side * turn * k / (count - 1), abs(leg.radius)) for k in range(count)]
+
+
 def leads(legs: Sequence[Leg]) -> list[int]:
     """The number of the waypoint to which each leg of a route leads; an arc at a waypoint leads to the next one."""
     numbers, at = [], 0

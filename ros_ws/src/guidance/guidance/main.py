@@ -1,0 +1,14 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The executable `guidance`."""
+
+from flight_ros.startup import start_nodes
+
+
+def main() -> None:
+    """Start the guidance node."""
+    start_nodes("guidance.node:GuidanceNode")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,304 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The guidance node: from pose, y, target and route to u_m, in real time or in lockstep."""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Point, PoseStamped
+from nav_msgs.msg import Odometry, Path
+from rclpy.serialization import deserialize_message
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import Marker, MarkerArray
+
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
+from flight_core.vectors import ChannelError, StampedVector, require_not_future, select
+from flight_ros.flight_node import FlightNode
+from flight_ros.messages import NO_CHANNELS
+from flight_ros.publisher_lock import PublisherLock
+from flight_ros.rclpy_private import DeserializationError
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.ticker import Tick
+from flight_ros.topics import (
+    GUIDANCE,
+    INTERNALS,
+    MARKERS,
+    NEWEST_SAMPLES,
+    ODOMETRY,
+    PATH,
+    POSE,
+    PUBLISH,
+    ROUTE,
+    TARGET,
+    U_M,
+    Y,
+    publisher_qos,
+)
+from guidance import modes, path
+from guidance.guidance import ATTITUDE, Guidance, GuidanceOutput
+from guidance.modes import Mode
+from guidance.odometry import body_velocity, quaternion
+from guidance.params import GuidanceParameters
+from guidance.route_file import Waypoint
+from rise_di_controller.guard import Mode as ControllerMode
+
+MAP, BODY = "map", "base_link"  # frames of REP 105: east, north, up; forward, left, up
+MAX_TARGETS = 16  # messages of target a tick; later ones wait, so that a storm delays no u_m
+ODOMETRY_PERIOD_NS, PATH_PERIOD_NS = NANOSECONDS // 10, NANOSECONDS
+PATH_LENGTH = 600  # poses of the flown path
+
+SENTENCES: Mapping[Mode, str] = {
+    Mode.OFF: "no u_m: disengaged, or pose or y is missing",
+    Mode.ENGAGED: "engaged",
+    Mode.DEAD_RECKONING: "pose is stale: wings are levelled by the rates of y",
+    Mode.POSE_LOST: "pose is lost: all rates are zero",
+}
+LEVELS = {Mode.ENGAGED: DiagnosticStatus.OK, Mode.POSE_LOST: DiagnosticStatus.ERROR}  # else WARN
+
+
+class GuidanceNode(FlightNode[GuidanceParameters]):
+    """At each tick it takes the received y, pose, target and route, steps `guidance.Guidance` and publishes u_m and guidance.
+
+    In real time it flies while the controller is ENGAGED. In lockstep the number of samples of y gives the time. A step waits
+    for the y and the pose of its instant. It publishes exactly one u_m, without channels where guidance has no command.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("guidance", GuidanceParameters)
+        self._guidance = Guidance(self.parameters)
+        outputs = self.parameters.outputs
+        self._y_subscription, self._y_decoder = self.subscribe(Y), self.decoder(Y, outputs)
+        self._pose_subscription, self._pose_decoder = self.subscribe(POSE), self.named_decoder(POSE)
+        self._target_subscription, self._target_decoder = self.subscribe(TARGET, NEWEST_SAMPLES), self.named_decoder(TARGET)
+        self._route_subscription = self.subscribe(ROUTE, PUBLISH)
+        self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
+        self._u_m_encoder = self.encoder(U_M, (*outputs, *ATTITUDE))
+        self._log_encoder = self.encoder(GUIDANCE, self._guidance.names)
+        self._y_lock, self._pose_lock = PublisherLock(), PublisherLock()
+        self._allowed, self._mode = True, Mode.OFF
+        if self.parameters.lockstep:
+            self._number = 0  # of the next y
+            self._y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
+            self._y_due: deque[StampedVector | None] = deque()
+            self._pose_due: deque[StampedVector] = deque()
+            self._empty_encoder = self.encoder(U_M, ())
+        else:
+            self._controller_mode = ControllerMode.WAITING
+            self._internals, self._internals_decoder = self.subscribe(INTERNALS), self.decoder(INTERNALS, ["mode"])
+        self._odometry, self._path, self._markers = (
+            self.create_publisher(topic.type, topic.name, publisher_qos(period))
+            for topic, period in ((ODOMETRY, ODOMETRY_PERIOD_NS), (PATH, PATH_PERIOD_NS), (MARKERS, PATH_PERIOD_NS))
+        )
+        self._flown: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
+        for kind, name, answer in (
+            (SetBool, "engage", self._engage),
+            (Trigger, "hold", lambda _: self._guidance.hold() or "guidance does not fly"),
+            (Trigger, "skip", lambda _: self._guidance.skip() or "no route is flown"),
+        ):
+            self.create_service(kind, f"~/{name}", _service(answer))
+
+    def period_ns(self) -> int:
+        return self._guidance.period_ns
+
+    def start_ns(self) -> int:
+        return nanoseconds(self.parameters.start_time)
+
+    def tick(self, tick: Tick, now_ns: int) -> None:
+        self._follow_controller()
+        for sample in self._received_y():
+            if sample is not None:
+                self._accept(self._y_subscription, self._y_lock, self._guidance.take_y, sample, now_ns)
+        for sample in self._received_poses():
+            self._accept(self._pose_subscription, self._pose_lock, self._guidance.take_pose, sample, now_ns)
+        if (output := self._step(now_ns, tick.number * self.period_ns())) is not None:
+            self._publish(output, now_ns)
+
+    def advance(self) -> bool:
+        if not self._y_due:
+            self._y_due.extend(self._received_y())
+        self._pose_due.extend(self._received_poses())
+        advanced = False
+        while self._y_due:
+            now_ns = self._number * self._y_period_ns
+            due = now_ns % self.period_ns() == 0
+            if due and not (self._pose_due and self._pose_due[-1].stamp_ns >= now_ns):
+                break
+            self._number += 1
+            if (y := self._y_due.popleft()) is not None:
+                self._accept(self._y_subscription, self._y_lock, self._guidance.take_y, y, now_ns)
+            while self._pose_due and self._pose_due[0].stamp_ns <= now_ns:
+                pose = self._pose_due.popleft()
+                self._accept(self._pose_subscription, self._pose_lock, self._guidance.take_pose, pose, now_ns)
+            if due and (output := self._step(now_ns, now_ns)) is not None:
+                self._publish(output, now_ns)
+            elif due:
+                self._publish_u_m(self._empty_encoder.encode(now_ns, NO_CHANNELS))
+            advanced = True
+        return advanced
+
+    def awaited_topic(self) -> str:
+        return (self._pose_subscription if self._y_due else self._y_subscription).name
+
+    def _step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
+        self._take_targets(now_ns)
+        self._take_routes()
+        output = self._guidance.step(now_ns, t_ns)
+        if (mode := self._guidance.mode) is not self._mode:
+            sentence = f"{self._mode.name} -> {mode.name}: {SENTENCES[mode]}"
+            if mode is Mode.ENGAGED:
+                self.get_logger().info(sentence)
+            else:
+                self.get_logger().warning(sentence)
+            self._mode = mode
+        return output
+
+    def _publish(self, output: GuidanceOutput, now_ns: int) -> None:
+        self._publish_u_m(self._u_m_encoder.encode(now_ns, output.u_m))
+        self._publish_log(self._log_encoder.encode(now_ns, output.log))
+        step = self.period_ns()
+        if now_ns % ODOMETRY_PERIOD_NS < step:
+            self._publish_odometry(now_ns)
+        if now_ns % PATH_PERIOD_NS < step:
+            self._publish_path(now_ns)
+
+    # Received messages
+
+    def _received_y(self) -> list[StampedVector | None]:
+        samples: list[StampedVector | None] = []
+        for received in self._y_subscription.take():
+            try:
+                samples.append(self._y_decoder.decode(received.message))
+            except ChannelError as error:
+                self.reject(self._y_subscription, error.reason, str(error))
+                samples.append(None)
+        return samples
+
+    def _received_poses(self) -> list[StampedVector]:
+        """The poses in the order of `modes.POSE`, without sideslip where there is none."""
+        samples = []
+        for received in self._pose_subscription.take():
+            try:
+                sample = self._pose_decoder.decode(received.message)
+                channels = {"beta": 0.0} | sample.channels
+                pose = select(modes.POSE, [*channels], [*channels.values()])
+                samples.append(StampedVector(sample.stamp_ns, pose, sample.sender))
+            except ChannelError as error:
+                self.reject(self._pose_subscription, error.reason, str(error))
+        return samples
+
+    def _accept(
+        self,
+        subscription: PolledSubscription,
+        lock: PublisherLock,
+        take: Callable[[StampedVector, int], None],
+        sample: StampedVector,
+        now_ns: int,
+    ) -> None:
+        """Give a sample to guidance, unless its stamp is bad or it is from a conflicting publisher."""
+        max_age_ns = nanoseconds(self.parameters.max_age)
+        try:
+            lock.check(sample.sender, now_ns, max_age_ns, max_age_ns + nanoseconds(self.parameters.hold))
+            take(sample, now_ns)
+            lock.refresh(sample.sender, now_ns)
+        except ChannelError as error:
+            self.reject(subscription, error.reason, str(error))
+
+    def _take_targets(self, now_ns: int) -> None:
+        for received in self._target_subscription.take(MAX_TARGETS):
+            try:
+                sample = self._target_decoder.decode(received.message)
+                require_not_future(sample.stamp_ns, now_ns, nanoseconds(self.parameters.max_age))
+                self._guidance.take_target(sample.channels)
+            except ChannelError as error:
+                self.reject(self._target_subscription, error.reason, str(error))
+
+    def _take_routes(self) -> None:
+        for received in self._route_subscription.take()[-1:]:
+            try:
+                message = deserialize_message(received.message, Path)
+                points = [one.pose.position for one in message.poses]
+                route = self.parameters.plan([Waypoint(one.y, one.x, one.z) for one in points])
+            except (ParameterError, DeserializationError) as error:
+                self.reject(self._route_subscription, "route", " ".join(str(error).split()))
+            else:
+                self.get_logger().info(f"route of {len(points)} waypoints")
+                self._guidance.take_route(route)
+
+    def _follow_controller(self) -> None:
+        """Fly while the controller is ENGAGED. After it was INACTIVE, hold what is measured; after a failsafe, go on."""
+        for received in self._internals.take()[-1:]:
+            try:
+                sample = self._internals_decoder.decode(received.message)
+            except ChannelError:
+                continue
+            if sample is not None and sample.value[0] != self._controller_mode:
+                self._controller_mode = ControllerMode(int(sample.value[0]))
+                engaged, inactive = (
+                    self._controller_mode is mode for mode in (ControllerMode.ENGAGED, ControllerMode.INACTIVE)
+                )
+                self._guidance.pause(paused=not engaged, forget=inactive)
+
+    def _engage(self, request: Any) -> bool | str:
+        if request.data and not self.parameters.lockstep and self._controller_mode is not ControllerMode.ENGAGED:
+            return f"the controller is {self._controller_mode.name}, expected ENGAGED"
+        self._guidance.engage(engaged=request.data)
+        return True
+
+    # For maps and 3-D views
+
+    def _publish_odometry(self, now_ns: int) -> None:
+        pose, y = self._guidance.pose(), self._guidance.y()
+        message = Odometry()
+        message.header.stamp, message.header.frame_id, message.child_frame_id = _stamp(now_ns), MAP, BODY
+        placed = message.pose.pose
+        placed.position = Point(x=pose["east"], y=pose["north"], z=pose["altitude"])
+        for key, value in zip("xyzw", quaternion(pose["phi"], pose["theta"], pose["psi"]), strict=True):
+            setattr(placed.orientation, key, value)
+        for key, value in zip("xyz", body_velocity(pose), strict=True):
+            setattr(message.twist.twist.linear, key, value)
+        for key, value in zip("xyz", (y["p"], -y["q"], -y["r"]), strict=True):
+            setattr(message.twist.twist.angular, key, value)
+        self._odometry.publish(message)
+        self._flown.append(PoseStamped(header=message.header, pose=placed))
+
+    def _publish_path(self, now_ns: int) -> None:
+        flown = Path(poses=list(self._flown))
+        flown.header.stamp, flown.header.frame_id = _stamp(now_ns), MAP
+        self._path.publish(flown)
+        if (route := self._guidance.route) is None:
+            return
+        marker = Marker(ns="route", type=Marker.LINE_STRIP, action=Marker.ADD)
+        marker.header, marker.pose.orientation.w, marker.scale.x = flown.header, 1.0, 3.0
+        marker.color.r = marker.color.g = marker.color.a = 1.0
+        start = (0.0, 0.0)
+        for leg, altitude in zip(route.legs, route.altitude, strict=True):
+            points = path.outline(leg, start)
+            marker.points += [Point(x=east, y=north, z=altitude) for north, east in points]
+            start = points[-1]
+        self._markers.publish(MarkerArray(markers=[marker]))
+
+    def status(self) -> tuple[bytes, str, dict[str, object]]:
+        ages = {} if self.parameters.lockstep else self._guidance.ages(self.now_ns())
+        further: dict[str, object] = {f"age of {name} (s)": f"{age:.4f}" for name, age in ages.items()}
+        if (state := self._guidance.state) is not None:
+            further |= {"lateral": state.lateral.name, "vertical": state.vertical.name, "leg": state.leg}
+        return LEVELS.get(self._mode, DiagnosticStatus.WARN), SENTENCES[self._mode], further
+
+
+def _service(answer: Callable[[Any], bool | str]) -> Callable[[Any, Any], Any]:
+    """A service callback: True, or a sentence of refusal, as the response."""
+
+    def callback(request: Any, response: Any) -> Any:
+        result = answer(request)
+        response.success, response.message = result is True, "" if result is True else str(result)
+        return response
+
+    return callback
+
+
+def _stamp(time_ns: int) -> Time:
+    return Time(sec=time_ns // NANOSECONDS, nanosec=time_ns % NANOSECONDS)

@@ -1,0 +1,29 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Pose as odometry of REP 103: the map frame is east, north, up, the body frame forward, left, up."""
+
+import math
+from collections.abc import Mapping
+
+
+def quaternion(phi: float, theta: float, psi: float) -> tuple[float, float, float, float]:
+    """Orientation x, y, z, w of forward-left-up in east-north-up: R_z(pi/2 - psi) R_y(-theta) R_x(phi); angles in rad."""
+    (cr, sr), (cp, sp), (cy, sy) = (
+        (math.cos(angle / 2.0), math.sin(angle / 2.0)) for angle in (phi, -theta, math.pi / 2.0 - psi)
+    )
+    return (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
+def body_velocity(pose: Mapping[str, float]) -> tuple[float, float, float]:
+    """Velocity over ground forward, left and up in the body frame, m/s, from a pose."""
+    phi, theta, psi = pose["phi"], pose["theta"], pose["psi"]
+    ahead = pose["v_north"] * math.cos(psi) + pose["v_east"] * math.sin(psi)
+    right = pose["v_east"] * math.cos(psi) - pose["v_north"] * math.sin(psi)
+    forward = ahead * math.cos(theta) + pose["climb"] * math.sin(theta)
+    down = ahead * math.sin(theta) - pose["climb"] * math.cos(theta)
+    return forward, -right * math.cos(phi) - down * math.sin(phi), right * math.sin(phi) - down * math.cos(phi)

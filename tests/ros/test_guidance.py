@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Guidance over topics: lockstep as in one process, targets and routes in flight, services, faults."""
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Point, PoseStamped
+from nav_msgs.msg import Path as PathMessage
+from std_srvs.srv import SetBool, Trigger
+from tests.ros.conftest import Process, Start
+from tests.ros.peer import OUTPUTS, Peer
+from tests.ros.test_lockstep import ROUGH, fly, scenario_file
+
+from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
+from flight_analysis.closed_loop.simulate import simulate
+from flight_bringup.scenarios import find_scenario
+from flight_log.tape_reader import read_run
+from flight_ros.messages import to_message
+from flight_ros.topics import PUBLISH
+from guidance.modes import POSE, Lateral, Vertical
+from rise_di_controller.guard import Mode as ControllerMode
+
+PEER_TOPICS = ("u_m", "guidance", "pose", "/diagnostics")
+LEVEL = {"altitude": 50.0, "v_north": 25.0}
+
+
+def test_a_lockstep_flight_repeats_the_bytes_of_one_process(start: Start, tmp_path: Path) -> None:
+    scenario = scenario_file(tmp_path, 3.0, "osprey_route", aircraft=ROUGH)
+    recorded = read_run(fly(start, scenario, "runs")).tape
+    for name, signal in simulate(load_scenario(scenario)).signals.items():
+        assert signal.names == recorded[name].names
+        assert signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
+        assert signal.values.tobytes() == recorded[name].values.tobytes(), name
+    assert len(recorded["u_m"].stamp_ns) == 150  # one at each instant but the first: y takes 10 ms
+
+
+@pytest.fixture
+def calm(tmp_path: Path) -> Path:
+    """The osprey in calm air that turns to the right from t = 1 s on."""
+    varied = find_scenario("osprey_route").vary(
+        aircraft={"wind": [0.0, 0.0], "turbulence": None},
+        guidance={"route": None, "program": {"phi": {"start": [1.0], "value": [0.5]}}},
+    )
+    path = tmp_path / "calm.yaml"
+    path.write_text(scenario_yaml(varied), encoding="utf-8")
+    return path
+
+
+class Flight:
+    """A guidance node alone; the peer is aircraft and controller."""
+
+    def __init__(self, start: Start, peer_node: Peer, scenario: Path) -> None:
+        self.peer, self.process = peer_node, start("guidance.main", "--ros-args", "--params-file", str(scenario))
+        self.mode = ControllerMode.ENGAGED
+
+    def send(self, sender: str = "/aircraft#1") -> None:
+        """One y, one pose and one sample of internals, stamped now."""
+        now_ns, pose = time.time_ns(), np.array([LEVEL.get(name, 0.0) for name in POSE])
+        self.peer.publish("y", to_message(now_ns, OUTPUTS, np.zeros(4), sender))
+        self.peer.publish("pose", to_message(now_ns, POSE, pose, sender))
+        self.peer.publish("internals", to_message(now_ns, ["mode"], np.array([float(self.mode)]), "/controller#1"))
+
+    def until(self, condition: Callable[[], object], each: Callable[[], object] = lambda: None) -> None:
+        """Send, and call `each`, until the condition holds."""
+
+        def both() -> None:
+            self.send()
+            each()
+
+        self.peer.until(condition, each=both)
+
+    def last(self, name: str) -> float:
+        """The last value of a channel of `guidance`; NaN before the first."""
+        messages = self.peer.received["guidance"]
+        return float(messages[-1].position[messages[-1].name.index(name)]) if messages else math.nan
+
+    def target(self, **values: float) -> None:
+        """Publish commands by channel."""
+        self.peer.publish("target", to_message(time.time_ns(), [*values], np.array([*values.values()]), "/operator#1"))
+
+
+@pytest.fixture
+def flight(start: Start, peer_node: Peer, calm: Path) -> Flight:
+    """Guidance that has engaged."""
+    made = Flight(start, peer_node, calm)
+    made.until(lambda: peer_node.received["u_m"])
+    return made
+
+
+def test_targets_select_the_modes_and_bad_ones_are_refused(flight: Flight) -> None:
+    flight.until(lambda: flight.last("target.altitude") == 60.0, lambda: flight.target(heading=1.0, altitude=60.0))
+    assert flight.last("mode.lateral") == Lateral.HEADING
+    assert flight.last("mode.vertical") == Vertical.ALTITUDE
+    for reason, values in {"bounds": {"phi": 2.0}, "name": {"bank": 0.1}, "finite": {"heading": math.nan}}.items():
+        flight.until(partial(flight.peer.counted, f"refused target: {reason}"), partial(flight.target, **values))
+    assert flight.last("target.heading") == 1.0
+
+
+def test_a_storm_of_targets_delays_no_command(flight: Flight) -> None:
+    def storm() -> None:
+        flight.send()
+        for k in range(20):
+            flight.target(heading=0.01 * k)
+
+    flight.peer.until(lambda: not math.isnan(flight.last("target.heading")), each=storm)
+    flight.peer.received["u_m"].clear()
+    flight.peer.until(lambda: len(flight.peer.received["u_m"]) > 100, each=storm)
+    stamps = [message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec for message in flight.peer.received["u_m"]]
+    assert np.median(np.diff(stamps)) == pytest.approx(0.02, abs=1e-6)  # every tick, except where the host is late
+
+
+def test_services_hold_skip_and_disengage(flight: Flight) -> None:
+    def call(kind: type, name: str, request: object) -> tuple[bool, str]:
+        response = flight.peer.call(kind, f"guidance/{name}", request, each=flight.send)
+        return response.success, response.message
+
+    flight.until(lambda: flight.last("mode.lateral") == Lateral.PHI, lambda: flight.target(phi=0.2))
+    assert call(Trigger, "hold", Trigger.Request()) == (True, "")
+    flight.until(lambda: flight.last("mode.lateral") == Lateral.HEADING)
+    assert call(Trigger, "skip", Trigger.Request()) == (False, "no route is flown")
+    assert call(SetBool, "engage", SetBool.Request(data=False)) == (True, "")
+    flight.until(lambda: "ENGAGED -> OFF" in flight.process.output)
+    flight.peer.received["u_m"].clear()
+    flight.mode = ControllerMode.INACTIVE
+    flight.until(lambda: call(SetBool, "engage", SetBool.Request(data=True)) == (False, REFUSAL))
+    flight.mode = ControllerMode.ENGAGED
+    flight.until(lambda: call(SetBool, "engage", SetBool.Request(data=True)) == (True, ""))
+    flight.until(lambda: flight.peer.received["u_m"])
+
+
+REFUSAL = "the controller is INACTIVE, expected ENGAGED"
+
+
+def test_a_route_is_flown_when_it_arrives_and_refused_when_it_cannot_be_flown(flight: Flight) -> None:
+    publisher = flight.peer.node.create_publisher(PathMessage, "route", PUBLISH)
+
+    def route(*points: tuple[float, float, float]) -> PathMessage:
+        message = PathMessage()
+        message.poses = [pose_at(*point) for point in points]
+        return message
+
+    alone = route((0.0, 0.0, 50.0))
+    flight.until(lambda: flight.peer.counted("refused route: route"), lambda: publisher.publish(alone))
+    good = route((0.0, 0.0, 50.0), (0.0, 900.0, 55.0))  # east, north, up
+    flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE, lambda: publisher.publish(good))
+    assert flight.last("to_go") == pytest.approx(900.0)
+    assert flight.last("target.altitude") == 55.0
+
+
+def pose_at(east: float, north: float, up: float) -> PoseStamped:
+    """A stamped pose at a position."""
+    message = PoseStamped()
+    message.pose.position = Point(x=east, y=north, z=up)
+    return message
+
+
+def test_a_second_publisher_of_pose_is_refused_and_a_stale_pose_levels_the_wings(flight: Flight) -> None:
+    flight.until(lambda: flight.peer.counted("refused pose: sender", 5), lambda: flight.send("/other#2"))
+
+    def without_pose() -> None:
+        now_ns = time.time_ns()
+        flight.peer.publish("y", to_message(now_ns, OUTPUTS, np.zeros(4), "/aircraft#1"))
+
+    flight.peer.until(lambda: "pose is stale: wings are levelled" in flight.process.output, each=without_pose)
+    flight.until(lambda: "DEAD_RECKONING -> ENGAGED" in flight.process.output)
+
+
+def test_the_wings_are_levelled_when_guidance_is_stopped_or_killed_in_a_turn(calm: Path, start: Start, peer_node: Peer) -> None:
+    shared = ("--ros-args", "--params-file", str(calm))
+    packages = ("rise_di_controller", "aircraft_sim", "reference_model")
+    nodes: dict[str, Process] = {package: start(f"{package}.main", *shared) for package in packages}
+    guidance = start("guidance.main", *shared)
+
+    def phi() -> float:
+        last = peer_node.received["pose"][-1:]
+        return float(last[0].position[last[0].name.index("phi")]) if last else 0.0
+
+    peer_node.until(lambda: phi() > 0.25, timeout=60.0)
+    with guidance.stopped():
+        nodes["reference_model"].wait_for("/u_m timed out: wings are levelled")
+        peer_node.until(lambda: abs(phi()) < math.radians(5.0))
+    peer_node.until(lambda: phi() > 0.4, timeout=60.0)  # it goes on
+    guidance.popen.kill()
+    peer_node.received["pose"].clear()
+    peer_node.until(lambda: peer_node.received["pose"] and abs(phi()) < math.radians(5.0))
+    banks = [message.position[message.name.index("phi")] for message in peer_node.received["pose"]]
+    assert np.degrees(np.abs(banks).max()) < 45.0
