@@ -411,6 +411,22 @@ def test_delay_that_the_loop_has_already_counts_against_the_margin() -> None:
     assert min(alone) < 0.05 < max(alone)  # thrust bears three times what the surfaces bear
 
 
+def test_the_delay_margin_lasts_up_to_the_speed_at_which_the_loop_with_its_responses_turns_unstable(
+    osprey: Study, selected: selection.Selection
+) -> None:
+    margin = selected.engineering.delay_margin
+    assert margin is not None
+    controller = selected.engineering.controller.model_copy(update={"delay": margin / 2.0})
+    ratio = selection.stable_speed_ratio(osprey, controller)
+    assert 1.0 < ratio < selection.MAX_SPEED_RATIO
+    surfaces = np.array([name != "V" for name in controller.outputs])
+    for factor, stable in ((ratio, True), (ratio + selection.SPEED_STEP, False)):  # the same response by a larger input_scale
+        scale = np.where(surfaces, factor**2, 1.0) * controller.input_scale
+        scaled = controller.model_copy(update={"input_scale": tuple(scale.tolist())})
+        assert (selection.assess_gains(osprey, scaled, SERVOS).delay_margin != 0.0) == stable
+    assert selection.stable_speed_ratio(osprey, selected.theorem.controller) == 0.0
+
+
 def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
     literal = find_scenario("osprey_servo").vary(controller={"sign": "literal"})
     answer: GainAssessment = selection.check_gains(literal, osprey)

@@ -212,7 +212,7 @@ def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) ->
         table.add_row(*row)
     console.print(table)
     for name, answer in answers.items():
-        console.print(f"{name}: {_format_delay_margin(answer)}", highlight=False, soft_wrap=True)
+        console.print(f"{name}: {_format_delay_margin(found, answer)}", highlight=False, soft_wrap=True)
 
     for part, heading in (("theorem", "Theorem 1"), ("loop", "The loop")):
         headings = [text for name in answers for text in (f"{name}\nvalue and bound", "\nmargin")]
@@ -241,14 +241,26 @@ def _condition_name(row: tuple[Condition, ...], outputs: tuple[str, ...]) -> str
     return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
 
 
-def _format_delay_margin(answer: GainAssessment) -> str:
+def _format_delay_margin(found: Study, answer: GainAssessment) -> str:
     if answer.delay_margin is None:
         return "no linear loop (literal sign)"
     if answer.delay_margin == 0.0:
         return "predicted delay margin none: the linear loop is unstable with this lag"
     each = zip(answer.controller.outputs, answer.channel_margins, strict=True)
     alone = ", ".join(f"{output} {_milliseconds(margin)}" for output, margin in each)
-    return f"predicted delay margin {_milliseconds(answer.delay_margin)}; in one channel alone: {alone}"
+    margin = f"predicted delay margin {_milliseconds(answer.delay_margin)}; in one channel alone: {alone}"
+    ratio = gain_selection.stable_speed_ratio(found, answer.controller)
+    if math.isinf(ratio):
+        return f"{margin}; it lasts beyond {gain_selection.MAX_SPEED_RATIO:g} times the trim speed"
+    return f"{margin}; it lasts up to {ratio * found.airframe.speed:.3g} m/s, {ratio:.3g} of the trim speed, without a schedule"
+
+
+def _stable_speed_ratio(found: Study, answer: GainAssessment) -> float | None:
+    """The ratio; None where the literal sign has no linear loop, or without a limit."""
+    if answer.delay_margin is None:
+        return None
+    ratio = gain_selection.stable_speed_ratio(found, answer.controller)
+    return ratio if math.isfinite(ratio) else None
 
 
 def _milliseconds(margin: float) -> str:
@@ -275,6 +287,7 @@ def _as_json(found: Study, answers: dict[str, GainAssessment], seed: int) -> dic
             "controller": answer.controller.model_dump(exclude_none=True),
             "delay_margin": finite_or_null(answer.delay_margin),
             "channel_margins": finite_or_null(answer.channel_margins),
+            "stable_speed_ratio": _stable_speed_ratio(found, answer),
             "bounds": {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")}
             | {"rho": answer.bounds.rho},
             "conditions": [

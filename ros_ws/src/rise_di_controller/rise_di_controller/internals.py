@@ -40,7 +40,9 @@ def groups(
     of_law = [name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS)]
     grouped = {group: tuple(outputs) for group in (*OUTPUT_GROUPS, *of_law)}
     grouped |= {group: tuple(inputs) for group in INPUT_GROUPS}
-    return grouped if law.inner is None else grouped | {"z": tuple(estimates), "u_o": tuple(inputs), "sigma": ("observer",)}
+    if "z" in field_names(law):
+        grouped |= {"z": tuple(estimates), "u_o": tuple(inputs), "sigma": ("observer",)}
+    return grouped
 
 
 def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:

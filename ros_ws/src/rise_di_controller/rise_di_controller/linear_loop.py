@@ -59,12 +59,12 @@ def linear_law(law: TunedLaw, m: int, period: float) -> LinearLaw:
     An observer has faded in. Raises ParameterError for the literal sign, which is not linear anywhere.
     """
     control_law, params = law
-    of_law = params.law if control_law.inner is not None else params
+    of_law = getattr(params, "law", params)  # that of an observer or a schedule
     literal = isinstance(of_law, LawParams) and of_law.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
     zero = np.zeros(m)
     at_rest = fields(control_law.engage(Measurements(zero, zero, zero, zero, zero), params))
-    if control_law.inner is not None:
+    if "sigma" in at_rest:
         at_rest["sigma"] = np.ones(1)
     ends = np.cumsum([len(value) for value in at_rest.values()])
     size = int(ends[-1]) if len(ends) else 0

@@ -2,15 +2,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of RISE-DI: validation, and conversion to the arrays of the law."""
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from flight_core.parameters import Positive, Positives, as_tuple, require_length
-from rise_di_controller.control_law import ControlLaw
+from flight_core.parameters import Parameters, Positive, Positives, as_tuple, require, require_length
+from rise_di_controller.control_law import ControlLaw, TunedLaw
 from rise_di_controller.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
 from rise_di_controller.params import ControllerParameters
+from rise_di_controller.schedule import ScheduleParams, with_schedule
+
+
+class ScheduleParameters(Parameters):
+    """The schedule of input_scale over dynamic pressure, an extension of the paper."""
+
+    speed: Positive = Field(description="the trim speed V0 at which input_scale holds, m/s: airspeed is speed + V of y")
+    time: Positive = Field(default=1.0, description="time constant at which input_scale follows, s")
+
+    def extended(self, law: TunedLaw, outputs: Sequence[str]) -> TunedLaw:
+        """A law with the schedule."""
+        airspeed = np.array([float(name == "V") for name in outputs])
+        params = ScheduleParams(law.params, np.float64(self.speed), airspeed, np.float64(self.time))
+        return TunedLaw(with_schedule(law.control_law), params)
 
 
 class RiseDiParameters(ControllerParameters):
@@ -30,13 +45,26 @@ class RiseDiParameters(ControllerParameters):
         description="width of the softened sign in total lags, one or one per channel; stable above 1, 3 is usual"
     )
 
+    schedule: ScheduleParameters | None = Field(
+        default=None, description="an extension of the paper: input_scale follows the dynamic pressure; off where absent"
+    )
+
     def check_law(self) -> None:
-        """One value for each channel; k_d has none for the last."""
+        """One value for each channel; k_d has none for the last. A schedule needs V, and no model of the trim beside it."""
         require_length("k_d", self.k_d, self.outputs[:-1])
         for key in ("Lambda", "beta", "omega"):
             require_length(key, getattr(self, key), self.outputs)
         if isinstance(self.softening, tuple):
             require_length("softening", self.softening, self.outputs)
+        if self.schedule is not None:
+            require("V" in self.outputs, "schedule", f"the outputs {', '.join(self.outputs)}", "V among them")
+            alone = self.feedforward is None and self.observer is None
+            require(alone, "schedule", "a feedforward or an observer beside it", "neither: their model holds at the trim speed")
+
+    def tuned_law(self) -> TunedLaw:
+        """The law with its parameters, extended by the observer or the schedule where there is one."""
+        law = super().tuned_law()
+        return law if self.schedule is None else self.schedule.extended(law, self.outputs)
 
     def control_law(self) -> ControlLaw:
         """RISE-DI with its sampled sign."""
@@ -57,8 +85,8 @@ class RiseDiParameters(ControllerParameters):
         )
 
     def summary(self) -> str:
-        """How the sign is sampled, and the reason as a sentence."""
-        return self.sampled_sign()[1]
+        """How the sign is sampled, and the reason as a sentence; whether input_scale is scheduled."""
+        return self.sampled_sign()[1] + ("" if self.schedule is None else "; input_scale follows the dynamic pressure")
 
     def sampled_sign(self) -> tuple[Sign, str]:
         """How the sign is sampled, and the reason as a sentence."""

@@ -59,6 +59,8 @@ STEP = 0.01
 INPUT_LIMITS = ("lower", "upper", "slew")  # limits of the controller, one an input. They are reordered with the inputs.
 
 
+SPEED_STEP, MAX_SPEED_RATIO = 0.05, 3.0  # of the search for the speed up to which the delay margin lasts
+
 Controller = TypeVar("Controller", bound=ControllerParameters)
 
 
@@ -425,7 +427,7 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
     channels = ChannelPairing(controller.outputs, controller.inputs)
     D = require_channels(study.Omega[np.ix_(rows, columns)], channels, controller.D)
     params = controller.law_params()
-    loop = Loop(params.K * 0.0 + controller.lag, controller.delay, 1.0 / controller.rate)
+    loop = _loop(controller)
     bounds, holds, counts = _bounds(study, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2)
     gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
     C, Bs = study.C[rows], study.B[:, :, columns]
@@ -459,6 +461,27 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
         least = loop.period if controller.observer is None else controller.observer.margin - controller.delay
         conditions += (Condition("delay margin", None, margin, least),)
     return GainAssessment(controller, theorem, conditions, bounds, margin, each)
+
+
+def stable_speed_ratio(study: Study, controller: RiseDiParameters) -> float:
+    """Airspeed over that of the trim up to which the delay margin lasts with fixed gains; 0 without one at trim.
+
+    The response to every input but that of V grows with V^2, all else is that of the trim. The answer is rounded down to
+    SPEED_STEP, and infinite where the linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
+    """
+    rows, columns = law_order(study.airframe, controller)
+    loop, linear = _loop(controller), linear_law(controller.tuned_law(), len(rows), 1.0 / controller.rate)
+    surfaces, no_delay = np.array([name != "V" for name in controller.outputs]), np.zeros(len(rows))
+    plant, steps = LinearPlant(study.A[0] + study.gravity, study.B[0][:, columns], study.C[rows]), round(1.0 / SPEED_STEP)
+    for step in range(steps, round(MAX_SPEED_RATIO * steps) + 1):
+        response = np.where(surfaces, (step / steps) ** 2, 1.0)
+        if not is_stable(plant._replace(B=plant.B * response), linear, loop, no_delay):
+            return (step - 1) / steps if step > steps else 0.0
+    return math.inf
+
+
+def _loop(controller: RiseDiParameters) -> Loop:
+    return Loop(np.array(controller.lag, dtype=np.float64), controller.delay, 1.0 / controller.rate)
 
 
 def _bounds(

@@ -1,0 +1,143 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Schedule of input_scale over dynamic pressure: its equation, bumpless, in flight with a delay, replayed."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flight_analysis.closed_loop.replay import replay
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_bringup.scenarios import find_scenario
+from flight_campaign import fleet
+from flight_core.parameters import ParameterError
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
+from rise_di_controller.control_law import Measurements, TunedLaw
+from rise_di_controller.schedule import SCALE_RANGE, target_scale
+
+SPEED = 46.3  # m/s, trim of the c172p
+C172P = find_scenario("jsbsim_c172p")  # outputs of the controller: q, p, r, V
+FASTER = 16.0  # m/s: 1.81 times the dynamic pressure of the trim
+
+
+def flight(schedule: bool, delay: float, duration: float) -> Scenario:
+    """The c172p in calm air, from 46.3 to 62.3 m/s, with a delayed y."""
+    pulse = {"V": {"start": [1.0], "stop": [1000.0], "value": [FASTER]}}
+    return C172P.vary(
+        flight={"duration": duration},
+        aircraft={"gusts": {}, "sensors": {"delay": delay}},
+        reference_model={"pulses": pulse, "coordinated_turn": None},
+        controller={"schedule": {"speed": SPEED}} if schedule else {},
+    )
+
+
+@cache
+def flown(schedule: bool) -> Tape:
+    """A flight with y 30 ms late, for 60 s."""
+    return simulate(flight(schedule, 0.03, 60.0))
+
+
+def law() -> TunedLaw:
+    return flight(schedule=True, delay=0.0, duration=1.0).controller.tuned_law()
+
+
+def y_at(V: float) -> FloatArray:
+    return np.array([0.0, 0.0, 0.0, V])
+
+
+@pytest.mark.parametrize(
+    ("V", "scale"),
+    [
+        (0.0, 1.0),
+        (SPEED, 0.3),
+        (FASTER, (46.3 / 62.3) ** 2),
+        (-10.0, (46.3 / 36.3) ** 2),
+        (-SPEED, 3.0),
+        (-1e3, 3.0),
+        (1e6, 0.3),
+    ],
+)
+def test_the_scale_is_the_ratio_of_dynamic_pressures_within_its_range(V: float, scale: float) -> None:
+    assert SCALE_RANGE == (0.3, 3.0)
+    assert target_scale(y_at(V), law().params) == pytest.approx([scale, scale, scale, 1.0])
+
+
+def test_a_change_of_the_scale_leaves_u_as_it_is() -> None:
+    control_law, params = law()
+    rng = np.random.default_rng(1)
+    zero = np.zeros(4)
+    state = control_law.engage(Measurements(zero, zero, zero, zero, zero), params)
+    for _ in range(20):
+        y = 0.01 * rng.normal(size=4)
+        state, u = control_law.step(state, Measurements(y, zero, zero, zero, zero), np.float64(0.01), params)
+    instant, at_once = np.float64(1e-9), params._replace(time=np.float64(1e-9))
+    y[3] += FASTER
+    moved = Measurements(y, y_at(FASTER), zero, zero, zero)  # the reference moved too: the same error
+    state, after = control_law.step(state, moved, instant, at_once)
+    assert state.scale[0] == pytest.approx((SPEED / (SPEED + y[3])) ** 2)
+    assert after == pytest.approx(u, rel=1e-6)
+
+
+def test_engagement_at_another_speed_starts_at_its_scale() -> None:
+    control_law, params = law()
+    state = control_law.engage(Measurements(y_at(FASTER), y_at(FASTER), *np.zeros((3, 4))), params)
+    assert state.scale == pytest.approx([(46.3 / 62.3) ** 2] * 3 + [1.0])
+
+
+def rms(tape: Tape) -> dict[str, float]:
+    """Standard deviation of the rates over the last 5 s, mrad/s."""
+    last = tape.time("y") > tape.time("y")[-1] - 5.0
+    return {name: 1e3 * float(np.std(tape["y"][name][last])) for name in ("q", "p", "r")}
+
+
+def test_at_1_8_times_the_dynamic_pressure_the_schedule_keeps_a_delayed_loop_at_rest() -> None:
+    # Without it, the loop with 30 ms of delay is in a limit cycle of tens of mrad/s in q. The margin at trim is 18 ms.
+    assert rms(flown(False))["q"] > 10.0
+    tape = flown(True)
+    assert max(rms(tape).values()) < 0.1
+    assert tape["internals"]["scale.q"][-1] == pytest.approx((46.3 / 62.3) ** 2, rel=0.01)
+    assert set(tape["internals"]["scale.V"]) == {1.0}
+
+
+def test_a_flight_with_a_schedule_is_replayed_to_the_last_bit() -> None:
+    scenario = flight(schedule=True, delay=0.03, duration=60.0)
+    result = replay(flown(True), scenario.controller)
+    assert result.checked.all()
+    assert result.equal()
+
+
+def test_the_scale_is_restored_from_a_log_without_its_beginning() -> None:
+    tape = flown(True)
+    end = tape["internals"].stamp_ns[-1]
+    rest = {name: signal.within([(end - 10**9, end)]) for name, signal in tape.signals.items()}
+    result = replay(Tape(rest), flight(schedule=True, delay=0.03, duration=60.0).controller)
+    assert result.checked.sum() == 100  # ticks of the last second, less the first
+    assert result.equal()
+
+
+def test_without_the_section_nothing_is_logged_and_nothing_changes() -> None:
+    assert "scale.q" not in flown(False)["internals"].names
+    assert not hasattr(C172P.controller.tuned_law().params, "airspeed")
+
+
+@pytest.mark.parametrize("name", ["osprey_observer"])
+def test_a_model_of_the_trim_beside_a_schedule_is_refused(name: str) -> None:
+    with pytest.raises(ParameterError, match=r"schedule: found a feedforward or an observer beside it, expected neither"):
+        find_scenario(name).vary(controller={"schedule": {"speed": 25.0}})
+
+
+def test_many_aircraft_have_each_their_scale() -> None:
+    control_law, params = law()
+    many, V = fleet.shared(params), np.array([[-10.0, 0.0, FASTER]])
+    y: Any = np.concatenate([np.zeros((3, 3)), V])
+    found = target_scale(y, many)
+    assert found.shape == (4, 3)
+    assert found[0] == pytest.approx([target_scale(y_at(one), params)[0] for one in V[0]])
+    zero = np.zeros((4, 3))
+    state = control_law.engage(Measurements(y, y, zero, zero, zero), many)
+    _, u = control_law.step(state, Measurements(y + 0.01, y, zero, zero, zero), np.float64(0.01), many)
+    assert u.shape == (4, 3)
