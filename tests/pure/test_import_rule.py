@@ -49,7 +49,7 @@ IMPORTS: dict[str, set[str]] = {
     },
     "flight_view": {
         "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_analysis.report", "flight_core", "flight_log",
-        "rise_di_controller",
+        "guidance", "rise_di_controller",
     },
     "flight_cli": {
         "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop", "flight_analysis.design",

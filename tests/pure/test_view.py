@@ -23,7 +23,7 @@ from flight_core.tape import Tape
 from flight_log.bag import BagWriter
 from flight_log.disk import try_lock
 from flight_view import server as http
-from flight_view.flight import MAX_TEXT, Flight, description
+from flight_view.flight import MAX_TEXT, Flight
 from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
 from flight_view.watch import newest_run, require_log
@@ -98,9 +98,9 @@ def test_a_flight_that_is_followed_equals_one_that_is_replayed(piece: int, recor
 def test_the_description_has_units_limits_gusts_and_commands_of_the_scenario(recorded: Path) -> None:
     flight = Flight(recorded)
     flight.update()
-    shown = description(flight)
+    shown = flight.description
     assert shown["units"]["q"] == {"unit": "mrad/s", "factor": 1000.0}
-    assert shown["modes"]["1"] == "ENGAGED"
+    assert shown["modes"][""]["1"] == "ENGAGED"
     assert [name for name, *_ in shown["gusts"]] == ["vertical", "lateral"]
     assert shown["commands"][0][1] > 0.0
     json.dumps(shown, allow_nan=False)
@@ -204,7 +204,7 @@ async def serving(*runs: Path) -> AsyncIterator[Server]:
         yield server
     finally:
         task.cancel()
-        server.close()
+        await server.close()
 
 
 def against(*runs: Path) -> Callable[[Callable[[Server], Coroutine[Any, Any, None]]], None]:

@@ -28,8 +28,11 @@ from flight_log.follow import Follower, Messages
 from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_view.series import Series
+from guidance import modes as guidance
+from guidance.path import outline
 from rise_di_controller.guard import Mode
 
+ARC_STEP = math.radians(5.0)  # of the arcs of a route that is drawn
 SLOW, FAST = 50.0, 100.0  # Hz
 RATES = {"internals": math.inf, "guidance": SLOW, "pose": SLOW, "truth": SLOW, "u": FAST, "y": FAST, "y_m": FAST}
 """Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples would be hidden."""
@@ -37,6 +40,7 @@ RATES = {"internals": math.inf, "guidance": SLOW, "pose": SLOW, "truth": SLOW, "
 GROUPS = {
     "internals": ("mode", "late", "y", "y_m", "e", "u_free", "u", "limited", "Pi", "integral_e"),
     "truth": ("actuator", "gust"),
+    "guidance": ("mode", "leg", "xtrack", "to_go", "phi_c", "theta_c", "climb_c", "V_c", "limited", "target"),
 }
 """Groups of channels that are kept; of the other topics all."""
 
@@ -70,7 +74,12 @@ class Flight:
         self.name = run.stem if run.is_file() else run.resolve().name
         self.samples: dict[str, Series] = {}  # by topic
         self.events: list[Event] = []
-        self.scenario: Scenario | None = None
+        modes = {"": Mode, "mode": guidance.Mode, "mode.lateral": guidance.Lateral, "mode.vertical": guidance.Vertical}
+        # What a page shows beside the samples, ready for JSON: the names of modes; what `_described` has once it is read.
+        self.description: dict[str, Any] = {
+            "name": self.name,
+            "modes": {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind in modes.items()},
+        }
         self.notes: list[str] = []
         self.bands: dict[str, float] = {}  # half-widths of the settling bands, SI
         self._follower = Follower(run, self._rate_of)
@@ -165,17 +174,16 @@ class Flight:
             if record.name == LOST_MESSAGES:
                 for topic, count in record.metadata.items():
                     self._note(f"{topic}: the recorder lost {count} messages")
-        elif record.media_type == SCENARIO_MEDIA_TYPE and self.scenario is None:
+        elif record.media_type == SCENARIO_MEDIA_TYPE and "units" not in self.description:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / "scenario.yaml"
                 path.write_bytes(record.data)
                 try:
-                    scenario = load_scenario(path)
-                    display_units(scenario)  # reads the airframe, which may be a file of another machine
+                    self.description |= _described(
+                        load_scenario(path)
+                    )  # reads the airframe, which may be a file of another machine
                 except ParameterError as error:
                     self._note(f"units, limits and commands are unknown: {error}")
-                else:
-                    self.scenario = scenario
 
     def _take(self, messages: Messages) -> None:
         if messages.type_name != JOINT_STATE:
@@ -262,18 +270,17 @@ def _text(text: str) -> str:
     return printable(text)[:MAX_TEXT]
 
 
-def description(flight: Flight) -> dict[str, Any]:
-    """What the page shows beside the samples: units, limits, gusts and commands of the scenario. Ready for JSON."""
-    described: dict[str, Any] = {"name": flight.name, "modes": {str(int(mode)): mode.name for mode in Mode}}
-    if (scenario := flight.scenario) is None:
-        return described
-    controller = scenario.controller
+def _described(scenario: Scenario) -> dict[str, Any]:
+    """Units, limits, gusts, commands and route of a scenario. Raises ParameterError where the airframe cannot be read."""
+    controller, guided = scenario.controller, scenario.guidance
     bounds = zip(controller.inputs, controller.lower or (), controller.upper or (), strict=False)
-    return described | {
+    waypoints = () if guided is None else guided.waypoints()
+    return {
         "scenario": controller.summary(),
         "duration": scenario.flight.duration,
         "units": {name: unit._asdict() for name, unit in display_units(scenario).items()},
         "limits": {name: [one if math.isfinite(one) else None for one in pair] for name, *pair in bounds},
         "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
         "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],
+        "route": outline(guided.plan(waypoints), ARC_STEP) if guided is not None and waypoints else [],
     }

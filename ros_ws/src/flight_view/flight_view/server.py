@@ -25,7 +25,7 @@ from tornado.web import Application, HTTPError, RequestHandler
 
 from flight_analysis.report.summary import finite_or_null
 from flight_core.rates import NANOSECONDS
-from flight_view.flight import Flight, description
+from flight_view.flight import Flight
 
 ADDRESS = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
@@ -78,9 +78,10 @@ class Server:
         self.port = listener.getsockname()[1]
         self._http.add_socket(listener)
 
-    def close(self) -> None:
-        """Stop listening."""
+    async def close(self) -> None:
+        """Stop listening and close all connections."""
         self._http.stop()
+        await self._http.close_all_connections()
 
     def accepts(self, host: str) -> bool:
         """Whether a Host header names this server, exactly."""
@@ -154,10 +155,10 @@ def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False) -> 
         "topics": topics,
         "first_event": first["events"],
         "events": events,
-        "described": flight.scenario is not None,
+        "described": "units" in flight.description,
     }
     if known.get("described") != str(head["described"]).lower():
-        head["flight"] = description(flight)
+        head["flight"] = flight.description
     text = json.dumps(head, allow_nan=False).encode()
     text += b" " * (-(len(text) + 4) % 8)
     return b"".join([struct.pack("<I", len(text)), text, *columns])

@@ -69,4 +69,4 @@ async def _serve(runs: Sequence[Path], port: int, announce: Callable[[str], None
     except OSError as error:
         raise ParameterError(f"{error.filename}: cannot be read ({error.strerror}), expected the log of a flight") from None
     finally:
-        server.close()
+        await server.close()

@@ -108,6 +108,25 @@ def leads(legs: Sequence[Leg]) -> list[int]:
     return numbers
 
 
+def outline(route: Route, step: float) -> list[tuple[float, float, float]]:
+    """Points along a route, north, east and altitude, m: ends of lines, and points of arcs at most `step` rad apart."""
+    first = route.legs[0]
+    points = [(*first.start, route.altitude[0])] if isinstance(first, Line) else []
+    for leg, altitude in zip(route.legs, route.altitude, strict=True):
+        if isinstance(leg, Line):
+            points.append((*leg.end, altitude))
+            continue
+        side = math.copysign(1.0, leg.radius)
+        begin = course_of(leg.centre, points[-1][:2]) if points else 0.0
+        turn = 2.0 * math.pi if leg.end is None else side * (course_of(leg.centre, leg.end) - begin) % (2.0 * math.pi)
+        pieces = max(1, math.ceil(turn / step))
+        for k in range(pieces + 1):
+            bearing = begin + side * turn * k / pieces
+            north, east = (abs(leg.radius) * of(bearing) for of in (math.cos, math.sin))
+            points.append((leg.centre[0] + north, leg.centre[1] + east, altitude))
+    return points
+
+
 def route(waypoints: Sequence[Point], radius: float, least: float) -> tuple[Leg, ...]:
     """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the last waypoint.
 

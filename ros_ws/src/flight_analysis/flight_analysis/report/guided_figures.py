@@ -17,7 +17,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from guidance.guidance import digest
 from guidance.modes import Lateral, Mode, Vertical
-from guidance.path import Arc, Route, course_of
+from guidance.path import Route, outline
 from rise_di_controller import guard
 
 TRACK_POINTS = 2400
@@ -71,7 +71,7 @@ def track_figure(tape: Tape, route: Route | None, speed: float) -> go.Figure:
     figure = go.Figure()
     if route is not None:
         line = {"color": REFERENCE, "width": 6.0}
-        path_north, path_east = route_points(route)
+        path_north, path_east, _ = zip(*outline(route, ARC_STEP), strict=True)
         figure.add_trace(go.Scatter(x=path_east, y=path_north, mode="lines", name="route", line=line, hoverinfo="skip"))
     track = go.Scatter(
         x=east.astype(np.float32), y=north.astype(np.float32), mode="lines", name="flown", line={"color": PLANT, "width": 1.4}
@@ -81,26 +81,6 @@ def track_figure(tape: Tape, route: Route | None, speed: float) -> go.Figure:
     figure.update_xaxes(title_text="east (m)")
     figure.update_yaxes(title_text="north (m)", scaleanchor="x", scaleratio=1.0)
     return set_layout(figure, TRACK_HEIGHT, labels=16)
-
-
-def route_points(route: Route) -> tuple[list[float], list[float]]:
-    """North and east along a route, m: ends of lines, and points of arcs at most ARC_STEP apart."""
-    points = [route.legs[0].start] if route.legs and not isinstance(route.legs[0], Arc) else []
-    for leg in route.legs:
-        if not isinstance(leg, Arc):
-            points.append(leg.end)
-            continue
-        side = math.copysign(1.0, leg.radius)
-        begin = course_of(leg.centre, points[-1])
-        turn = 2.0 * math.pi
-        if leg.end is not None:
-            turn = side * (course_of(leg.centre, leg.end) - begin) % (2.0 * math.pi)
-        for angle in np.linspace(0.0, turn, 2 + int(turn / ARC_STEP)):
-            bearing = begin + side * float(angle)
-            points.append(
-                (leg.centre[0] + abs(leg.radius) * math.cos(bearing), leg.centre[1] + abs(leg.radius) * math.sin(bearing))
-            )
-    return [point[0] for point in points], [point[1] for point in points]
 
 
 def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:

@@ -91,6 +91,7 @@ export function chartsOf(flight, ghost) {
   charts.push(...guidanceCharts(flight, line));
   if (flight.get("pose")?.channels.includes("altitude")) {
     const lines = [line("pose", "altitude", "altitude", "--plant", 1.4)];
+    if (flight.get("guidance")?.channels.includes("target.altitude")) lines.unshift(line("guidance", "target.altitude", "command", "--reference", 4));
     if (ghost) lines.unshift(line("pose", "altitude", "of the ghost", "--ghost", 1.2, {flight: ghost, dash: [5, 3]}));
     charts.push({title: "altitude", unit: "m", lines});
   }
@@ -157,7 +158,7 @@ export function drawChart(canvas, chart, flight, view, cursor, selection, colour
   }
   ctx.strokeStyle = colour("--line");
   ctx.lineWidth = 1;
-  const marks = ticks(low, high, 4);
+  const marks = ticks(low, high, 5);
   for (const {value} of marks) stroke(ctx, [[LEFT, y(value)], [right, y(value)]]);
   for (const {value} of ticks(from, to, Math.max(width / 110, 2))) stroke(ctx, [[x(value), TOP], [x(value), bottom]]);
   ctx.strokeStyle = colour("--limit");

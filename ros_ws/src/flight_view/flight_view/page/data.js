@@ -1,5 +1,7 @@
 // The samples of a flight: fetched from the server, kept in typed arrays by topic and channel.
 
+const PATIENCE = 10_000; // ms; the server answers within 2 s, also without news
+
 // Index of the last of the first `count` times that is not after `t`; -1 before the first one.
 export function indexAt(times, count, t) {
   let low = 0, high = count;
@@ -103,7 +105,7 @@ export class Flight { // one flight of the server
   }
 
   async poll() { // one request; true when samples came
-    const response = await fetch(`data/${this.number}?${this.query()}`);
+    const response = await fetch(`data/${this.number}?${this.query()}`, {signal: AbortSignal.timeout(PATIENCE)});
     if (!response.ok) throw new Error(await response.text());
     return this.take(decode(await response.arrayBuffer()));
   }

@@ -7,6 +7,7 @@ const SPEEDS = [0.1, 0.2, 0.5, 1, 2, 5, 10];
 const WINDOW = 20; // s
 const SILENT = 1000; // ms without a sample after which a recording says "no data"
 const RETRY = 500; // ms between two requests to a server that does not answer
+const GUIDED = [["mode", "guidance"], ["mode.lateral", "lateral"], ["mode.vertical", "vertical"], ["leg", "leg"], ["xtrack", "cross-track"], ["to_go", "to go"]];
 const BADGES = {CONNECTING: "", WAITING: "warn", READING: "", LIVE: "good", "NO DATA": "bad", "NO SERVER": "bad", INTERRUPTED: "warn", ENDED: ""};
 
 const $ = id => document.getElementById(id);
@@ -14,7 +15,7 @@ const flight = new Flight(0);
 let ghost = null, charts = [], chartKey = "", colours = {}, dirty = true, shownEvents = -1;
 const clock = {t: 0, playing: false, speed: 1, live: true, started: false};
 const view = {kind: "window", from: 0, to: WINDOW};
-const link = {serving: false, samples: 0}; // the server answers; when, in ms, the last answer with samples came
+const link = {serving: false, refusal: "", samples: 0}; // the server answers; why it refuses; when, in ms, the last answer with samples came
 const scene = new Scene($("scene"), redraw);
 
 // ---- Colours of the scheme
@@ -34,12 +35,15 @@ async function follow(one) {
       const came = await one.poll();
       if (one === flight) {
         link.serving = true;
+        link.refusal = "";
         if (came) link.samples = performance.now();
       }
       taken();
     } catch (error) {
-      if (one === flight) link.serving = false;
-      if (!(error instanceof TypeError)) console.warn(error.message);
+      if (one === flight) {
+        link.serving = false;
+        link.refusal = error.name === "Error" ? error.message : "";
+      }
       await new Promise(resume => setTimeout(resume, RETRY));
     }
     redraw();
@@ -59,7 +63,7 @@ function taken() { // a recording is followed at its end; a log that has ended s
   }
   if (clock.live) {
     clock.t = end();
-    clock.live = recording;
+    clock.live = flight.head.state !== "ended";
   }
   if (flight.head.ghost && !ghost) {
     ghost = new Flight(1);
@@ -195,10 +199,10 @@ function drawState() {
   text($("name"), ghost ? `${flight.info.name} and ghost ${ghost.info.name}` : flight.info.name);
   document.title = `${now === "ENDED" ? "" : `${now}: `}${flight.info.name}`;
   const mode = flight.get("internals")?.at("mode", clock.t);
-  text($("mode"), Number.isFinite(mode) ? flight.info.modes[mode] ?? `mode ${mode}` : "");
+  text($("mode"), Number.isFinite(mode) ? flight.info.modes[""]?.[mode] ?? `mode ${mode}` : "");
   $("mode").style.background = MODE_COLOURS[mode] ?? "";
   text($("time"), `t = ${clock.t.toFixed(2)} s`);
-  const sentences = [...faults, ...(ghost?.head.faults ?? []).map(one => `ghost: ${one}`)];
+  const sentences = [link.refusal, ...faults, ...(ghost?.head.faults ?? []).map(one => `ghost: ${one}`)].filter(Boolean);
   $("notes").hidden = sentences.length === 0;
   if (list($("notes").lastElementChild, sentences)) text($("notes").firstElementChild, `${sentences.length} notes on the log`);
   for (const [id, on] of [["live", clock.live], ["window", view.kind === "window"], ["whole", view.kind === "whole"]]) $(id).setAttribute("aria-pressed", on);
@@ -224,7 +228,10 @@ function drawReadouts() {
     heading, roll: shown(pose?.phi * degrees, 1, "deg"), pitch: shown(pose?.theta * degrees, 1, "deg"), altitude: shown(pose?.altitude, 1, "m"),
     "ground speed": shown(pose?.speed, 1, "m/s"), climb: shown(pose?.climb, 1, "m/s"),
   };
-  for (const name of guidance?.channels ?? []) if (/^(mode|leg|xtrack)/.test(name)) values[name] = shown(guidance.at(name, clock.t), name === "xtrack" ? 1 : 0, "");
+  for (const [name, label] of guidance ? GUIDED : []) {
+    const value = guidance.at(name, clock.t);
+    values[label] = flight.info.modes[name]?.[value] ?? shown(value, name === "leg" ? 0 : 1, name === "leg" ? "" : "m");
+  }
   const node = $("readouts"), names = Object.keys(values);
   if (node.children.length !== 2 * names.length) {
     node.replaceChildren(...names.flatMap(name => [Object.assign(document.createElement("dt"), {textContent: name}), document.createElement("dd")]));

@@ -1,0 +1,296 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The live page in a browser: a flight that grows, replay, signs of the scene, states, hostile names, phone and dark scheme."""
+
+import asyncio
+import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.browser import CHROMIUM, Browser
+from tests.joint_states import JOINT_STATE, vector
+
+from flight_bringup.scenarios import find_scenario
+from flight_core.tape import Signal, Tape
+from flight_log.bag import BagWriter, LogAttachments
+from flight_log.disk import try_lock
+from flight_log.tape_writer import write_run
+from flight_view.flight import Flight
+from flight_view.server import Server
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+TOKEN = "a-token"  # noqa: S105 - of a test
+STATE = "document.getElementById('state')?.textContent"
+DRAWN = "Number(document.body?.dataset.drawn ?? 0)"
+TIME = "parseFloat(document.getElementById('time')?.textContent.slice(4))"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("profile")) as started:
+        yield started
+
+
+@contextmanager
+def serving(*runs: Path) -> Iterator[str]:
+    """Serve runs from a thread of this process; the address with the token."""
+    ready, address = threading.Event(), ""
+    loop = asyncio.new_event_loop()
+
+    async def serve() -> None:
+        nonlocal address
+        server = Server([Flight(run) for run in runs], TOKEN)
+        server.listen(0)
+        address = f"http://127.0.0.1:{server.port}/?token={TOKEN}"
+        ready.set()
+        try:
+            await server.follow()
+        except asyncio.CancelledError:
+            await server.close()
+
+    task = loop.create_task(serve())
+    thread = threading.Thread(target=loop.run_until_complete, args=(task,))
+    thread.start()
+    try:
+        ready.wait()
+        yield address
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join()
+        loop.close()
+
+
+@contextmanager
+def shown(browser: Browser, *runs: Path) -> Iterator[str]:
+    """Serve finished runs and open the page; afterwards leave it, so that it does not ask a server that has ended."""
+    with serving(*runs) as address:
+        browser.open(address)
+        browser.wait_for(f"{DRAWN} > 1 && {STATE} === 'ENDED'")
+        yield address
+        browser.open("about:blank")
+        browser.wait_for("location.href === 'about:blank'")
+
+
+def colours_of(browser: Browser, selector: str) -> int:
+    """Number of different colours on a canvas."""
+    script = f"""(canvas => {{
+        const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d', {{willReadFrequently: true}});
+        copy.drawImage(canvas, 0, 0);
+        return new Set(new Uint32Array(copy.getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size;
+    }})(document.querySelector('{selector}'))"""
+    return int(browser.run(script))
+
+
+def press(browser: Browser, key: str) -> None:
+    browser.run(f"void document.body.dispatchEvent(new KeyboardEvent('keydown', {{key: '{key}', bubbles: true}}))")
+
+
+def test_a_recorded_flight_is_drawn_and_asks_no_other_host(browser: Browser, recorded: Path) -> None:
+    with shown(browser, recorded) as address:
+        titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
+        assert titles[:5] == ["q: y over y_m", "p: y over y_m", "r: y over y_m", "V: y over y_m", "q: error e"]
+        assert {"elevator", "wind", "altitude", "ticks: lateness"} <= set(titles)
+        for selector in ("#scene", "#horizon", "#timeline", "#charts canvas"):
+            assert colours_of(browser, selector) > 5
+        hosts = browser.run("[...new Set(performance.getEntriesByType('resource').map(one => new URL(one.name).host))]")
+        assert hosts == [address.split("/")[2]]
+        assert browser.run("document.getElementById('events').textContent") == "0.00 s  mode: ENGAGED"
+        assert browser.run("location.search") == ""  # the token is not in the history
+        assert browser.console == []
+
+
+def test_keys_step_single_ticks_jump_to_events_and_play(browser: Browser, recorded: Path, tape: Tape) -> None:
+    with shown(browser, recorded):
+        assert browser.run(TIME) == 0.0
+        for expected in (0.01, 0.02, 0.03):  # 100 Hz
+            press(browser, "ArrowRight")
+            browser.wait_for(f"{TIME} === {expected}")
+        press(browser, "ArrowLeft")
+        browser.wait_for(f"{TIME} === 0.02")
+        press(browser, "End")
+        browser.wait_for(f"{TIME} === {tape.time('y')[-1]:.2f}")
+        press(browser, "[")
+        browser.wait_for(f"{TIME} < 1")
+        for _ in range(6):
+            press(browser, "+")
+        press(browser, "Home")
+        press(browser, " ")
+        browser.wait_for(f"{TIME} === {tape.time('y')[-1]:.2f}")  # 10 times
+        assert browser.run("document.getElementById('speed').value") == "10"
+        assert browser.console == []
+
+
+def test_a_flight_that_is_recorded_is_followed_to_its_end(browser: Browser, recorded: Path, tmp_path: Path) -> None:
+    content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
+    with serving(tmp_path) as address:
+        browser.open(address)
+        browser.wait_for(f"{STATE} === 'WAITING'")
+        path.write_bytes(content[: len(content) // 2])
+        with path.open("rb") as recorder:
+            assert try_lock(recorder)
+            browser.wait_for(f"{STATE} === 'NO DATA'")  # after LIVE, which lasts a second
+            half = browser.run(TIME)
+            assert 0.2 < half < 1.9
+            path.write_bytes(content[: len(content) * 3 // 4])
+            browser.wait_for(f"{TIME} > {half}")
+        browser.wait_for(f"{STATE} === 'INTERRUPTED'")
+        path.write_bytes(content)
+        browser.wait_for(f"{STATE} === 'ENDED' && {TIME} === 2")
+        assert browser.console == []
+    browser.wait_for(f"{STATE} === 'NO SERVER'")
+    before = browser.run(DRAWN)
+    press(browser, "Home")
+    browser.wait_for(f"{DRAWN} > {before} && {TIME} === 0")  # the page keeps what it has
+
+
+def test_a_second_run_is_a_ghost_and_the_pictures_need_no_webgl(browser: Browser, recorded: Path) -> None:
+    with shown(browser, recorded, recorded):
+        browser.wait_for("document.getElementById('name').textContent === 'run and ghost run'")
+        assert browser.run("document.documentElement.outerHTML.includes('webgl')") is False
+        for camera in ("orbit", "map", "chase"):
+            before = browser.run(DRAWN)
+            browser.run(f"void document.querySelector('[data-camera={camera}]').click()")
+            browser.wait_for(f"{DRAWN} > {before}")
+            assert colours_of(browser, "#scene") > 20
+        assert browser.console == []
+
+
+def test_names_that_are_html_are_shown_as_text(browser: Browser, tmp_path: Path) -> None:
+    hostile = "<img src=x onerror=document.title=1>"
+    with BagWriter(tmp_path / hostile.replace("/", "")) as bag:
+        y = bag.add_topic("/y", JOINT_STATE, "")
+        for k in range(200):
+            bag.write(y, k * 10_000_000, k * 10_000_000, k, vector(k * 10_000_000, [hostile], [math.sin(k)]))
+    with shown(browser, tmp_path / hostile):
+        assert browser.run("document.getElementById('name').textContent") == hostile
+        assert browser.run("document.querySelectorAll('img').length") == 0
+        assert browser.run("document.querySelector('#charts canvas').getAttribute('aria-label')") == f"{hostile}: y over y_m"
+        assert browser.console == []
+
+
+def test_a_phone_has_one_column_and_the_dark_scheme_its_own_colours(browser: Browser, recorded: Path) -> None:
+    with shown(browser, recorded):
+        browser.call("Emulation.setDeviceMetricsOverride", width=390, height=800, deviceScaleFactor=2, mobile=True)
+        browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
+        try:
+            before = browser.run(DRAWN)
+            browser.wait_for(f"{DRAWN} > {before}")
+            assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+            assert browser.run("document.getElementById('charts').getBoundingClientRect().left") < 20
+            assert browser.run("getComputedStyle(document.body).backgroundColor") == "rgb(27, 31, 36)"
+            assert browser.run("document.getElementById('scene').width") == 2 * browser.run(
+                "document.getElementById('scene').clientWidth"
+            )
+        finally:
+            browser.call("Emulation.clearDeviceMetricsOverride")
+            browser.call("Emulation.setEmulatedMedia", features=[])
+        assert browser.console == []
+
+
+# Signs of the scene: what a roll right, a nose up and a nose right do on the screen
+
+
+def seen(browser: Browser, expression: str) -> Any:
+    """An expression with scene.js as `m`, and `at`: the place on the screen of a body point of a pose, seen from behind."""
+    at = """const at = (point, phi, theta, psi) => m.project(m.camera([-10, 0, -3], [10, 0, 3]),
+        m.toWorld(m.rotation(phi, theta, psi), point), 500, 400, 400).slice(0, 2);"""
+    return browser.run(f"import('./scene.js').then(m => {{ {at} return {expression} }})")
+
+
+@pytest.fixture(scope="module")
+def page(browser: Browser, recorded: Path) -> Iterator[Browser]:
+    with shown(browser, recorded):
+        yield browser
+
+
+def test_the_attitude_is_drawn_with_the_right_signs(page: Browser) -> None:
+    nose, right, level = "[1, 0, 0]", "[0, 1, 0]", "0, 0, 0"
+    (x, y), (x_level, y_level) = seen(page, f"[at({right}, 0.3, 0, 0), at({right}, {level})]")
+    assert x_level > 200  # the right wing is on the right, seen from behind
+    assert y > y_level  # roll right: the right wing goes down
+    (_, y), (x_level, y_level) = seen(page, f"[at({nose}, 0, 0.3, 0), at({nose}, {level})]")
+    assert y < y_level  # nose up
+    (x, _), _ = seen(page, f"[at({nose}, 0, 0, 0.3), 0]")
+    assert x > x_level  # nose right
+
+
+def test_the_rotation_is_the_euler_sequence_of_the_textbook(page: Browser) -> None:
+    # Stevens, Lewis, Aircraft Control and Simulation, eq. (1.3-20), here as a product of plane rotations.
+    phi, theta, psi = 0.7, -0.4, 2.1
+
+    def plane(i: int, j: int, angle: float) -> Any:
+        matrix = np.eye(3)
+        matrix[i, i] = matrix[j, j] = math.cos(angle)
+        matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
+        return matrix
+
+    expected = plane(0, 1, psi) @ plane(2, 0, theta) @ plane(1, 2, phi)
+    assert np.array(seen(page, f"m.rotation({phi}, {theta}, {psi})")) == pytest.approx(expected, abs=1e-12)
+
+
+def test_surfaces_deflect_in_the_sense_of_their_input(page: Browser) -> None:
+    # The trailing edges are the last points of a surface. Down is +z, right is +y.
+    edges = "m.aircraft({%s}).filter(one => one.part === 'surface').map(one => one.points[2])"
+    still = np.array(seen(page, edges % ""))
+    right_aileron, right_elevator, left_aileron, left_elevator, rudder = range(5)
+    up = np.array(seen(page, edges % "elevator: 0.3")) - still
+    assert up[right_elevator, 2] < 0 > up[left_elevator, 2]  # nose up: both go up
+    roll = np.array(seen(page, edges % "aileron: 0.3")) - still
+    assert roll[right_aileron, 2] < 0 < roll[left_aileron, 2]  # roll right: the right one goes up, the left one down
+    yaw = np.array(seen(page, edges % "rudder: 0.3")) - still
+    assert yaw[rudder, 1] > 0  # nose right: it goes to the right
+
+
+def test_the_horizon_falls_when_the_nose_rises_and_turns_left_in_a_roll_to_the_right(page: Browser) -> None:
+    def sky(pose: str, x: float, y: float) -> bool:
+        """Whether a point of the instrument shows the sky; x and y in fractions of its radius from its centre."""
+        script = f"""import('./scene.js').then(m => {{
+            const canvas = document.createElement('canvas');
+            canvas.style = 'width: 200px; height: 200px';
+            document.body.append(canvas);
+            m.drawHorizon(canvas, {pose}, name => ({{'--sky': '#0000ff', '--ground': '#00ff00'}})[name] ?? '#888888');
+            const [column, row] = [canvas.width * (1 + {x}) / 2, canvas.height * (1 + {y}) / 2];
+            const [r, g, b] = canvas.getContext('2d').getImageData(column, row, 1, 1).data;
+            canvas.remove();
+            return b > g;
+        }})"""
+        return bool(page.run(script))
+
+    level, up, roll = (f"{{attitude: true, phi: {phi}, theta: {theta}}}" for phi, theta in ((0, 0), (0, 0.2), (0.5, 0)))
+    assert (sky(level, -0.6, -0.1), sky(level, -0.6, 0.1)) == (True, False)
+    assert sky(up, -0.6, 0.1)
+    assert [sky(roll, -0.6, y) for y in (-0.1, 0.1)] == [True, True]  # the horizon falls on the left and rises on the right
+    assert [sky(roll, 0.6, y) for y in (-0.1, 0.1)] == [False, False]
+
+
+def test_a_zoomed_out_line_keeps_its_peaks(page: Browser) -> None:
+    peaks = """(() => {
+        const series = new d.Series(['a']);
+        const t = Float64Array.from({length: 100000}, (_, k) => k / 100), a = new Float32Array(100000);
+        a[12345] = 7; a[54321] = -5;
+        series.append(t, [a]);
+        const chosen = c.rows(series, series.column('a'), [0, 1000], 500);
+        return [chosen.length, Math.max(...chosen.map(k => a[k])), Math.min(...chosen.map(k => a[k]))];
+    })()"""
+    count, largest, least = page.run(f"import('./data.js').then(d => import('./charts.js').then(c => {peaks}))")
+    assert count <= 1000
+    assert (largest, least) == (7, -5)
+
+
+def test_a_guided_flight_shows_its_route_and_its_modes(browser: Browser, tmp_path: Path) -> None:
+    names = ("mode", "mode.lateral", "mode.vertical", "leg", "xtrack", "to_go", "phi_c", "theta_c", "target.altitude")
+    stamps = np.arange(200, dtype=np.int64) * 20_000_000
+    guidance = Signal(stamps, names, np.tile([1.0, 4.0, 2.0, 3.0, -2.5, 100.0, 0.1, 0.0, 30.0], (200, 1)))
+    write_run(Tape({"guidance": guidance}), tmp_path / "run", LogAttachments(find_scenario("osprey_route").path))
+    with shown(browser, tmp_path / "run"):
+        readouts = browser.run("document.getElementById('readouts').innerText")
+        for text in ("ENGAGED", "ROUTE", "ALTITUDE", "-2.5 m"):
+            assert text in readouts
+        titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
+        assert titles == ["phi over its command", "theta over its command", "cross-track"]
+        assert browser.console == []
