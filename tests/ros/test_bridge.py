@@ -340,7 +340,7 @@ def test_the_controller_is_active_only_while_engaged_and_the_summary_says_when_a
     tape = read_run(run).tape
     mode, t = tape["internals"]["mode"], tape.time("internals")
     flies = t[mode == Mode.ENGAGED]
-    assert engagement["start"] - 0.05 < flies[0] < engagement["start"] + 1.0  # the timeout of an activation
+    assert abs(engagement["start"] - flies[0]) < 1.0  # the timeout of an activation, which is reported when it has answered
     assert engagement["stop"] - 0.1 < flies[-1] < engagement["stop"] + LATE
     u, t_u = tape["u"].values, tape.time("u")
     assert not u[t_u < flies[0]].any()  # no integral before the engagement, none 2 s after it
