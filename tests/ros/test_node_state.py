@@ -97,6 +97,15 @@ def test_a_process_ending_while_others_wait_is_named_at_once(only_stage: Path, o
     assert time.monotonic() - begin < 2.5  # READY_TIMEOUT is 3 s
 
 
+def test_a_process_that_ends_is_named_with_its_fatal_line_not_its_last_one(
+    only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    lines = "[FATAL] [1.0] [controller]: lost contact with aircraft", "[INFO] [1.1] [controller]: 3 messages in run"
+    only_stage.write_text(f"import sys\nprint({chr(10).join(lines)!r})\nsys.exit(3)\n", encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"^controller ended with status 3: lost contact with aircraft$"):
+        start_stage(osprey_gust, tmp_path / "run")
+
+
 def test_the_state_of_a_node_in_another_flight_does_not_start_this_one(
     start_node: Start, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:

@@ -173,8 +173,9 @@ class FlightProcesses:
                     return f"{process.node.executable} was killed by {signal.Signals(-status).name}"
                 if status == 0:
                     return f"{process.node.executable} was shut down"
-                last = next((line for line in reversed(process.lines) if line.strip()), "no output")
-                message = re.sub(r"^(\[[^]]*\] ?)*(: )?|^error: ", "", last)  # without the logger's brackets
+                lines = [line for line in process.lines if line.strip()] or ["no output"]
+                cause = next((line for line in reversed(lines) if re.match(r"\[FATAL\]|error: ", line)), lines[-1])
+                message = re.sub(r"^(\[[^]]*\] ?)*(: )?|^error: ", "", cause)  # without the logger's brackets
                 return f"{process.node.executable} ended with status {status}: {message}"
         return None
 
