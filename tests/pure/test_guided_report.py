@@ -110,7 +110,7 @@ def test_the_wind_follows_from_the_velocities_over_ground_and_through_the_air() 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_the_drawn_route_lies_on_its_legs(side: float) -> None:
     legs = path.route([(0.0, 0.0), (1000.0, 0.0), (1000.0, side * 1000.0)], 200.0, 100.0)
-    outline = path.outline(Route(legs, (0.0,) * 4, (SPEED,) * 4), math.radians(5.0))
+    outline = path.route_outline(Route(legs, (0.0,) * 4, (SPEED,) * 4))
     points = [(north, east) for north, east, _ in outline]
     assert points[:2] == [(0.0, 0.0), pytest.approx((800.0, 0.0))]
     for point in points:

@@ -29,10 +29,9 @@ from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, fli
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_view.series import Series
 from guidance import modes as guidance
-from guidance.path import outline
+from guidance.path import route_outline
 from rise_di_controller.guard import Mode
 
-ARC_STEP = math.radians(5.0)  # of the arcs of a route that is drawn
 SLOW, FAST = 50.0, 100.0  # Hz
 RATES = {"internals": math.inf, "guidance": SLOW, "pose": SLOW, "truth": SLOW, "u": FAST, "y": FAST, "y_m": FAST}
 """Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples would be hidden."""
@@ -282,5 +281,5 @@ def _described(scenario: Scenario) -> dict[str, Any]:
         "limits": {name: [one if math.isfinite(one) else None for one in pair] for name, *pair in bounds},
         "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
         "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],
-        "route": outline(guided.plan(waypoints), ARC_STEP) if guided is not None and waypoints else [],
+        "route": route_outline(guided.plan(waypoints)) if guided is not None and waypoints else [],
     }

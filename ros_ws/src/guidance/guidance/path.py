@@ -99,6 +99,15 @@ def outline(leg: Leg, start: Point) -> list[Point]:
     return [_along(leg.centre, first + side * turn * k / (count - 1), abs(leg.radius)) for k in range(count)]
 
 
+def route_outline(route: Route) -> list[tuple[float, float, float]]:
+    """Points along a route, for drawing: north, east and altitude, m. Each leg has its own altitude."""
+    points: list[tuple[float, float, float]] = []
+    for leg, altitude in zip(route.legs, route.altitude, strict=True):
+        start = leg.start if isinstance(leg, Line) else points[-1][:2] if points else _along(leg.centre, 0.0, abs(leg.radius))
+        points += [(*point, altitude) for point in outline(leg, start)]
+    return points
+
+
 def leads(legs: Sequence[Leg]) -> list[int]:
     """The number of the waypoint to which each leg of a route leads; an arc at a waypoint leads to the next one."""
     numbers, at = [], 0
@@ -106,25 +115,6 @@ def leads(legs: Sequence[Leg]) -> list[int]:
         at += isinstance(leg, Line)
         numbers.append(at + 1 if isinstance(leg, Arc) and leg.end is not None else at)
     return numbers
-
-
-def outline(route: Route, step: float) -> list[tuple[float, float, float]]:
-    """Points along a route, north, east and altitude, m: ends of lines, and points of arcs at most `step` rad apart."""
-    first = route.legs[0]
-    points = [(*first.start, route.altitude[0])] if isinstance(first, Line) else []
-    for leg, altitude in zip(route.legs, route.altitude, strict=True):
-        if isinstance(leg, Line):
-            points.append((*leg.end, altitude))
-            continue
-        side = math.copysign(1.0, leg.radius)
-        begin = course_of(leg.centre, points[-1][:2]) if points else 0.0
-        turn = 2.0 * math.pi if leg.end is None else side * (course_of(leg.centre, leg.end) - begin) % (2.0 * math.pi)
-        pieces = max(1, math.ceil(turn / step))
-        for k in range(pieces + 1):
-            bearing = begin + side * turn * k / pieces
-            north, east = (abs(leg.radius) * of(bearing) for of in (math.cos, math.sin))
-            points.append((leg.centre[0] + north, leg.centre[1] + east, altitude))
-    return points
 
 
 def route(waypoints: Sequence[Point], radius: float, least: float) -> tuple[Leg, ...]:

@@ -17,7 +17,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from guidance.guidance import digest
 from guidance.modes import Lateral, Mode, Vertical
-from guidance.path import Route, outline
+from guidance.path import Route, route_outline
 from rise_di_controller import guard
 
 TRACK_POINTS = 2400
@@ -25,7 +25,6 @@ TRACK_HEIGHT = 560  # pixels
 WIND_ARROWS = 8
 ARROW_PIXELS = 45.0  # of the strongest wind
 LEAST_WIND = 0.3  # m/s, below which no arrow is drawn
-ARC_STEP = math.radians(5.0)
 MODE_SHADES = {Mode.DEAD_RECKONING: MODE_COLOURS[guard.Mode.HOLD], Mode.POSE_LOST: MODE_COLOURS[guard.Mode.RAMP]}
 
 Bounds = Mapping[str, tuple[float, float]]  # least and largest command by channel, SI; infinite without a limit
@@ -71,7 +70,7 @@ def track_figure(tape: Tape, route: Route | None, speed: float) -> go.Figure:
     figure = go.Figure()
     if route is not None:
         line = {"color": REFERENCE, "width": 6.0}
-        path_north, path_east, _ = zip(*outline(route, ARC_STEP), strict=True)
+        path_north, path_east, _ = zip(*route_outline(route), strict=True)
         figure.add_trace(go.Scatter(x=path_east, y=path_north, mode="lines", name="route", line=line, hoverinfo="skip"))
     track = go.Scatter(
         x=east.astype(np.float32), y=north.astype(np.float32), mode="lines", name="flown", line={"color": PLANT, "width": 1.4}
