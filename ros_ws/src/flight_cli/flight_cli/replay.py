@@ -12,7 +12,8 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from flight_analysis.closed_loop.replay import OPEN_LOOP, ReplayResult, recorded_parameters, vary
+from flight_analysis.closed_loop.guidance_replay import GuidanceReplay, replay_guidance
+from flight_analysis.closed_loop.replay import OPEN_LOOP, Difference, ReplayResult, recorded_parameters, recorded_scenario, vary
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
 from flight_analysis.report.summary import finite_or_null
@@ -35,7 +36,7 @@ def replay(
     csv_file: Annotated[Path | None, typer.Option("--csv", help="CSV file for u as recorded and as computed.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
-    """Compute every tick of a recorded flight again and compare it with the log bit by bit.
+    """Compute every tick of a recorded flight again, and every step of guidance, and compare it with the log bit by bit.
 
     --set computes u from the recorded y and y_m with other parameters. That is an open loop: the aircraft did not fly this u.
     Exit status: 0 every bit equal, 1 a tick differs or flew with other parameters, 2 bad input.
@@ -48,15 +49,42 @@ def replay(
         others = vary(parameters, dict(map(_parse_setting, settings))) if settings else None
         changes = parameter_changes(run, "controller", type(parameters).model_fields) if others is None else []
         result = recompute(recorded.tape, parameters, others, changes)
+        guided = None
+        if others is None and "guidance" in recorded.tape:
+            guided = replay_guidance(recorded.tape, recorded_scenario(recorded.scenario).guidance)
     require(bool(result.checked.any()), str(run), "no tick that could be checked", "a log with two successive ticks")
     if csv_file is not None:
         _write_csv(csv_file, result, parameters.inputs)
     notes = (*recorded.tape.notes, *result.notes, *_parameter_notes(result, open_loop=others is not None))
+    notes += () if guided is None else guided.notes
     if as_json:
-        print(json.dumps(_as_json(result, notes, parameters.inputs, settings or [])))
+        of_guidance = None if guided is None else _guidance_as_json(guided)
+        print(json.dumps({**_as_json(result, notes, parameters.inputs, settings or []), "guidance": of_guidance}))
     else:
         _show(result, notes, parameters.inputs, open_loop=others is not None)
-    raise typer.Exit(0 if result.equal() else DIFFERS)
+        if guided is not None:
+            _show_guidance(guided)
+    raise typer.Exit(0 if result.equal() and (guided is None or guided.equal()) else DIFFERS)
+
+
+def _show_guidance(guided: GuidanceReplay) -> None:
+    first, of = guided.first, f"guidance: {guided.checked} of {guided.steps} steps checked"
+    if first is None:
+        print(f"{of}, every bit equal")
+    else:
+        print(f"{of}, {guided.differing} differ, the first at t = {first.t:.6g} s: {_difference(first)}")
+
+
+def _difference(first: Difference) -> str:
+    """A difference as a text."""
+    by = "which is not a number" if first.ulps is None else f"{first.computed - first.recorded:+.3g}, {first.ulps} ULP"
+    return f"{first.channel} recorded {first.recorded!r}, computed {first.computed!r}, {by}"
+
+
+def _guidance_as_json(guided: GuidanceReplay) -> dict[str, Any]:
+    first = guided.first
+    shown = None if first is None else {**finite_or_null(first._asdict()), "ulps": first.ulps}
+    return {"steps": guided.steps, "checked": guided.checked, "differing": guided.differing, "first": shown}
 
 
 def _parse_setting(text: str) -> tuple[str, Any]:
@@ -87,12 +115,7 @@ def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...],
     else:
         different = result.different()
         rows = np.flatnonzero(different.any(axis=1))
-        nan = first.ulps is None
-        by = "which is not a number" if nan else f"{first.computed - first.recorded:+.3g}, {first.ulps} ULP"
-        console.print(
-            f"tick {first.number} differs first, at t = {first.t:.6g} s: {first.channel} recorded {first.recorded!r},"
-            f" computed {first.computed!r}, {by}"
-        )
+        console.print(f"tick {first.number} differs first, at t = {first.t:.6g} s: {_difference(first)}")
         by_group = ", ".join(f"{name} in {count}" for name, count in _count_by_group(result).items())
         console.print(f"{of}, {len(rows)} differ, the last at t = {result.t[rows[-1]]:.6g} s; {by_group}")
     if open_loop:

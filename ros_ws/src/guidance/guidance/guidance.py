@@ -60,6 +60,11 @@ def names(outputs: Sequence[str]) -> tuple[str, ...]:
     )
 
 
+def u_m(state: GuidanceState) -> FloatArray:
+    """What is published as u_m: the commands in the order of the parameters' outputs, then ATTITUDE."""
+    return np.array([*state.u_m, state.phi, state.theta - state.alpha])
+
+
 def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: Route | None) -> FloatArray:
     """A sample of the log, in the order of `names`: inputs, state after the step, commands."""
     given = sum(1 << k for k, name in enumerate(TARGETS) if name in inputs.given)
@@ -227,6 +232,4 @@ class Guidance:
         inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given)
         self._begin, self._given = Begin.NO, {}
         self._state, commands = modes.step(self._state, inputs, self.route, self._params)
-        state = self._state
-        u_m = np.array([*state.u_m, state.phi, state.theta - state.alpha])
-        return GuidanceOutput(u_m, row(inputs, state, commands, self.route))
+        return GuidanceOutput(u_m(self._state), row(inputs, self._state, commands, self.route))

@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Replay of guidance: each step computed again from its logged inputs and the state that the sample before holds."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_analysis.closed_loop.replay import Difference
+from flight_core.parameters import ParameterError, require
+from flight_core.tape import Tape
+from guidance import guidance, modes
+from guidance.modes import Begin, GuidanceState
+from guidance.params import GuidanceParameters
+
+
+class GuidanceReplay(NamedTuple):
+    """The steps of `guidance` as recorded and as computed; u_m is among their channels."""
+
+    steps: int
+    checked: int
+    differing: int
+    first: Difference | None
+    notes: tuple[str, ...]
+
+    def equal(self) -> bool:
+        """Whether every checked bit is equal."""
+        return self.differing == 0
+
+
+def replay_guidance(tape: Tape, parameters: GuidanceParameters | None) -> GuidanceReplay:
+    """Compute every step of the topic `guidance` again, and the u_m that was published at its instant.
+
+    The legs of a route that arrived in flight are not in the log's scenario: steps on it are not checked. Raises ParameterError
+    for a log without the scenario's section of guidance, and for channels of another version.
+    """
+    if parameters is None:
+        raise ParameterError("the log: found guidance, expected its section in the scenario too")
+    signal, t, outputs = tape["guidance"], tape.time("guidance"), parameters.outputs
+    names = guidance.names(outputs)
+    require(signal.names == names, "guidance", "other channels", "those that this version records")
+    waypoints = parameters.waypoints()
+    route = parameters.plan(waypoints) if waypoints else None
+    legs = {guidance.digest(each): each for each in (None, route)}
+    published = {} if "u_m" not in tape else dict(zip(tape["u_m"].stamp_ns.tolist(), tape["u_m"].values, strict=True))
+    params, checked, differing = parameters.params(), 0, 0
+    first: Difference | None = None
+    previous: GuidanceState | None = None
+    for k, (stamp_ns, row) in enumerate(zip(signal.stamp_ns.tolist(), signal.values, strict=True)):
+        inputs, recorded = guidance.restored(stamp_ns, dict(zip(names, row.tolist(), strict=True)), outputs)
+        flown = int(row[names.index("route")])
+        if flown in legs and (previous is not None or inputs.begin is Begin.HOLD):
+            checked += 1
+            state, commands = modes.step(previous, inputs, legs[flown], params)
+            both = (
+                np.append(row, published.get(stamp_ns, guidance.u_m(recorded))),
+                np.append(guidance.row(inputs, state, commands, legs[flown]), guidance.u_m(state)),
+            )
+            columns = np.flatnonzero(both[0].view(np.int64) != both[1].view(np.int64))
+            if len(columns):
+                differing += 1
+                column = int(columns[0])
+                channel = (*names, *(f"published.{name}" for name in (*outputs, *guidance.ATTITUDE)))[column]
+                first = first or Difference(k + 1, float(t[k]), channel, float(both[0][column]), float(both[1][column]))
+        previous = recorded
+    missing = len(t) - checked
+    why = "the log does not hold their route, or the state before them"
+    notes = (f"{missing} steps of guidance not checked: {why}",) if missing else ()
+    return GuidanceReplay(len(t), checked, differing, first, notes)
