@@ -3,14 +3,18 @@
 """Guided flights in one process: holds, routes, protection, failsafe, refusals, and the log from which each step follows."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, guidance_by_rule, load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
+from flight_bringup.scenarios import find_scenario, with_route, written
+from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
@@ -19,6 +23,7 @@ from guidance import guidance, modes
 from guidance.guidance import Guidance
 from guidance.modes import Mode, Vertical
 from guidance.params import GuidanceParameters
+from guidance.route_file import Waypoint, read_route
 
 ROUTE = find_scenario("osprey_route")
 SECTION: dict[str, Any] = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0, "throttle_authority": [3.0, 3.0]}
@@ -225,7 +230,7 @@ def test_an_airframe_of_one_plane_is_refused() -> None:
         guidance_by_rule(sections["aircraft"], sections["reference_model"], sections["controller"])
 
 
-def test_a_scenario_with_guidance_is_restored_from_its_parameters(tmp_path: Any) -> None:
+def test_a_scenario_with_guidance_is_restored_from_its_parameters(tmp_path: Path) -> None:
     path = tmp_path / "again.yaml"
     path.write_text(scenario_yaml(ROUTE), encoding="utf-8")
     assert load_scenario(path).guidance == ROUTE.guidance
@@ -236,3 +241,52 @@ def test_every_step_of_a_guided_flight_has_a_command_from_t_0_on() -> None:
     tape = simulate(calm(1.0))
     assert tape["u_m"].stamp_ns.tolist() == [nanoseconds(0.02 * k) for k in range(51)]
     assert tape["u_m"].names == ("q", "V", "p", "r", "phi", "theta")
+
+
+def test_replay_computes_every_step_again_and_names_the_first_difference() -> None:
+    scenario = calm(4.0, program=program(heading=0.5))
+    tape = simulate(scenario)
+    result = replay_guidance(tape, scenario.guidance)
+    assert (result.steps, result.checked, result.differing, result.notes) == (201, 201, 0, ())
+    tape["u_m"].values[100, 2] = np.nextafter(tape["u_m"].values[100, 2], 1.0)
+    changed = replay_guidance(tape, scenario.guidance)
+    assert changed.differing == 1
+    assert changed.first is not None
+    assert (changed.first.number, changed.first.channel, changed.first.ulps) == (101, "published.p", 1)
+
+
+def test_replay_leaves_a_route_that_arrived_in_flight_unchecked() -> None:
+    scenario = calm(2.0, route={"north": [0.0, 900.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]})
+    section = calm(2.0).guidance
+    result = replay_guidance(simulate(scenario), section)
+    assert result.checked == 0
+    assert result.notes == ("101 steps of guidance not checked: the log does not hold their route, or the state before them",)
+
+
+def test_a_route_file_is_flown_and_stays_with_the_flight(tmp_path: Path) -> None:
+    file = tmp_path / "line.yaml"
+    file.write_text("route: [[0, 0, 0], [800, 0, 10, 26.5], [800, 900, 10]]", encoding="utf-8")
+    scenario = written(with_route(ROUTE, read_route(file)), tmp_path / "osprey_route.yaml")
+    section = load_scenario(scenario.path).guidance
+    assert section is not None
+    assert section.waypoints() == (Waypoint(0, 0, 0, 25.0), Waypoint(800, 0, 10, 26.5), Waypoint(800, 900, 10, 26.5))
+    with pytest.raises(ParameterError, match=r"route\[1\].altitude: found 500 m above the waypoint before, expected at most"):
+        with_route(ROUTE, [Waypoint(0.0, 0.0, 0.0), Waypoint(900.0, 0.0, 500.0)])
+    with pytest.raises(ParameterError, match="kinematics: found 'linear' beside guidance"):
+        with_route(find_scenario("osprey_servo"), read_route(file))
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["target", "bank=3"], "target: found 'bank=3', expected NAME=VALUE with one of phi, heading"),
+        (["target", "heading=north"], "target: found 'heading=north', expected heading=VALUE with a number"),
+        (["target", "V=30", "V=31"], "target: found a command twice, expected each once"),
+        (["fly", "--route", "a.gpx"], "route: found the file a.gpx, expected one that ends in .geojson"),
+        (["fly", "--route", "a.kml", "--origin", "91,8"], "--origin: found '91,8', expected a latitude and a longitude"),
+    ],
+)
+def test_bad_words_of_the_command_line_are_one_sentence(words: list[str], sentence: str) -> None:
+    result = CliRunner().invoke(application([*COMMANDS]), words)
+    assert isinstance(result.exception, ParameterError)
+    assert sentence in str(result.exception)

@@ -45,7 +45,7 @@ IMPORTS: dict[str, set[str]] = {
         "flight_core", "reference_model", "rise_di_controller",
     },
     "flight_bringup": {
-        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.report", "flight_core", "flight_log",
+        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.report", "flight_core", "flight_log", "guidance",
     },
     "flight_view": {
         "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_analysis.report", "flight_core", "flight_log",
@@ -54,7 +54,7 @@ IMPORTS: dict[str, set[str]] = {
     "flight_cli": {
         "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop", "flight_analysis.design",
         "flight_analysis.metrics", "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log",
-        "flight_view", "rise_di_controller",
+        "flight_view", "guidance", "rise_di_controller",
     },
 }  # fmt: skip
 """Which units of the stack a unit imports; nodes, executables and clients import flight_ros beside these."""

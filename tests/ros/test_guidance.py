@@ -42,10 +42,10 @@ def test_a_lockstep_flight_repeats_the_bytes_of_one_process(start: Start, tmp_pa
 
 @pytest.fixture
 def calm(tmp_path: Path) -> Path:
-    """The osprey in calm air that turns to the right from t = 1 s on."""
+    """The osprey in calm air, without a route."""
     varied = find_scenario("osprey_route").vary(
         aircraft={"wind": [0.0, 0.0], "turbulence": None},
-        guidance={"route": None, "program": {"phi": {"start": [1.0], "value": [0.5]}}},
+        guidance={"route": None},
     )
     path = tmp_path / "calm.yaml"
     path.write_text(scenario_yaml(varied), encoding="utf-8")
@@ -102,6 +102,17 @@ def test_targets_select_the_modes_and_bad_ones_are_refused(flight: Flight) -> No
     assert flight.last("target.heading") == 1.0
 
 
+def test_the_command_target_says_what_is_in_force_and_what_is_refused(flight: Flight, start: Start) -> None:
+    good = start("flight_cli.cli", "target", "heading=90", "altitude=60")
+    flight.until(lambda: good.popen.poll() is not None)
+    assert "in force: heading=90, altitude=60" in good.succeed().output
+    assert (flight.last("target.heading"), flight.last("target.altitude")) == (math.pi / 2.0, 60.0)
+    refused = start("flight_cli.cli", "target", "phi=80")  # degrees
+    flight.until(lambda: refused.popen.poll() is not None)
+    assert refused.end() == 1
+    assert "target.phi: found 1.39626, expected -0.523599 to 0.523599" in flight.process.output
+
+
 def test_a_storm_of_targets_delays_no_command(flight: Flight) -> None:
     def storm() -> None:
         flight.send()
@@ -121,8 +132,7 @@ def test_services_hold_skip_and_disengage(flight: Flight) -> None:
         return response.success, response.message
 
     flight.until(lambda: flight.last("mode.lateral") == Lateral.PHI, lambda: flight.target(phi=0.2))
-    assert call(Trigger, "hold", Trigger.Request()) == (True, "")
-    flight.until(lambda: flight.last("mode.lateral") == Lateral.HEADING)
+    flight.until(lambda: flight.last("mode.lateral") == Lateral.HEADING, lambda: call(Trigger, "hold", Trigger.Request()))
     assert call(Trigger, "skip", Trigger.Request()) == (False, "no route is flown")
     assert call(SetBool, "engage", SetBool.Request(data=False)) == (True, "")
     flight.until(lambda: "ENGAGED -> OFF" in flight.process.output)
@@ -181,7 +191,10 @@ def test_the_wings_are_levelled_when_guidance_is_stopped_or_killed_in_a_turn(cal
         last = peer_node.received["pose"][-1:]
         return float(last[0].position[last[0].name.index("phi")]) if last else 0.0
 
-    peer_node.until(lambda: phi() > 0.25, timeout=60.0)
+    def turn() -> None:
+        peer_node.publish("target", to_message(time.time_ns(), ["phi"], np.array([0.5]), "/operator#1"))
+
+    peer_node.until(lambda: phi() > 0.25, timeout=60.0, each=turn)
     with guidance.stopped():
         nodes["reference_model"].wait_for("/u_m timed out: wings are levelled")
         peer_node.until(lambda: abs(phi()) < math.radians(5.0))

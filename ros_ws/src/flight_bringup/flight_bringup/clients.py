@@ -1,12 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS clients of the command line: a monitor of a running flight, a client of controller and bridge, a player of a log."""
+"""ROS clients of the command line: a monitor of a flight, clients of controller, bridge and guidance, a player of a log."""
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, Self
 
+import numpy as np
 import rclpy
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
@@ -16,11 +18,12 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
 from flight_core.vectors import ChannelError, FloatArray
 from flight_ros import transport
-from flight_ros.messages import Decoder, stamp_of
+from flight_ros.messages import Decoder, NamedDecoder, stamp_of, to_message
 from flight_ros.player import Player
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import (
     ENGAGEMENT,
+    GUIDANCE,
     INTERNALS,
     LOCKSTEP,
     NEWEST_SAMPLES,
@@ -28,6 +31,7 @@ from flight_ros.topics import (
     PUBLISH,
     RECORDED,
     STATES,
+    TARGET,
     Y_M,
     NodeState,
     U,
@@ -35,11 +39,12 @@ from flight_ros.topics import (
 )
 from rise_di_controller.guard import Mode
 
-__all__ = ["EngagementClient", "FlightMonitor", "Player"]
+__all__ = ["EngagementClient", "FlightMonitor", "Player", "TargetClient"]
 
 MODES = {float(mode): mode.name for mode in Mode}
 
 SERVICE_TIMEOUT = 10.0  # s
+TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at its ticks
 FIRST_U = 30.0  # s: the nodes of a flight start, and the autopilot may send its first messages late
 AT_REST = 20  # so many equal samples of u in a row: it has reached trim
 
@@ -59,6 +64,13 @@ class _Client:
     def __exit__(self, *_: object) -> None:
         self._node.destroy_node()
         rclpy.try_shutdown()
+
+    def _spin_until(self, condition: Callable[[], bool], message: str, timeout: float = SERVICE_TIMEOUT) -> None:
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if time.monotonic() > deadline:
+                raise ParameterError(message)
+            rclpy.spin_once(self._node, timeout_sec=0.02)
 
 
 class FlightMonitor(_Client):
@@ -176,9 +188,34 @@ class EngagementClient(_Client):
         self._spin_until(future.done, f"{service}: no response, expected one within {SERVICE_TIMEOUT:g} s")
         return future.result()
 
-    def _spin_until(self, condition: Callable[[], bool], message: str, timeout: float = SERVICE_TIMEOUT) -> None:
-        deadline = time.monotonic() + timeout
-        while not condition():
-            if time.monotonic() > deadline:
-                raise ParameterError(message)
-            rclpy.spin_once(self._node, timeout_sec=0.02)
+
+class TargetClient(_Client):
+    """Commands the guidance of a running flight."""
+
+    def __init__(self, namespace: str) -> None:
+        super().__init__("operator", namespace)
+        self._guidance, self._decoder = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True), NamedDecoder()
+        self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
+        self._in_force: dict[str, float] = {}
+
+    def send(self, values: Mapping[str, float]) -> str:
+        """Publish commands by channel until guidance has them in force. Returns why they are not, or ""."""
+        silent = f"{self._guidance.name}: not received, expected a flight with guidance in this domain"
+        self._spin_until(lambda: bool(self._received()), silent)
+        try:
+            self._spin_until(lambda: self._published(values), "", TARGET_TIMEOUT)
+        except ParameterError:
+            return f"guidance did not take them in {TARGET_TIMEOUT:g} s; its log says why"
+        return ""
+
+    def _published(self, values: Mapping[str, float]) -> bool:
+        message = to_message(time.time_ns(), [*values], np.array([*values.values()]), self._node.get_fully_qualified_name())
+        self._publisher.publish(message)
+        return all(self._received().get(f"target.{name}") == value for name, value in values.items())
+
+    def _received(self) -> dict[str, float]:
+        """The channels of the last sample of `guidance`; empty before the first."""
+        for received in self._guidance.take()[-1:]:
+            with suppress(ChannelError):
+                self._in_force = self._decoder.decode(received.message).channels
+        return self._in_force

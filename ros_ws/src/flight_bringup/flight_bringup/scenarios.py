@@ -1,13 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The scenarios of the stack, and the file of a scenario's name."""
+"""The scenarios of the stack, the file of a scenario's name, and scenarios with a route."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario
-from flight_core.files import is_file
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
+from flight_core.files import is_file, writing
 from flight_core.parameters import require
+from guidance.feasibility import speeds
+from guidance.route_file import Waypoint
 
 
 def share() -> Path:
@@ -28,3 +31,17 @@ def find_scenario(name: str, duration: Any = None) -> Scenario:
     require(is_file(path), "scenario", f"{name!r}", f"one of {', '.join(scenarios())}, or the path of a scenario file (.yaml)")
     scenario = load_scenario(path.absolute())
     return scenario if duration is None else scenario.vary(flight={"duration": duration})
+
+
+def with_route(scenario: Scenario, waypoints: Sequence[Waypoint]) -> Scenario:
+    """The scenario with a route that guidance flies from the start. Raises ParameterError where it cannot be flown."""
+    flown = speeds(waypoints, scenario.aircraft.channels().speed)
+    route = {key: [getattr(one, key) for one in waypoints] for key in ("north", "east", "altitude")} | {"V": list(flown)}
+    return scenario.vary(guidance={"route": route})
+
+
+def written(scenario: Scenario, path: Path) -> Scenario:
+    """A scenario that differs from its file, as a file of its own. Raises ParameterError where it cannot be written."""
+    with writing("", path, "a folder that can"):
+        path.write_text(scenario_yaml(scenario), encoding="utf-8")
+    return load_scenario(path)

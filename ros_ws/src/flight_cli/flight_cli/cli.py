@@ -31,6 +31,7 @@ COMMANDS = MappingProxyType(
         "airframes": "Show the airframes of the library, and what the theorem asks of each.",
         "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an airframe from a log.",
         "check-signs": "Compare the signs of a channel map with the D of the controller.",
+        "target": "Command what a running guided flight holds: heading, altitude, airspeed and more.",
         "engage": "Engage or disengage the autopilot behind a running bridge.",
         "campaign": "Fly a Monte Carlo campaign of uncertain aircraft.",
         "compare": "Compare RISE-DI with other control laws on the same aircraft.",

@@ -13,10 +13,11 @@ from rich.console import Console
 from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import find_autopilot, require_limits
-from flight_bringup.scenarios import find_scenario
-from flight_cli.output import CLOCK_COLUMNS, ENDED_EARLY, INTERRUPTED, display_path, progress_bar, show_flight
+from flight_bringup.scenarios import find_scenario, with_route, written
+from flight_cli.output import CLOCK_COLUMNS, ENDED_EARLY, INTERRUPTED, display_path, parse_numbers, progress_bar, show_flight
 from flight_core import outcome as ends
 from flight_core.parameters import ParameterError, require
+from guidance.route_file import Origin, read_route
 
 STATUS = {ends.COMPLETED: 0, ends.INTERRUPTED: INTERRUPTED}
 
@@ -37,11 +38,17 @@ def fly(
             metavar="MAP", help="Fly an autopilot in place of the aircraft, by a channel map; a dry run without --send."
         ),
     ] = None,
+    route: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Fly a route: .geojson, .kml or .yaml. Guidance starts with it.")
+    ] = None,
+    origin: Annotated[
+        str | None, typer.Option(metavar="LAT,LON", help="Where north = east = 0 for a route in latitudes, degrees.")
+    ] = None,
     send: Annotated[bool, typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged.")] = False,
     runs: Annotated[Path, typer.Option(help="Folder that the run's folder is made in.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")] = False,
 ) -> None:
-    """Fly a scenario: aircraft, reference model, controller and recorder as processes over ROS 2 topics, in real time.
+    """Fly a scenario: aircraft, reference model, controller, recorder, guidance as processes over ROS 2 topics, in real time.
 
     Exit status: 0 completed, 2 bad input, 3 ended early, 130 interrupted.
     """
@@ -56,7 +63,11 @@ def fly(
     require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
     real_time = "a flight in real time over topics: an autopilot does not wait"
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
+    if route is not None:
+        chosen = with_route(chosen, read_route(route, _origin(origin)))
     run = new_run(chosen, runs)
+    if route is not None:
+        chosen = written(chosen, run / f"{chosen.name}.yaml")
     with progress_bar(*CLOCK_COLUMNS, quiet=as_json) as bar:
         task = bar.add_task("flight", total=chosen.flight.duration, clock="", shown="")
 
@@ -94,3 +105,13 @@ def fly(
         show_flight(Console(), result.flight)
         print(f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  {display_path(result.report)}")
     raise typer.Exit(status)
+
+
+def _origin(text: str | None) -> Origin | None:
+    """The origin of a route, from "47.38,8.54"."""
+    if text is None:
+        return None
+    numbers = parse_numbers(text)
+    fits = len(numbers) == 2 and abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 180.0
+    require(fits, "--origin", repr(text), "a latitude and a longitude in degrees, as in 47.38,8.54")
+    return Origin(*numbers)
