@@ -13,6 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.identification import (
     AUTHORITY_FRACTION,
     HEIGHTS,
@@ -23,6 +24,7 @@ from flight_analysis.design.identification import (
     Responses,
     fly_all,
     identify,
+    manoeuvre_result,
     moderate_turbulence,
     reference_parameters,
     steepest_tangent,
@@ -202,6 +204,26 @@ def test_the_shipped_scenario_is_what_the_command_writes(cessna: IdentifiedAircr
             found = shipped[section]["ros__parameters"][key]
             numbers = isinstance(value, float) or (isinstance(value, list) and isinstance(value[0], float))
             assert found == (pytest.approx(value, rel=1e-3, abs=1e-6) if numbers else value), key
+
+
+@pytest.fixture(scope="module")
+def f15() -> IdentifiedAircraft:
+    """An aircraft whose sideslip grows while p and r are held, under guidance by rule."""
+    return identify("f15", 180.0, 4572.0, guided=True)
+
+
+def test_guidance_with_sideslip_feedback_flies_holds_and_turns_of_the_f15(f15: IdentifiedAircraft) -> None:
+    assert f15.sideslip_zero > 0.0
+    assert f15.failure == ""
+    log = simulate(f15.scenario().vary(aircraft={"gusts": {}}))["guidance"]
+    assert log["pose.psi"][-1] == pytest.approx(math.pi / 2.0, abs=math.radians(2.0))  # the band of a settled heading
+    assert log["pose.altitude"][-1] == pytest.approx(4572.0 + 100.0, abs=5.0)  # that of a settled altitude
+    assert np.max(np.abs(log["pose.beta"])) < math.radians(2.0)  # measured 1.4; it diverges without the feedback
+
+
+def test_without_sideslip_feedback_the_f15_is_lost(f15: IdentifiedAircraft) -> None:
+    lost = manoeuvre_result(simulate(f15.scenario().vary(guidance={"sideslip_gain": 0.0})))
+    assert lost.rms["V"] > 10.0  # m/s, of a command that is constant
 
 
 def test_an_extended_state_observer_lowers_every_error_in_turbulence(cessna: IdentifiedAircraft) -> None:

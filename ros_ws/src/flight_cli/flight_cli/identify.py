@@ -75,6 +75,9 @@ def identify(
     observer: Annotated[
         bool, typer.Option("--observer", help="Without --log: add an extended-state observer from Omega and lags.")
     ] = False,
+    guidance: Annotated[
+        bool, typer.Option("--guidance", help="Without --log: fly and write guidance by rule in place of the pulses.")
+    ] = False,
     margin: Annotated[
         float | None, typer.Option(help="Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests.")
     ] = None,
@@ -104,6 +107,7 @@ def identify(
             "--margin": margin,
         }
         of_others |= {"--scenario": scenario, "--delay": delay, "--refly": refly or None, "--observer": observer or None}
+        of_others["--guidance"] = guidance or None
         for name, value in (of_others | {"--namespace": namespace}).items():
             require(value is None, name, f"{value}", "none beside --bridge")
         if speed is None or write is None:
@@ -119,6 +123,7 @@ def identify(
         "--altitude": altitude,
         "--output": output,
         "--observer": observer or None,
+        "--guidance": guidance or None,
     }
     of_log = {"--airframe": airframe, "--write": write, "--scenario": scenario, "--delay": delay, "--namespace": namespace}
     of_log |= {"--refly": refly or None}
@@ -134,11 +139,17 @@ def identify(
         raise ParameterError("identify: found too few arguments, expected --log, or an aircraft with --speed and --altitude")
     else:
         observer_margin = (STEP_MARGIN if margin is None else margin) if observer else None
-        _identify_by_steps(aircraft, speed, altitude, output, observer_margin, as_json)
+        _identify_by_steps(aircraft, speed, altitude, output, observer_margin, guidance, as_json)
 
 
 def _identify_by_steps(
-    airframe: str, speed: float, altitude: float, output: Path | None, observer_margin: float | None, as_json: bool
+    airframe: str,
+    speed: float,
+    altitude: float,
+    output: Path | None,
+    observer_margin: float | None,
+    guided: bool,
+    as_json: bool,
 ) -> None:
     require(airframe.startswith(PREFIX), "airframe", f"{airframe!r}", f"an aircraft of JSBSim, {PREFIX}NAME")
     name = require_aircraft(airframe)
@@ -151,7 +162,7 @@ def _identify_by_steps(
     console = Console(quiet=as_json)
     try:
         with console.status("trim") as status:
-            found = identify_aircraft(name, speed, altitude, status.update, observer_margin)
+            found = identify_aircraft(name, speed, altitude, status.update, observer_margin, guided=guided)
     except FlightEnded as error:
         print(f"error: {error}", file=sys.stderr)
         raise typer.Exit(CANNOT_FLY) from None
@@ -346,7 +357,7 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
     if found.sideslip_zero > 0.0:
         console.print(
             f"with p and r constant, sideslip grows at {found.sideslip_zero:.2g} 1/s:"
-            " a zero in the right half plane, outside the theorem",
+            " a zero in the right half plane, outside the theorem; the sideslip feedback of --guidance flies it",
             highlight=False,
             soft_wrap=True,
         )

@@ -153,6 +153,8 @@ AUTHORITY_FRACTION = 1.0 / 3.0  # of the throttle's authority for the commanded 
 DURATION = 60.0  # s
 GUST_SPEED, GUST_LENGTH = 5.0, 30.48  # m/s down, and m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
 GUST_START = 50.0  # s
+TURN, CLIMB = math.pi / 2.0, 100.0  # rad, m: the targets of guidance in place of the pulses
+TURN_START, CLIMB_START = 2.0, 30.0  # s
 MODERATE_WIND, MODERATE_SIGMA = 15.4, 3.05  # m/s, of moderate turbulence: 30 kt at 20 ft, MIL-F-8785C 3.7.3.4; 10 ft/s
 
 
@@ -244,6 +246,8 @@ def identify(
     altitude: float,
     progress: Callable[[str], None] = lambda _: None,
     observer_margin: float | None = None,
+    *,
+    guided: bool = False,
 ) -> IdentifiedAircraft:
     """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s, altitude in m.
 
@@ -251,7 +255,9 @@ def identify(
     and D from the minors. 4. Gains by the engineering procedure for y_dot = Omega u behind the lags; all other terms count as
     f. 5. A simulation in moderate turbulence with K and Lambda alone: the slew of its u replaces that of the ideal control,
     and gives beta. With `observer_margin`, the delay margin in s of the loop on y_dot = Omega u, an extended-state observer and
-    the gains beside it replace them. 6. Simulations of the result: in calm air, with a gust, in turbulence.
+    the gains beside it replace them. 6. Simulations of the result: in calm air, with a gust, in turbulence. With `guided` the
+    scenario has guidance by rule in place of the pulses: a turn by 90 degrees and a climb by 100 m. Its sideslip feedback
+    flies an aircraft whose `sideslip_zero` is positive, too.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its outputs and inputs cannot be
     paired.
@@ -279,7 +285,7 @@ def identify(
     setting = _setting(trim, measured.lag)
 
     def scenario_text(selection: Selection) -> str:
-        return _text(condition, trim, measured, commands, selection)
+        return _text(condition, trim, measured, commands, selection, guided)
 
     progress("slew of the inputs")
     first = gain_selection.select_gains(studied, setting)
@@ -386,9 +392,9 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
 # SPDX-License-Identifier: Apache-2.0
 #
 # JSBSim's {{ condition.name }} at {{ condition.speed | digits(6) }} m/s and {{ condition.altitude | digits(6) }} m: \
-commands on every channel, a gust from above.
+{{ "guidance turns and climbs" if guided else "commands on every channel" }}, a gust from above.
 # Written by: rise-di identify {{ condition.title }} --speed {{ condition.speed | digits(6) }} \
---altitude {{ condition.altitude | digits(6) }}
+--altitude {{ condition.altitude | digits(6) }}{{ " --guidance" if guided }}
 # Commands in trim: {% for name in inputs %}{{ name }} {{ trim.commands[loop.index0] | digits(3) }}\
 {{ ", " if not loop.last }}{% endfor %}.
 # Steepest response, in rad/s^2 and m/s^2 per unit of command: {% for name in outputs %}{{ name }} by \
@@ -421,21 +427,41 @@ commands on every channel, a gust from above.
 # rad/s; that of V asks for a third of the throttle's authority
       damping: {{ commands.second_order.damping | flow }}
     rise: {{ commands.rise | flow }}                  # s, edge of a pulse: bounds u_m_dot
+{% if guided %}
+    live: {speed: {{ condition.speed | flow }}}          # m/s: the wings are levelled when guidance is lost
+{% else %}
     pulses:                    # s, s, and rad/s or m/s
 {% for name, pulse in commands.pulses.items() %}
       {{ name }}: {{ pulse | flow }}
 {% endfor %}
     coordinated_turn: {{ commands.coordinated_turn | flow }}  # r += g/V0 sin(bank commanded)
+{% endif %}
 
 # Omega and the lags are those of step tests; the slew behind beta is that of u with K and Lambda alone in moderate turbulence.
 {{ controller }}
+{% if guided %}
+/**/guidance:                  # what is left out follows by rule: docs/guidance.md
+  ros__parameters:
+    rate: 50.0                 # Hz
+    program:                   # s, rad, m
+      heading: {{ program.heading | flow }}
+      altitude: {{ program.altitude | flow }}
+
+{% endif %}
 /**/recorder:
   ros__parameters:
     rate: 100.0                # Hz, polling of the subscriptions
 """)
 
 
-def _text(condition: FlightCondition, trim: Trim, steps: Responses, commands: Mapping[str, Any], selection: Selection) -> str:
+def _text(
+    condition: FlightCondition,
+    trim: Trim,
+    steps: Responses,
+    commands: Mapping[str, Any],
+    selection: Selection,
+    guided: bool,
+) -> str:
     """The scenario file."""
     return SCENARIO_YAML.render(
         condition=condition,
@@ -449,5 +475,10 @@ def _text(condition: FlightCondition, trim: Trim, steps: Responses, commands: Ma
         gust={"start": GUST_START, "speed": GUST_SPEED, "length": GUST_LENGTH},
         turbulence=moderate_turbulence(condition.altitude),
         commands=commands,
+        guided=guided,
+        program={
+            "heading": {"start": [TURN_START], "value": [TURN]},
+            "altitude": {"start": [CLIMB_START], "value": [condition.altitude + CLIMB]},
+        },
         controller=gain_selection.as_yaml(selection),
     )
