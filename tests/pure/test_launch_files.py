@@ -251,6 +251,17 @@ def test_a_flight_ends_after_its_duration_and_in_lockstep_when_the_aircraft_comp
     assert ends(publish(follow, context, f"/aircraft#{PID}", NodeState.COMPLETED))
 
 
+@pytest.mark.parametrize(("name", "given"), [("fly", {}), ("bridge", {"map": "ardupilot"})])
+def test_the_live_page_is_served_where_it_is_asked_for_and_may_end(name: str, given: dict[str, str], tmp_path: Path) -> None:
+    assert not every(ExecuteProcess, started(name, **given, runs=tmp_path)[0])
+    actions, context = started(name, **given, watch="true", runs=tmp_path)
+    (page,) = every(ExecuteProcess, actions)
+    run = overrides(nodes(actions)["recorder"])["directory"]
+    assert page.cmd == [stand_in.ExecutableInPackage(package="flight_cli", executable="rise-di"), "watch", run, "--wait"]
+    assert page.on_exit is None
+    assert nodes(all_ready(actions, context))
+
+
 def test_a_bridge_is_a_dry_run_by_default_and_its_topics_are_recorded(tmp_path: Path) -> None:
     actions, context = started("bridge", map="ardupilot", runs=tmp_path)
     bridge = overrides(nodes(all_ready(actions, context))["bridge"])

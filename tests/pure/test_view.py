@@ -3,17 +3,24 @@
 """The live page without a browser: a followed flight, what the server answers, and clients that it refuses."""
 
 import asyncio
+import io
 import json
+import re
+import signal
 import socket
 import struct
+import subprocess
+import sys
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from numpy.typing import NDArray
+from rich.console import Console
 from tests.conftest import REPOSITORY
 from tests.joint_states import JOINT_STATE, vector
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPResponse
@@ -26,6 +33,7 @@ from flight_view import server as http
 from flight_view.flight import MAX_TEXT, Flight
 from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
+from flight_view.text import picture
 from flight_view.watch import newest_run, require_log
 
 TOKEN = "a-token"  # noqa: S105 - of a test
@@ -392,3 +400,65 @@ def test_no_run_and_no_log_are_sentences(tmp_path: Path) -> None:
         newest_run(tmp_path / "nowhere")
     with pytest.raises(ParameterError, match=r"found no \.mcap file, expected the folder of a run or an MCAP file"):
         require_log(tmp_path)
+
+
+# The command
+
+
+def command(*words: object) -> list[str]:
+    return [sys.executable, "-m", "flight_cli.cli", *map(str, words)]
+
+
+@pytest.mark.parametrize("ignored", [False, True], ids=["in front", "in the background, with SIGINT ignored"])
+def test_watch_prints_an_address_and_ends_quietly_with_ctrl_c(recorded: Path, ignored: bool) -> None:
+    before = ["/bin/sh", "-c", 'trap "" INT; exec "$@"', "sh"] if ignored else []
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([*before, *command("watch", recorded, "--port", 0)], **pipes) as process:  # type: ignore[call-overload]
+        address, tunnel = process.stdout.readline(), process.stdout.readline()
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{20,}\n", address)
+        port = address.split(":")[2].partition("/")[0]
+        assert f"ssh -L {port}:127.0.0.1:{port} " in tunnel
+        sockets = psutil.Process(process.pid).net_connections()
+        assert [(one.type, one.laddr.ip) for one in sockets] == [(socket.SOCK_STREAM, "127.0.0.1")]  # no UDP: no ROS
+        process.send_signal(signal.SIGINT)
+        assert process.wait(20.0) == 0
+        assert process.stderr.read() == ""
+
+
+def test_a_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        ended = subprocess.run(command("watch", recorded, "--port", port), capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr == f"error: --port: {port} cannot be used (Address already in use), expected a free port of this host\n"
+    for words, expected in (
+        (("--wait",), "error: --wait: found no RUN, expected the folder of a run that will be recorded\n"),
+        ((recorded, recorded, "--text"), "error: --text: found two runs, expected one run\n"),
+    ):
+        ended = subprocess.run(command("watch", *words), capture_output=True, text=True, check=False, cwd=recorded)
+        assert (ended.returncode, ended.stderr) == (2, expected)
+
+
+def test_a_flight_with_its_page_prints_the_address_and_leaves_no_server(tmp_path: Path) -> None:
+    words = ("fly", "osprey_gust", "--in-process", "--duration", "0.5", "--watch", "--json", "--runs", tmp_path)
+    ended = subprocess.run(command(*words), capture_output=True, text=True, check=True)
+    assert json.loads(ended.stdout)["outcome"] == "completed"
+    found = re.search(r"http://127\.0\.0\.1:(\d+)/", ended.stderr)
+    assert found is not None
+    with socket.socket() as client:
+        assert client.connect_ex(("127.0.0.1", int(found[1]))) != 0
+
+
+def test_the_terminal_shows_the_newest_values_in_the_units_of_the_report(recorded: Path, tape: Tape) -> None:
+    console = Console(width=120, record=True, file=io.StringIO())
+    flight = Flight(recorded)
+    console.print(picture(flight))  # before there is a sample
+    flight.update()
+    console.print(picture(flight))
+    text = console.export_text()
+    assert "run  WAITING" in text
+    assert "run  ENDED  ENGAGED  t = 2.0 s" in text
+    rows = {line.split()[0]: line.split()[2:] for line in text.splitlines() if re.match(r" (q|elevator) ", line)}
+    assert rows["q"][0] == f"{1e3 * tape['internals']['y.q'][-1]:.3f}"
+    assert rows["elevator"][0] == f"{np.degrees(tape['internals']['u.elevator'][-1]):.3f}"
+    assert "0.00 s  mode: ENGAGED" in text

@@ -38,6 +38,8 @@ from flight_bringup.launch.stages import (
     runs_argument,
     scenario_argument,
     start_in_stages,
+    watch_argument,
+    watch_page,
 )
 from flight_bringup.scenarios import find_scenario
 from launch import LaunchContext, LaunchDescription
@@ -55,6 +57,7 @@ def generate_launch_description() -> LaunchDescription:
             boolean_argument("recorder", True, "record the flight"),
             DeclareLaunchArgument("duration", default_value="", description="seconds to fly; empty flies until Ctrl-C"),
             runs_argument(),
+            watch_argument(),
             namespace_argument("namespace of all nodes, one an aircraft; topics that a map names in full are not in it"),
             OpaqueFunction(function=_fly),
         ]
@@ -79,4 +82,5 @@ def _fly(context: LaunchContext) -> list[Action]:
         end = [TimerAction(period=lead + scenario.flight.duration, actions=complete(run))] if duration else []
         return [*end, *(node(spec, start_time) for spec in second_stage(scenario, bridge=True))]
 
-    return start_in_stages(context, {spec: node(spec) for spec in (FIRST_STAGE if recorded else (CONTROLLER,))}, follow)
+    page = watch_page(context, run) if recorded else []
+    return page + start_in_stages(context, {spec: node(spec) for spec in (FIRST_STAGE if recorded else (CONTROLLER,))}, follow)

@@ -28,6 +28,8 @@ from flight_bringup.launch.stages import (
     runs_argument,
     scenario_argument,
     start_in_stages,
+    watch_argument,
+    watch_page,
 )
 from flight_bringup.scenarios import find_scenario
 from flight_ros.topics import NodeState
@@ -47,6 +49,7 @@ def generate_launch_description() -> LaunchDescription:
                 description="true: as fast as the machine allows, repeatable to the byte; empty: the value in the scenario",
             ),
             runs_argument(),
+            watch_argument(),
             namespace_argument(),
             OpaqueFunction(function=_fly),
         ]
@@ -69,4 +72,4 @@ def _fly(context: LaunchContext) -> list[Action]:
             end = TimerAction(period=lead + scenario.flight.duration, actions=complete(run))
         return [end, *(node(spec, start_time) for spec in second_stage(scenario))]
 
-    return start_in_stages(context, {spec: node(spec) for spec in FIRST_STAGE}, follow)
+    return watch_page(context, run) + start_in_stages(context, {spec: node(spec) for spec in FIRST_STAGE}, follow)

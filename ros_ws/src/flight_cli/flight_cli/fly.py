@@ -15,6 +15,7 @@ from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.output import CLOCK_COLUMNS, ENDED_EARLY, INTERRUPTED, display_path, parse_numbers, progress_bar, show_flight
+from flight_cli.watch import watched
 from flight_core import outcome as ends
 from flight_core.parameters import ParameterError, require
 from guidance.route_file import Origin, read_route
@@ -23,6 +24,7 @@ STATUS = {ends.COMPLETED: 0, ends.INTERRUPTED: INTERRUPTED}
 
 
 def fly(
+    context: typer.Context,
     scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_gust",
     duration: Annotated[float | None, typer.Option(help="Duration in s; by default that of the scenario.")] = None,
     in_process: Annotated[
@@ -45,6 +47,7 @@ def fly(
         str | None, typer.Option(metavar="LAT,LON", help="Where north = east = 0 for a route in latitudes, degrees.")
     ] = None,
     send: Annotated[bool, typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Serve the live page of the flight while it lasts.")] = False,
     runs: Annotated[Path, typer.Option(help="Folder that the run's folder is made in.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")] = False,
 ) -> None:
@@ -68,6 +71,8 @@ def fly(
     run = new_run(chosen, runs)
     if route is not None:
         chosen = written(chosen, run / f"{chosen.name}.yaml")
+    if watch:
+        print(*context.with_resource(watched(run)), sep="\n", file=sys.stderr)
     with progress_bar(*CLOCK_COLUMNS, quiet=as_json) as bar:
         task = bar.add_task("flight", total=chosen.flight.duration, clock="", shown="")
 

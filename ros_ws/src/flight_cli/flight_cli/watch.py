@@ -2,12 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di watch`: see a flight on a page or in the terminal, live or recorded."""
 
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from flight_bringup.processes import end_with_parent
 from flight_core.parameters import require
+from flight_view.flight import Flight
+from flight_view.text import show
 from flight_view.watch import DEFAULT_PORT, newest_run, require_log, serve
 
 
@@ -16,17 +23,37 @@ def watch(
         Path | None, typer.Argument(help="Folder of a run, or an MCAP file; by default the run in progress, else the last one.")
     ] = None,
     ghost: Annotated[Path | None, typer.Argument(metavar="[RUN2]", help="A second run, shown as a ghost.")] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this host; 0 takes any free one.")] = DEFAULT_PORT,
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Port on this host; 0 takes any free one.", show_default=f"{DEFAULT_PORT}"),
+    ] = None,
     wait: Annotated[bool, typer.Option("--wait", help="Wait for the log of RUN where there is none yet.")] = False,
+    text: Annotated[bool, typer.Option("--text", help="Show the flight in the terminal, without a browser.")] = False,
     runs: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("runs"),
 ) -> None:
     """See a flight on a page: charts, horizon, scene and timeline, live while it is recorded, or again later.
 
-    The page is served on this host alone; Ctrl-C ends it. Exit status: 0, or 2 for bad input.
+    The page is served on this host alone, until Ctrl-C. Exit status: 0 ended, 2 bad input, 130 interrupted in the terminal.
     """
+    require(not wait or run is not None, "--wait", "no RUN", "the folder of a run that will be recorded")
     chosen = [newest_run(runs) if run is None else run, *([ghost] if ghost is not None else [])]
     for one in chosen:
         if not wait:
             require_log(one)
-    require(not wait or run is not None, "--wait", "no RUN", "the folder of a run that will be recorded")
-    serve(chosen, port, lambda line: print(line, flush=True))
+    if text:
+        require(ghost is None, "--text", "two runs", "one run")
+        show(Flight(chosen[0]))
+        return
+    serve(chosen, (DEFAULT_PORT, 0) if port is None else (port,), lambda line: print(line, flush=True))
+
+
+@contextmanager
+def watched(run: Path) -> Iterator[list[str]]:
+    """Serve the page of a run that will be recorded, by another process during the block. Yields its lines for the user."""
+    command = [*end_with_parent(), sys.executable, "-m", "flight_cli.cli", "watch", str(run), "--wait"]
+    # In a process group of its own: Ctrl-C reaches the flight alone, whose end the page still shows.
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0) as server:  # noqa: S603
+        try:
+            yield [line.rstrip() for line in (server.stdout.readline(), server.stdout.readline())] if server.stdout else []
+        finally:
+            server.terminate()

@@ -39,23 +39,27 @@ def require_log(run: Path) -> None:
     require(bool(bag_files(run)), str(run), "no .mcap file", "the folder of a run or an MCAP file")
 
 
-def serve(runs: Sequence[Path], port: int, announce: Callable[[str], None]) -> None:
-    """Serve a run, and a second one as its ghost, until SIGINT or SIGTERM. `announce` gets lines for the user.
+def serve(runs: Sequence[Path], ports: Sequence[int], announce: Callable[[str], None]) -> None:
+    """Serve a run, and a second one as its ghost, on the first free port, until SIGINT or SIGTERM.
 
-    Raises ParameterError where the port is taken, or a log cannot be read.
+    `announce` gets two lines for the user. Raises ParameterError where all ports are taken, or a log cannot be read.
     """
     with suppress(OSError):
         os.nice(NICE)
-    asyncio.run(_serve(runs, port, announce))
+    asyncio.run(_serve(runs, ports, announce))
 
 
-async def _serve(runs: Sequence[Path], port: int, announce: Callable[[str], None]) -> None:
+async def _serve(runs: Sequence[Path], ports: Sequence[int], announce: Callable[[str], None]) -> None:
     server = Server([Flight(run) for run in runs], secrets.token_urlsafe(16))
-    try:
-        server.listen(port)
-    except (OSError, OverflowError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise ParameterError(f"--port: {port} cannot be used ({reason}), expected a free port of this host") from None
+    for port in ports:
+        try:
+            server.listen(port)
+        except OSError as error:
+            reason = os.strerror(error.errno or 0)  # the sentence of `strerror` may hold the address
+        else:
+            break
+    else:
+        raise ParameterError(f"--port: {port} cannot be used ({reason}), expected a free port of this host")
     announce(f"http://{ADDRESS}:{server.port}/?token={server.token}")
     announce(f"from another machine first: ssh -L {server.port}:{ADDRESS}:{server.port} {socket.gethostname()}")
     follow = asyncio.ensure_future(server.follow())

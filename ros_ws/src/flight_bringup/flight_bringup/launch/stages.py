@@ -12,11 +12,20 @@ from pathlib import Path
 import psutil
 from diagnostic_msgs.msg import KeyValue
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, RegisterEventHandler, Shutdown, TimerAction
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteProcess,
+    LogInfo,
+    OpaqueFunction,
+    RegisterEventHandler,
+    Shutdown,
+    TimerAction,
+)
 from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.ros_adapters import get_ros_node
+from launch_ros.substitutions import ExecutableInPackage
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
@@ -55,6 +64,19 @@ def boolean_argument(name: str, default: bool, description: str) -> DeclareLaunc
 def runs_argument() -> DeclareLaunchArgument:
     """The argument `runs`."""
     return DeclareLaunchArgument("runs", default_value="runs", description="folder in which the folder of the run is created")
+
+
+def watch_argument() -> DeclareLaunchArgument:
+    """The argument `watch`."""
+    return boolean_argument("watch", False, "serve the live page of the flight: docs/live-view.md")
+
+
+def watch_page(context: LaunchContext, run: Path) -> list[Action]:
+    """The process that serves the live page of a run, where it is asked for. The flight does not depend on it."""
+    if argument(context, "watch") != "true":
+        return []
+    rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
+    return [ExecuteProcess(cmd=[rise_di, "watch", str(run), "--wait"], name="watch", output="screen")]
 
 
 def namespace_argument(description: str = "namespace of all nodes, one an aircraft") -> DeclareLaunchArgument:

@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A flight in the terminal: state, mode, outputs over their references, inputs, attitude, the last events."""
+
+import math
+import time
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from flight_core.rates import NANOSECONDS
+from flight_view.flight import Flight
+from rise_di_controller.internals import Saturation
+
+REFRESH = 10.0  # Hz
+EVENTS = 6  # the last ones
+SATURATED = {float(one): one.name.lower() for one in (Saturation.MAGNITUDE, Saturation.RATE)}
+STYLES = {"recording": "bold green", "no data": "bold red", "interrupted": "bold yellow", "waiting": "yellow"}
+
+
+def show(flight: Flight) -> None:
+    """Show a flight until its recording has ended, or Ctrl-C. Raises as `Flight.update`."""
+    with Live(picture(flight), refresh_per_second=REFRESH, transient=False) as live:
+        while True:
+            flight.update()
+            live.update(picture(flight))
+            if flight.state() == "ended":
+                break
+            time.sleep(1.0 / REFRESH)
+
+
+def picture(flight: Flight) -> RenderableType:
+    """All that is shown of a flight, at its newest samples."""
+    mode = flight.description["modes"][""].get(f"{_newest(flight, 'internals', 'mode'):.0f}", "")
+    head = Text.assemble(
+        (flight.name, "bold"),
+        "  ",
+        (flight.state().upper(), STYLES.get(flight.state(), "")),
+        f"  {mode}  t = {flight.end:.1f} s",
+    )
+    parts: list[RenderableType] = [head, _outputs(flight), _inputs(flight)]
+    if "pose" in flight.samples:
+        parts.append(Text(_attitude(flight)))
+    start_ns = flight.start_ns
+    lines = [f"{(one.stamp_ns - start_ns) / NANOSECONDS:8.2f} s  {one.kind}: {one.text}" for one in flight.events[-EVENTS:]]
+    parts += [Text(line, style="dim") for line in lines]
+    return Group(*parts, *(Text(f"note: {sentence}", style="yellow") for sentence in flight.faults()))
+
+
+def _outputs(flight: Flight) -> Table:
+    table = _table("output", "y", "y_m", "e", "band")
+    for name in _names(flight, "e"):
+        unit, factor = _unit(flight, name)
+        values = [_newest(flight, "internals", f"{group}.{name}") for group in ("y", "y_m", "e")]
+        inside = abs(values[2]) <= flight.bands.get(name, math.inf)
+        cells = [_number(value * factor) for value in (*values, flight.bands.get(name, math.nan))]
+        table.add_row(f"{name} {unit}", *cells, style="" if inside else "yellow")
+    return table
+
+
+def _inputs(flight: Flight) -> Table:
+    table = _table("input", "u", "before limits", "saturated")
+    for name in _names(flight, "u"):
+        unit, factor = _unit(flight, name)
+        values = [_newest(flight, "internals", f"{group}.{name}") * factor for group in ("u", "u_free")]
+        saturated = SATURATED.get(_newest(flight, "internals", f"limited.{name}"), "")
+        table.add_row(f"{name} {unit}", *map(_number, values), saturated, style="yellow" if saturated else "")
+    return table
+
+
+def _attitude(flight: Flight) -> str:
+    roll, pitch, heading = (math.degrees(_newest(flight, "pose", name)) for name in ("phi", "theta", "psi"))
+    altitude, climb = (_newest(flight, "pose", name) for name in ("altitude", "climb"))
+    angles = f"roll {roll:+.1f} deg, pitch {pitch:+.1f} deg, heading {heading % 360.0:.0f} deg"
+    return f"{angles}, altitude {altitude:.1f} m, climb {climb:+.1f} m/s"
+
+
+def _table(first: str, *others: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column(first, min_width=16)
+    for name in others:
+        table.add_column(name, justify="right", min_width=9)
+    return table
+
+
+def _names(flight: Flight, group: str) -> Sequence[str]:
+    """Names of the channels "group.name" of the ticks."""
+    names = flight.samples["internals"].names if "internals" in flight.samples else ()
+    return [name.partition(".")[2] for name in names if name.startswith(f"{group}.")]
+
+
+def _unit(flight: Flight, name: str) -> tuple[str, float]:
+    unit = flight.description.get("units", {}).get(name, {"unit": "", "factor": 1.0})
+    return (f"({unit['unit']})" if unit["unit"] else ""), unit["factor"]
+
+
+def _newest(flight: Flight, topic: str, channel: str) -> float:
+    """The newest value of a channel; NaN without one."""
+    samples = flight.samples.get(topic)
+    if samples is None or not samples.count or channel not in samples.names:
+        return math.nan
+    return float(samples.values[-1, samples.names.index(channel)])
+
+
+def _number(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3f}"
