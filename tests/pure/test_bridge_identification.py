@@ -127,13 +127,8 @@ def test_a_sign_against_the_map_is_refused(identified: Identified) -> None:
         join(MAP, response, flipped)
 
 
-@pytest.mark.parametrize("lag", [0.03, 0.4])
-def test_the_model_of_a_channel_is_that_of_its_own_simulation_from_any_start(
-    lag: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # y_dot = 80 v - 12 y with a lag of 0.05 s, integrated in steps of 1 ms, and y late by 0.08 s; noise as of a gyroscope.
-    # From a slow start the search meets the same response with a lag of 1/12 s and a pole at 20 1/s.
-    monkeypatch.setattr(open_loop_fit, "STARTS", ((0.03, lag),))
+def measured_channel(noise: float) -> tuple[Signal, Signal]:
+    """Output and input of y_dot = 80 v - 12 y, v with a lag of 0.05 s, in steps of 1 ms; y late by 0.08 s, and noise."""
     params = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
     t = np.arange(0.0, 14.0, 0.001)
     arrays = params.law_params()
@@ -142,15 +137,41 @@ def test_the_model_of_a_channel_is_that_of_its_own_simulation_from_any_start(
     for k in range(len(t) - 1):
         v[k + 1] = v[k] + 0.001 * (u[k] - v[k]) / 0.05
         y[k + 1] = y[k] + 0.001 * (80.0 * v[k] - 12.0 * y[k])
-    late = np.interp(t - 0.08, t, y) + 0.002 * np.random.default_rng(1).standard_normal(len(t))
+    late = np.interp(t - 0.08, t, y) + noise * np.random.default_rng(1).standard_normal(len(t))
     stamps = np.round(t * 1e9).astype(np.int64)
-    measured, commanded = (Signal(stamps[::10], (name,), one[::10, None]) for name, one in (("q", late), ("elevator", u)))
-    model = fit_channel(measured, commanded, "q", "elevator", 1.0)
+    return Signal(stamps[::10], ("q",), late[::10, None]), Signal(stamps[::10], ("elevator",), u[::10, None])
+
+
+@pytest.mark.parametrize("lag", [0.03, 0.4])
+def test_the_model_of_a_channel_is_that_of_its_own_simulation_from_any_start(
+    lag: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # From a slow start the search meets the same response with a lag of 1/12 s and a pole at 20 1/s.
+    monkeypatch.setattr(open_loop_fit, "STARTS", ((0.03, lag),))
+    model = fit_channel(*measured_channel(noise=0.002), "q", "elevator", 1.0)  # rad/s, as of a gyroscope
     assert model is not None
     assert model.usable
     assert model.stiffness == 0.0
     np.testing.assert_allclose(model.Omega / model.damping, 80.0 / 12.0, rtol=0.02)
     np.testing.assert_allclose([model.Omega, model.lag + model.delay], [80.0, 0.13], rtol=0.1)
+
+
+def test_noise_as_large_as_the_response_leaves_a_model_with_standard_errors() -> None:
+    # 0.1 rad/s is the rms of the response: 70 % of y is unexplained, and gain and phase of the loop are certain
+    model = fit_channel(*measured_channel(noise=0.1), "q", "elevator", 1.0)
+    assert model is not None
+    assert model.misfit > 0.5
+    assert model.usable
+    gain, phase = model.at_loop_frequency()
+    s = 0.5j / (model.delay + model.lag)
+    known = 80.0 / (s + 12.0) / (0.05 * s + 1.0) * np.exp(-0.08 * s)
+    assert abs(gain.value - abs(known)) < 3.0 * gain.deviation  # 99.7 %
+    assert abs(phase.value + np.angle(known)) < 3.0 * phase.deviation
+
+
+def test_noise_far_above_the_response_leaves_no_model() -> None:
+    model = fit_channel(*measured_channel(noise=5.0), "q", "elevator", 1.0)
+    assert model is None or not model.usable
 
 
 def test_a_map_without_an_envelope_is_refused() -> None:

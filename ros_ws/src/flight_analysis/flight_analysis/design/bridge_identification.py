@@ -142,7 +142,8 @@ def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelMo
     refused = []
     for i, (name, output, model) in enumerate(zip(pairing.inputs, pairing.outputs, models, strict=True)):
         if model is not None and model.usable:
-            Omega[i, i], deviation[i], lag[i], delay[i] = model.Omega, model.deviation[2], model.lag, model.delay
+            Omega[i, i], deviation[i] = model.Omega, np.sqrt(model.covariance[2, 2])
+            lag[i], delay[i] = model.lag, model.delay
             damping[i], stiffness[i], zero[i] = model.damping, model.stiffness, model.slow / model.Omega
             misfit[i] = model.misfit
         elif response.refusal[i] or response.sign_ratio[i] < MIN_RATIO:

@@ -21,7 +21,8 @@ from flight_core.vectors import FloatArray
 
 STEP = 0.004  # s, of the simulation
 BEFORE, AFTER = 0.3, 0.5  # s around the excitation of an input
-MAX_MISFIT = 0.3  # rms of the output error by the rms of y: 9 % of the power, as disturbances and other channels leave
+MIN_CERTAINTY = 5.0  # standard errors: those from which on a sign of Omega is certain too
+LOOP_FREQUENCY = 0.5  # of 1 / (delay + lag): about where the loops of `rise-di gains` cross 1
 MIN_GAIN = 0.8  # of the misfit: a second order has to lower it by a fifth
 STARTS = ((0.03, 0.03), (0.1, 0.1))  # s, delay and lag
 # Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow
@@ -31,8 +32,20 @@ ORDERS = (4, 6)  # parameters of the first and of the second order
 CORRELATION = 0.5  # s, over which errors of neighbouring samples are taken as correlated
 
 
+class Estimate(NamedTuple):
+    """A value and its standard error."""
+
+    value: float
+    deviation: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the value is MIN_CERTAINTY standard errors or more."""
+        return self.value >= MIN_CERTAINTY * self.deviation
+
+
 class ChannelModel(NamedTuple):
-    """The model of one channel, SI, and standard errors of its parameters in their order."""
+    """The model of one channel, SI, and the covariance of its parameters in their order."""
 
     delay: float  # s
     lag: float  # s
@@ -40,13 +53,33 @@ class ChannelModel(NamedTuple):
     damping: float  # 1/s
     stiffness: float  # 1/s^2; 0 where the first order is enough
     slow: float
-    deviation: FloatArray  # (6,)
+    covariance: FloatArray  # (6, 6)
     misfit: float  # rms of the output error / rms of y
 
     @property
     def usable(self) -> bool:
-        """Whether the model explains the response, and its zero is stable."""
-        return self.misfit <= MAX_MISFIT and self.slow * self.Omega >= 0.0
+        """Whether gain and phase of the loop are certain, and the zero is stable: noise may be as large as y."""
+        gain, phase = self.at_loop_frequency()
+        return gain.is_certain and phase.deviation <= 1.0 / MIN_CERTAINTY and self.slow * self.Omega >= 0.0
+
+    def at_loop_frequency(self) -> tuple[Estimate, Estimate]:
+        """abs(y / u), and the phase by which y is behind u, rad, at LOOP_FREQUENCY.
+
+        Omega, damping, lag and delay may take each other's place in a fit; these two are what the loop needs.
+        """
+        theta = np.array(self[:6])
+        s = 1j * LOOP_FREQUENCY / (self.delay + self.lag)
+
+        def logarithm(theta: FloatArray) -> complex:
+            delay, lag, Omega, damping, stiffness, slow = theta
+            ratio = (abs(Omega) * s + np.sign(Omega) * slow) / (s**2 + damping * s + stiffness) / (lag * s + 1.0)
+            return complex(np.log(ratio) - s * delay)
+
+        steps = 1e-6 * np.maximum(np.abs(theta), 1e-3)
+        slope = np.array([logarithm(theta + step) - logarithm(theta - step) for step in np.diag(steps)]) / (2.0 * steps)
+        gain, phase = (float(np.sqrt(part @ self.covariance @ part)) for part in (slope.real, slope.imag))
+        found = logarithm(theta)
+        return Estimate(float(np.exp(found.real)), gain * float(np.exp(found.real))), Estimate(-found.imag, phase)
 
 
 def fit_channel(y: Signal, u: Signal, output: str, name: str, sign: float) -> ChannelModel | None:
@@ -113,8 +146,8 @@ def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
     rho = np.correlate(e, e, "full")[len(e) : len(e) + lags] / (e @ e)
     inflation = 1.0 + 2.0 * float(np.sum(np.maximum(rho, 0.0)))
     J = fit.jac
-    deviation = np.zeros(6)
+    covariance = np.zeros((6, 6))
     variance = float(e @ e) / (len(e) - len(fit.x)) * inflation
-    deviation[: len(fit.x)] = np.sqrt(variance * np.diag(np.linalg.pinv(J.T @ J)))
+    covariance[: len(fit.x), : len(fit.x)] = variance * np.linalg.pinv(J.T @ J)
     delay, lag, Omega, damping, stiffness, slow = np.concatenate([fit.x, np.zeros(6 - len(fit.x))]).tolist()
-    return ChannelModel(delay, lag, Omega, damping, stiffness, slow, deviation, misfit)
+    return ChannelModel(delay, lag, Omega, damping, stiffness, slow, covariance, misfit)
