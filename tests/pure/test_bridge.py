@@ -28,6 +28,11 @@ def receive_u(bridge: Bridge, t: float, u: float = 0.0, sender: str = "controlle
     bridge.take_u(np.full(4, u), sender, at(t))
 
 
+def unlimited(name: str) -> ChannelMap:
+    """A map of the library without its envelope, which needs the pose."""
+    return load_map(name).model_copy(update={"envelope": {}})
+
+
 def new_bridge(channel_map: ChannelMap = CHANNEL_MAP, *, dry_run: bool = False) -> Bridge:
     return Bridge(channel_map, dry_run=dry_run)
 
@@ -193,7 +198,7 @@ PX4_STATUS = {"armed": 2.0, "offboard": 4.0}  # armed, in Hold
 
 def px4_bridge(t: float = 0.0, **status: float) -> Bridge:
     """A bridge with the map of PX4 in Hold that has received y and u."""
-    bridge = new_bridge(load_map("px4"))
+    bridge = new_bridge(unlimited("px4"))
     refresh(bridge, t, **status)
     return bridge
 
@@ -239,7 +244,7 @@ def test_an_engagement_without_the_awaited_mode_ends_after_its_time_with_the_rea
 
 
 def test_an_engagement_is_refused_with_the_sentence_of_the_condition() -> None:
-    bridge = new_bridge(load_map("px4"))
+    bridge = new_bridge(unlimited("px4"))
     assert bridge.engage(at(0.0)) == "armed: arming_state not received yet (/fmu/out/vehicle_status_v1)"
     bridge = px4_bridge(armed=1.0)
     assert bridge.engage(at(0.0)) == "the aircraft is not armed (arming_state is 1)"
@@ -287,7 +292,7 @@ STICKS = {"elevator": 1400.0, "thrust": 1450.0, "aileron": 1520.0, "rudder": 149
 
 def ardupilot_bridge(t: float = 0.0, sticks: dict[str, float] = STICKS) -> Bridge:
     """A bridge with the map of ArduPilot in MANUAL, with the sticks in these positions."""
-    bridge = new_bridge(load_map("ardupilot"))
+    bridge = new_bridge(unlimited("ardupilot"))
     receive_outputs(bridge, t, tuple(bridge.outputs))
     receive_u(bridge, t)
     for name, raw in {"manual": 0.0, "armed": 1.0, "flying": 1.0}.items():
@@ -320,7 +325,7 @@ def test_an_engagement_whose_limits_leave_the_range_around_the_trim_is_refused()
 
 
 def test_u_that_times_out_sends_the_captured_trim_where_the_map_says_so() -> None:
-    content = load_map("ardupilot").model_dump()
+    content = unlimited("ardupilot").model_dump()
     content["silence"] = {"max_age": 0.2, "neutral": 0.3, "release": 0.5}
     bridge = ardupilot_bridge()
     bridge.channel_map = ChannelMap.validate_mapping(content, "map")
