@@ -127,19 +127,29 @@ def test_a_sign_against_the_map_is_refused(identified: Identified) -> None:
         join(MAP, response, flipped)
 
 
-def measured_channel(noise: float) -> tuple[Signal, Signal]:
-    """Output and input of y_dot = 80 v - 12 y, v with a lag of 0.05 s, in steps of 1 ms; y late by 0.08 s, and noise."""
-    params = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
-    t = np.arange(0.0, 14.0, 0.001)
-    arrays = params.law_params()
-    u = np.array([(arrays.amplitude * excitation.signal(one, arrays))[0] for one in np.floor(t / 0.01 + 1e-9) * 0.01])
-    v, y = np.zeros_like(t), np.zeros_like(t)
-    for k in range(len(t) - 1):
-        v[k + 1] = v[k] + 0.001 * (u[k] - v[k]) / 0.05
-        y[k + 1] = y[k] + 0.001 * (80.0 * v[k] - 12.0 * y[k])
-    late = np.interp(t - 0.08, t, y) + noise * np.random.default_rng(1).standard_normal(len(t))
-    stamps = np.round(t * 1e9).astype(np.int64)
-    return Signal(stamps[::10], ("q",), late[::10, None]), Signal(stamps[::10], ("elevator",), u[::10, None])
+class Known(NamedTuple):
+    """y'' + damping y' + stiffness y = Omega v', v with a lag, y late by a delay; by default a channel of first order."""
+
+    Omega: float = 80.0
+    damping: float = 12.0
+    stiffness: float = 0.0
+    lag: float = 0.05  # s
+    delay: float = 0.08  # s
+
+    def measured(self, noise: float) -> tuple[Signal, Signal]:
+        """Output and input of an experiment, in steps of 1 ms, with noise."""
+        params = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
+        t = np.arange(0.0, 14.0, 0.001)
+        arrays = params.law_params()
+        u = np.array([(arrays.amplitude * excitation.signal(one, arrays))[0] for one in np.floor(t / 0.01 + 1e-9) * 0.01])
+        v, z, y = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
+        for k in range(len(t) - 1):
+            v[k + 1] = v[k] + 0.001 * (u[k] - v[k]) / self.lag
+            y[k + 1] = y[k] + 0.001 * (self.Omega * v[k] - self.damping * y[k] - self.stiffness * z[k])
+            z[k + 1] = z[k] + 0.001 * y[k + 1]
+        late = np.interp(t - self.delay, t, y) + noise * np.random.default_rng(1).standard_normal(len(t))
+        stamps = np.round(t * 1e9).astype(np.int64)
+        return Signal(stamps[::10], ("q",), late[::10, None]), Signal(stamps[::10], ("elevator",), u[::10, None])
 
 
 @pytest.mark.parametrize("lag", [0.03, 0.4])
@@ -147,8 +157,8 @@ def test_the_model_of_a_channel_is_that_of_its_own_simulation_from_any_start(
     lag: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # From a slow start the search meets the same response with a lag of 1/12 s and a pole at 20 1/s.
-    monkeypatch.setattr(open_loop_fit, "STARTS", ((0.03, lag),))
-    model = fit_channel(*measured_channel(noise=0.002), "q", "elevator", 1.0)  # rad/s, as of a gyroscope
+    monkeypatch.setattr(open_loop_fit, "STARTS", ((0.03, lag, 5.0, 30.0, 6.0),))
+    model = fit_channel(*Known().measured(noise=0.002), "q", "elevator", 1.0)  # rad/s, as of a gyroscope
     assert model is not None
     assert model.usable
     assert model.stiffness == 0.0
@@ -158,7 +168,7 @@ def test_the_model_of_a_channel_is_that_of_its_own_simulation_from_any_start(
 
 def test_noise_as_large_as_the_response_leaves_a_model_with_standard_errors() -> None:
     # 0.1 rad/s is the rms of the response: 70 % of y is unexplained, and gain and phase of the loop are certain
-    model = fit_channel(*measured_channel(noise=0.1), "q", "elevator", 1.0)
+    model = fit_channel(*Known().measured(noise=0.1), "q", "elevator", 1.0)
     assert model is not None
     assert model.misfit > 0.5
     assert model.usable
@@ -169,8 +179,17 @@ def test_noise_as_large_as_the_response_leaves_a_model_with_standard_errors() ->
     assert abs(phase.value + np.angle(known)) < 3.0 * phase.deviation
 
 
+def test_the_fast_oscillation_of_a_light_airplane_is_found() -> None:
+    # that of PX4's airplane in yaw: 480 / s^2 is 3.5 Hz, and its response returns to 0 within 0.15 s
+    known = Known(Omega=500.0, damping=24.0, stiffness=480.0, lag=0.01, delay=0.02)
+    model = fit_channel(*known.measured(noise=0.02), "q", "elevator", 1.0)
+    assert model is not None
+    assert model.usable
+    np.testing.assert_allclose(model[2:5], [500.0, 24.0, 480.0], rtol=0.1)
+
+
 def test_noise_far_above_the_response_leaves_no_model() -> None:
-    model = fit_channel(*measured_channel(noise=5.0), "q", "elevator", 1.0)
+    model = fit_channel(*Known().measured(noise=5.0), "q", "elevator", 1.0)
     assert model is None or not model.usable
 
 

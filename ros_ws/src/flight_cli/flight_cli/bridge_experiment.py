@@ -25,7 +25,7 @@ from flight_analysis.design.bridge_identification import (
 )
 from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
 from flight_analysis.design.response_identification import Response, identify_response
-from flight_analysis.report.run_folder import new_run
+from flight_analysis.report.run_folder import link_latest, new_run
 from flight_analysis.report.summary import finite_or_null
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
@@ -97,6 +97,7 @@ def _excite(
             announce=lambda line: bar.console.print(line, highlight=False, soft_wrap=True),
             engaged_for=planned.controller.duration,
         )
+    link_latest(run)
     console.print(f"outcome: {outcome}\nlog:     {display_path(run)}", highlight=False)
     return run
 

@@ -23,11 +23,13 @@ STEP = 0.004  # s, of the simulation
 BEFORE, AFTER = 0.3, 0.5  # s around the excitation of an input
 MIN_CERTAINTY = 5.0  # standard errors: those from which on a sign of Omega is certain too
 LOOP_FREQUENCY = 0.5  # of 1 / (delay + lag): about where the loops of `rise-di gains` cross 1
-MIN_GAIN = 0.8  # of the misfit: a second order has to lower it by a fifth
-STARTS = ((0.03, 0.03), (0.1, 0.1))  # s, delay and lag
+MIN_GAIN = 0.85  # of the misfit, by which a second order has to lower it: noise alone does not in 10 s
+# Delay s, lag s, damping 1/s, stiffness 1/s^2, zero 1/s: a slow response to slow servos, a short-period or Dutch roll mode of a
+# transport and that of a model aircraft
+STARTS = ((0.03, 0.03, 5.0, 30.0, 6.0), (0.1, 0.1, 5.0, 30.0, 6.0), (0.03, 0.01, 30.0, 400.0, 1.0))
 # Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow
 LOWER = np.array([0.0, 0.003, -np.inf, 0.0, 0.0, -np.inf])
-UPPER = np.array([0.4, 1.0, np.inf, 60.0, 1000.0, np.inf])
+UPPER = np.array([0.4, 1.0, np.inf, 120.0, 3000.0, np.inf])
 ORDERS = (4, 6)  # parameters of the first and of the second order
 CORRELATION = 0.5  # s, over which errors of neighbouring samples are taken as correlated
 
@@ -127,8 +129,9 @@ def _simulated(t: FloatArray, t_u: FloatArray, impulse: FloatArray, theta: Float
 def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) -> Any:
     size = float(np.ptp(values)) / amplitude
     fits = []
-    for delay, lag in STARTS:
-        start = np.array([delay, lag, 5.0 * size, 5.0, 30.0, 30.0 * size])[:order]
+    for delay, lag, damping, stiffness, zero in STARTS:
+        Omega = damping * size
+        start = np.array([delay, lag, Omega, damping, stiffness, zero * Omega])[:order]
         scale = np.array([0.05, 0.05, 5.0 * abs(size), 10.0, 100.0, 50.0 * abs(size)])[:order]
         fits.append(least_squares(residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60))
     best = min(fits, key=lambda one: float(one.cost))

@@ -134,14 +134,14 @@ def write_report(run: Path, outcome: str | None = None) -> FlightResult:
         (folder / SUMMARY).write_text(json.dumps(flight.summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         write_page(folder / REPORT, [flight])
         if outcome is not None:
-            _link_latest(folder)
+            link_latest(folder)
     return FlightResult(flight, min(bag_files(run), default=folder), folder / REPORT)
 
 
 def write_empty_summary(run: Path, scenario: Scenario, outcome: str) -> None:
     """Write summary.json of a flight that ended before its first sample. The log stays as it is."""
     (run / SUMMARY).write_text(json.dumps(empty_summary(scenario, outcome), indent=2) + "\n", encoding="utf-8")
-    _link_latest(run)
+    link_latest(run)
 
 
 def _folder(run: Path) -> Path:
@@ -164,7 +164,7 @@ def _until_last_input(tape: Tape) -> Tape:
     return replace(tape, signals={name: signal.until(end_ns) for name, signal in tape.signals.items()})
 
 
-def _link_latest(run: Path) -> None:
+def link_latest(run: Path) -> None:
     """Point runs/latest at a run, atomically."""
     latest, temporary = run.parent / "latest", run.parent / f".latest-{os.getpid()}"
     temporary.symlink_to(run.name)
