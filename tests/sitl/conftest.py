@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.sitl.kit import ArduPlane, missing
+from tests.sitl.kit import ArduPlane, Px4, missing
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -18,13 +18,30 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason=reason))
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(autouse=True, scope="session")
+def domain_of_the_autopilots() -> None:
+    """The autopilots are in domain 0, in networks of their own."""
+    os.environ.pop("ROS_DOMAIN_ID", None)
+
+
+@pytest.fixture(scope="module")
 def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
-    """An ArduPlane in flight, with servos of 0.03 s, for all tests of the session."""
-    os.environ.pop("ROS_DOMAIN_ID", None)  # the autopilot is in domain 0, in a network of its own
-    autopilot = ArduPlane(tmp_path_factory.mktemp("arduplane"))
+    """An ArduPlane in flight, with servos of 0.03 s."""
+    autopilot = ArduPlane(tmp_path_factory.mktemp("run"))
     try:
         autopilot.up(SIM_SERVO_SPEED=0.03)
+        autopilot.take_off()
+        yield autopilot
+    finally:
+        autopilot.down()
+
+
+@pytest.fixture(scope="module")
+def px4(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Px4]:
+    """PX4's airplane in flight. Without a stick it goes on, and without an offboard heartbeat it changes to Hold."""
+    autopilot = Px4(tmp_path_factory.mktemp("run"))
+    try:
+        autopilot.up(COM_RCL_EXCEPT=7, COM_OBL_RC_ACT=5)
         autopilot.take_off()
         yield autopilot
     finally:

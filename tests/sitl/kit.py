@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The kit of autopilots in software: one is started and stopped, commanded, and flown by commands of the stack beside it.
+"""The kits of autopilots in software: one is started and stopped, commanded, and flown by commands of the stack beside it.
 
-The kit is no part of this repository. RISE_DI_SITL names its folder, by default ../shared/sitl beside the checkout; its README
-says what it needs. PILOT_PYTHON is an interpreter with pymavlink, by default python3.
+The kits are no part of this repository. RISE_DI_SITL names the folder of ArduPlane's, by default ../shared/sitl beside the
+checkout; that of PX4 is its folder px4. Their READMEs say what they need. PILOT_PYTHON is an interpreter with pymavlink, by
+default python3.
 """
 
 import csv
@@ -11,29 +12,36 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import psutil
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
 
+from autopilot_bridge.params import find_map
 from flight_core.vectors import FloatArray
+from flight_log.tape_reader import read_run
 
 KIT = Path(os.environ.get("RISE_DI_SITL", REPOSITORY.parent / "shared" / "sitl"))
 PROFILE = REPOSITORY / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopback.xml"
 PILOT_PYTHON = os.environ.get("PILOT_PYTHON", "python3")
-POLL = 0.1  # s, between two questions to the pilot
-HOME_ALTITUDE = 584.0  # m, where the kit puts the aircraft
+POLL = 0.1  # s, between two questions to the autopilot
+MAX_AGE = 0.5  # s, in place of the shipped maps' 0.2 s, for busy hosts
 SAFE_STICKS = (1500, 1500, 1000, 1500, 1800, 1500, 1500)  # us, as the kit begins; the throttle is closed
+ALTITUDE = 300.0  # m above the ground, of ArduPlane's flights: an open loop in turbulence loses some of it
 
 
 def missing() -> str:
-    """Why the kit cannot run here; empty where it can."""
-    if not (KIT / "sitl").is_file():
-        return f"no kit in {KIT}: RISE_DI_SITL names its folder"
+    """Why the kits cannot run here; empty where they can."""
+    for script in (KIT / "sitl", KIT / "px4" / "sitl"):
+        if not script.is_file():
+            return f"no {script}: RISE_DI_SITL names the folder of the kit"
     if os.geteuid() != 0:
         return "not root, and the kit makes a network namespace"
     if shutil.which("ip") is None:
@@ -48,78 +56,217 @@ def missing() -> str:
     return ""
 
 
-class ArduPlane:
-    """ArduPlane, its agent and its transmitter, in a network of their own."""
+class Autopilot:
+    """An autopilot and its agent in a network of their own, and the flights of the stack beside it."""
+
+    script: Path
+    namespace: str  # of the network, as the kit names it
 
     def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        self._script = str(KIT / "sitl")
         self._processes: list[Process] = []
-
-    def up(self, **parameters: float) -> None:
-        """Start agent, autopilot and transmitter, with parameters of the autopilot."""
-        extra = self.folder / "extra.parm"
-        self.folder.mkdir(parents=True, exist_ok=True)
-        extra.write_text("".join(f"{name} {value:g}\n" for name, value in parameters.items()), encoding="utf-8")
-        self._call("up", str(PROFILE), timeout=90.0, EXTRA_PARM=str(extra), PILOT_PYTHON=PILOT_PYTHON)
+        self._restarted: list[subprocess.Popen[bytes]] = []  # processes of the kit
 
     def down(self) -> None:
         """Stop everything in its network."""
         self._call("down", timeout=30.0)
         for process in self._processes:
             process.end()
+        for restarted in self._restarted:
+            restarted.wait(10.0)
 
     def say(self, *words: str) -> str:
-        """The answer of the pilot to a command."""
-        return self._call("say", *words, timeout=30.0, PILOT_PYTHON=PILOT_PYTHON)
+        """The answer to a command."""
+        return self._call("say", *words, timeout=30.0)
 
     def _call(self, action: str, *words: str, timeout: float, **environment: str) -> str:
-        command = [self._script, action, str(self.folder), *words]
+        command = [str(self.script), action, str(self.folder), *words]
         # Files, not pipes: what `up` starts would hold a pipe open.
         output = self.folder / f"{action}.txt"
         with output.open("w", encoding="utf-8") as file:
             done = subprocess.run(
-                command, env={**os.environ, **environment}, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
-                timeout=timeout, check=False,
+                command, env={**os.environ, "PILOT_PYTHON": PILOT_PYTHON, **environment}, stdin=subprocess.DEVNULL,
+                stdout=file, stderr=subprocess.STDOUT, timeout=timeout, check=False,
             )  # fmt: skip
         text = output.read_text(encoding="utf-8")
         assert done.returncode == 0, f"{' '.join(command)}: {text}"
         return text.strip()
 
+    def kill(self, *programs: str) -> Callable[[], None]:
+        """Kill processes of the kit; what is returned starts them again as the kit started them."""
+        pids = [int(line) for line in (self.folder / "pids").read_text(encoding="utf-8").split()]
+        parents = [psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)]
+
+        def is_one(process: psutil.Process, program: str) -> bool:
+            return any(Path(word).name == program for one in (process, *process.children()) for word in one.cmdline())
+
+        chosen = [next(one for one in parents if is_one(one, program)) for program in programs]
+        again = [(["ip", "netns", "exec", self.namespace, *one.cmdline()], one.environ()) for one in chosen]
+        for parent in chosen:
+            for process in (*parent.children(), parent):
+                process.kill()
+
+        def start() -> None:
+            psutil.wait_procs(chosen)
+            for program, (command, environment) in zip(programs, again, strict=True):
+                with (self.folder / f"{program}_again.log").open("w", encoding="utf-8") as log:
+                    started = subprocess.Popen(
+                        command, env=environment, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+                    )
+                self._restarted.append(started)
+                with (self.folder / "pids").open("a", encoding="utf-8") as file:
+                    file.write(f"{started.pid}\n")
+
+        return start
+
     def start(self, *arguments: str) -> Process:
         """Start a command of rise-di in the autopilot's network."""
-        within = (self._script, "in", str(self.folder))
-        self._processes.append(Process("flight_cli.cli", *arguments, cwd=REPOSITORY, within=within))
+        return self._module("flight_cli.cli", *arguments)
+
+    def _module(self, *arguments: str, path: str = "") -> Process:
+        """Start a Python module, with its arguments, in the autopilot's network."""
+        within = ("env", f"PYTHONPATH={path}", str(self.script), "in", str(self.folder))
+        self._processes.append(Process(*arguments, cwd=REPOSITORY, within=within))
         return self._processes[-1]
+
+    def state(self) -> dict[str, Any]:
+        """What the autopilot says of itself now."""
+        raise NotImplementedError
+
+    def until(self, condition: Callable[[dict[str, Any]], bool], timeout: float = 60.0) -> dict[str, Any]:
+        """Poll the state until a condition holds."""
+        deadline = time.monotonic() + timeout
+        while not condition(state := self.state()):
+            assert time.monotonic() < deadline, f"not within {timeout} s; {state}"
+            time.sleep(POLL)
+        return state
+
+    def level(self) -> None:
+        """Fly straight and level in a mode of the autopilot."""
+        raise NotImplementedError
+
+    def hand_over(self) -> None:
+        """Change to the mode in which the stack is engaged, where the bridge does not ask for it."""
+
+    def patient_map(self, name: str, *changes: tuple[str, str]) -> str:
+        """A copy of a map with longer ages, and further changes of its text."""
+        text = find_map(name).read_text(encoding="utf-8")
+        for old, new in (("max_age: 0.2 ", f"max_age: {MAX_AGE} "), ("max_age: 0.35 ", f"max_age: {MAX_AGE} "), *changes):
+            text = text.replace(old, new)
+        path = self.folder / f"{Path(name).stem}.yaml"
+        path.write_text(text, encoding="utf-8")
+        return str(path)
+
+    def fly(self, scenario: Path, channel_map: str, duration: float, *options: str) -> Process:
+        """Start a flight of the stack."""
+        arguments = (str(scenario), "--bridge", channel_map, "--duration", f"{duration:g}", "--runs", str(self.folder / "runs"))
+        return self.start("fly", *arguments, *options)
+
+    @contextmanager
+    def engaged(self, scenario: Path, channel_map: str, duration: float) -> Iterator[Process]:
+        """A flight of the stack, engaged from level flight. Afterwards the autopilot flies level in its own mode."""
+        self.level()
+        flight = self.fly(scenario, channel_map, duration, "--send")
+        try:
+            flight.wait_for("DISENGAGED")
+            self.hand_over()
+            self.start("engage").succeed()
+            yield flight
+        finally:
+            if flight.popen.poll() is None:
+                flight.interrupt()
+                flight.end()
+            self.level()
+
+    @property
+    def run(self) -> Path:
+        """The folder of the last flight."""
+        return (self.folder / "runs" / "latest").resolve()
+
+    def summary(self) -> dict[str, Any]:
+        """The summary of the last flight: its outcome, and its engagements with start, stop, reason."""
+        found: dict[str, Any] = json.loads((self.run / "summary.json").read_text(encoding="utf-8"))
+        return found
+
+
+class Agreement(NamedTuple):
+    """A signal of the stack over the autopilot's own, at the delay between both with the smallest residual."""
+
+    slope: float  # by orthogonal regression: the instants of both jitter, so an ordinary one, with noise in one alone, is low
+    offset: float  # difference of the means
+    delay: float  # s
+
+
+def agreement(t: FloatArray, logged: FloatArray, t_y: FloatArray, y: FloatArray) -> Agreement:
+    """The agreement of y(t_y) with logged(t)."""
+    fits = []
+    for delay in np.arange(-0.3, 0.3, 0.005):
+        delayed = np.interp(t + delay, t_y, y)
+        variances, directions = np.linalg.eigh(np.cov(logged, delayed))
+        found = Agreement(float(directions[1, 1] / directions[0, 1]), float(np.mean(delayed - logged)), float(delay))
+        fits.append((float(variances[0]), found))
+    return min(fits)[1]
+
+
+METRES = 111_318.845 * 1e-7  # per unit of GLOBAL_POSITION_INT.lat: ArduPilot's LATLON_TO_M
+HOME = (-353_632_620, 1_491_652_370)  # 1e-7 deg, where the kit puts the aircraft
+IN_METRES = {
+    "north": (METRES, HOME[0]),
+    "east": (METRES * float(np.cos(np.radians(HOME[0] * 1e-7))), HOME[1]),
+    "altitude": (1e-3, 0.0),
+    "v_north": (1e-2, 0.0),
+    "v_east": (1e-2, 0.0),
+    "climb": (-1e-2, 0.0),
+}
+"""What turns a value of GLOBAL_POSITION_INT into that of the pose: factor and the value at 0."""
+LOGGED: tuple[tuple[str, str, dict[str, str]], ...] = (
+    ("y", "ATTITUDE", {"p": "rollspeed", "q": "pitchspeed", "r": "yawspeed"}),
+    ("pose", "ATTITUDE", {"phi": "roll", "theta": "pitch", "psi": "yaw"}),
+    (
+        "pose",
+        "GLOBAL_POSITION_INT",
+        {"north": "lat", "east": "lon", "altitude": "relative_alt", "v_north": "vx", "v_east": "vy", "climb": "vz"},
+    ),
+)
+"""Topic, message of MAVLink, and its field for each channel."""
+
+
+class ArduPlane(Autopilot):
+    """ArduPlane, its agent and its transmitter."""
+
+    script = KIT / "sitl"
+    namespace = "rise_di_sitl"
+    home = 584.0  # m, where the kit puts the aircraft
+
+    def up(self, **parameters: float) -> None:
+        """Start agent, autopilot and transmitter, with parameters of the autopilot."""
+        extra = self.folder / "extra.parm"
+        extra.write_text("".join(f"{name} {value:g}\n" for name, value in parameters.items()), encoding="utf-8")
+        self._call("up", str(PROFILE), timeout=90.0, EXTRA_PARM=str(extra))
 
     def state(self) -> dict[str, Any]:
         """Mode, attitude, speed, sticks and servos."""
         state: dict[str, Any] = json.loads(self.say("get"))
         return state
 
-    def until(self, condition: Callable[[dict[str, Any]], bool], timeout: float = 60.0) -> dict[str, Any]:
-        """Poll the state until a condition holds."""
-        deadline = time.monotonic() + timeout
-        while not condition(state := self.state()):
-            assert time.monotonic() < deadline, f"not within {timeout} s; {state}; {self.say('text')}"
-            time.sleep(POLL)
-        return state
-
     def take_off(self) -> None:
-        """Arm and climb to 60 m above the ground."""
+        """Arm, and climb to ALTITUDE."""
         deadline = time.monotonic() + 120.0
         while "ok" not in self.say("mode", "TAKEOFF") or self.say("arm") != "True":
             assert time.monotonic() < deadline, self.say("text")
             time.sleep(1.0)
-        self.until(lambda state: bool(state.get("alt", 0.0) > HOME_ALTITUDE + 60.0))
+        self.until(lambda state: bool(state.get("alt", 0.0) > self.home + 60.0))
+        self.level()
 
     def level(self) -> None:
-        """Fly straight and level in GUIDED."""
+        """Fly straight and level in GUIDED, at ALTITUDE or above."""
         for channel, position in enumerate(SAFE_STICKS, 1):
             self.say("stick", str(channel), str(position))
-        assert "ok" in self.say("mode", "GUIDED")
-        altitude = self.state()["alt"] - HOME_ALTITUDE
-        self.say("goto", f"{altitude:.0f}")
+        assert "ok" in self.say("mode", "GUIDED"), self.say("text")
+        target = max(self.state()["alt"] - self.home, ALTITUDE)
+        self.say("goto", f"{target:.0f}")
+        self.until(lambda state: bool(state["alt"] > self.home + target - 20.0), timeout=120.0)
         self.until(lambda state: max(abs(state["roll"]), abs(state["climb"]) / 20.0, abs(state["pitchspeed"])) < 0.05)
 
     def hand_over(self) -> None:
@@ -127,8 +274,114 @@ class ArduPlane:
         self.say("sticks_from_servos")
         assert "ok" in self.say("mode", "MANUAL")
 
+    def restart(self) -> None:
+        """End the autopilot and start it again, on the ground. Its ground station notices no other way."""
+        again = self.kill("pilot.py", "arduplane")
+        (self.folder / "pilot.sock").unlink()
+        again()
+        deadline = time.monotonic() + 60.0
+        while not (self.folder / "pilot.sock").exists():
+            assert time.monotonic() < deadline, "no heartbeat of the restarted autopilot"
+            time.sleep(POLL)
+
     def log(self, kind: str, *fields: str) -> tuple[FloatArray, FloatArray]:
         """The autopilot's own log over MAVLink: the times of arrival, s of the system clock, and the fields."""
         with (self.folder / "mavlink.csv").open(encoding="utf-8", newline="") as file:
             rows = [(float(row[0]), json.loads(row[2])) for row in csv.reader(file) if len(row) == 3 and row[1] == kind]
         return np.array([t for t, _ in rows]), np.array([[row[field] for field in fields] for _, row in rows])
+
+    def wander(self, flight: Process) -> None:
+        """Fly turns and climbs until a flight of the stack ends by itself."""
+        heading = 0.0
+        while flight.popen.poll() is None:
+            heading += 140.0
+            self.say("goto", f"{ALTITUDE + heading % 100.0:.0f}", f"{heading % 360.0:.0f}")
+            self.until(lambda state: abs(state["roll"]) > 0.5)  # rad, in the turn
+            self.until(lambda state: abs(state["roll"]) < 0.1)  # rad, out of it
+        flight.succeed()
+
+    def compare(self) -> dict[str, Agreement]:
+        """The rates and the pose of the last flight with the autopilot's own log."""
+        tape, compared = read_run(self.run).tape, {}
+        for topic, kind, rows in LOGGED:
+            t, logged = self.log(kind, *rows.values())
+            signal = tape[topic]
+            t_y = signal.stamp_ns / 1e9
+            inside = (t > t_y[0] + 0.5) & (t < t_y[-1] - 0.5)
+            for name, values in zip(rows, logged[inside].T, strict=True):
+                measured = signal[name]
+                if name == "psi":
+                    measured, values = np.unwrap(measured), np.unwrap(values)  # noqa: PLW2901 - the same angle
+                elif name in IN_METRES:
+                    scale, begin = IN_METRES[name]
+                    values = scale * (values - begin)  # noqa: PLW2901 - the same position
+                compared[name] = agreement(t[inside], values, t_y, measured)
+        return compared
+
+
+class Px4(Autopilot):
+    """PX4 and its agent. There is no transmitter."""
+
+    script = KIT / "px4" / "sitl"
+    namespace = "rise_di_px4"
+    tools = KIT / "px4" / "fly"
+    home = 489.4  # m, where its simulator begins
+
+    def up(self, **parameters: float) -> None:
+        """Start agent and autopilot, with parameters of the autopilot."""
+        self._call(
+            "up", str(PROFILE), timeout=60.0, **{f"PX4_PARAM_{name}": f"{value:g}" for name, value in parameters.items()}
+        )
+
+    def listen(self, topic: str, *names: str) -> dict[str, float]:
+        """Fields of the newest message of a topic of uORB."""
+        lines = [line.strip().partition(":") for line in self.say("listener", topic, "-n", "1").splitlines()]
+        found = {name: value.split() for name, _, value in lines if name in names and value.strip()}
+        numbers = {name: float(words[0].removesuffix(",")) for name, words in found.items()}
+        if "timestamp" in found:  # "308080000 (0.320000 seconds ago)"
+            numbers["ago"] = float(found["timestamp"][1].removeprefix("("))
+        return numbers
+
+    def state(self) -> dict[str, Any]:
+        """nav_state and arming_state, altitude above home."""
+        state = self.listen("vehicle_status", "nav_state", "arming_state")
+        height = self.listen("vehicle_local_position", "z", "vz")
+        return {**state, "alt": -height.get("z", 0.0), "climb": -height.get("vz", 0.0)}
+
+    def take_off(self) -> None:
+        """Take off from the runway, into Hold. The airplane cannot hold its default speed of 15 m/s."""
+        deadline, armed = time.monotonic() + 60.0, False
+        while not armed:
+            assert time.monotonic() < deadline, "PX4 does not arm"
+            time.sleep(1.0)
+            with suppress(AssertionError):  # not running yet, or refused until its estimator is ready
+                self.say("commander", "takeoff")
+                armed = self.state()["arming_state"] == ARMED
+        self.until(lambda state: state["alt"] > 20.0)
+        self.say("param", "set", "FW_AIRSPD_MIN", "8")
+        self.say("param", "set", "FW_AIRSPD_TRIM", "11.2")
+
+    def level(self) -> None:
+        """Fly straight ahead in Hold, towards a place 20 km to the north, 150 m above the ground."""
+        self.until(lambda _: self.tool("say", "away", "0", "20000", "150").end() == 0)  # not before its agent is connected
+        self.until(
+            lambda state: state["nav_state"] == HOLD and state["alt"] > 100.0 and abs(state["climb"]) < 0.5, timeout=120.0
+        )
+
+    def tool(self, name: str, *arguments: str) -> Process:
+        """Start a tool of the kit in the autopilot's network."""
+        return self._module(name, *arguments, path=str(self.tools))
+
+    def mode_changed(self) -> float:
+        """When nav_state changed last, s of the monotonic clock."""
+        status = self.listen("vehicle_status", "timestamp", "nav_state_timestamp")
+        return time.monotonic() - status["ago"] - 1e-6 * (status["timestamp"] - status["nav_state_timestamp"])
+
+
+HOLD, OFFBOARD, ARMED = 4, 14, 2  # nav_state of PX4: AUTO_LOITER, OFFBOARD; its arming_state
+
+
+def burn(seconds: float, per_core: int = 4) -> Sequence[subprocess.Popen[bytes]]:
+    """Keep every core busy with several processes at once for a time."""
+    code = f"import time; end = time.monotonic() + {seconds}\nwhile time.monotonic() < end: pass"
+    return [subprocess.Popen([sys.executable, "-c", code]) for _ in range(per_core * (os.cpu_count() or 1))]

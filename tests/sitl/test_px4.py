@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The map of `examples/px4_airplane` against PX4's own uXRCE-DDS client: into offboard, and back into a mode of PX4's own."""
+
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from tests.conftest import REPOSITORY
+from tests.ros.conftest import Process
+from tests.sitl.kit import HOLD, MAX_AGE, OFFBOARD, Px4
+
+from flight_bringup.scenarios import find_scenario
+from flight_log.tape_reader import read_run
+
+EXAMPLE = REPOSITORY / "examples" / "px4_airplane"
+SCENARIO = find_scenario(str(EXAMPLE / "scenario.yaml"))
+LATE = 0.4  # s, for a busy host: commands and questions start processes
+OWN_LAW = 0.6  # s, from the event to a mode of PX4's own, where the bridge asks for it
+LOSS = 1.5  # s: COM_OF_LOSS_T, 1 s by default, after the last heartbeat, and 0.5 s of its failsafe
+
+
+def engaged(px4: Px4, duration: float) -> AbstractContextManager[Process]:
+    """A flight of the stack, engaged from Hold, straight ahead."""
+    return px4.engaged(SCENARIO.path, px4.patient_map(str(EXAMPLE / "map.yaml")), duration)
+
+
+def test_an_engaged_flight_tracks_its_commands_in_offboard(px4: Px4) -> None:
+    """The part of y that goes along with y_m has half to one and a half of its size, thrust is off its limits, ticks replay.
+
+    The noise of its gyro is larger than the commands: rms 50 mrad/s in q and 104 in p, in Hold too. The part is uncertain
+    by 0.1, and in a flight it was 1.04 in q, 0.93 in p, 0.83 in V, 0.25 s after y_m.
+    """
+    with engaged(px4, SCENARIO.flight.duration) as flight:
+        assert px4.state()["nav_state"] == OFFBOARD
+        flight.succeed(SCENARIO.flight.duration + 30.0)
+        px4.until(lambda state: state["nav_state"] == HOLD, timeout=OWN_LAW + LATE)
+    (one,) = px4.summary()["engagements"]  # to the end of the flight
+    tape = read_run(px4.run).tape
+    y, y_m, u = tape["y"], tape["y_m"], tape["u"]
+    t = (y.stamp_ns - tape.start_ns) / 1e9
+    first = min(pulse.start[0] for pulse in SCENARIO.reference_model.pulses.values())
+    assert one["start"] < first, "engaged after the first command"
+    for name, pulse in SCENARIO.reference_model.pulses.items():
+        inside = (t > pulse.start[0]) & (t < pulse.stop[-1] + 1.0)
+        parts = []
+        for delay in np.arange(0.0, 0.6, 0.05):
+            reference = np.interp(t[inside] - delay, (y_m.stamp_ns - tape.start_ns) / 1e9, y_m[name])
+            moved = reference - reference.mean()
+            parts.append(float(y[name][inside] @ moved / (moved @ moved)))
+        assert 0.5 < max(parts) < 1.5, name
+    assert np.mean((u["thrust"] <= -0.25) | (u["thrust"] >= 0.202)) < 0.05  # of the time at a limit of the scenario
+    px4.start("replay", str(px4.run)).succeed()
+
+
+class Event(NamedTuple):
+    """What ends an engagement, the reason in the summary, and the time until a mode of PX4's own flies, s."""
+
+    act: Callable[[Px4, Process], Callable[[], object] | None]
+    reason: str
+    own_law: float
+
+
+def release(px4: Px4, _: Process) -> None:
+    px4.start("engage", "--off").succeed()
+
+
+def override(px4: Px4, _: Process) -> Callable[[], object]:
+    """The stick says aux1 = 1 from 2 s on."""
+    px4.say("param", "set", "COM_RC_IN_MODE", "1")
+    stick = px4.tool("stick", "6", "2").wait_for("aux1 sent")
+
+    def undo() -> None:
+        stick.end()
+        px4.say("param", "set", "COM_RC_IN_MODE", "4")
+
+    return undo
+
+
+def change_mode(px4: Px4, _: Process) -> None:
+    px4.say("commander", "mode", "auto:loiter")
+
+
+def kill(module: str) -> Callable[[Px4, Process], None]:
+    return lambda _, flight: flight.child(module).kill()
+
+
+def kill_agent(px4: Px4, _: Process) -> Callable[[], object]:
+    return px4.kill("MicroXRCEAgent")
+
+
+EVENTS = {
+    "release": Event(release, "disengaged by request", OWN_LAW),
+    "override by the stick": Event(override, "pilot override by pilot", OWN_LAW),
+    "mode changed": Event(change_mode, "the mode is not offboard", OWN_LAW),
+    "controller killed": Event(kill("rise_di_controller.main"), "controller was killed", MAX_AGE + OWN_LAW),
+    "bridge killed": Event(kill("autopilot_bridge.main"), "bridge was killed", LOSS),
+    "agent killed": Event(kill_agent, "s old", LOSS),
+}
+
+
+@pytest.mark.parametrize("name", EVENTS)
+def test_px4_flies_by_its_own_law_again(px4: Px4, name: str) -> None:
+    """Within the time of the event PX4 is in a mode of its own, and the log says why the engagement ended."""
+    event = EVENTS[name]
+    with engaged(px4, 90.0) as flight:
+        undo = event.act(px4, flight)
+        began = time.monotonic()
+        px4.until(lambda state: state["nav_state"] != OFFBOARD, timeout=10.0)
+        own_law = px4.mode_changed() - began
+        if "killed" not in name or event.act is kill_agent:  # without one of its nodes the flight ends by itself
+            flight.wait_for("RELEASE").interrupt()
+        flight.end()
+        if undo is not None:
+            undo()
+    print(f"{name}: {own_law:.2f} s")
+    assert own_law <= event.own_law + LATE  # below 0 where the command took longer than the change
+    summary = px4.summary()
+    (one,) = summary["engagements"]
+    assert event.reason in f"{one['reason']}; {summary['outcome']}"
+
+
+def test_the_stack_engages_again_after_a_restart_of_the_agent(px4: Px4) -> None:
+    """PX4's client connects again by itself, where it has noticed that the agent was away."""
+    with engaged(px4, 120.0) as flight:
+        again = px4.kill("MicroXRCEAgent")
+        flight.wait_for("s old")
+        px4.until(lambda _: "disconnected" in px4.say("uxrce_dds_client", "status"))
+        again()
+        px4.until(lambda _: px4.start("engage").end() == 0)
+        flight.interrupt()
+        flight.end()
+    first, _ = px4.summary()["engagements"]
+    assert "s old" in first["reason"]
