@@ -9,7 +9,7 @@ places of its messages: those of other topics cost nothing.
 import math
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -25,13 +25,12 @@ from mcap.writer import MCAP0_MAGIC
 from flight_core.rates import NANOSECONDS
 from flight_log.named_vectors import stamp_of
 from flight_log.rosbag2_metadata import bag_files
-from flight_log.scan import DECODE_ERRORS, MAX_CHUNK_BYTES, MESSAGE, RECORD, decode, decompress, split
+from flight_log.scan import DECODE_ERRORS, MAX_CHUNK_BYTES, RECORD, decode, decompress, split
 
 MESSAGE_INDEX = struct.Struct(
     "<HI"
 )  # channel and size, before pairs of log time and offset (MCAP specification, Message Index)
-BODY = RECORD.size + MESSAGE.size  # bytes before the data of a message
-SENT_AT = BODY - 8  # of the publish time
+HEAD = struct.Struct("<BQHIQQ")  # RECORD and MESSAGE: opcode, length, channel, sequence, log time, publish time
 ENDS = (Opcode.DATA_END, Opcode.FOOTER)
 
 
@@ -148,25 +147,28 @@ class Follower:
             raise McapError("messages without their channel")
         if size == 0 or channel.rate <= 0.0:
             return
-        offsets = np.frombuffer(content, "<u8", offset=MESSAGE_INDEX.size)[1::2]
-        first, last = (self._message_at(int(place))[1] for place in (offsets[0], offsets[-1]))
-        sent_ns, data = [], []
-        for place in offsets[_every(channel, len(offsets), first, last)].tolist():
-            sent, body = self._message_at(place)
-            sent_ns.append(sent)
-            data.append(body)
-        if data:
-            yield Messages(channel.topic, channel.type_name, sent_ns, data)
+        places = np.frombuffer(content, "<u8", offset=MESSAGE_INDEX.size)[1::2]
+        if channel.rate < math.inf:
+            if channel.step == 0:
+                ends = self._messages_at([int(places[0]), int(places[-1])])[1]
+                channel.step = _step(channel.rate, len(places), ends)
+            chosen = places[channel.skip :: max(channel.step, 1)]
+            channel.skip = (channel.skip - len(places)) % max(channel.step, 1)
+            places = chosen
+        if len(places):
+            yield Messages(channel.topic, channel.type_name, *self._messages_at(places.tolist()))
 
-    def _message_at(self, place: int) -> tuple[int, bytes]:
-        """Publish time in ns and data of a message of the last chunk. Raises one of DECODE_ERRORS."""
-        if place + BODY > len(self._chunk):
-            raise McapError("a message index beyond its chunk")
-        opcode, length = RECORD.unpack_from(self._chunk, place)
-        if opcode != Opcode.MESSAGE or place + RECORD.size + length > len(self._chunk):
-            raise McapError("a message index without its message")
-        sent_ns = int.from_bytes(self._chunk[place + SENT_AT : place + BODY], "little")
-        return sent_ns, self._chunk[place + BODY : place + RECORD.size + length]
+    def _messages_at(self, places: Sequence[int]) -> tuple[list[int], list[bytes]]:
+        """Publish times in ns and data of messages of the last chunk. Raises one of DECODE_ERRORS."""
+        chunk, sent_ns, data = self._chunk, [], []
+        for place in places:
+            opcode, length, _, _, _, sent = HEAD.unpack_from(chunk, place)
+            end = place + RECORD.size + length
+            if opcode != Opcode.MESSAGE or end > len(chunk):
+                raise McapError("a message index without its message")
+            sent_ns.append(sent)
+            data.append(chunk[place + HEAD.size : end])
+        return sent_ns, data
 
     def _walk_unindexed(self) -> Iterator[Messages | Attachment | Metadata]:
         """The messages of a chunk without a message index. Raises one of DECODE_ERRORS."""
@@ -195,15 +197,7 @@ class Follower:
                 self._channels[record.id] = _Channel(record.topic, type_name, self._rate_of(record.topic, type_name))
 
 
-def _every(channel: _Channel, count: int, first: bytes, last: bytes) -> slice:
-    """Which of `count` messages of a channel are read: every step-th, as evenly over the chunks as within one."""
-    if channel.rate == math.inf:
-        return slice(None)
-    if channel.step == 0:
-        span_ns = stamp_of(last) - stamp_of(first)
-        if count > 1 and span_ns > 0:
-            channel.step = max(1, math.floor(NANOSECONDS / channel.rate * (count - 1) / span_ns + 0.01))
-    step = channel.step or 1
-    chosen = slice(channel.skip, None, step)
-    channel.skip = (channel.skip - count) % step
-    return chosen
+def _step(rate: float, count: int, ends: Sequence[bytes]) -> int:
+    """Every how many-th of `count` messages is read, from the stamps of the first and the last; 0 where they do not tell."""
+    span_ns = stamp_of(ends[1]) - stamp_of(ends[0])
+    return max(1, math.floor(NANOSECONDS / rate * (count - 1) / span_ns + 0.01)) if count > 1 and span_ns > 0 else 0

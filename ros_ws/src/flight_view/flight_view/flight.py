@@ -6,7 +6,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,8 +32,8 @@ from guidance import modes as guidance
 from guidance.path import route_outline
 from rise_di_controller.guard import Mode
 
-SLOW, FAST = 50.0, 100.0  # Hz
-RATES = {"internals": math.inf, "guidance": SLOW, "pose": SLOW, "truth": SLOW, "u": FAST, "y": FAST, "y_m": FAST}
+RATE = 50.0  # Hz
+RATES = {"internals": math.inf, **dict.fromkeys(("guidance", "pose", "truth", "u", "y", "y_m"), RATE)}
 """Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples would be hidden."""
 
 GROUPS = {
@@ -45,6 +45,7 @@ GROUPS = {
 
 LOG, LOG_TYPE, WARN = "/rosout", "rcl_interfaces/msg/Log", 30  # rcl_interfaces/msg/Log: WARN=30
 MAX_EVENTS, MAX_NOTES, MAX_CHANNELS = 5000, 50, 200
+BATCH = 2000  # messages that are decoded together
 MAX_TEXT = 400  # characters of a text from the log
 SILENT = 1.0  # s without a sample after which the state is "no data"
 
@@ -61,6 +62,7 @@ class Event(NamedTuple):
 class _Topic:
     name: str  # without the namespace
     decode: Decoder
+    messages: list[bytes] = field(default_factory=list)  # not decoded yet
     names: tuple[str, ...] = ()  # of all channels
     columns: NDArray[np.intp] | None = None  # those of the kept channels
 
@@ -144,6 +146,8 @@ class Flight:
             if time.monotonic() > deadline:
                 self._behind = True
                 break
+        for topic in self._topics.values():
+            self._decode(topic)
         if found:
             self._changed = self._now()
             self._update_bands()
@@ -193,7 +197,14 @@ class Flight:
             if (decode := decoder(messages.topic, messages.type_name)) is None:
                 return
             topic = self._topics[messages.topic] = _Topic(messages.topic.rpartition("/")[2], decode)
-        decoded = topic.decode(messages.data)
+        topic.messages += messages.data
+        if len(topic.messages) >= BATCH:
+            self._decode(topic)
+
+    def _decode(self, topic: _Topic) -> None:
+        """The messages of a topic that have been read, together: one by one is slow."""
+        decoded = topic.decode(topic.messages)
+        topic.messages = []
         self._unreadable += decoded.unreadable
         for samples in decoded.samples:
             self._take_samples(topic, samples)

@@ -1,0 +1,267 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The cost of watching a flight: opening a long log, the server beside a flight, the delay to the screen, missed ticks.
+
+.venv/bin/python -m benchmarks.view                      # all
+.venv/bin/python -m benchmarks.view open --hours 1       # a log of that length, read by the server
+.venv/bin/python -m benchmarks.view live --seconds 30    # a flight in real time, a client, and a browser where there is one
+.venv/bin/python -m benchmarks.view flights --count 10   # that many flights with a client and as many without, in turns
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.cookiejar import CookieJar
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from benchmarks.processes import threads_ns
+from tests.browser import CHROMIUM, Browser
+
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.run_folder import attachments_for
+from flight_bringup.scenarios import find_scenario
+from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_log.bag import BagWriter
+from flight_log.named_vectors import JOINT_STATE, STAMP
+from flight_log.stored_messages import StoredMessage, stored_messages
+from flight_log.tape_writer import write_run
+
+SCENARIO = "osprey_servo"  # y, y_m and truth at 500 Hz, ticks at 100 Hz, noise
+PIECE = 60.0  # s of flight that are repeated to a long log
+FLUSH_PERIOD_NS = nanoseconds(0.1)  # as the recorder
+START_S = 1_795_000_000  # s, stamps of today
+POLLS = 20.0  # Hz, of the client
+RISE_DI = str(Path(sys.executable).parent / "rise-di")
+
+
+# A long log
+
+
+def write_long_log(run: Path, hours: float) -> None:
+    """Repeat a flight of PIECE s with moved stamps, with a chunk each 0.1 s as the recorder writes them."""
+    scenario = find_scenario(SCENARIO).vary(flight={"duration": PIECE})
+    with tempfile.TemporaryDirectory() as folder:
+        write_run(simulate(scenario), Path(folder), attachments_for(scenario, Path(folder)))
+        messages = [one for one in stored_messages(Path(folder)) if one.received_ns < nanoseconds(PIECE)]
+    with BagWriter(run) as bag:
+        bag.add_attachments(attachments_for(scenario, run), 0)
+        channels = {topic: bag.add_topic(topic, JOINT_STATE, "") for topic in dict.fromkeys(one.topic for one in messages)}
+        flushed_ns = 0
+        for k in range(round(hours * 3600.0 / PIECE)):
+            for one in messages:
+                now_ns = one.received_ns + nanoseconds((k * PIECE) + START_S)
+                if now_ns - flushed_ns >= FLUSH_PERIOD_NS:
+                    bag.flush()
+                    flushed_ns = now_ns
+                bag.write(channels[one.topic], now_ns, now_ns, 0, moved(one, now_ns))
+
+
+def moved(one: StoredMessage, now_ns: int) -> bytes:
+    """The message with another stamp. Its t, where it has one, stays, as in one flight the first alone counts."""
+    seconds, rest = divmod(now_ns, NANOSECONDS)
+    return one.data[: STAMP.start] + seconds.to_bytes(4, "little") + rest.to_bytes(4, "little") + one.data[STAMP.stop :]
+
+
+READ = """
+import json, resource, sys, time
+from pathlib import Path
+begin = time.monotonic()
+from flight_view.flight import Flight
+loaded = time.monotonic()
+flight = Flight(Path(sys.argv[1]))
+flight.update(0.05)
+first = time.monotonic()
+while flight.update(0.05):
+    pass
+rows = {name: samples.count for name, samples in flight.samples.items()}
+print(json.dumps({"import": loaded - begin, "first samples": first - loaded, "whole log": time.monotonic() - loaded,
+    "processor": time.process_time(), "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "flight": flight.end,
+    "rows": rows, "state": flight.state()}))
+"""
+
+
+def open_log(hours: float) -> dict[str, Any]:
+    """Times in s and memory in MB to read a long log as the server reads it."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+        write_long_log(run, hours)
+        shown = subprocess.run([sys.executable, "-c", READ, str(run)], capture_output=True, text=True, check=True).stdout  # noqa: S603
+        result: dict[str, Any] = json.loads(shown)
+        return result | {"log": sum(path.stat().st_size for path in run.glob("*.mcap")) / 1e6}
+
+
+# Beside a flight
+
+
+class Client(threading.Thread):
+    """Asks for news as the page does, until stopped; the delays from a sample's stamp to its arrival."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__(daemon=True)
+        self._opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
+        self._base = address.partition("?")[0]
+        self._opener.open(address).read()
+        self._stop = threading.Event()
+        self.delays: list[float] = []
+        self.bytes = 0
+
+    def run(self) -> None:
+        """Ask until stopped, or until the server ends."""
+        head: dict[str, Any] = {}
+        rows: dict[str, int] = {}
+        while not self._stop.wait(1.0 / POLLS):
+            known = {"epoch": head.get("epoch", ""), "state": head.get("state", ""), "described": "true", **rows}
+            query = "&".join(f"{name}={value}" for name, value in known.items())
+            try:
+                content = self._opener.open(f"{self._base}data/0?{query}").read()
+            except OSError:
+                break
+            now = time.time()
+            self.bytes += len(content)
+            size = int.from_bytes(content[:4], "little")
+            head, place = json.loads(content[4 : 4 + size]), 4 + size
+            for topic in head["topics"]:
+                count = topic["count"]
+                if topic["name"] == "internals" and head["state"] == "recording":
+                    start = int(head["epoch"].partition(".")[0]) / NANOSECONDS
+                    self.delays.append(now - start - float(np.frombuffer(content, "<f8", count, place)[-1]))
+                rows[topic["name"]] = topic["first"] + count
+                place += 8 * count + -(-4 * count * len(topic["channels"]) // 8) * 8
+
+    def stop(self) -> None:
+        """Ask no more."""
+        self._stop.set()
+        self.join()
+
+
+@contextmanager
+def flying(runs: Path, seconds: float) -> Iterator[tuple["subprocess.Popen[str]", Path]]:
+    """A flight in real time, and the folder of its run."""
+    command = [RISE_DI, "fly", SCENARIO, "--duration", f"{seconds:g}", "--runs", str(runs), "--json"]
+    known = set(runs.iterdir())
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as flight:  # noqa: S603
+        while not (new := set(runs.iterdir()) - known):
+            time.sleep(0.02)
+        yield flight, new.pop()
+
+
+@contextmanager
+def watching(run: Path) -> Iterator[tuple[psutil.Popen, str]]:
+    """The server of a run, and its address."""
+    command = [RISE_DI, "watch", str(run), "--wait", "--port", "0"]
+    server = psutil.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        yield server, server.stdout.readline().strip()
+    finally:
+        server.terminate()
+        server.wait()
+
+
+MEASURE = """(start => {
+    const delays = window.delays = [], time = document.getElementById('time'), state = document.getElementById('state');
+    let before = '';
+    (function look() {
+        if (time.textContent !== before && state.textContent === 'LIVE') {
+            before = time.textContent;
+            delays.push(Date.now() / 1e3 - start - parseFloat(before.slice(4)));
+        }
+        requestAnimationFrame(look);
+    })();
+})"""
+
+
+def live(seconds: float, *, browser: bool) -> dict[str, Any]:
+    """Processor share and memory of the server beside a flight, traffic, and delays to the client and to the screen."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        flying(Path(folder), seconds) as (flight, run),
+        watching(run) as (server, address),
+    ):
+        client, drawn = Client(address), []
+        client.start()
+        time.sleep(3.0)  # the flight has begun
+        before, begin = threads_ns(server.pid), time.monotonic()
+        if browser:
+            with Browser(Path(folder) / "profile") as page:
+                page.open(address)
+                page.wait_for("document.getElementById('state')?.textContent === 'LIVE'")
+                page.run(f"{MEASURE}({start_of(client)})")
+                time.sleep(seconds - 8.0)
+                drawn = page.run("delays")
+        else:
+            time.sleep(seconds - 6.0)
+        share = (threads_ns(server.pid) - before) / (time.monotonic() - begin) / NANOSECONDS
+        memory = server.memory_info().rss / 2**20
+        flight.communicate()
+        client.stop()
+        traffic = client.bytes / seconds
+    shown = {"processor": share, "memory": memory, "traffic": traffic, "to the client": percentiles(client.delays)}
+    return shown | ({"to the screen": percentiles(drawn[len(drawn) // 5 :])} if browser else {})
+
+
+def start_of(client: Client) -> float:
+    """System time of t = 0, s, as the page has it."""
+    content = client._opener.open(f"{client._base}data/0").read()
+    size = int.from_bytes(content[:4], "little")
+    return int(json.loads(content[4 : 4 + size])["epoch"].partition(".")[0]) / NANOSECONDS
+
+
+def percentiles(delays: list[float]) -> dict[str, float]:
+    """Median, 90th and 99th percentile, s, and their number."""
+    return {f"p{k}": float(np.percentile(delays, k)) for k in (50, 90, 99)} | {"count": len(delays)} if delays else {}
+
+
+def flights(count: int, seconds: float) -> dict[str, Any]:
+    """Missed ticks and late p99 of flights without and with a watching client, in turns."""
+    found: dict[str, list[tuple[int, float]]] = {"without": [], "with": []}
+    for _ in range(count):
+        for kind, results in found.items():
+            with tempfile.TemporaryDirectory() as folder, flying(Path(folder), seconds) as (flight, run):
+                if kind == "with":
+                    with watching(run) as (_, address):
+                        client = Client(address)
+                        client.start()
+                        output, _ = flight.communicate()
+                        client.stop()
+                else:
+                    output, _ = flight.communicate()
+            ticks = json.loads(output)["ticks"]
+            results.append((ticks["without_new_y"], ticks["late_p99"]))
+    return {
+        kind: {"missed": [missed for missed, _ in results], "late p99": [late for _, late in results]}
+        for kind, results in found.items()
+    }
+
+
+def main() -> None:
+    """Measure, and print the figures as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=["open", "live", "flights", []], help="all by default")
+    parser.add_argument("--hours", type=float, default=1.0, help="length of the log")
+    parser.add_argument("--seconds", type=float, default=30.0, help="length of the live flight")
+    parser.add_argument("--count", type=int, default=10, help="flights with a client, and as many without")
+    parser.add_argument("--no-browser", action="store_true", help="measure without a browser on this machine")
+    arguments = parser.parse_args()
+    parts = arguments.parts or ["open", "live", "flights"]
+    if "open" in parts:
+        print(json.dumps({"open": open_log(arguments.hours)}, indent=2))
+    if "live" in parts:
+        print(json.dumps({"live": live(arguments.seconds, browser=False)}, indent=2))
+        if CHROMIUM is not None and not arguments.no_browser:
+            print(json.dumps({"live with a browser": live(arguments.seconds, browser=True)}, indent=2))
+    if "flights" in parts:
+        print(json.dumps({"flights": flights(arguments.count, 10.0)}, indent=2))
+
+
+if __name__ == "__main__":
+    main()
