@@ -77,7 +77,19 @@ def test_every_relative_link_and_anchor_exists(page: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "page", ["architecture", "glossary", "theory", "symbols", "interfaces", "laws", "experiments", "evidence"]
+    "page",
+    [
+        "architecture",
+        "glossary",
+        "theory",
+        "symbols",
+        "interfaces",
+        "laws",
+        "guidance",
+        "fly-a-route",
+        "experiments",
+        "evidence",
+    ],
 )
 def test_the_readme_links_the_page(page: str) -> None:
     assert f"docs/{page}.md" in links(REPOSITORY / "README.md")

@@ -4,14 +4,17 @@
 
 import math
 import re
+from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.conftest import REPOSITORY
 
+from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from guidance.feasibility import Performance, flyable_legs, speeds
 from guidance.path import Arc, Line
-from guidance.route_file import Waypoint
+from guidance.route_file import Waypoint, read_route
 
 CAN = Performance(
     speed=40.0, stall_speed=25.0, bank=math.radians(30.0), roll_rate=0.3, climb=2.5, sink=4.0, wind=10.0
@@ -81,6 +84,18 @@ def test_an_altitude_beyond_the_climb_to_the_next_point_is_refused(altitude: flo
     assert flyable_legs(
         tuple(one._replace(altitude=1000.0 + change * (k > 0)) for k, one in enumerate(route)), RADIUS, PERIOD, CAN
     )
+
+
+def test_the_route_of_the_tutorial_is_flown_and_its_refusal_is_the_one_shown(tmp_path: Path) -> None:
+    page = (REPOSITORY / "docs" / "fly-a-route.md").read_text(encoding="utf-8")
+    guidance = find_scenario("osprey_route").guidance
+    assert guidance is not None
+    (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    (tmp_path / "triangle.yaml").write_text(block, encoding="utf-8")
+    assert len(guidance.plan(read_route(tmp_path / "triangle.yaml")).legs) == 6  # three lines, two fillets, an orbit
+    with pytest.raises(ParameterError) as refused:
+        guidance.plan([Waypoint(0, 0, 0), Waypoint(500, 0, 0), Waypoint(500, 200, 0), Waypoint(0, 200, 0)])
+    assert f"error: guidance.{refused.value}\n" in page
 
 
 def test_a_leg_too_short_for_its_fillets_and_a_route_of_one_waypoint_are_refused() -> None:

@@ -55,7 +55,7 @@ def test_a_segment_ends_where_the_mode_the_command_or_the_leg_changes() -> None:
     lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
     found = segments(log(mode__lateral=lateral, leg=after(20.0, 1.0), target__altitude=after(30.0, 50.0)))
     assert [(one.start, one.stop) for one in found] == [near(0.0, 10.0), near(10.0, 20.0), near(20.0, 30.0), near(30.0, 39.98)]
-    assert [one.leg for one in found] == [None, 1, 2, 2]
+    assert [one.leg for one in found] == [None, 0, 1, 1]
     assert [one.lateral.quantity for one in found] == ["heading", "xtrack", "xtrack", "xtrack"]
 
 
@@ -160,7 +160,7 @@ def test_the_cross_track_error_is_drawn_by_leg_where_a_path_is_followed() -> Non
     lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
     figure = guided_figures.cross_track_figure(context_of(log(mode__lateral=lateral, leg=after(20.0, 1.0), xtrack=7.0)))
     assert figure is not None
-    assert [note.text for note in figure.layout.annotations] == ["leg 1", "leg 2"]
+    assert [note.text for note in figure.layout.annotations] == ["leg 0", "leg 1"]
     assert np.isnan(figure.data[0].y[0])
     assert figure.data[0].y[-1] == 7.0
 
@@ -197,7 +197,7 @@ def test_a_guided_flight_has_captures_and_turns_in_place_of_commands(flight: Rec
     t = flight.tape.time("y")
     assert set(part_masks(t, transients(flight.scenario, flight.tape))) == {"whole", "calm", "capture", "turn", "gust"}
     tables = {table.caption: table for table in flight_tables(flight.summary, {}, [])}
-    assert [row[0] for row in tables["Guidance by segment"].rows] == ["leg 1"]
+    assert [row[0] for row in tables["Guidance by segment"].rows] == ["leg 0"]
     heads = [column.head for column in tables["Tracking error (true error)"].columns]
     assert "turn" in heads
     assert "command" not in heads

@@ -14,11 +14,13 @@ from rich.table import Table
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
+    QUANTITY_UNITS,
     SATURATION_COLUMN,
     Column,
     RecordedFlight,
     columns_of,
     display_units,
+    format_value,
     input_rows,
     parts_legend,
     table_rows,
@@ -38,9 +40,27 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         title = "Inputs about trim, and mean abs(u_dot) per second"
         columns = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
         console.print(grouped_table(title, "input", columns, rows))
+    if summary["guidance"]:
+        console.print(_guidance_table(summary["guidance"]["segments"]))
     console.print(f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
     for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"])):
         console.print(line, highlight=False)
+
+
+def _guidance_table(segments: Sequence[Mapping[str, Any]]) -> Table:
+    """What guidance held in each segment: rms and largest error."""
+    headings = ("segment", "to (s)", "lateral\nrms", "\nmax", "vertical\nrms", "\nmax", "V\nrms")
+    table = new_table("Guidance by segment, in m, m/s and deg", headings, left=("segment",))
+    for one in segments:
+        held = one["lateral"], one["vertical"]
+        units = [QUANTITY_UNITS[each["quantity"]] for each in held]
+        names = ", ".join(each["quantity"] for each in held)
+        errors = [
+            format_value(each[name], unit.factor) for each, unit in zip(held, units, strict=True) for name in ("rms", "max")
+        ]
+        leg = "" if one["leg"] is None else f"leg {one['leg']}: "
+        table.add_row(leg + names, f"{one['stop']:.1f}", *errors, format_value(one["V"]["rms"]))
+    return table
 
 
 def new_table(title: str, headings: Iterable[str], left: Container[str] = (), wrapped: Container[str] = ()) -> Table:

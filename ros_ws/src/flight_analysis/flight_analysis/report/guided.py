@@ -46,7 +46,7 @@ class Segment(NamedTuple):
 
     start: float  # s
     stop: float  # s
-    leg: int | None  # number of the leg of a route, from 1
+    leg: int | None  # number of the leg of a route, from 0 as in `target`
     lateral: Held
     vertical: Held
     V: Held
@@ -69,7 +69,7 @@ def segments(tape: Tape) -> list[Segment]:
         on_path = "xtrack" if lateral in {Lateral.ORBIT, Lateral.ROUTE} else lateral.name.lower()
         quantities = (on_path, vertical.name.lower(), "V")
         held = [_held(name, t[first:after], errors[name][first:after]) for name in quantities]
-        leg = int(log["leg"][last]) + 1 if lateral is Lateral.ROUTE else None
+        leg = int(log["leg"][last]) if lateral is Lateral.ROUTE else None
         found.append(Segment(float(t[first]), float(t[min(after, len(t) - 1)]), leg, *held))
     return found
 

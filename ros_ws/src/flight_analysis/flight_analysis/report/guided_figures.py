@@ -136,7 +136,7 @@ def cross_track_figure(context: PlotContext) -> go.Figure | None:
     error = Curve(_signal(context, {"xtrack": np.where(on_path, log["xtrack"], np.nan)}), ERROR)
     t, legs = context.tape.time("guidance"), np.where(lateral == Lateral.ROUTE, log["leg"], -1.0)
     spans = [
-        Interval(f"leg {int(leg) + 1}", *span, END_STOP if leg % 2 else "#ffffff", True)
+        Interval(f"leg {int(leg)}", *span, END_STOP if leg % 2 else "#ffffff", True)
         for leg in np.unique(legs[legs >= 0.0])
         for span in mask_spans(t, legs == leg)
     ]
