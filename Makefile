@@ -20,7 +20,7 @@ PACKAGES := $(notdir $(patsubst %/package.xml,%,$(wildcard ros_ws/src/*/package.
 BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/config/*.yaml ros_ws/src/*/launch/*.py)
 
 FLY_GROUPS := --group ros --group core --group report --group build
-ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group dev
+ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group docs --group dev
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
 

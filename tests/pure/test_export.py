@@ -13,7 +13,8 @@ from tests.recordings import EPOCH
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.export import wide_table, write_csv, write_parquet, write_png
+from flight_analysis.report.data_frame import data_frame
+from flight_analysis.report.export import write_csv, write_parquet, write_png
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.tape import Signal, Tape
 
@@ -28,7 +29,7 @@ def flight(osprey_gust: Scenario) -> RecordedFlight:
 def test_the_table_has_a_row_per_instant_and_null_without_a_sample() -> None:
     y = Signal(np.array([EPOCH, EPOCH + 1, EPOCH + 2]), ("q", "V"), np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
     u = Signal(np.array([EPOCH + 1, EPOCH + 3, EPOCH + 3]), ("thrust",), np.array([[0.5], [0.25], [0.75]]))
-    assert wide_table(Tape({"y": y, "u": u}, EPOCH)).to_dict(as_series=False) == {
+    assert data_frame(Tape({"y": y, "u": u}, EPOCH)).to_dict(as_series=False) == {
         "stamp_ns": [EPOCH, EPOCH + 1, EPOCH + 2, EPOCH + 3],
         "t": [0.0, 1e-9, 2e-9, 3e-9],
         "y.q": [1.0, 3.0, 5.0, None],

@@ -8,6 +8,7 @@ setup(
     description="Basics of the RISE-DI flight stack without ROS: parameters, named vectors, rates, integrators, scenario files, the tape.",
     license="Apache-2.0",
     packages=["flight_core"],
+    package_data={"flight_core": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_core"]),
         ("share/flight_core", ["package.xml"]),

@@ -6,10 +6,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from flight_analysis.metrics import best_error
 from flight_analysis.report import comparison
+from flight_analysis.report.data_frame import data_frame
 from flight_analysis.report.figures import GUST, REFERENCE, flight_end, gust_intervals
 from flight_analysis.report.summary import NO_UNIT, RecordedFlight, channel_label
 from flight_core.rates import NANOSECONDS
@@ -24,40 +23,14 @@ FIGURE_WIDTH, ROW_HEIGHT = 15.0, 2.2  # inches
 DPI = 120
 
 
-def wide_table(tape: Tape) -> "pl.DataFrame":
-    """All signals as one table, SI: a row per instant with a sample of any topic, a column "topic.channel" per channel.
-
-    The first columns are "stamp_ns" (int64) and "t" = (stamp_ns - start) / 1e9. A topic without a sample at an instant has
-    nulls there. Of two samples with one stamp the table holds the later.
-    """
-    import polars as pl  # noqa: PLC0415
-
-    stamps = np.unique(np.concatenate([signal.stamp_ns for signal in tape.signals.values()]))
-    columns: dict[str, np.ndarray] = {"stamp_ns": stamps, "t": (stamps - tape.start_ns) / NANOSECONDS}
-    missing: dict[str, np.ndarray] = {}
-    for topic, signal in tape.signals.items():
-        rows = np.searchsorted(stamps, signal.stamp_ns)
-        absent = np.ones(len(stamps), dtype=bool)
-        absent[rows] = False
-        for name in signal.names:
-            column = np.full(len(stamps), np.nan)
-            column[rows] = signal[name]
-            columns[f"{topic}.{name}"], missing[f"{topic}.{name}"] = column, absent
-    return pl.DataFrame(columns).with_columns(
-        pl.when(pl.Series(absent)).then(None).otherwise(pl.col(name)).alias(name)
-        for name, absent in missing.items()
-        if absent.any()
-    )
-
-
 def _joined_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
     """The table of a flight, or those of several with the name of the flight in a first column "run"."""
     import polars as pl  # noqa: PLC0415
 
     if len(flights) == 1:
-        return wide_table(flights[0].tape)
+        return data_frame(flights[0].tape)
     tables = [
-        wide_table(flight.tape).select(pl.lit(label).alias("run"), pl.all())
+        data_frame(flight.tape).select(pl.lit(label).alias("run"), pl.all())
         for label, flight in zip(comparison.labels(flights), flights, strict=True)
     ]
     return pl.concat(tables, how="diagonal")

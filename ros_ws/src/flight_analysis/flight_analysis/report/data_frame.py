@@ -1,0 +1,39 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A flight as a data frame of polars."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Tape
+
+if TYPE_CHECKING:  # it loads in some tenths of a second
+    import polars as pl
+
+
+def data_frame(tape: Tape) -> "pl.DataFrame":
+    """All signals as one table, SI: a row per instant with a sample of any topic, a column "topic.channel" per channel.
+
+    The first columns are "stamp_ns" (int64) and "t" = (stamp_ns - start) / 1e9. A topic without a sample at an instant has
+    nulls there. Of two samples with one stamp the table holds the later.
+    """
+    import polars as pl  # noqa: PLC0415
+
+    stamps = np.unique(np.concatenate([signal.stamp_ns for signal in tape.signals.values()]))
+    columns: dict[str, np.ndarray] = {"stamp_ns": stamps, "t": (stamps - tape.start_ns) / NANOSECONDS}
+    missing: dict[str, np.ndarray] = {}
+    for topic, signal in tape.signals.items():
+        rows = np.searchsorted(stamps, signal.stamp_ns)
+        absent = np.ones(len(stamps), dtype=bool)
+        absent[rows] = False
+        for name in signal.names:
+            column = np.full(len(stamps), np.nan)
+            column[rows] = signal[name]
+            columns[f"{topic}.{name}"], missing[f"{topic}.{name}"] = column, absent
+    return pl.DataFrame(columns).with_columns(
+        pl.when(pl.Series(absent)).then(None).otherwise(pl.col(name)).alias(name)
+        for name, absent in missing.items()
+        if absent.any()
+    )
