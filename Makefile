@@ -4,6 +4,7 @@
 # make fly     set up what is needed, fly the default scenario     make fly SCENARIO=... ARGS="--duration 10"
 # make test    set up what is needed, run all checks and tests
 # make test-sitl   fly a real autopilot in software: docs/autopilots.md
+# make docs   write the site of docs/ to site/; make docs ARGS=serve shows it while it is written
 # make evidence   measure what has not been measured yet, write docs/evidence.md     make evidence ARGS="--again speed"
 # make messages PACKAGE=... SOURCE=...   build a message package of an autopilot for the stack: docs/autopilots.md
 # make setup   what flying and its report need: .venv/, the workspace built, .venv/bin/rise-di; make setup-all: campaigns and tests too
@@ -24,7 +25,7 @@ ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group docs --gro
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
 
-.PHONY: fly test test-sitl check evidence messages setup setup-all lock clean
+.PHONY: fly test test-sitl check docs evidence messages setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
@@ -39,6 +40,10 @@ check: setup-all
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: setup-all
+	$(BIN)/python -m tools.parameters
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs $(or $(ARGS),build --quiet)
 
 evidence: setup-all
 	@$(BIN)/python -m benchmarks.evidence $(ARGS)

@@ -87,8 +87,7 @@ class UncertaintyParameters(Parameters):
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
     wind: WindEffect = Field(
         default=AIR_RELATIVE,
-        description="effect of wind on x_dot. air_relative: by the aircraft's own A, through alpha, beta and V relative to the"
-        " air; published: that of the airframe",
+        description="effect of wind on x_dot: by the aircraft's own A, alpha, beta and V relative to the air, or published",
     )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
     number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's aircraft, from 0 on")

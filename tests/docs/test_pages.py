@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The commands and the Python of the tutorials run as they stand, page by page, each in an empty folder."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tools import parameters
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PAGES = [REPOSITORY / "docs" / "get-started.md", *sorted((REPOSITORY / "docs" / "tutorials").glob("*.md"))]
+NOTEBOOKS = sorted((REPOSITORY / "examples" / "notebooks").glob("*.ipynb"))
+BLOCK = re.compile(
+    r"(?:<!-- (?P<reason>not run by the tests of the pages: [^\n]+) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)```", re.DOTALL
+)
+EXECUTED = {"sh", "python"}
+TIMEOUT = 240.0  # s, of a block: the longest takes about 30 s on an idle host
+
+
+def blocks(page: Path) -> list[tuple[str, str, str]]:
+    """Kind, text and the reason for not running it, of each block of a page."""
+    return [(one["kind"], one["text"], one["reason"] or "") for one in BLOCK.finditer(page.read_text(encoding="utf-8"))]
+
+
+def run(command: list[str], folder: Path) -> None:
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}", "MPLBACKEND": "agg"}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=TIMEOUT, check=False)
+    assert done.returncode == 0, f"{' '.join(command)}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_the_blocks_of_a_page_run_in_their_order(page: Path, tmp_path: Path) -> None:
+    executed: list[str] = []  # the Python blocks of a page are one session
+    for kind, text, reason in blocks(page):
+        if kind == "sh" and not reason:
+            run(["bash", "-euo", "pipefail", "-c", text], tmp_path)
+        elif kind == "python" and not reason:
+            executed.append(text)
+    if executed:
+        run([sys.executable, "-c", "\n".join(executed)], tmp_path)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_each_block_of_a_page_is_run_or_says_why_not(page: Path) -> None:
+    assert blocks(page)
+    assert all(kind in EXECUTED for kind, _, _ in blocks(page))
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs_and_is_stored_without_its_output(notebook: Path, tmp_path: Path) -> None:
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert code
+    assert not any(cell.get("outputs") for cell in cells)
+    run([sys.executable, "-c", "\n".join(code)], tmp_path)
+
+
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    run(
+        [
+            sys.executable,
+            "-m",
+            "mkdocs",
+            "build",
+            "--strict",
+            "--quiet",
+            "-f",
+            str(REPOSITORY / "mkdocs.yml"),
+            "-d",
+            str(tmp_path / "site"),
+        ],
+        tmp_path,
+    )
+    pages = {path.relative_to(REPOSITORY / "docs").with_suffix(".html") for path in (REPOSITORY / "docs").rglob("*.md")}
+    assert all((tmp_path / "site" / page).is_file() for page in pages)
+
+
+def test_the_reference_of_parameters_is_that_of_the_classes() -> None:
+    assert parameters.PAGE.read_text(encoding="utf-8") == parameters.page(), "python -m tools.parameters writes it again"
