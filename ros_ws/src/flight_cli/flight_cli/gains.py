@@ -249,10 +249,15 @@ def _format_delay_margin(found: Study, answer: GainAssessment) -> str:
     each = zip(answer.controller.outputs, answer.channel_margins, strict=True)
     alone = ", ".join(f"{output} {_milliseconds(margin)}" for output, margin in each)
     margin = f"predicted delay margin {_milliseconds(answer.delay_margin)}; in one channel alone: {alone}"
+    return f"{margin}; {speed_of_margin(found, answer)}"
+
+
+def speed_of_margin(found: Study, answer: GainAssessment) -> str:
+    """Up to which speed a delay margin above 0 lasts with fixed gains."""
     ratio = gain_selection.stable_speed_ratio(found, answer.controller)
     if math.isinf(ratio):
-        return f"{margin}; it lasts beyond {gain_selection.MAX_SPEED_RATIO:g} times the trim speed"
-    return f"{margin}; it lasts up to {ratio * found.airframe.speed:.3g} m/s, {ratio:.3g} of the trim speed, without a schedule"
+        return f"it lasts beyond {gain_selection.MAX_SPEED_RATIO:g} times the trim speed"
+    return f"it lasts up to {ratio * found.airframe.speed:.3g} m/s, {ratio:.3g} of the trim speed, without a schedule"
 
 
 def _stable_speed_ratio(found: Study, answer: GainAssessment) -> float | None:

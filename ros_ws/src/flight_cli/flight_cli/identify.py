@@ -34,7 +34,7 @@ from flight_analysis.report.plotting import Curve, Interval, PlotContext, Sample
 from flight_analysis.report.summary import DisplayUnit
 from flight_bringup.scenarios import find_scenario
 from flight_cli.bridge_experiment import identify_behind_bridge
-from flight_cli.gains import observed
+from flight_cli.gains import observed, speed_of_margin
 from flight_cli.output import COUNT_COLUMNS, new_table, progress_bar, write_text
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require
@@ -354,6 +354,8 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
         table.add_row(f"{output} by {name}", *(f"{figure:.3g}" for figure in figures))
     console.print(table)
     margin = "" if answer.delay_margin is None else f"; delay margin {MILLI * answer.delay_margin:.0f} ms"
+    if answer.delay_margin:
+        margin += f", {speed_of_margin(found.selection.study, answer)}"
     if found.sideslip_zero > 0.0:
         console.print(
             f"with p and r constant, sideslip grows at {found.sideslip_zero:.2g} 1/s:"
@@ -362,7 +364,7 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
             soft_wrap=True,
         )
     sign = controller.sampled_sign()[0].name.lower()
-    console.print(f"coupling max abs(U - I) = {found.coupling:.2g}; {sign} sign{margin}", highlight=False)
+    console.print(f"coupling max abs(U - I) = {found.coupling:.2g}; {sign} sign{margin}", highlight=False, soft_wrap=True)
     _show_flights(console, found)
 
 
