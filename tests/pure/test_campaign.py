@@ -23,7 +23,8 @@ from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
-from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define
+from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk_figures
+from flight_campaign.campaign_report import write_page
 from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
@@ -105,6 +106,46 @@ def test_an_aircraft_of_a_campaign_has_the_same_score_in_the_single_process_simu
     rms = np.array([[np.sqrt(np.mean(true[name][at_ticks] ** 2))] for name in outputs])
     unit = score_units(outputs, again.aircraft.channels().outputs)
     assert worst.score == pytest.approx(score(rms, unit)[0], rel=1e-3)  # as of single flights: tests of fleets
+
+
+@pytest.fixture(scope="module")
+def mission() -> Definition:
+    """Two aircraft on the first seconds of the osprey's route."""
+    return define(find_scenario("osprey_route").vary(flight={"duration": 6.0}), 2, 0.3, 7, 2)
+
+
+def test_a_campaign_of_a_guided_scenario_flies_missions(mission: Definition) -> None:
+    chunk = fly_chunk_figures(mission.model_dump_json(), (0, 0))
+    assert not chunk.diverged.any()
+    for number in (0, 1):
+        tape = simulate(mission.aircraft_scenario(number))
+        log, figures = tape["guidance"], {name: values[number] for name, values in chunk.figures.items()}
+        largest = np.max(np.abs(log["xtrack"]))
+        assert figures["max.xtrack"] == largest
+        assert figures["score"] == pytest.approx(largest / 12.5)  # half a second of flight at 25 m/s
+        assert figures["max.phi"] == np.max(np.abs(log["pose.phi"]))
+        assert figures["rms.q"] == pytest.approx(np.sqrt(np.mean(error(tape)["q"] ** 2)))
+    assert chunk.figures["score"][0] != chunk.figures["score"][1]  # each has its own A and B
+
+
+def test_the_report_of_missions_says_what_their_score_counts(mission: Definition, tmp_path: Path) -> None:
+    campaign = Campaign.begin(tmp_path, mission)
+    tally = Tally.of(*fly_chunk_figures(mission.model_dump_json(), (0, 0)))
+    write_page(tmp_path / "page.html", campaign.definition, [tally], [tally.summary() | {"factor": 1.0, "fly_again": []}])
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "the largest cross-track error on the route in 12.5 m" in page
+    assert "max xtrack (m)" in page
+    assert "max phi (deg)" in page
+
+
+def test_missions_need_a_route_and_an_airframe_with_matrices() -> None:
+    route = find_scenario("osprey_route")
+    assert route.guidance is not None
+    program = route.vary(guidance={"route": None, "program": {"heading": {"start": [1.0], "value": [1.0]}}})
+    with pytest.raises(ParameterError, match=r"guidance.route: found none, expected a route"):
+        define(program, 2, 0.3, 7, 2)
+    with pytest.raises(ParameterError, match=r"airframe: found jsbsim:c172p, expected an airframe with matrices"):
+        define(find_scenario("jsbsim_c172p_route"), 2, 0.3, 7, 2)
 
 
 def test_a_campaign_flies_the_effect_of_wind_that_its_definition_names(tmp_path: Path) -> None:

@@ -41,8 +41,8 @@ IMPORTS: dict[str, set[str]] = {
         "rise_di_controller",
     },
     "flight_campaign": {
-        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.report",
-        "flight_core", "reference_model", "rise_di_controller",
+        "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.metrics",
+        "flight_analysis.report", "flight_core", "guidance", "reference_model", "rise_di_controller",
     },
     "flight_bringup": {
         "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.report", "flight_core", "flight_log", "guidance",

@@ -19,6 +19,7 @@ from aircraft_sim.uncertainty import WindEffect, gust_directions, sampled_matric
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
+from flight_campaign.missions import fly_mission, require_mission
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.files import writing
 from flight_core.parameters import ParameterError, Parameters, require
@@ -102,6 +103,8 @@ def define(
         names = ", ".join(SWEPT)
         require(sweep.parameter in SWEPT, "--sweep", sweep.parameter, f"a parameter of the controller: {names}")
         require(all(factor > 0.0 for factor in sweep.factors), "--sweep", sweep.factors, "factors above 0")
+    if scenario.guidance is not None:
+        require_mission(scenario)
     published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
     values = {
         "name": scenario.name,
@@ -135,13 +138,17 @@ def fly_chunk(text: str, job: Job) -> str:
 
 
 def fly_chunk_figures(text: str, job: Job) -> Chunk:
-    """Fly a chunk of a campaign, aircraft by aircraft."""
+    """Fly a chunk of a campaign, aircraft by aircraft. One of a guided scenario flies missions."""
     from flight_campaign import fleet  # noqa: PLC0415 - JAX, which the command needs only for flights
 
     definition = Definition.model_validate_json(text)
     case, chunk = job
-    scenario, course, vehicle, law = _prepare(text, case)
     first, count, part = chunk * definition.chunk, definition.size(job), definition.uncertainty
+    if "guidance" in definition.sections:
+        flown = [fly_mission(definition.aircraft_scenario(number, case)) for number in range(first, first + count)]
+        by_name = {name: np.array([one.figures[name] for one in flown]) for name in flown[0].figures}
+        return Chunk(first, np.array([one.diverged for one in flown]), by_name)
+    scenario, course, vehicle, law = _prepare(text, case)
     # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft are dropped.
     airframe = load_airframe(scenario.aircraft.airframe)
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, definition.chunk)

@@ -10,10 +10,12 @@ import numpy as np
 import plotly.graph_objects as go
 
 from aircraft_sim.uncertainty import WindEffect
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.metrics import CAPTURE_TIME
 from flight_analysis.report.comparison import COLOURS
 from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
 from flight_analysis.report.plotting import SampleStore, set_layout, subplot, subplot_grid
-from flight_analysis.report.summary import NO_UNIT, Column, DisplayUnit, display_units
+from flight_analysis.report.summary import NO_UNIT, QUANTITY_UNITS, Column, DisplayUnit, display_units
 from flight_analysis.report.tables import Table
 from flight_campaign.campaign import Definition
 from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
@@ -26,15 +28,15 @@ SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 
 def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cases: Sequence[Mapping[str, Any]]) -> None:
     """Write the report of a campaign: one tally and the figures of the summary for each case."""
-    units = display_units(definition.scenario())
+    scenario = definition.scenario()
+    units = QUANTITY_UNITS | display_units(scenario)
     labels = _labels(definition)
     title = f"Campaign {definition.name}"
     text = (
         f"{tallies[0].flights} aircraft, every entry of A and B within"
         f" ±{100 * definition.uncertainty:g} % of the airframe, seed {definition.seed}; the same wind and noise for all, the"
         f" effect of wind on x_dot {WIND_EFFECTS[definition.wind]}; true errors at the controller's ticks."
-        " Score: the sum over the channels of rms error in"
-        f" 10 mrad/s (p: 20) and 0.1 m/s; loss of track: a score above {LOSS_OF_TRACK_SCORE:g}."
+        f" Score: {score_meaning(scenario)}; loss of track: a score above {LOSS_OF_TRACK_SCORE:g}."
     )
     tables = [_ends(labels, cases), *(_figures(label, one, units) for label, one in zip(labels, tallies, strict=True))]
     tables.append(_worst(labels, cases))
@@ -50,6 +52,14 @@ def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cas
     ]
     page = Page(title, [Line(text)], [TableGroup(tables)], sections, SampleStore())
     path.write_text(page_html(page), encoding="utf-8")
+
+
+def score_meaning(scenario: Scenario) -> str:
+    """What the score of a campaign counts."""
+    if scenario.guidance is not None:
+        half = CAPTURE_TIME * scenario.aircraft.channels().speed
+        return f"the largest cross-track error on the route in {half:g} m, {CAPTURE_TIME:g} s of flight at the trim speed"
+    return "the sum over the channels of rms error in 10 mrad/s (p: 20) and 0.1 m/s"
 
 
 def _labels(definition: Definition) -> list[str]:

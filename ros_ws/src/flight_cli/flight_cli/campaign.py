@@ -14,15 +14,17 @@ from rich.console import Console
 from aircraft_sim.uncertainty import WindEffect
 from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.report.run_folder import REPORT, SUMMARY, new_run
-from flight_analysis.report.summary import display_units
+from flight_analysis.report.summary import QUANTITY_UNITS, display_units
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import Campaign, Definition, Sweep, define
 from flight_campaign.campaign_report import WIND_EFFECTS, write_page
+from flight_campaign.missions import MISSION_CHUNK
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
 from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, SHOWN_COLUMN, display_path, new_table, parse_numbers, progress_bar
 from flight_core.parameters import require
 
+CHUNK = 1000  # aircraft computed at once
 RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
 
 
@@ -48,7 +50,10 @@ def campaign(
         str | None, typer.Option(help="A controller parameter and factors to multiply it by, as in beta=0.5,1,2.")
     ] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")] = None,
-    chunk: Annotated[int, typer.Option(min=1, help="Aircraft computed at once; use more on a GPU.")] = 1000,
+    chunk: Annotated[
+        int | None,
+        typer.Option(min=1, help="Aircraft computed at once; 1000, or 10 where they fly a route. Use more on a GPU."),
+    ] = None,
     engine: Annotated[EngineName, typer.Option(help="Threads of this process, or processes and hosts of dask.")] = (
         EngineName.THREADS
     ),
@@ -68,7 +73,8 @@ def campaign(
         monte_carlo = Campaign.resume(resume)
     else:
         chosen = find_scenario(str(scenario), duration)
-        definition = define(chosen, aircraft, uncertainty, seed, chunk, None if sweep is None else _parse_sweep(sweep), wind)
+        size = chunk or (CHUNK if chosen.guidance is None else MISSION_CHUNK)
+        definition = define(chosen, aircraft, uncertainty, seed, size, None if sweep is None else _parse_sweep(sweep), wind)
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
     speed = _fly_missing(monte_carlo, flies, quiet=as_json)
@@ -150,7 +156,7 @@ def _write_worst(monte_carlo: Campaign, case: int, tally: Tally) -> list[dict[st
 
 
 def _show(console: Console, definition: Definition, case: int, tally: Tally, figures: dict[str, Any]) -> None:
-    units = display_units(definition.scenario(case))
+    units = QUANTITY_UNITS | display_units(definition.scenario(case))
     title = f"\n{definition.name}: {tally.flights} aircraft within +-{100 * definition.uncertainty:g} %, seed {definition.seed}"
     title += f", effect of wind {WIND_EFFECTS[definition.wind]}"
     if definition.sweep is not None:
