@@ -31,7 +31,9 @@ fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
 
 test: check
-	$(BIN)/python -m pytest $(ARGS)
+	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; \
+	  $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile tests/pure tests/docs tests/fuzz || status=$$?; \
+	  $(BIN)/python -m pytest tests/ros || status=$$?; exit $$status) # flights in real time have the host for themselves
 
 test-sitl: setup-all
 	$(BIN)/python -m pytest tests/sitl $(ARGS)
