@@ -33,9 +33,12 @@ from guidance.route_file import Waypoint
 from guidance.vertical import VerticalParams
 
 OUTPUTS = ("q", "V", "p", "r")
-BY_RULE = ("outputs", "natural_frequency", "speed", "throttle_authority")
+BY_RULE = ("outputs", "natural_frequency", "speed", "throttle_authority", "roll_authority")
 FLOOR_FRACTION = 0.8
 """Speed floor over the trim speed where no stall speed is known."""
+
+FASTEST_ROLL = 0.35
+"""rad/s, 20 deg/s."""
 
 STEEPEST = 0.1
 """Largest climb and sink rate over the trim speed."""
@@ -87,6 +90,9 @@ class GuidanceParameters(KeyedParameters):
     throttle_authority: Annotated[tuple[Positive, ...], BeforeValidator(as_tuple)] = Field(
         default=(), description="deceleration and acceleration of full throttle down and up from trim, m/s^2"
     )
+    roll_authority: Positive | None = Field(
+        default=None, description="roll acceleration of full aileron from trim, rad/s^2; none: not known"
+    )
     stall_speed: Positive | None = Field(
         default=None, description="V_s, m/s, true airspeed; none: the speed floor 1.15 V_s is 0.8 V0"
     )
@@ -95,7 +101,9 @@ class GuidanceParameters(KeyedParameters):
     bank: Annotated[float, Field(gt=0, le=math.radians(60.0))] = Field(
         default=math.radians(30.0), description="largest bank phi_max, rad"
     )
-    roll_rate: Positive = Field(default=0.15, description="largest rate of the bank p_max, rad/s")
+    roll_rate: Positive | None = Field(
+        default=None, description="largest rate of the bank p_max, rad/s; none: by the aileron's authority"
+    )
     load: Positive = Field(default=0.3, description="largest change of the load factor by pitch, 1")
     pitch: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(math.radians(-15.0), math.radians(25.0)), description="least and largest pitch, rad"
@@ -105,7 +113,9 @@ class GuidanceParameters(KeyedParameters):
     acceleration: Positive = Field(default=1.0, description="permitted vertical acceleration, m/s^2")
     altitude_gain: Positive = Field(default=0.2, description="k_h, climb rate per altitude error, 1/s")
     alpha_time: Positive = Field(default=2.0, description="time constant of the estimated angle of attack, s")
-    sideslip_gain: NonNegative = Field(default=0.5, description="k_beta, 1/s, used where `pose` has beta")
+    sideslip_gain: NonNegative | None = Field(
+        default=None, description="k_beta, 1/s, used where `pose` has beta; none: by rule, at most 0.5"
+    )
     period: Positive | None = Field(default=None, description="period of path following, s; none: the least one by rule")
     damping: Annotated[float, Field(ge=0.5, le=1.0)] = Field(default=0.75, description="damping of path following, 1")
     capture: Annotated[float, Field(gt=0, le=math.pi / 4.0)] = Field(
@@ -151,9 +161,22 @@ class GuidanceParameters(KeyedParameters):
     def _floor(self) -> float:
         return FLOOR_FRACTION * self.speed if self.stall_speed is None else protection.speed_floor(self.stall_speed)
 
+    def largest_roll_rate(self) -> float:
+        """p_max, rad/s: 0.35, or less where 0.4 w p_max, the largest p_m_dot after a step, is a third of the authority."""
+        frequency = self.natural_frequency[self.outputs.index("p")]
+        authority = math.inf if self.roll_authority is None else self.roll_authority
+        return self.roll_rate or min(FASTEST_ROLL, authority / (3.0 * 0.4 * frequency))
+
+    def k_beta(self) -> float:
+        """k_beta = min(0.5, k_chi V0 d / s), 1/s: a lateral gust of s = 1.5 m/s turns a held heading by d = 1 deg."""
+        if self.sideslip_gain is not None:
+            return self.sideslip_gain
+        k_chi = self.natural_frequency[self.outputs.index("p")] / 14.0
+        return min(0.5, k_chi * self.speed * math.radians(1.0) / 1.5)
+
     def least_period(self) -> float:
         """Least period of path following, s."""
-        return least_period(self.speed, self.bank, self.roll_rate)
+        return least_period(self.speed, self.bank, self.largest_roll_rate())
 
     def least_radius(self) -> float:
         """Least radius of fillets and orbits, m."""
@@ -170,9 +193,9 @@ class GuidanceParameters(KeyedParameters):
         frequency = dict(zip(self.outputs, self.natural_frequency, strict=True))
         floor, (climb, sink) = self._floor(), self.climb_limits()
         roll, pitch = frequency["p"] / 4.0, frequency["q"] / 4.0
-        turn = GRAVITY * math.tan(self.bank) / self.speed
+        turn, roll_rate = GRAVITY * math.tan(self.bank) / self.speed, self.largest_roll_rate()
         slew = {
-            "p": frequency["p"] * self.roll_rate,
+            "p": frequency["p"] * roll_rate,
             "q": frequency["q"] * (self.load * GRAVITY / self.speed + turn * math.sin(self.bank)),
             "r": frequency["r"] * turn,
             "V": 0.25 * frequency["V"],
@@ -182,7 +205,7 @@ class GuidanceParameters(KeyedParameters):
             period_ns=period_ns(self.rate, "rate"),
             speed=self.speed,
             k_chi=roll / 3.5,
-            attitude=AttitudeParams(roll, pitch, self.roll_rate, self.load, 20.0, self.sideslip_gain),
+            attitude=AttitudeParams(roll, pitch, roll_rate, self.load, 20.0, self.k_beta()),
             vertical=VerticalParams(self.altitude_gain, self.acceleration, climb, sink, self.alpha_time),
             path=PathParams(self.period or self.least_period(), self.damping, self.capture),
             limits=Limits(self.bank, self.pitch[0], self.pitch[1], floor, floor / protection.FLOOR, self.least_radius()),
@@ -202,7 +225,7 @@ class GuidanceParameters(KeyedParameters):
         """Legs through waypoints. Raises ParameterError for a route that cannot be flown."""
         floor, (climb, sink) = self._floor(), self.climb_limits()
         stall, flown = floor / protection.FLOOR, speeds(waypoints, self.speed)
-        can = Performance(self.speed, stall, self.bank, self.roll_rate, climb, sink, self.wind)
+        can = Performance(self.speed, stall, self.bank, self.largest_roll_rate(), climb, sink, self.wind)
         banks = [protection.bank_limit(self.bank, stall, max(speed, floor)) for speed in flown]
         radius = max(least_radius(speed, self.wind, bank) for speed, bank in zip(flown, banks, strict=True))
         legs = flyable_legs(waypoints, self.radius or math.ceil(radius), self.period or self.least_period(), can)

@@ -113,8 +113,9 @@ def guidance_by_rule(
 ) -> dict[str, Any]:
     """Parameters of guidance that follow from the other sections.
 
-    The throttle's authority is abs(Omega_VV) u of RISE-DI, Omega_ii = omega / input_scale, with the limits of u from trim; none
-    where the controller has no such numbers. Raises ParameterError for a model or an aircraft that guidance cannot fly.
+    The authorities of throttle and aileron are abs(Omega_ii) u of RISE-DI, Omega_ii = omega / input_scale, with the limits of
+    u from trim; none where the controller has no such numbers. Raises ParameterError for a model or an aircraft that guidance
+    cannot fly.
     """
     key, channels = "reference_model.second_order", aircraft.channels()
     if reference.second_order is None:
@@ -127,9 +128,14 @@ def guidance_by_rule(
         "speed": channels.speed,
     }
     if isinstance(controller, RiseDiParameters) and controller.lower and controller.upper:
-        i = controller.outputs.index("V")
-        slope = controller.omega[i] / controller.input_scale[i]
-        values["throttle_authority"] = (-controller.lower[i] * slope, controller.upper[i] * slope)
+
+        def effect(i: int) -> float:
+            return controller.omega[i] / controller.input_scale[i]
+
+        at_p, at_v = (controller.outputs.index(name) for name in ("p", "V"))
+        down, up = (abs(limits[at_v]) * effect(at_v) for limits in (controller.lower, controller.upper))
+        values["throttle_authority"] = (down, up)
+        values["roll_authority"] = min(-controller.lower[at_p], controller.upper[at_p]) * effect(at_p)
     return values
 
 
