@@ -1,0 +1,360 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Acceptance of guidance: holds, a rectangle and an orbit, by rule alone, in calm air and in turbulence of 1.5 m/s.
+
+    .venv/bin/python -m benchmarks.guidance [--only osprey_servo c172p] [--manoeuvres heading orbit] [--seeds 5]
+
+Flights in one process. Each row is a figure with its limit; in turbulence it is the worst of all seeds. The rectangle is flown
+without wind and with a wind of a fifth of the airspeed across its first leg. No number is tuned to an aircraft. The 737 is
+identified first, which takes some minutes.
+"""
+
+import argparse
+import math
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from benchmarks.sampling import new_table
+from rich.console import Console
+
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_bringup.scenarios import find_scenario
+from flight_core.outcome import COMPLETED
+from flight_core.tape import Tape
+from flight_core.units import GRAVITY
+from flight_core.vectors import FloatArray
+from guidance.lateral import least_radius
+from guidance.params import GuidanceParameters
+from guidance.protection import FLOOR
+
+SIGMA = 1.5  # m/s, of the turbulence
+START = 5.0  # s, of the command
+BANK, TURN, CLIMB, FASTER = math.radians(20.0), math.pi / 2.0, 100.0, 0.1  # rad, rad, m, of V0
+WIND = 0.2  # of V0
+SIDES = (3.0, 2.5)  # of the rectangle, in radii
+LOW, LOW_WIND = 100.0, 10.9  # m and m/s at 20 ft, for an airframe without altitude: lateral intensity 1.5 m/s, MIL-F-8785C
+SWITCH_PERIOD = 5.0  # s
+
+
+class Air(NamedTuple):
+    """The air of a flight."""
+
+    name: str
+    seed: int | None = None
+    across: float = 0.0  # wind to the east, of V0
+
+
+class Figure(NamedTuple):
+    """A figure of a flight and its limit."""
+
+    name: str
+    value: float
+    limit: float
+
+
+class Manoeuvre(NamedTuple):
+    """A manoeuvre: the section of guidance and the duration, s; and its figures."""
+
+    plan: Callable[[GuidanceParameters], tuple[dict[str, Any], float]]
+    figures: Callable[[Tape, GuidanceParameters, bool], Iterator[Figure]]  # the last: whether the air is calm
+    winds: tuple[float, ...] = (0.0,)
+    turbulent: bool = True
+
+
+def program(**channels: float) -> dict[str, Any]:
+    """Commands from START on."""
+    return {name: {"start": [START], "value": [value]} for name, value in channels.items()}
+
+
+def after(tape: Tape, t: float, *names: str) -> tuple[FloatArray, ...]:
+    """Channels of `guidance` from t on."""
+    keep = tape.time("guidance") >= t
+    return tuple(tape["guidance"][name][keep] for name in names)
+
+
+def settled(tape: Tape, name: str, target: float, band: float) -> float:
+    """Time from START until a channel stays within a band, s."""
+    t, outside = tape.time("guidance"), np.abs(tape["guidance"][name] - target) > band
+    return float(t[np.flatnonzero(outside)[-1]] - START) if outside.any() else 0.0
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def of_phi(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+    """Overshoot and settling of a step of the bank; rms in turbulence."""
+    if calm:
+        yield Figure("overshoot (%)", 100.0 * (tape["guidance"]["pose.phi"].max() / BANK - 1.0), 8.0)
+        yield Figure("settled to 1 deg (s)", settled(tape, "pose.phi", BANK, math.radians(1.0)), 4.0)
+    else:
+        yield Figure("rms (deg)", math.degrees(rms(after(tape, START + 5.0, "pose.phi")[0] - BANK)), 3.0)
+
+
+def of_heading(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+    """Overshoot of a turn, and what it costs in altitude and airspeed."""
+    psi, altitude, V = after(tape, START, "pose.psi", "pose.altitude", "y.V")
+    yield Figure("overshoot (%)", 100.0 * (np.unwrap(psi).max() / TURN - 1.0), 2.0 if calm else 5.0)
+    yield Figure("altitude (m)", np.abs(altitude - altitude[0]).max(), 5.0 if calm else 15.0)
+    yield Figure("V (m/s)", np.abs(V).max(), 2.0 if calm else 5.0)
+
+
+def of_altitude(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+    """Overshoot of a climb and what it costs in airspeed."""
+    altitude, V = after(tape, START, "pose.altitude", "y.V")
+    start = tape["guidance"]["target.altitude"][0]
+    yield Figure("overshoot (%)", 100.0 * ((altitude.max() - start) / CLIMB - 1.0), 3.0 if calm else 20.0)
+    if calm:
+        yield Figure("V (m/s)", np.abs(V).max(), 4.0)
+    else:
+        yield Figure("V below 0.8 V0 (m/s)", 0.8 * section.speed - (section.speed + V.min()), 2.0)
+
+
+def of_speed(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+    """Overshoot of an acceleration and what it costs in altitude; rms of V in turbulence over that of the wind."""
+    altitude, V = after(tape, START, "pose.altitude", "y.V")
+    step = FASTER * section.speed
+    if calm:
+        yield Figure("overshoot (%)", 100.0 * (V.max() / step - 1.0), 5.0)
+        yield Figure("altitude (m)", np.abs(altitude - altitude[0]).max(), 3.0)
+    else:
+        end = tape.time("guidance")[-1]
+        late = after(tape, end - 60.0, "y.V")[0]
+        yield Figure("rms over wind's", rms(late - step) / SIGMA, 1.2)
+
+
+def of_rectangle(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+    """Largest cross-track error from 30 s on and before the last orbit, in s of flight."""
+    leg, xtrack = after(tape, 30.0, "leg", "xtrack")
+    flown = np.abs(xtrack[leg < leg.max()])
+    if leg.max() < 7.0:
+        yield Figure("legs flown", leg.max(), -math.inf)
+    yield Figure("cross-track (s)", flown.max() / section.speed, 0.35 if calm else 0.5)
+
+
+def of_orbit(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+    """Rms of the cross-track error, in s of flight."""
+    end = tape.time("guidance")[-1]
+    yield Figure("rms (s)", rms(after(tape, end - lap(section), "xtrack")[0]) / section.speed, 0.02 if calm else 0.15)
+
+
+def of_switch(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+    """Largest jump of u within 20 ms of a change of the mode, in percent of the range of each input."""
+    t, u = tape.time("u"), tape["u"].values
+    span = u.max(axis=0) - u.min(axis=0)
+    limits = np.array([RANGES.get(name, one) for name, one in zip(tape["u"].names, span, strict=True)])
+    jumps = [np.abs(u[at + 2] - u[at]) / limits for at in np.searchsorted(t, START + SWITCH_PERIOD * np.arange(len(SWITCHES)))]
+    yield Figure("jump of u (% of range)", 100.0 * float(np.max(jumps)), 2.0)
+
+
+RANGES: dict[str, float] = {}
+"""Range of each input of the aircraft that flies."""
+
+
+def of_limits(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+    """How far the bank is beyond its limit, and the airspeed below nine tenths of the floor, in any manoeuvre."""
+    phi, V = after(tape, 0.0, "pose.phi", "y.V")
+    yield Figure("bank beyond (deg)", math.degrees(np.abs(phi).max() - section.bank), 2.0 if calm else 3.0)
+    floor = section.params().limits.stall_speed * FLOOR
+    yield Figure("V below 0.9 floor (m/s)", 0.9 * floor - (section.speed + V.min()), 0.0)
+
+
+def lap(section: GuidanceParameters) -> float:
+    """Time round the smallest orbit, s."""
+    return 2.0 * math.pi * section.least_radius() / section.speed
+
+
+def rectangle(section: GuidanceParameters) -> tuple[dict[str, Any], float]:
+    """A rectangle with fillets of the least radius, without altitude changes."""
+    radius = math.ceil(least_radius(section.speed, section.wind, section.bank))
+    length, width = (side * radius for side in SIDES)
+    route = {"north": [0.0, length, length, 0.0, 0.0], "east": [0.0, 0.0, width, width, 0.0]}
+    slowest = section.speed - section.wind
+    return {"route": route, "radius": float(radius)}, 2.0 * (length + width) / slowest
+
+
+SWITCHES: tuple[dict[str, float], ...] = (
+    {"phi": 0.3},
+    {"heading": 0.5, "climb": 0.5},
+    {"course": -0.5, "altitude": 0.0},
+    {"phi": -0.2, "theta": 0.0},
+    {"heading": 1.0, "altitude": 0.0},
+)
+"""Commands one after another; altitude and theta count from those of trim."""
+
+
+def switching(section: GuidanceParameters) -> tuple[dict[str, Any], float]:
+    """A change of both modes every SWITCH_PERIOD."""
+    steps: dict[str, dict[str, list[float]]] = {}
+    for k, switch in enumerate(SWITCHES):
+        for name, value in switch.items():
+            channel = steps.setdefault(name, {"start": [], "value": []})
+            channel["start"].append(START + SWITCH_PERIOD * k)
+            channel["value"].append(value)
+    return {"program": steps}, START + SWITCH_PERIOD * len(SWITCHES)
+
+
+MANOEUVRES: Mapping[str, Manoeuvre] = {
+    "phi": Manoeuvre(lambda _: ({"program": program(phi=BANK)}, 30.0), of_phi),
+    "heading": Manoeuvre(
+        lambda section: (
+            {"program": program(heading=TURN)},
+            START + TURN * section.speed / (GRAVITY * math.tan(section.bank)) + 40.0,
+        ),
+        of_heading,
+    ),
+    "altitude": Manoeuvre(
+        lambda section: ({"program": program(altitude=CLIMB)}, START + CLIMB / section.climb_limits()[0] + 60.0), of_altitude
+    ),
+    "V": Manoeuvre(
+        lambda section: (
+            {"program": program(V=(1.0 + FASTER) * section.speed)},
+            START + FASTER * section.speed / section.params().slew[section.outputs.index("V")] + 80.0,
+        ),
+        of_speed,
+    ),
+    "rectangle": Manoeuvre(rectangle, of_rectangle, (0.0, WIND)),
+    "orbit": Manoeuvre(
+        lambda section: (
+            {"program": program(north=0.0, east=section.least_radius() + 1.0, radius=section.least_radius() + 1.0)},
+            2.0 * lap(section) + 30.0,
+        ),
+        of_orbit,
+    ),
+    "switch": Manoeuvre(switching, of_switch, turbulent=False),
+}
+
+
+def prepared(scenario: Scenario) -> Scenario:
+    """A scenario with guidance by rule in calm air, without the commands and the gusts of its own."""
+    aircraft: dict[str, Any] = {"gusts": {}, "turbulence": None}
+    if not scenario.aircraft.is_jsbsim:
+        aircraft |= {"kinematics": "euler"}
+    live = {"speed": scenario.aircraft.channels().speed}
+    reference = {"live": live, "pulses": {}, "sines": {}, "coordinated_turn": None}
+    return scenario.vary(aircraft=aircraft, reference_model=reference).vary(guidance={})
+
+
+@cache
+def aircraft_of(name: str) -> Scenario:
+    """The scenario of an aircraft, with guidance."""
+    if name == "osprey_servo":
+        slower = {"rate": 100.0, "step": 0.005}  # as the law: four times faster than with 500 Hz
+        return prepared(find_scenario(name).vary(aircraft=slower, reference_model={"rate": 100.0}))
+    if name in {"c172p", "f16"}:
+        return prepared(find_scenario(f"jsbsim_{name}"))
+    from flight_analysis.design.identification import identify  # noqa: PLC0415 - for this aircraft alone
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"jsbsim_{name}.yaml"
+        path.write_text(identify(name, *CONDITIONS[name]).text, encoding="utf-8")
+        return prepared(load_scenario(path))
+
+
+CONDITIONS: Mapping[str, tuple[float, float]] = {"737": (154.0, 6096.0)}
+"""Trim speed, m/s, and altitude, m, of the aircraft that are identified."""
+AIRCRAFT = ("osprey_servo", "c172p", *CONDITIONS, "f16")
+
+
+def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure]:
+    """The figures of a flight."""
+    guidance = scenario.guidance
+    if guidance is None:
+        raise ValueError(f"{scenario.name} has no guidance")
+    speed, altitude = guidance.speed, scenario.aircraft.altitude or 0.0
+    section, duration = manoeuvre.plan(guidance.model_copy(update={"wind": air.across * speed}))
+    for name in ("altitude", "theta"):
+        if name in section.get("program", {}):
+            offset = altitude if name == "altitude" else trim_pitch(scenario)
+            section["program"][name]["value"] = [offset + value for value in section["program"][name]["value"]]
+    if "route" in section:
+        section["route"]["altitude"] = [altitude] * len(section["route"]["north"])
+    aircraft: dict[str, Any] = {"wind": [0.0, air.across * speed]}
+    if manoeuvre.figures is of_switch:
+        aircraft["sensors"] = {}  # noise moves u by itself
+    if air.seed is not None:
+        low = {"altitude": LOW, "wind": LOW_WIND} if altitude == 0.0 else {"altitude": altitude, "sigma": SIGMA}
+        aircraft["turbulence"] = low | {"seed": air.seed}
+    varied = scenario.vary(flight={"duration": duration}, aircraft=aircraft, guidance=section | {"wind": air.across * speed})
+    controller = scenario.controller
+    RANGES.clear()
+    if controller.lower and controller.upper:
+        RANGES.update(
+            {name: high - low for name, low, high in zip(controller.inputs, controller.lower, controller.upper, strict=True)}
+        )
+    tape = simulate(varied)
+    if tape.outcome != COMPLETED:
+        yield Figure(f"lost: {tape.outcome}", math.inf, 0.0)
+        return
+    calm = air.seed is None
+    yield from manoeuvre.figures(tape, guidance, calm)
+    yield from of_limits(tape, guidance, calm)
+
+
+def trim_pitch(scenario: Scenario) -> float:
+    """Pitch in trim, rad."""
+    return float(simulate(scenario.vary(flight={"duration": 0.1}))["guidance"]["pose.theta"][0])
+
+
+EXEMPT = {("f16", "heading", "altitude (m)"): 40.0, ("f16", "orbit", "rms (s)"): 0.05}
+"""Limits of an aircraft whose rudder is at its stop in turns: its own yaw damper feeds r back without a washout."""
+
+
+class Row(NamedTuple):
+    """The worst value of a figure over the seeds."""
+
+    aircraft: str
+    manoeuvre: str
+    air: str
+    figure: Figure
+
+
+def rows(aircraft: Sequence[str], manoeuvres: Sequence[str], seeds: int) -> Iterator[Row]:
+    """All rows, as they are flown."""
+    for name in aircraft:
+        for title in manoeuvres:
+            manoeuvre = MANOEUVRES[title]
+            for across in manoeuvre.winds:
+                wind = f", wind {across:g} V" if across else ""
+                airs = {f"calm{wind}": [Air("calm", None, across)]}
+                if manoeuvre.turbulent:
+                    airs[f"turbulence{wind}"] = [Air("turbulence", seed + 1, across) for seed in range(seeds)]
+                for shown, several in airs.items():
+                    worst: dict[str, Figure] = {}
+                    for air in several:
+                        for figure in flown(aircraft_of(name), manoeuvre, air):
+                            own = max(figure.limit, EXEMPT.get((name, title, figure.name), figure.limit))
+                            worst[figure.name] = max(
+                                figure._replace(limit=own), worst.get(figure.name, figure), key=lambda one: one.value
+                            )
+                    yield from (Row(name, title, shown, figure) for figure in worst.values())
+
+
+def main() -> None:
+    """Fly and print the table; exit status 1 where a limit is not met."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="*", choices=AIRCRAFT, default=AIRCRAFT, help="aircraft")
+    parser.add_argument("--manoeuvres", nargs="*", choices=[*MANOEUVRES], default=[*MANOEUVRES], help="manoeuvres")
+    parser.add_argument("--seeds", type=int, default=5, help="of the turbulence")
+    options = parser.parse_args()
+    table = new_table("Guidance by rule", ("aircraft", "manoeuvre", "air", "figure", "worst", "limit", ""), texts=4)
+    missed = 0
+    for row in rows(options.only, options.manoeuvres, options.seeds):
+        met = row.figure.value <= row.figure.limit
+        missed += not met
+        cells = (*row[:3], row.figure.name, f"{row.figure.value:.3g}", f"{row.figure.limit:.3g}", "" if met else "missed")
+        print(*cells, sep="\t", file=sys.stderr, flush=True)
+        table.add_row(*cells)
+    Console().print(table)
+    sys.exit(missed > 0)
+
+
+if __name__ == "__main__":
+    main()
