@@ -172,7 +172,7 @@ def test_a_command_that_cannot_be_flown_is_refused_and_changes_nothing(values: d
 @pytest.mark.parametrize(
     ("section", "sentence"),
     [
-        ({"period": 15.0}, r"guidance.period: found 15.0 s, expected at least 24.5 s: max\(14 s"),
+        ({"period": 13.0}, r"guidance.period: found 13.0 s, expected at least 14 s: max\(14 s"),
         ({"outputs": ["q", "V", "p"]}, r"guidance.outputs: found q, V, p, expected q, V, p, r"),
         ({"stall_speed": 24.0}, r"guidance.stall_speed: found 24.0 m/s, expected a floor of 1.15 V_s below 25 m/s"),
         ({"program": program(bank=0.1)}, r"guidance.program.bank: found a channel, expected one of phi"),
@@ -196,6 +196,10 @@ def test_the_numbers_that_are_left_out_follow_from_the_other_sections() -> None:
     params = section.params()
     assert (params.attitude.k_phi, params.attitude.k_theta, params.limits.floor) == (1.25, 1.0, 20.0)
     assert (params.vertical.climb, params.path.period) == (2.5, section.least_period())
+    assert params.attitude.k_beta == pytest.approx(5.0 / 14.0 * 25.0 * math.radians(1.0) / 1.5)
+    assert params.attitude.roll_rate == 0.35  # 45 rad/s^2 of aileron would permit more
+    weak = GuidanceParameters.validate_mapping(SECTION | {"roll_authority": 1.036}, "guidance")
+    assert weak.largest_roll_rate() == pytest.approx(1.036 / 6.0)  # the 737 of JSBSim
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,31 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmark of guidance at a small size: one manoeuvre in calm air, and figures of a flight that is known."""
+
+import math
+
+import numpy as np
+import pytest
+from benchmarks import guidance as benchmark
+
+from flight_core.tape import Signal, Tape
+
+
+def test_a_step_of_the_bank_is_flown_within_its_limits() -> None:
+    rows = list(benchmark.rows(["osprey_servo"], ["phi"], seeds=0))
+    assert [row.figure.name for row in rows][:2] == ["overshoot (%)", "settled to 1 deg (s)"]
+    for row in rows:
+        assert row.figure.value <= row.figure.limit, row
+
+
+def test_a_known_step_has_the_figures_that_it_must_have() -> None:
+    # 10 % beyond 20 deg from 1 s after the start, then exact from 3 s on.
+    t = np.arange(0, 1000) * 0.02
+    phi = benchmark.BANK * np.where(t < 6.0, 0.0, np.where(t < 8.0, 1.1, 1.0))
+    signal = Signal((t * 1e9).round().astype(np.int64), ("pose.phi",), phi[:, None])
+    section = benchmark.aircraft_of("osprey_servo").guidance
+    assert section is not None
+    overshoot, settled = benchmark.of_phi(Tape({"guidance": signal}), section, calm=True)
+    assert overshoot.value == pytest.approx(10.0)
+    assert settled.value == pytest.approx(3.0, abs=0.03)  # within 1 deg = 5 %
+    assert math.isclose(benchmark.lap(section), 2.0 * math.pi * section.least_radius() / 25.0)
