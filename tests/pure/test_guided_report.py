@@ -4,6 +4,7 @@
 
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from flight_analysis.metrics import part_masks
 from flight_analysis.report import guided_figures
 from flight_analysis.report.figures import plot_context
 from flight_analysis.report.guided import guidance_summary, segments
+from flight_analysis.report.html import write_page
 from flight_analysis.report.summary import RecordedFlight, summarise, transients
 from flight_analysis.report.tables import flight_tables
 from flight_bringup.scenarios import find_scenario
@@ -191,6 +193,17 @@ def test_the_figures_of_a_flight_are_those_of_its_scenario(flight: RecordedFligh
     bounds = guided_figures.bounds_of(flight.scenario)
     assert bounds["V"] == (0.8 * 25.0, math.inf)  # by rule, without a stall speed
     assert guided_figures.mean_wind(flight.tape, 25.0) == pytest.approx(np.array([[3.0, 0.0]] * 8), abs=1.0)  # less turbulence
+
+
+def test_a_comparison_draws_all_ground_tracks_over_the_route(flight: RecordedFlight, tmp_path: Path) -> None:
+    other = flight._replace(name="other")
+    write_page(tmp_path / "page.html", [flight, other])
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert page.count("<h2>Ground track</h2>") == 1
+    route = guided_figures.flown_route(flight.scenario, flight.tape)
+    tracks = {"one": (flight.tape, "#000000"), "two": (flight.tape, "#111111")}
+    figure = guided_figures.tracks_figure(tracks, route)
+    assert [trace.name for trace in figure.data] == ["route", "one", "two"]
 
 
 def test_a_guided_flight_has_captures_and_turns_in_place_of_commands(flight: RecordedFlight) -> None:

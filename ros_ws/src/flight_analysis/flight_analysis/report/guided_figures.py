@@ -64,19 +64,26 @@ def flown_route(scenario: Scenario, tape: Tape) -> Route | None:
 
 def track_figure(tape: Tape, route: Route | None, speed: float) -> go.Figure:
     """Ground track over the route with its fillets, equal axes, and arrows of the wind. `speed`: trim speed V0, m/s."""
-    pose = tape["guidance"].group("pose")
-    keep = np.unique(np.linspace(0, len(pose.stamp_ns) - 1, TRACK_POINTS).astype(int))
-    north, east = pose["north"][keep], pose["east"][keep]
+    figure = tracks_figure({"flown": (tape, PLANT)}, route)
+    _add_wind(figure, tape, speed)
+    return set_layout(figure, TRACK_HEIGHT, labels=16)
+
+
+def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], route: Route | None) -> go.Figure:
+    """Ground tracks over a route, equal axes: the tape of a guided flight and its colour by label."""
     figure = go.Figure()
     if route is not None:
         line = {"color": REFERENCE, "width": 6.0}
-        path_north, path_east, _ = zip(*route_outline(route), strict=True)
-        figure.add_trace(go.Scatter(x=path_east, y=path_north, mode="lines", name="route", line=line, hoverinfo="skip"))
-    track = go.Scatter(
-        x=east.astype(np.float32), y=north.astype(np.float32), mode="lines", name="flown", line={"color": PLANT, "width": 1.4}
-    )
-    figure.add_trace(track.update(text=[f"t = {t:.1f} s" for t in tape.time("guidance")[keep]], hoverinfo="x+y+text"))
-    _add_wind(figure, tape, speed)
+        north, east, _ = (np.array(values, dtype=np.float32) for values in zip(*route_outline(route), strict=True))
+        figure.add_trace(go.Scatter(x=east, y=north, mode="lines", name="route", line=line, hoverinfo="skip"))
+    for label, (tape, colour) in tracks.items():
+        t, pose = tape.time("guidance"), tape["guidance"].group("pose")
+        keep = np.unique(np.linspace(0, len(t) - 1, TRACK_POINTS).astype(int))
+        north, east = (pose[name][keep].astype(np.float32) for name in ("north", "east"))
+        track = go.Scatter(
+            x=east, y=north, mode="lines", name=label, line={"color": colour, "width": 1.4}, hoverinfo="x+y+text"
+        )
+        figure.add_trace(track.update(text=[f"t = {instant:.1f} s" for instant in t[keep]]))
     figure.update_xaxes(title_text="east (m)")
     figure.update_yaxes(title_text="north (m)", scaleanchor="x", scaleratio=1.0)
     return set_layout(figure, TRACK_HEIGHT, labels=16)

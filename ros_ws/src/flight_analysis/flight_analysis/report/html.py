@@ -98,6 +98,12 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
         Section("Spectrum of u", "", figures.spectrum_figure(runs, colours, context.units), over_time=False),
         Section("Timing of the ticks", "", figures.timing_figure(runs, colours), over_time=False),
     ]
+    guided = {label: flight for label, flight in zip(colours, flights, strict=True) if flight.summary["guidance"] is not None}
+    if guided:
+        first = next(iter(guided.values()))
+        route = guided_figures.flown_route(first.scenario, first.tape)
+        tracks = {label: (flight.tape, colours[label]) for label, flight in guided.items()}
+        sections.insert(0, Section("Ground track", "", guided_figures.tracks_figure(tracks, route), over_time=False))
     return Page(f"{len(flights)} flights compared", lines, groups, sections, context.samples)
 
 
