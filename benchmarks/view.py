@@ -156,9 +156,9 @@ def flying(runs: Path, seconds: float) -> Iterator[tuple["subprocess.Popen[str]"
 
 
 @contextmanager
-def watching(run: Path) -> Iterator[tuple[psutil.Popen, str]]:
-    """The server of a run, and its address."""
-    command = [RISE_DI, "watch", str(run), "--wait", "--port", "0"]
+def watching(*runs: Path) -> Iterator[tuple[psutil.Popen, str]]:
+    """The server of a run, or of a run and its ghost, and its address."""
+    command = [RISE_DI, "watch", *map(str, runs), "--wait", "--port", "0"]
     server = psutil.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         yield server, server.stdout.readline().strip()

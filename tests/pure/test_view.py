@@ -157,8 +157,14 @@ def test_samples_beyond_the_limit_become_coarser_and_keep_their_peaks() -> None:
     assert (samples.values.max(), samples.values.min()) == (9.0, -7.0)
     assert (np.diff(samples.stamp_ns) > 0).all()
     assert samples.stamp_ns[[0, -1]].tolist() == [0, 999]
-    samples.append(np.array([998, 1000, 1001], dtype=np.int64), np.ones((3, 2)))
-    assert (samples.refused, int(samples.stamp_ns[-1])) == (1, 1001)
+
+
+def test_a_row_of_a_recovered_overrun_is_kept_in_order_and_one_of_another_time_is_refused() -> None:
+    samples = Series(("a",))
+    for stamps in ([0, 50_000_000], [47_000_000, 60_000_000], [-3_000_000_000, 70_000_000]):
+        samples.append(np.array(stamps, dtype=np.int64), np.ones((2, 1)))
+    assert samples.stamp_ns.tolist() == [0, 50_000_000, 50_000_000, 60_000_000, 70_000_000]
+    assert samples.refused == 1
 
 
 def test_a_browser_gets_thinned_samples_again_from_the_start(recorded: Path) -> None:

@@ -9,7 +9,7 @@ places of its messages: those of other topics cost nothing.
 import math
 import os
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -78,6 +78,12 @@ class Follower:
     def path(self) -> Path | None:
         """The file that is read now; None while there is none. Raises ParameterError for a folder with several bags."""
         return next((file for file in bag_files(self.run) if file not in self._read_files), None)
+
+    def skip(self, topics: Container[str]) -> None:
+        """Read no more messages of these topics, by their full names, in this file."""
+        for channel in self._channels.values():
+            if channel.topic in topics:
+                channel.rate = 0.0
 
     def read(self) -> Iterator[Messages | Attachment | Metadata]:
         """All that was written since the last call. A caller may stop the iteration: the next call continues.

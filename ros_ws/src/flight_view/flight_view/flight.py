@@ -36,8 +36,10 @@ RATE = 50.0  # Hz
 RATES = {"internals": math.inf, **dict.fromkeys(("guidance", "pose", "truth", "u", "y", "y_m"), RATE)}
 """Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples would be hidden."""
 
+IN_TICKS = ("u", "y", "y_m")  # topics that the ticks have, too: not read from the first tick on
+
 GROUPS = {
-    "internals": ("mode", "late", "y", "y_m", "e", "u_free", "u", "limited", "Pi", "integral_e"),
+    "internals": ("mode", "late", "y", "y_m", "e", "u_free", "u", "limited"),
     "truth": ("actuator", "gust"),
     "guidance": ("mode", "leg", "xtrack", "to_go", "phi_c", "theta_c", "climb_c", "V_c", "limited", "target"),
 }
@@ -197,6 +199,8 @@ class Flight:
             if (decode := decoder(messages.topic, messages.type_name)) is None:
                 return
             topic = self._topics[messages.topic] = _Topic(messages.topic.rpartition("/")[2], decode)
+            if topic.name == "internals":
+                self._follower.skip({f"{self._namespace}/{name}" for name in IN_TICKS})
         topic.messages += messages.data
         if len(topic.messages) >= BATCH:
             self._decode(topic)
@@ -269,10 +273,17 @@ class Flight:
         samples = self.samples.get("internals")
         if samples is None or samples.count < 1.1 * self._banded + 2:
             return
-        ticks = Signal(samples.stamp_ns, samples.names, samples.values.astype(float))
-        if (y := ticks.group("y")).names and (y_m := ticks.group("y_m")).names == y.names:
+        y, y_m = (self._ticks(group) for group in ("y", "y_m"))
+        if y.names and y.names == y_m.names:
             self.bands = settling_bands(Tape({"y": y, "y_m": y_m}))
         self._banded = samples.count
+
+    def _ticks(self, group: str) -> Signal:
+        """A group of channels of the ticks."""
+        ticks = self.samples["internals"]
+        columns = [k for k, name in enumerate(ticks.names) if name.startswith(f"{group}.")]
+        names = tuple(ticks.names[k].removeprefix(f"{group}.") for k in columns)
+        return Signal(ticks.stamp_ns, names, ticks.values[:, columns].astype(float))
 
 
 def _text(text: str) -> str:

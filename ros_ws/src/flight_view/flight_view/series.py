@@ -7,8 +7,11 @@ from numpy.typing import NDArray
 
 from flight_core.vectors import FloatArray
 
-MAX_ROWS = 250_000
-"""Rows of a topic. 40 channels then need 40 MB; 100 Hz last 42 min before the samples become coarser."""
+MAX_ROWS = 200_000
+"""Rows of a topic. 30 channels then need 24 MB; 100 Hz last 33 min before the samples become coarser."""
+
+DISORDER_NS = 1_000_000_000
+"""A controller that recovers from an overrun has ticks a few ms older than the one before."""
 
 FIRST_ROWS = 4096
 
@@ -20,7 +23,7 @@ class Series:
         self.names = names
         self.count = 0
         self.thinned = 0  # how often the rows were halved
-        self.refused = 0  # rows older than the row before them
+        self.refused = 0  # rows that are too old
         self._max_rows = max_rows
         self._stamp_ns = np.zeros(FIRST_ROWS, dtype=np.int64)
         self._values = np.zeros((FIRST_ROWS, len(names)), dtype=np.float32)
@@ -36,14 +39,15 @@ class Series:
         return self._values[: self.count]
 
     def append(self, stamp_ns: NDArray[np.int64], values: FloatArray) -> None:
-        """Append rows. A row that is older than one before it is refused."""
-        earliest = self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min
-        ordered = stamp_ns >= np.maximum.accumulate(np.concatenate([[earliest], stamp_ns]))[:-1]
-        self.refused += int(np.count_nonzero(~ordered))
-        stamp_ns, values = stamp_ns[ordered], values[ordered]
-        for start in range(0, len(stamp_ns), self._max_rows // 2):
+        """Append rows. A row up to DISORDER_NS older than one before it takes that one's stamp; an older one is refused."""
+        earliest = self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min + DISORDER_NS
+        ordered = np.maximum.accumulate(np.concatenate([[earliest], stamp_ns]))[1:]
+        kept = stamp_ns >= ordered - DISORDER_NS
+        self.refused += int(np.count_nonzero(~kept))
+        ordered, values = ordered[kept], values[kept]
+        for start in range(0, len(ordered), self._max_rows // 2):
             part = slice(start, start + self._max_rows // 2)
-            self._append_part(stamp_ns[part], values[part])
+            self._append_part(ordered[part], values[part])
 
     def _append_part(self, stamp_ns: NDArray[np.int64], values: FloatArray) -> None:
         if self.count + len(stamp_ns) > self._max_rows:
@@ -51,8 +55,8 @@ class Series:
         end = self.count + len(stamp_ns)
         if end > len(self._stamp_ns):
             size = min(max(end, len(self._stamp_ns) * 3 // 2), max(end, self._max_rows))
-            self._stamp_ns = np.resize(self._stamp_ns, size)
-            self._values = np.resize(self._values, (size, len(self.names)))
+            self._stamp_ns = np.concatenate([self.stamp_ns, np.zeros(size - self.count, dtype=np.int64)])
+            self._values = np.concatenate([self.values, np.zeros((size - self.count, len(self.names)), dtype=np.float32)])
         self._stamp_ns[self.count : end] = stamp_ns
         with np.errstate(over="ignore"):  # beyond float32 a value is drawn as infinite
             self._values[self.count : end] = values

@@ -55,9 +55,10 @@ function timed(flight, name) { // topics of the controller where it has engaged,
 
 // The charts of a flight, by what its log holds; `ghost` is the second flight or null.
 export function chartsOf(flight, ghost) {
-  const {units, limits} = flight.info, charts = [];
+  const {units, limits} = flight.info;
   const unit = name => units[name] ?? {unit: "", factor: 1};
   const line = (topic, channel, label, colour, width, more = {}) => ({flight, topic, channel, label, colour, width, factor: 1, ...more});
+  const charts = guidanceCharts(flight, line);
   const names = group => flight.get("internals")?.group(group) ?? [];
   const outputs = names("y").length ? names("y") : flight.get("y")?.channels ?? [];
   for (const name of outputs) {
@@ -88,7 +89,6 @@ export function chartsOf(flight, ghost) {
     const colours = ["--plant", "--ghost", "--error"];
     charts.push({title: "wind", unit: "m/s", lines: winds.map((name, k) => line("truth", `gust.${name}`, name, colours[k % 3], 1.2))});
   }
-  charts.push(...guidanceCharts(flight, line));
   if (flight.get("pose")?.channels.includes("altitude")) {
     const lines = [line("pose", "altitude", "altitude", "--plant", 1.4)];
     if (flight.get("guidance")?.channels.includes("target.altitude")) lines.unshift(line("guidance", "target.altitude", "command", "--reference", 4));

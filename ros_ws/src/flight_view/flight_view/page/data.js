@@ -97,7 +97,10 @@ export class Flight { // one flight of the server
       this.begin = Math.min(this.begin, t[0]);
       this.end = Math.max(this.end, t[t.length - 1]);
     }
-    if (head.first_event === this.events.length) this.events.push(...head.events.map(([t, kind, text]) => ({t, kind, text})));
+    if (head.first_event === this.events.length) {
+      this.events.push(...head.events.map(([t, kind, text]) => ({t, kind, text})));
+      if (head.events.length) this.events.sort((one, other) => one.t - other.t); // topics arrive one behind another
+    }
     if (head.flight) this.info = {...this.info, ...head.flight};
     const {state, faults, bands, described, ghost} = head;
     this.head = {state, faults, bands, described, ghost};

@@ -91,7 +91,7 @@ export class Scene {
   constructor(canvas, changed) {
     this.canvas = canvas;
     this.mode = "chase";
-    this.distance = 16; // m
+    this.distance = 16; // m, of the camera
     this.azimuth = 0.6; // rad, orbit
     this.elevation = 0.35;
     let held = null;
@@ -110,6 +110,14 @@ export class Scene {
       this.zoom(Math.exp(event.deltaY * 0.0015));
       changed();
     }, {passive: false});
+  }
+
+  show(mode, flight, t) { // the map shows the whole path
+    const pose = flight.get("pose"), north = pose?.column("north"), east = pose?.column("east"), at = poseAt(flight, t);
+    this.mode = mode;
+    this.distance = 16;
+    if (mode !== "map" || !north || !at) return;
+    for (let k = 0; k < pose.count; k += 25) this.distance = Math.max(this.distance, Math.hypot(north[k] - at.place[0], east[k] - at.place[1]) * 1.5);
   }
 
   zoom(factor) {

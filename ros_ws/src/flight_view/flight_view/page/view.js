@@ -10,6 +10,8 @@ const RETRY = 500; // ms between two requests to a server that does not answer
 const GUIDED = [["mode", "guidance"], ["mode.lateral", "lateral"], ["mode.vertical", "vertical"], ["leg", "leg"], ["xtrack", "cross-track"], ["to_go", "to go"]];
 const BADGES = {CONNECTING: "", WAITING: "warn", READING: "", LIVE: "good", "NO DATA": "bad", "NO SERVER": "bad", INTERRUPTED: "warn", ENDED: ""};
 
+const ASKED = parseFloat(new URLSearchParams(location.hash.slice(1)).get("t")); // s, of an address that ends with #t=12.5
+
 const $ = id => document.getElementById(id);
 const flight = new Flight(0);
 let ghost = null, charts = [], chartKey = "", colours = {}, dirty = true, shownEvents = -1;
@@ -59,7 +61,7 @@ function taken() { // a recording is followed at its end; a log that has ended s
     clock.started = flight.head.state !== "reading";
     clock.live = recording;
     view.kind = recording ? "window" : "whole";
-    if (!recording) clock.t = begin();
+    if (!recording) seek(Number.isFinite(ASKED) ? ASKED : begin());
   }
   if (clock.live) {
     clock.t = end();
@@ -131,6 +133,11 @@ function setSpeed(index) {
 
 function setView(kind) {
   view.kind = kind;
+  redraw();
+}
+
+function setCamera(mode) {
+  scene.show(mode, flight, clock.t);
   redraw();
 }
 
@@ -223,7 +230,7 @@ function list(node, lines) {
 function drawReadouts() {
   const pose = poseAt(flight, clock.t), degrees = 180 / Math.PI, guidance = flight.get("guidance");
   const shown = (value, digits, unit) => (Number.isFinite(value) ? `${value.toFixed(digits)} ${unit}` : "-");
-  const heading = pose && Number.isFinite(pose.psi) ? `${((pose.psi * degrees + 360) % 360).toFixed(0).padStart(3, "0")} deg` : "-";
+  const heading = pose && Number.isFinite(pose.psi) ? `${String((Math.round(pose.psi * degrees) + 360) % 360).padStart(3, "0")} deg` : "-";
   const values = {
     heading, roll: shown(pose?.phi * degrees, 1, "deg"), pitch: shown(pose?.theta * degrees, 1, "deg"), altitude: shown(pose?.altitude, 1, "m"),
     "ground speed": shown(pose?.speed, 1, "m/s"), climb: shown(pose?.climb, 1, "m/s"),
@@ -239,19 +246,18 @@ function drawReadouts() {
   Object.values(values).forEach((value, k) => text(node.children[2 * k + 1], value));
 }
 
-function drawEvents() { // newest last; the last one before the cursor is marked
-  const {events} = flight, node = $("events");
-  if (shownEvents > events.length) { node.replaceChildren(); shownEvents = 0; }
-  for (const {t, kind, text: content} of events.slice(Math.max(shownEvents, 0))) {
-    const item = document.createElement("li");
-    item.className = kind;
-    item.textContent = `${t.toFixed(2)} s  ${kind}: ${content}`;
-    item.addEventListener("click", () => seek(t));
-    node.append(item);
+function drawEvents() { // in the order of time; the last one before the cursor is marked
+  const node = $("events");
+  if (shownEvents !== flight.events.length) {
+    shownEvents = flight.events.length;
+    node.replaceChildren(...flight.events.map(({t, kind, text: content}) => {
+      const item = Object.assign(document.createElement("li"), {className: kind, textContent: `${t.toFixed(2)} s  ${kind}: ${content}`});
+      item.addEventListener("click", () => seek(t));
+      return item;
+    }));
     node.scrollTop = node.scrollHeight;
   }
-  shownEvents = events.length;
-  const past = events.findLastIndex(({t}) => t <= clock.t + 1e-9);
+  const past = flight.events.findLastIndex(({t}) => t <= clock.t + 1e-9);
   node.querySelector(".now")?.classList.remove("now");
   node.children[past]?.classList.add("now");
 }
@@ -289,7 +295,7 @@ const ACTIONS = {
   " ": play, l: live, w: () => setView("window"), a: () => setView("whole"), "[": () => jump(-1), "]": () => jump(1),
   ArrowLeft: event => step(-1, event.shiftKey), ArrowRight: event => step(1, event.shiftKey),
   Home: () => seek(begin()), End: () => seek(end()), "-": () => setSpeed(SPEEDS.indexOf(clock.speed) - 1), "+": () => setSpeed(SPEEDS.indexOf(clock.speed) + 1),
-  c: () => { scene.mode = {chase: "orbit", orbit: "map", map: "chase"}[scene.mode]; redraw(); },
+  c: () => setCamera({chase: "orbit", orbit: "map", map: "chase"}[scene.mode]),
 };
 
 function start() {
@@ -299,7 +305,7 @@ function start() {
     ["previous", () => jump(-1)], ["next", () => jump(1)], ["live", live], ["window", () => setView("window")], ["whole", () => setView("whole")]]) {
     $(id).addEventListener("click", action);
   }
-  $("cameras").addEventListener("click", ({target}) => { if (target.dataset.camera) { scene.mode = target.dataset.camera; redraw(); } });
+  $("cameras").addEventListener("click", ({target}) => { if (target.dataset.camera) setCamera(target.dataset.camera); });
   addEventListener("keydown", event => {
     const action = ACTIONS[event.key];
     if (!action || event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select") || (event.key === " " && event.target.closest("button"))) return;
