@@ -15,6 +15,7 @@ import sys
 import tempfile
 import threading
 import time
+import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -111,7 +112,7 @@ class Client(threading.Thread):
         self._opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
         self._base = address.partition("?")[0]
         self._opener.open(address).read()
-        self._stop = threading.Event()
+        self._ended = threading.Event()
         self.delays: list[float] = []
         self.bytes = 0
 
@@ -119,9 +120,9 @@ class Client(threading.Thread):
         """Ask until stopped, or until the server ends."""
         head: dict[str, Any] = {}
         rows: dict[str, int] = {}
-        while not self._stop.wait(1.0 / POLLS):
+        while not self._ended.wait(1.0 / POLLS):
             known = {"epoch": head.get("epoch", ""), "state": head.get("state", ""), "described": "true", **rows}
-            query = "&".join(f"{name}={value}" for name, value in known.items())
+            query = urllib.parse.urlencode(known)
             try:
                 content = self._opener.open(f"{self._base}data/0?{query}").read()
             except OSError:
@@ -130,6 +131,7 @@ class Client(threading.Thread):
             self.bytes += len(content)
             size = int.from_bytes(content[:4], "little")
             head, place = json.loads(content[4 : 4 + size]), 4 + size
+            rows["events"] = head["first_event"] + len(head["events"])
             for topic in head["topics"]:
                 count = topic["count"]
                 if topic["name"] == "internals" and head["state"] == "recording":
@@ -140,7 +142,7 @@ class Client(threading.Thread):
 
     def stop(self) -> None:
         """Ask no more."""
-        self._stop.set()
+        self._ended.set()
         self.join()
 
 

@@ -32,6 +32,8 @@ from flight_log.repair import repair
 from flight_log.rosbag2_metadata import FileContents, TopicCount, bag_metadata_yaml, read_bag_metadata
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
 from flight_log.tape_reader import read_run
+from flight_view.flight import Flight
+from flight_view.server import answer
 from guidance.route_file import READERS, Origin, read_route
 from rise_di_controller.controller import Controller
 from rise_di_controller.rise_di import RiseDiParameters
@@ -61,9 +63,18 @@ def mcap(data: bytes, folder: Path) -> None:
     file = run / "run_0.mcap"
     rejected(lambda: read_run(file))
     rejected(lambda: read_playback(file))
+    rejected(lambda: _watch(file))
     rejected(lambda: _replay(file))
     if not rejected(lambda: repair(run)) and any(one.damaged for one in repair(run).files):
         raise AssertionError("the repaired log is damaged")
+
+
+def _watch(file: Path) -> None:
+    """What the live page gets of a log."""
+    flight = Flight(file)
+    with np.errstate(all="ignore"):
+        flight.update()
+        answer(flight, {})
 
 
 def metadata(data: bytes, folder: Path) -> None:

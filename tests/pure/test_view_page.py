@@ -67,13 +67,20 @@ def serving(*runs: Path) -> Iterator[str]:
 
 @contextmanager
 def shown(browser: Browser, *runs: Path) -> Iterator[str]:
-    """Serve finished runs and open the page; afterwards leave it, so that it does not ask a server that has ended."""
+    """Serve finished runs and open the page; leave it before the server ends."""
     with serving(*runs) as address:
         browser.open(address)
         browser.wait_for(f"{DRAWN} > 1 && {STATE} === 'ENDED'")
-        yield address
-        browser.open("about:blank")
-        browser.wait_for("location.href === 'about:blank'")
+        try:
+            yield address
+        finally:
+            leave(browser)
+
+
+def leave(browser: Browser) -> None:
+    """Leave the page, which then logs no refused connection to a server that has ended."""
+    browser.open("about:blank")
+    browser.wait_for("location.href === 'about:blank'")
 
 
 def colours_of(browser: Browser, selector: str) -> int:
@@ -146,6 +153,7 @@ def test_a_flight_that_is_recorded_is_followed_to_its_end(browser: Browser, reco
     before = browser.run(DRAWN)
     press(browser, "Home")
     browser.wait_for(f"{DRAWN} > {before} && {TIME} === 0")  # the page keeps what it has
+    leave(browser)
 
 
 def test_a_second_run_is_a_ghost_and_the_pictures_need_no_webgl(browser: Browser, recorded: Path) -> None:

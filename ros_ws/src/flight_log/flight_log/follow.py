@@ -68,7 +68,8 @@ class Follower:
         self._begin_file()
 
     def _begin_file(self) -> None:
-        self._position = 0
+        self._path: Path | None = None
+        self._position = self._size = 0  # bytes: read, and there at the last look
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, _Channel] = {}
         self._chunk = b""  # the last chunk
@@ -77,7 +78,9 @@ class Follower:
     @property
     def path(self) -> Path | None:
         """The file that is read now; None while there is none. Raises ParameterError for a folder with several bags."""
-        return next((file for file in bag_files(self.run) if file not in self._read_files), None)
+        if self._path is None:
+            self._path = next((file for file in bag_files(self.run) if file not in self._read_files), None)
+        return self._path
 
     def skip(self, topics: Container[str]) -> None:
         """Read no more messages of these topics, by their full names, in this file."""
@@ -91,21 +94,24 @@ class Follower:
         Raises OSError when the file cannot be read, ParameterError for a folder with several bags.
         """
         while not self.fault and (path := self.path) is not None:
+            if path.stat().st_size == self._size:
+                return
             with path.open("rb") as stream:
-                for opcode, content in self._records(stream):
+                size = os.fstat(stream.fileno()).st_size
+                for opcode, content in self._records(stream, size):
                     if opcode in ENDS:
                         break
                     yield from self._decoded(opcode, content)
                 else:
+                    self._size = size
                     return
             yield from self._decoded(Opcode.DATA_END, b"")
             self.complete = True
             self._read_files.append(path)
             self._begin_file()
 
-    def _records(self, stream: IO[bytes]) -> Iterator[tuple[int, bytes]]:
+    def _records(self, stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
         """Opcode and content of each whole record behind the position, which moves on before each."""
-        size = os.fstat(stream.fileno()).st_size
         if self._position == 0 and size >= len(MCAP0_MAGIC):
             if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 self.fault = f"{stream.name} does not begin as an MCAP file"

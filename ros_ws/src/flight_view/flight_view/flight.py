@@ -119,7 +119,9 @@ class Flight:
         path = self._follower.path
         if path is None:
             return "waiting"
-        return "no data" if is_locked(path) else "interrupted"
+        if not is_locked(path):
+            return "interrupted"
+        return "no data" if self.samples else "waiting"
 
     def faults(self) -> list[str]:
         """Sentences on what the log lacks."""

@@ -14,13 +14,14 @@ import socket
 import struct
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tornado.httpserver import HTTPServer
-from tornado.iostream import IOStream
+from tornado.iostream import IOStream, StreamClosedError
 from tornado.web import Application, HTTPError, RequestHandler
 
 from flight_analysis.report.summary import finite_or_null
@@ -243,4 +244,5 @@ class _Data(_Handler):
         known = {name: values[-1].decode("ascii", "replace") for name, values in self.request.query_arguments.items()}
         content = await self.server.news(self.server.flights[number], known)
         self.set_header("Content-Type", "application/octet-stream")
-        await self.finish(content)
+        with suppress(StreamClosedError):  # the browser has left
+            await self.finish(content)

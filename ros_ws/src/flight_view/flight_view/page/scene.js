@@ -4,9 +4,10 @@ import {indexAt} from "./data.js";
 import {MODE_COLOURS, prepared} from "./charts.js";
 
 const SPAN = 3; // m, least drawn span
-const RELATIVE_SPAN = 0.2; // of the distance of the camera: the aircraft stays visible from afar
+const RELATIVE_SPAN = 0.13; // of the distance of the camera: the aircraft stays visible from afar
 const NEAR = 0.2; // m, nothing closer to the camera is drawn
 const FULL_DEFLECTION = 25 * Math.PI / 180; // rad, of an input that is given as a fraction
+const WHOLE = 2.3; // distance of the map over that of the farthest point of the path
 const MAX_TRAIL = 1500; // points
 const MAX_WIND = 10; // m/s, drawn as one span
 
@@ -117,7 +118,7 @@ export class Scene {
     this.mode = mode;
     this.distance = 16;
     if (mode !== "map" || !north || !at) return;
-    for (let k = 0; k < pose.count; k += 25) this.distance = Math.max(this.distance, Math.hypot(north[k] - at.place[0], east[k] - at.place[1]) * 1.5);
+    for (let k = 0; k < pose.count; k += 25) this.distance = Math.max(this.distance, Math.hypot(north[k] - at.place[0], east[k] - at.place[1]) * WHOLE);
   }
 
   zoom(factor) {

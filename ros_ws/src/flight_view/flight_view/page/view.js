@@ -275,8 +275,8 @@ function frame(now) {
   if (dirty) {
     dirty = false;
     arrange();
-    drawState();
     scene.draw(flight, ghost, clock.t, colour);
+    drawState();
     drawHorizon($("horizon"), poseAt(flight, clock.t), colour);
     const shown = currentView();
     for (const chart of charts) {
