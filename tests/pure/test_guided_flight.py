@@ -177,6 +177,7 @@ def test_a_command_that_cannot_be_flown_is_refused_and_changes_nothing(values: d
         ({"stall_speed": 24.0}, r"guidance.stall_speed: found 24.0 m/s, expected a floor of 1.15 V_s below 25 m/s"),
         ({"program": program(bank=0.1)}, r"guidance.program.bank: found a channel, expected one of phi"),
         ({"program": program(phi=0.9)}, r"guidance.program at 1 s.phi: found 0.9, expected -0.5"),
+        ({"program": program(leg=1.0)}, "guidance.program.leg: found no route, expected a section route beside it"),
         ({"program": {"phi": {"start": [1.0, 1.0], "value": [0.1, 0.2]}}}, "expected times in rising order"),
         ({"route": {"north": [0.0], "east": [0.0, 1.0], "altitude": [0.0]}}, "guidance.route.east: found 2 values, expected 1"),
         ({"pitch": [0.2, 0.1]}, "guidance.pitch: found .* expected the least before the largest"),

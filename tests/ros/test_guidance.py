@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Guidance over topics: lockstep as in one process, targets and routes in flight, services, faults."""
 
+import json
 import math
 import time
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from nav_msgs.msg import Path as PathMessage
 from std_srvs.srv import SetBool, Trigger
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import OUTPUTS, Peer
-from tests.ros.test_lockstep import ROUGH, fly, scenario_file
+from tests.ros.test_lockstep import LOG_SIZE, ROUGH, fly, scenario_file
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
@@ -38,6 +39,15 @@ def test_a_lockstep_flight_repeats_the_bytes_of_one_process(start: Start, tmp_pa
         assert signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
         assert signal.values.tobytes() == recorded[name].values.tobytes(), name
     assert len(recorded["u_m"].stamp_ns) == 150  # one at each instant but the first: y takes 10 ms
+
+
+def test_the_loss_of_guidance_ends_a_lockstep_flight_with_its_name(start: Start, tmp_path: Path) -> None:
+    command = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5, "osprey_route")), "--lockstep", "--runs", "runs")
+    command.wait_for_log(tmp_path / "runs", LOG_SIZE)
+    command.child("guidance.main").kill()
+    assert command.end() == 3
+    summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["outcome"] == "guidance was killed by SIGKILL"
 
 
 @pytest.fixture

@@ -49,7 +49,7 @@ from rise_di_controller.guard import Mode as ControllerMode
 MAP, BODY = "map", "base_link"  # frames of REP 105: east, north, up; forward, left, up
 MAX_TARGETS = 16  # messages of target a tick; later ones wait, so that a storm delays no u_m
 ODOMETRY_PERIOD_NS, PATH_PERIOD_NS = NANOSECONDS // 10, NANOSECONDS
-PATH_LENGTH = 600  # poses of the flown path
+PATH_LENGTH = 120  # poses of the flown path, one a second
 
 SENTENCES: Mapping[Mode, str] = {
     Mode.OFF: "no u_m: disengaged, or pose or y is missing",
@@ -161,9 +161,10 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         self._publish_log(self._log_encoder.encode(now_ns, output.log))
         step = self.period_ns()
         if now_ns % ODOMETRY_PERIOD_NS < step:
-            self._publish_odometry(now_ns)
-        if now_ns % PATH_PERIOD_NS < step:
-            self._publish_path(now_ns)
+            odometry = self._odometry_of(now_ns)
+            self._odometry.publish(odometry)
+            if now_ns % PATH_PERIOD_NS < step:
+                self._publish_path(odometry)
 
     # Received messages
 
@@ -250,7 +251,7 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
 
     # For maps and 3-D views
 
-    def _publish_odometry(self, now_ns: int) -> None:
+    def _odometry_of(self, now_ns: int) -> Odometry:
         pose, y = self._guidance.pose(), self._guidance.y()
         message = Odometry()
         message.header.stamp, message.header.frame_id, message.child_frame_id = _stamp(now_ns), MAP, BODY
@@ -262,12 +263,11 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
             setattr(message.twist.twist.linear, key, value)
         for key, value in zip("xyz", (y["p"], -y["q"], -y["r"]), strict=True):
             setattr(message.twist.twist.angular, key, value)
-        self._odometry.publish(message)
-        self._flown.append(PoseStamped(header=message.header, pose=placed))
+        return message
 
-    def _publish_path(self, now_ns: int) -> None:
-        flown = Path(poses=list(self._flown))
-        flown.header.stamp, flown.header.frame_id = _stamp(now_ns), MAP
+    def _publish_path(self, odometry: Odometry) -> None:
+        self._flown.append(PoseStamped(header=odometry.header, pose=odometry.pose.pose))
+        flown = Path(header=odometry.header, poses=list(self._flown))
         self._path.publish(flown)
         if (route := self._guidance.route) is None:
             return

@@ -152,6 +152,7 @@ class GuidanceParameters(KeyedParameters):
             read_target(target, params, f"program at {start:g} s")
         if self.route is not None:
             self.plan(self.waypoints())
+        require(self.route is not None or "leg" not in self.program, "program.leg", "no route", "a section route beside it")
         return self
 
     def by_rule(self) -> list[tuple[str, Any]]:
