@@ -455,6 +455,21 @@ def test_a_flight_with_its_page_prints_the_address_and_leaves_no_server(tmp_path
         assert client.connect_ex(("127.0.0.1", int(found[1]))) != 0
 
 
+def test_the_terminal_view_of_a_recorded_flight_ends_by_itself(recorded: Path) -> None:
+    ended = subprocess.run(command("watch", recorded, "--text"), capture_output=True, text=True, check=True)
+    assert "run  ENDED  ENGAGED  t = 2.0 s" in ended.stdout
+
+
+def test_a_log_that_vanishes_is_a_sentence(recorded: Path, tmp_path: Path) -> None:
+    path = tmp_path / "run_0.mcap"
+    path.write_bytes((recorded / "run_0.mcap").read_bytes()[:5000])
+    flight = Flight(path)
+    flight.update()
+    path.unlink()
+    with pytest.raises(ParameterError, match=r"run_0.mcap: cannot be read \(No such file or directory\), expected the log"):
+        flight.update()
+
+
 def test_the_terminal_shows_the_newest_values_in_the_units_of_the_report(recorded: Path, tape: Tape) -> None:
     console = Console(width=120, record=True, file=io.StringIO())
     flight = Flight(recorded)

@@ -6,6 +6,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -119,9 +120,10 @@ class Flight:
         path = self._follower.path
         if path is None:
             return "waiting"
-        if not is_locked(path):
-            return "interrupted"
-        return "no data" if self.samples else "waiting"
+        with suppress(OSError):
+            if is_locked(path):
+                return "no data" if self.samples else "waiting"
+        return "interrupted"
 
     def faults(self) -> list[str]:
         """Sentences on what the log lacks."""
@@ -138,18 +140,21 @@ class Flight:
     def update(self, budget: float = math.inf) -> bool:
         """Read for at most about `budget` s. Whether there was anything to read.
 
-        Raises ParameterError for a folder with several bags, OSError where the log cannot be read.
+        Raises ParameterError where the log cannot be read, or for a folder with several bags.
         """
         deadline, found, self._behind = time.monotonic() + budget, False, False
-        for record in self._follower.read():
-            found = True
-            if isinstance(record, Messages):
-                self._take(record)
-            else:
-                self._take_record(record)
-            if time.monotonic() > deadline:
-                self._behind = True
-                break
+        try:
+            for record in self._follower.read():
+                found = True
+                if isinstance(record, Messages):
+                    self._take(record)
+                else:
+                    self._take_record(record)
+                if time.monotonic() > deadline:
+                    self._behind = True
+                    break
+        except OSError as error:
+            raise ParameterError(f"{self.run}: cannot be read ({error.strerror}), expected the log of a flight") from None
         for topic in self._topics.values():
             self._decode(topic)
         if found:

@@ -70,7 +70,5 @@ async def _serve(runs: Sequence[Path], ports: Sequence[int], announce: Callable[
         await follow
     except asyncio.CancelledError:
         pass
-    except OSError as error:
-        raise ParameterError(f"{error.filename}: cannot be read ({error.strerror}), expected the log of a flight") from None
     finally:
         await server.close()
