@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, guidance_by_rule, load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
+from flight_bringup.graph import GUIDANCE, second_stage
 from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
@@ -206,7 +207,6 @@ def test_the_numbers_that_are_left_out_follow_from_the_other_sections() -> None:
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"aircraft": {"kinematics": "linear"}}, "aircraft.kinematics: found 'linear' beside guidance, expected euler"),
         ({"reference_model": {"live": {}}}, "reference_model.live.speed: found none beside guidance"),
         (
             {"guidance": {"speed": 30.0, "route": None}},
@@ -278,7 +278,10 @@ def test_a_route_file_is_flown_and_stays_with_the_flight(tmp_path: Path) -> None
     with pytest.raises(ParameterError, match=r"route\[1\].altitude: found 500 m above the waypoint before, expected at most"):
         with_route(ROUTE, [Waypoint(0.0, 0.0, 0.0), Waypoint(900.0, 0.0, 500.0)])
     with pytest.raises(ParameterError, match="kinematics: found 'linear' beside guidance"):
-        with_route(find_scenario("osprey_servo"), read_route(file))
+        simulate(ROUTE.vary(aircraft={"kinematics": "linear"}))
+    with pytest.raises(ParameterError, match="kinematics: found 'linear' beside guidance"):
+        second_stage(ROUTE.vary(aircraft={"kinematics": "linear"}))
+    assert GUIDANCE in second_stage(ROUTE.vary(aircraft={"kinematics": "linear"}), bridge=True)  # the autopilot flies
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from autopilot_bridge.params import ChannelMap, find_map, load_map
-from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
+from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, require_euler
 from flight_analysis.report.run_folder import attachments_for
 from flight_core.parameters import require
 
@@ -97,7 +97,12 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
 
 
 def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
-    """The second stage of a scenario: aircraft or bridge, the reference model, and guidance where the scenario has it."""
+    """The second stage of a scenario: aircraft or bridge, the reference model, and guidance where the scenario has it.
+
+    Raises ParameterError where guidance cannot fly the simulated aircraft.
+    """
+    if not bridge:
+        require_euler(scenario)
     stage = SECOND_STAGE_WITH_BRIDGE if bridge else SECOND_STAGE
     return stage if scenario.guidance is None else (*stage, GUIDANCE)
 
@@ -123,7 +128,8 @@ def parameter_overrides(
     if spec is BRIDGE:
         return {} if autopilot is None else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
     one_process = spec is ONE_PROCESS
-    guidance, stages = scenario.guidance, (*FIRST_STAGE, *second_stage(scenario))
+    guidance = scenario.guidance
+    stages = (*FIRST_STAGE, *SECOND_STAGE, *(() if guidance is None else (GUIDANCE,)))
     overrides: dict[NodeSpec, ParameterOverrides] = {node: {"lockstep": lockstep} for node in stages}
     if guidance is not None:
         overrides[GUIDANCE] |= {name: list(value) if isinstance(value, tuple) else value for name, value in guidance.by_rule()}

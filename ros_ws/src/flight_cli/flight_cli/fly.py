@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from flight_analysis.closed_loop.scenario import require_euler
 from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import find_autopilot, require_limits
@@ -68,6 +69,8 @@ def fly(
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     if route is not None:
         chosen = with_route(chosen, read_route(route, _origin(origin)))
+    if autopilot is None:
+        require_euler(chosen)
     run = new_run(chosen, runs)
     if route is not None:
         chosen = written(chosen, run / f"{chosen.name}.yaml")

@@ -186,14 +186,22 @@ def check_together(scenario: Scenario) -> None:
         _check_guidance(scenario, scenario.guidance)
 
 
+def require_euler(scenario: Scenario) -> None:
+    """Raise ParameterError where guidance would fly a simulated airframe that a bank does not turn.
+
+    Behind a bridge the airframe of the scenario does not fly.
+    """
+    aircraft = scenario.aircraft
+    turns = scenario.guidance is None or aircraft.is_jsbsim or aircraft.kinematics == "euler"
+    require(turns, "aircraft.kinematics", f"{aircraft.kinematics!r} beside guidance", "euler: a bank turns the aircraft")
+
+
 def _check_guidance(scenario: Scenario, guidance: GuidanceParameters) -> None:
     reference, aircraft = scenario.reference_model, scenario.aircraft
     rule = guidance_by_rule(aircraft, reference, scenario.controller)
     for key in ("speed", "outputs", "natural_frequency"):
         found = getattr(guidance, key)
         require(found == rule[key], f"guidance.{key}", found, f"{rule[key]}, as the other sections have it")
-    euler = aircraft.is_jsbsim or aircraft.kinematics == "euler"
-    require(euler, "aircraft.kinematics", f"{aircraft.kinematics!r} beside guidance", "euler: a bank turns the aircraft")
     levels = f"the trim speed {guidance.speed:g} m/s, by which the wings are levelled when guidance is lost"
     require(reference.live.speed is not None, "reference_model.live.speed", "none beside guidance", levels)
     pose_ns = every(aircraft.rate) * period_ns(aircraft.rate, "aircraft.rate")

@@ -9,7 +9,7 @@ import numpy as np
 
 from aircraft_sim import pose
 from aircraft_sim.simulator import Simulator
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario, require_euler
 from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
 from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
@@ -43,6 +43,7 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
     holds u until the next one. A lost sample of y is not on the tape; a delayed one has its own stamp. A flight that diverges
     or is interrupted (Ctrl-C) ends early: the tape holds the samples so far, and its `outcome` the reason.
     """
+    require_euler(scenario)
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     reference, controller = Reference(scenario.reference_model), Controller(scenario.controller)
     guidance = None if scenario.guidance is None else Guidance(scenario.guidance)
