@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from tests.conftest import REPOSITORY
 
-from flight_bringup.scenarios import find_scenario
+from flight_bringup.scenarios import find_scenario, with_route
 from flight_core.parameters import ParameterError
 from guidance.feasibility import Performance, flyable_legs, speeds
 from guidance.path import Arc, Line
@@ -96,6 +96,14 @@ def test_the_route_of_the_tutorial_is_flown_and_its_refusal_is_the_one_shown(tmp
     with pytest.raises(ParameterError) as refused:
         guidance.plan([Waypoint(0, 0, 0), Waypoint(500, 0, 0), Waypoint(500, 200, 0), Waypoint(0, 200, 0)])
     assert f"error: guidance.{refused.value}\n" in page
+
+
+def test_a_route_file_replaces_the_program_of_targets() -> None:
+    turns = find_scenario("osprey_route").vary(guidance={"program": {"heading": {"start": [2.0], "value": [1.0]}}})
+    flown = with_route(turns, [Waypoint(0, 0, 0), Waypoint(2000, 0, 10, 26.0)]).guidance
+    assert flown is not None
+    assert flown.program == {}
+    assert [one.speed for one in flown.waypoints()] == [25.0, 26.0]
 
 
 def test_a_leg_too_short_for_its_fillets_and_a_route_of_one_waypoint_are_refused() -> None:

@@ -34,10 +34,13 @@ def find_scenario(name: str, duration: Any = None) -> Scenario:
 
 
 def with_route(scenario: Scenario, waypoints: Sequence[Waypoint]) -> Scenario:
-    """The scenario with a route that guidance flies from the start. Raises ParameterError where it cannot be flown."""
+    """The scenario with a route that guidance flies from the start, in place of its route and its program of targets.
+
+    Raises ParameterError where it cannot be flown.
+    """
     flown = speeds(waypoints, scenario.aircraft.channels().speed)
     route = {key: [getattr(one, key) for one in waypoints] for key in ("north", "east", "altitude")} | {"V": list(flown)}
-    return scenario.vary(guidance={"route": route})
+    return scenario.vary(guidance={"route": route, "program": {}})
 
 
 def written(scenario: Scenario, path: Path) -> Scenario:
