@@ -10,13 +10,15 @@ import pytest
 from tests.joint_states import JOINT_STATE, vector
 from tests.recordings import EPOCH, MS
 
-from flight_analysis.report.run_folder import new_run, write_report
+from flight_analysis.report import run_folder
+from flight_analysis.report.run_folder import new_run, read_flight, write_report
 from flight_analysis.report.summary import empty_summary
 from flight_bringup.fly import fly_in_process
 from flight_bringup.scenarios import find_scenario
 from flight_cli.report import report
 from flight_core.parameters import ParameterError
 from flight_log.bag import BagWriter
+from flight_log.engagements import Engagement
 from flight_log.tape_reader import read_run
 
 
@@ -39,6 +41,18 @@ def test_one_run_as_figure_tables_and_json(runs: list[Path], tmp_path: Path, cap
     assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     assert csv.read_bytes()[:8] == b"stamp_ns"
     assert parquet.read_bytes()[:4] == b"PAR1"
+
+
+def test_an_engagement_shorter_than_a_sample_leaves_the_figures_of_the_flight(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = read_run(run)
+    instant = int(log.tape["y"].stamp_ns[5]) + 1  # between two samples
+    monkeypatch.setattr(run_folder, "read_run", lambda _: log._replace(engagements=[Engagement(instant, instant + 1, "lost")]))
+    summary = read_flight(run, "completed").summary
+    assert summary["duration"] > 1.0
+    assert summary["notes"][0].endswith("s: lost")
+    assert summary["notes"][1] == "the figures are of the whole flight: no y while engaged"
 
 
 def test_two_runs_are_compared(

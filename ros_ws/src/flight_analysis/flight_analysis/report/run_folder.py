@@ -86,10 +86,12 @@ def read_flight(run: Path, outcome: str | None = None) -> RecordedFlight:
     if outcome == COMPLETED and "internals" not in tape and flown is None:
         outcome = "the controller never engaged"
     name = folder.name if run.is_dir() else run.stem
-    summary = summarise(scenario, _engaged(tape, flown or []), outcome or _previous_outcome(folder / SUMMARY))
+    engaged = _engaged(tape, flown or [])
+    has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample
+    summary = summarise(scenario, engaged if has_figures else tape, outcome or _previous_outcome(folder / SUMMARY))
     if flown is not None:
         summary["engagements"] = [_engagement(tape, one) for one in flown]
-        summary["notes"] = [*engagement_notes(summary["engagements"]), *summary["notes"]]
+        summary["notes"] = [*engagement_notes(summary["engagements"], has_figures=has_figures), *summary["notes"]]
     return RecordedFlight(name, scenario, tape, summary)
 
 

@@ -131,15 +131,15 @@ def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
     return {key: finite_or_null(value) for key, value in summary.items()}
 
 
-def engagement_notes(flown: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Sentences on the engagements of a flight with a bridge."""
+def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
+    """Sentences on the engagements of a flight with a bridge, which have figures unless they are shorter than a sample."""
     if not flown:
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]
     sentences = []
     for one in flown:
         end = "the end of the log" if one["stop"] is None else f"{one['stop']:.1f} s: {one['reason']}"
         sentences.append(f"engaged from {one['start']:.1f} s to {end}")
-    return [*sentences, "the figures are of the engaged time alone"]
+    return [*sentences, f"the figures are of the {'engaged time alone' if has_figures else 'whole flight: no y while engaged'}"]
 
 
 def empty_summary(scenario: Scenario, outcome: str) -> dict[str, Any]:
