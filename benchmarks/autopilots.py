@@ -1,0 +1,340 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Flies real autopilots in software and writes docs/evidence_autopilots.md: identified gains, engagements, signs, pose.
+
+    python -m benchmarks.autopilots --sitl ../shared/sitl                       # everything, about 40 minutes
+    python -m benchmarks.autopilots --sitl ../shared/sitl --only signs          # one measurement; the others keep their results
+    python -m benchmarks.autopilots --render                                    # the page alone, from the stored results
+
+The kit is that of `make test-sitl`: docs/autopilots.md. build/autopilots/ has the results and the runs.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+
+from autopilot_bridge.params import load_map
+from flight_analysis.design.bridge_identification import channel_pairs, experiment
+from flight_analysis.design.response_identification import MIN_RATIO, identify_response
+from flight_core.rates import NANOSECONDS, seconds
+from flight_core.tape import Signal, Tape
+from flight_log.engagements import Engagement
+from flight_log.tape_reader import read_run
+
+if TYPE_CHECKING:
+    from tests.sitl.kit import ArduPlane, Autopilot
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+FOLDER = REPOSITORY / "build" / "autopilots"
+PAGE = REPOSITORY / "docs" / "evidence_autopilots.md"
+EXAMPLE = REPOSITORY / "examples" / "arduplane" / "scenario.yaml"
+PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
+ENGAGEMENTS, LARGEST_STEP = 20, 0.02  # of the range of a setpoint
+WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
+EXPERIMENT = 34.0  # s of the experiments on signs
+TURBULENCE = (0.0, 1.0, 2.0, 3.0)  # SIM_WIND_TURB of the experiments on signs, one after another
+DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
+
+
+# The autopilots
+
+
+@contextmanager
+def arduplane(servo: float) -> Iterator["ArduPlane"]:
+    """An ArduPlane in flight, with servos of this speed."""
+    from tests.sitl.kit import ArduPlane  # noqa: PLC0415 - after the kit's place is known
+
+    with _flying(ArduPlane(FOLDER / "arduplane"), SIM_SERVO_SPEED=servo) as plane:
+        yield plane
+
+
+@contextmanager
+def px4() -> Iterator["Autopilot"]:
+    """PX4's airplane in flight; without an offboard heartbeat it changes to Hold."""
+    from tests.sitl.kit import Px4  # noqa: PLC0415 - as above
+
+    with _flying(Px4(FOLDER / "px4"), COM_RCL_EXCEPT=7.0, COM_OBL_RC_ACT=5.0) as airplane:
+        yield airplane
+
+
+@contextmanager
+def _flying(autopilot: Any, **parameters: float) -> Iterator[Any]:
+    try:
+        autopilot.up(**parameters)
+        autopilot.take_off()
+        yield autopilot
+    finally:
+        autopilot.down()
+
+
+# Measurements
+
+
+def gains_of_arduplane() -> dict[str, Any]:
+    """ArduPlane with fast servos, by its own identification."""
+    with arduplane(0.03) as plane:
+        return identified(plane, plane.patient_map("ardupilot"), 24.0)
+
+
+def gains_of_slow_servos() -> dict[str, Any]:
+    """ArduPlane with its default servos, by its own identification."""
+    with arduplane(0.14) as plane:
+        return identified(plane, plane.patient_map("ardupilot"), 24.0)
+
+
+def gains_of_px4() -> dict[str, Any]:
+    """PX4's airplane, by its own identification."""
+    with px4() as airplane:
+        return identified(airplane, airplane.patient_map(str(PX4_MAP)), 11.5)
+
+
+def identified(autopilot: "Autopilot", channel_map: str, speed: float) -> dict[str, Any]:
+    """Experiment, gains, flight, replay: the commands of docs/autopilots.md."""
+    found = autopilot.folder / "found"
+    autopilot.level()
+    command = ("identify", "--bridge", channel_map, "--speed", f"{speed:g}", "--write", str(found))
+    excited = autopilot.start(*command)
+    excited.wait_for("DISENGAGED")
+    autopilot.hand_over()
+    autopilot.start("engage").succeed()
+    if excited.end(240.0):
+        return {"refused": excited.output}
+    log = autopilot.start(*command, "--log", str((REPOSITORY / "runs" / "latest").resolve()), "--json").succeed(240.0)
+    result = json.loads(log.lines[-1])
+    with autopilot.engaged(found / "scenario.yaml", str(found / "map.yaml"), 75.0) as flight:
+        flight.end(150.0)
+    kept = {key: result["controller"][key] for key in ("outputs", "k_g", "k_d", "Lambda", "delay", "lag")}
+    return {"controller": kept, "delay_margin": result["delay_margin"], "said": excited.output, **tracking(autopilot)}
+
+
+def tracking(autopilot: "Autopilot") -> dict[str, Any]:
+    """Of the last flight: errors while commanded, y behind y_m, the part of the time with u at a limit, whether it replays."""
+    summary, log = autopilot.summary(), read_run(autopilot.run)
+    replayed = autopilot.start("replay", str(autopilot.run)).end(120.0) == 0
+    return {
+        "engaged": summary["engagements"],
+        "outcome": summary["outcome"],
+        "rms": {name: error["command"]["rms"] for name, error in summary["errors"].items()},
+        "behind": {name: behind(log.tape, name, one) for one in log.engagements or [] for name in log.tape["y"].names},
+        "limited": {name: values["limited"]["magnitude"] for name, values in summary["inputs"].items()},
+        "replayed": replayed,
+    }
+
+
+def behind(tape: Tape, name: str, engaged: Engagement) -> float:
+    """The delay of y behind y_m with the smallest error, s."""
+    y, y_m = tape["y"], tape["y_m"]
+    t = np.arange(engaged.start_ns + NANOSECONDS, engaged.stop_ns or int(y.stamp_ns[-1]), NANOSECONDS // 100)
+    measured = np.interp(t, y.stamp_ns, y[name])
+    errors = [float(np.var(measured - np.interp(t - delay * NANOSECONDS, y_m.stamp_ns, y_m[name]))) for delay in DELAYS]
+    return float(DELAYS[int(np.argmin(errors))])
+
+
+def bumpless() -> dict[str, Any]:
+    """Engagements and releases in one flight: the largest step of a setpoint around each, of its range."""
+    with arduplane(0.03) as plane:
+        channel_map = plane.patient_map("ardupilot")
+        flown = plane.fly(EXAMPLE, channel_map, 1000.0, "--send")
+        flown.wait_for("DISENGAGED")
+        for _ in range(ENGAGEMENTS):
+            plane.level()
+            plane.hand_over()
+            plane.start("engage").succeed()
+            time.sleep(WINDOW[1] + 0.5)
+            plane.start("engage", "--off").succeed()
+        plane.level()
+        flown.interrupt()
+        flown.end(60.0)
+        log, inputs = read_run(plane.run), load_map(channel_map).inputs.values()
+        ranges = {f"{row.message}.{row.field}": row.range[1] - row.range[0] for row in inputs}
+        return {"steps": [step(log.tape["bridge/would_send"], ranges, one.start_ns) for one in log.engagements or []]}
+
+
+def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
+    """The largest step from one setpoint to the next around an engagement, of its range. Before it, that is the stick."""
+    begin, end = (engaged_ns + int(edge * NANOSECONDS) for edge in WINDOW)
+    around = sent.within([(begin, end)])
+    return max(float(np.max(np.abs(np.diff(around[name])))) / size for name, size in ranges.items())
+
+
+def signs(experiments: int = 20) -> dict[str, Any]:
+    """Omega_ii and its standard errors in short experiments, open loop, each in other turbulence."""
+    with arduplane(0.03) as plane:
+        channel_map = plane.patient_map("ardupilot")
+        loaded = load_map(channel_map)
+        pairing, expected = channel_pairs(loaded)
+        airframe, scenario = plane.folder / "signs_airframe.yaml", plane.folder / "signs.yaml"
+        planned = experiment(loaded, 24.0, 0.2, str(airframe))
+        airframe.write_text(planned.airframe, encoding="utf-8")
+        content = yaml.safe_load(planned.scenario)
+        content["/**/controller"]["ros__parameters"]["period"] = [6.0 if name == "V" else 3.0 for name in pairing.outputs]
+        scenario.write_text(yaml.safe_dump(content), encoding="utf-8")
+        plane.say("param", "SIM_WIND_SPD", "5")
+        flown = plane.fly(scenario, channel_map, 1000.0, "--send")
+        flown.wait_for("DISENGAGED")
+        used = []
+        for number in range(experiments):
+            used.append(TURBULENCE[number % len(TURBULENCE)])
+            plane.say("param", "SIM_WIND_TURB", f"{used[-1]:g}")
+            plane.level()
+            plane.hand_over()
+            plane.start("engage").succeed()
+            time.sleep(EXPERIMENT)
+            plane.start("engage", "--off").succeed()
+        plane.say("param", "SIM_WIND_TURB", "0")
+        plane.level()
+        flown.interrupt()
+        flown.end(60.0)
+        log, found = read_run(plane.run), []
+        tape = log.tape
+        for turbulence, one in zip(used, log.engagements or [], strict=True):
+            span = (one.start_ns, one.stop_ns or int(tape["y"].stamp_ns[-1]))
+            response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=[span])
+            effect = np.diag(response.Omega) * expected
+            sure = response.sign_ratio >= MIN_RATIO
+            verdicts = np.where(sure, np.where(effect > 0.0, "right", "wrong"), "unsure")
+            ended = {"turbulence": turbulence, "reason": one.reason, "seconds": seconds(span[1] - span[0])}
+            found.append(ended | dict(zip(pairing.inputs, verdicts.tolist(), strict=True)))
+        return {"experiments": found}
+
+
+def pose() -> dict[str, Any]:
+    """Rates and pose of the map `ardupilot` against the autopilot's own log, in turns and climbs."""
+    with arduplane(0.03) as plane:
+        flown = plane.fly(EXAMPLE, plane.patient_map("ardupilot"), 60.0)
+        flown.wait_for("DISENGAGED")
+        plane.wander(flown)
+        return {name: one._asdict() for name, one in plane.compare().items()}
+
+
+MEASUREMENTS: dict[str, Callable[[], dict[str, Any]]] = {
+    "arduplane": gains_of_arduplane,
+    "slow_servos": gains_of_slow_servos,
+    "px4": gains_of_px4,
+    "engagements": bumpless,
+    "signs": signs,
+    "pose": pose,
+}
+
+
+# The page
+
+
+def page() -> str:
+    """The text of the page from the stored results."""
+    stored = {name: FOLDER / f"{name}.json" for name in MEASUREMENTS}
+    results = {name: json.loads(file.read_text(encoding="utf-8")) for name, file in stored.items() if file.is_file()}
+    parts = [HEAD]
+    for name, (title, table) in TABLES.items():
+        parts.append(f"## {title}\n")
+        if name in results:
+            parts.append(f"    python -m benchmarks.autopilots --only {name}    # {results[name]['date']}\n")
+            parts.append(table(results[name]["result"]))
+        else:
+            parts.append("Not measured yet.\n")
+    return "\n".join(parts)
+
+
+def table_of_flight(result: dict[str, Any]) -> str:
+    """Errors, delays and margin of a flight with identified gains."""
+    if "refused" in result:
+        return "Refused:\n\n    " + "\n    ".join(result["refused"].splitlines()[-1:]) + "\n"
+    rows = ["| channel | rms while commanded | y behind y_m (s) |", "| --- | ---: | ---: |"]
+    for name, rms in result["rms"].items():
+        shown = f"{rms:.3f} m/s" if name == "V" else f"{1e3 * rms:.1f} mrad/s"
+        rows.append(f"| {name} | {shown} | {result['behind'][name]:.2f} |")
+    limited = ", ".join(f"{name} {100 * share:.0f} %" for name, share in result["limited"].items())
+    (one,) = result["engaged"]
+    stop = "the end of the flight" if one["stop"] is None else f"{one['stop']:.0f} s ({one['reason']})"
+    rows += [
+        f"\nEngaged from {one['start']:.0f} s to {stop}.",
+        f"Delay margin beyond the identified delay: {1e3 * result['delay_margin']:.0f} ms.",
+        f"u at a limit: {limited} of the time. Replay: {'every bit' if result['replayed'] else 'different'}.\n",
+    ]
+    return "\n".join(rows)
+
+
+def table_of_engagements(result: dict[str, Any]) -> str:
+    """Counts and the largest step."""
+    steps = np.array(result["steps"])
+    return (
+        f"{np.sum(steps <= LARGEST_STEP)} of {len(steps)} engagements without a step beyond {100 * LARGEST_STEP:g} % of the"
+        " range;"
+        f" the largest is {100 * steps.max():.2f} %, the median {100 * np.median(steps):.2f} %.\n"
+    )
+
+
+def table_of_signs(result: dict[str, Any]) -> str:
+    """Verdicts by turbulence. A sign that is right and certain would be found if it were flipped: the estimate is odd in it."""
+    rows = ["| SIM_WIND_TURB | experiments | signs found | unsure | wrong |", "| ---: | ---: | ---: | ---: | ---: |"]
+    for turbulence in sorted({one["turbulence"] for one in result["experiments"]}):
+        some = [one for one in result["experiments"] if one["turbulence"] == turbulence]
+        verdicts = [verdict for one in some for verdict in one.values() if verdict in {"right", "unsure", "wrong"}]
+        counts = " | ".join(str(verdicts.count(verdict)) for verdict in ("right", "unsure", "wrong"))
+        rows.append(f"| {turbulence:g} | {len(some)} | {counts} |")
+    return "\n".join(
+        [*rows, "\nEach sign flipped gives the opposite response, so that as many are found, and none is sure and wrong.\n"]
+    )
+
+
+def table_of_pose(result: dict[str, Any]) -> str:
+    """Slopes and offsets."""
+    rows = ["| channel | slope | offset (SI) | delay (s) |", "| --- | ---: | ---: | ---: |"]
+    rows += [f"| {name} | {one['slope']:.4f} | {one['offset']:.2g} | {one['delay']:.3f} |" for name, one in result.items()]
+    return "\n".join(rows) + "\n"
+
+
+HEAD = """# Evidence: real autopilots in software
+
+Flights of ArduPlane 4.8.0-dev and PX4 1.16.0 in software, on two cores beside other work.
+`python -m benchmarks.autopilots --sitl FOLDER` measures everything and writes this page; docs/autopilots.md
+says what the kit is. Age limits of y and u: 1 s, for the host. The identified gains fly the scenario that `identify` writes:
+pulses of 50 mrad/s in q and 150 mrad/s in p in coordinated turns, a step of at most 2 m/s in V.
+"""
+TABLES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
+    "arduplane": ("ArduPlane, servos of 0.03 s, gains by `identify --bridge`", table_of_flight),
+    "slow_servos": ("ArduPlane, its default servos of 0.14 s, gains by `identify --bridge`", table_of_flight),
+    "px4": ("PX4's airplane, gains by `identify --bridge`", table_of_flight),
+    "engagements": ("Engagements without a jump", table_of_engagements),
+    "signs": ("Signs, in short experiments in wind of 5 m/s", table_of_signs),
+    "pose": ("Rates and pose over the autopilot's own log", table_of_pose),
+}
+
+
+def main() -> None:
+    """Measure, store, render."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sitl", type=Path, help="folder of the kit")
+    parser.add_argument("--only", action="append", choices=MEASUREMENTS, help="repeatable")
+    parser.add_argument("--experiments", type=int, default=20, help="number of those on signs, 45 s each")
+    parser.add_argument("--render", action="store_true", help="no flight")
+    arguments = parser.parse_args()
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    if not arguments.render:
+        if arguments.sitl is not None:
+            os.environ["RISE_DI_SITL"] = str(arguments.sitl.resolve())
+        os.environ.pop("ROS_DOMAIN_ID", None)  # the autopilots are in domain 0, in networks of their own
+        from tests.sitl.kit import missing  # noqa: PLC0415 - after the kit's place is known
+
+        if reason := missing():
+            sys.exit(f"error: {reason}")
+        for name in arguments.only or MEASUREMENTS:
+            found = signs(arguments.experiments) if name == "signs" else MEASUREMENTS[name]()
+            result = {"date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "result": found}
+            (FOLDER / f"{name}.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
+            print(name, json.dumps(result), flush=True)
+    PAGE.write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
