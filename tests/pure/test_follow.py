@@ -83,8 +83,9 @@ def test_logs_without_message_indexes_or_chunks_are_read(options: dict[str, obje
     for k, data in enumerate(sent):
         writer.add_message(channel, k, data, k)
     writer.finish()  # type: ignore[no-untyped-call]
-    found = [data for one in Follower(path, all_of).read() if isinstance(one, Messages) for data in one.data]
-    assert found == sent
+    whole, follower = list(Follower(path, all_of).read()), Follower(path, all_of)
+    assert [data for one in whole if isinstance(one, Messages) for data in one.data] == sent
+    assert [next(iter(follower.read())) for _ in whole] == whole  # an iteration that is left is continued here, too
 
 
 def test_all_files_of_a_split_bag_are_read_in_order(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ places of its messages: those of other topics cost nothing.
 import math
 import os
 import struct
+from collections import deque
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -65,6 +66,7 @@ class Follower:
         self.fault = ""  # why nothing more of the log can be read
         self._rate_of = rate_of
         self._read_files: list[Path] = []
+        self._pending: deque[Messages | Attachment | Metadata] = deque()
         self._begin_file()
 
     def _begin_file(self) -> None:
@@ -93,22 +95,29 @@ class Follower:
 
         Raises OSError when the file cannot be read, ParameterError for a folder with several bags.
         """
+        yield from self._pending_records()
         while not self.fault and (path := self.path) is not None:
             if path.stat().st_size == self._size:
                 return
             with path.open("rb") as stream:
                 size = os.fstat(stream.fileno()).st_size
                 for opcode, content in self._records(stream, size):
+                    self._pending.extend(self._decoded(opcode, content))
                     if opcode in ENDS:
                         break
-                    yield from self._decoded(opcode, content)
+                    yield from self._pending_records()
                 else:
                     self._size = size
                     return
-            yield from self._decoded(Opcode.DATA_END, b"")
             self.complete = True
             self._read_files.append(path)
             self._begin_file()
+            yield from self._pending_records()
+
+    def _pending_records(self) -> Iterator[Messages | Attachment | Metadata]:
+        """What has been decoded; a caller that stops gets the rest with the next call."""
+        while self._pending:
+            yield self._pending.popleft()
 
     def _records(self, stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
         """Opcode and content of each whole record behind the position, which moves on before each."""

@@ -183,7 +183,7 @@ export class Scene {
   }
 
   grid(ctx, see, {place}, flight, colour) { // below the lowest point, with a line down to it
-    const step = 10 ** Math.ceil(Math.log10(this.distance / 2)), ground = Math.floor((this.lowest(flight.get("pose")) - 5) / 10) * 10;
+    const step = 10 ** Math.floor(Math.log10(0.8 * this.distance)), ground = Math.floor((this.lowest(flight.get("pose")) - 5) / 10) * 10;
     const [north, east] = [Math.round(place[0] / step) * step, Math.round(place[1] / step) * step];
     ctx.strokeStyle = colour("--grid");
     ctx.lineWidth = 1;
