@@ -69,9 +69,9 @@ def serving(*runs: Path) -> Iterator[str]:
 def shown(browser: Browser, *runs: Path) -> Iterator[str]:
     """Serve finished runs and open the page; leave it before the server ends."""
     with serving(*runs) as address:
-        browser.open(address)
-        browser.wait_for(f"{DRAWN} > 1 && {STATE} === 'ENDED'")
         try:
+            browser.open(address)
+            browser.wait_for(f"{DRAWN} > 1 && {STATE} === 'ENDED'")
             yield address
         finally:
             leave(browser)
@@ -288,6 +288,18 @@ def test_a_zoomed_out_line_keeps_its_peaks(page: Browser) -> None:
     count, largest, least = page.run(f"import('./data.js').then(d => import('./charts.js').then(c => {peaks}))")
     assert count <= 1000
     assert (largest, least) == (7, -5)
+
+
+def test_a_log_without_pose_shows_the_attitude_of_truth(browser: Browser, tape: Tape, tmp_path: Path) -> None:
+    stamps = np.arange(50, dtype=np.int64) * 20_000_000
+    truth = Signal(stamps, ("t", "x.phi", "x.theta"), np.column_stack([stamps / 1e9, np.full(50, 0.5), np.full(50, -0.1)]))
+    write_run(Tape({"truth": truth, "y": tape["y"]}), tmp_path / "run", LogAttachments())
+    with shown(browser, tmp_path / "run"):
+        text = browser.run("document.body.innerText")
+        assert "no pose in the log: attitude of truth, no place" in text
+        assert f"{math.degrees(0.5):.1f} deg" in text
+        assert colours_of(browser, "#scene") > 20
+        assert browser.console == []
 
 
 def test_a_guided_flight_shows_its_route_and_its_modes(browser: Browser, tmp_path: Path) -> None:

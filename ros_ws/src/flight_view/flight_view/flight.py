@@ -41,10 +41,10 @@ IN_TICKS = ("u", "y", "y_m")  # topics that the ticks have, too: not read from t
 
 GROUPS = {
     "internals": ("mode", "late", "y", "y_m", "e", "u_free", "u", "limited"),
-    "truth": ("actuator", "gust"),
+    "truth": ("actuator", "gust", "x.phi", "x.theta"),
     "guidance": ("mode", "leg", "xtrack", "to_go", "phi_c", "theta_c", "climb_c", "V_c", "limited", "target"),
 }
-"""Groups of channels that are kept; of the other topics all."""
+"""Channels and groups of channels that are kept; of the other topics all."""
 
 LOG, LOG_TYPE, WARN = "/rosout", "rcl_interfaces/msg/Log", 30  # rcl_interfaces/msg/Log: WARN=30
 MAX_EVENTS, MAX_NOTES, MAX_CHANNELS = 5000, 50, 200
@@ -224,7 +224,7 @@ class Flight:
         names, stamp_ns, values = decoded
         if topic.columns is None:
             kept = GROUPS.get(topic.name)
-            chosen = [i for i, name in enumerate(names) if kept is None or name.partition(".")[0] in kept]
+            chosen = [i for i, name in enumerate(names) if kept is None or name in kept or name.partition(".")[0] in kept]
             if len(chosen) > MAX_CHANNELS:
                 self._note(f"{topic.name}: {len(chosen) - MAX_CHANNELS} of its channels are not shown")
             topic.names, topic.columns = names, np.array(chosen[:MAX_CHANNELS], dtype=np.intp)

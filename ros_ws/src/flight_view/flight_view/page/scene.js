@@ -65,8 +65,13 @@ export function project(eye, point, focal, width, height) {
 }
 
 // The pose of a flight at a time, world coordinates; null where the log has none. Without a place it stays at the origin.
+// A log without the topic has the attitude of `truth`, for an airframe the deviation from trim.
 export function poseAt(flight, t) {
   const pose = flight.get("pose"), row = pose ? indexAt(pose.t, pose.count, t) : -1;
+  if (!pose) {
+    const [phi, theta] = ["x.phi", "x.theta"].map(name => flight.get("truth")?.at(name, t) ?? NaN), attitude = Number.isFinite(phi + theta);
+    return attitude ? {row, phi, theta, psi: 0, attitude, place: [0, 0, 0]} : null;
+  }
   if (row < 0) return null;
   const value = name => pose.column(name)?.[row] ?? NaN, finite = name => (Number.isFinite(value(name)) ? value(name) : 0);
   const [phi, theta, psi] = [value("phi"), value("theta"), finite("psi")];
@@ -174,6 +179,7 @@ export class Scene {
   }
 
   lowest(pose) { // altitude of the lowest row, m; looks at new rows only
+    if (!pose) return 0;
     if (this.seen?.pose !== pose) this.seen = {pose, count: 0, lowest: Infinity};
     const altitude = pose.column("altitude");
     for (; altitude && this.seen.count < pose.count; this.seen.count++) {
@@ -197,7 +203,7 @@ export class Scene {
     ctx.strokeStyle = colour("--quiet");
     this.line(ctx, see, place, [place[0], place[1], -ground]);
     ctx.setLineDash([]);
-    this.legend = `grid ${step} m, ground drawn at ${ground} m`;
+    this.legend = !flight.get("pose") ? "no pose in the log: attitude of truth, no place" : `grid ${step} m, ground drawn at ${ground} m`;
   }
 
   route(ctx, see, flight, pose, colour) {

@@ -230,7 +230,7 @@ function list(node, lines) {
 function drawReadouts() {
   const pose = poseAt(flight, clock.t), degrees = 180 / Math.PI, guidance = flight.get("guidance");
   const shown = (value, digits, unit) => (Number.isFinite(value) ? `${value.toFixed(digits)} ${unit}` : "-");
-  const heading = pose && Number.isFinite(pose.psi) ? `${String((Math.round(pose.psi * degrees) + 360) % 360).padStart(3, "0")} deg` : "-";
+  const heading = pose?.row >= 0 && Number.isFinite(pose.psi) ? `${String((Math.round(pose.psi * degrees) + 360) % 360).padStart(3, "0")} deg` : "-";
   const values = {
     heading, roll: shown(pose?.phi * degrees, 1, "deg"), pitch: shown(pose?.theta * degrees, 1, "deg"), altitude: shown(pose?.altitude, 1, "m"),
     "ground speed": shown(pose?.speed, 1, "m/s"), climb: shown(pose?.climb, 1, "m/s"),
@@ -264,6 +264,7 @@ function drawEvents() { // in the order of time; the last one before the cursor 
 
 let before = 0, second = 0;
 function frame(now) {
+  requestAnimationFrame(frame);
   const elapsed = Math.min(now - before, 250) / 1e3;
   before = now;
   if (clock.playing) {
@@ -286,7 +287,6 @@ function frame(now) {
     drawTimeline($("timeline"), flight, [begin(), Math.max(end(), begin() + 1)], shown, clock.t, colour);
     document.body.dataset.drawn = Number(document.body.dataset.drawn ?? 0) + 1;
   }
-  requestAnimationFrame(frame);
 }
 
 // ---- Controls
