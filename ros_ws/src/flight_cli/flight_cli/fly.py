@@ -16,7 +16,6 @@ from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.output import CLOCK_COLUMNS, ENDED_EARLY, INTERRUPTED, display_path, parse_numbers, progress_bar, show_flight
-from flight_cli.watch import watched
 from flight_core import outcome as ends
 from flight_core.parameters import ParameterError, require
 from guidance.route_file import Origin, read_route
@@ -75,6 +74,8 @@ def fly(
     if route is not None:
         chosen = written(chosen, run / f"{chosen.name}.yaml")
     if watch:
+        from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
+
         print(*context.with_resource(watched(run)), sep="\n", file=sys.stderr)
     with progress_bar(*CLOCK_COLUMNS, quiet=as_json) as bar:
         task = bar.add_task("flight", total=chosen.flight.duration, clock="", shown="")
