@@ -138,6 +138,25 @@ def test_without_fresh_y_there_is_no_command_and_a_frozen_pose_is_refused() -> N
         made.take_pose(StampedVector(0, np.array(LEVEL)), 400 * MS)
 
 
+@pytest.mark.parametrize(("gap", "continues"), [(5, True), (50, False)])
+def test_after_a_short_pause_the_commands_go_on_from_the_last_ones(gap: int, continues: bool) -> None:
+    made = flying()
+    made.take_target({"phi": 0.5})
+    before = run(made, 1, 9, np.zeros(4))
+    made.pause(paused=True, forget=False)
+    made.take_y(StampedVector(20 * MS * 9, np.zeros(4)), 20 * MS * 9)
+    assert made.step(20 * MS * 9, 20 * MS * 9) is None
+    made.pause(paused=False, forget=False)
+    number = 9 + gap
+    made.take_pose(StampedVector(20 * MS * number, np.array(LEVEL)), 20 * MS * number)
+    after_pause = run(made, number, number + 1, np.zeros(4))
+    assert after_pause["target.phi"][0] == 0.5
+    jump = abs(after_pause["u_m.p"][0] - before["u_m.p"][-1])
+    assert (
+        bool(jump <= 0.02 * 5.0 * 0.35 * (1.0 + 1e-9)) is continues
+    )  # a step of the slew limit; otherwise it starts from zero
+
+
 def test_a_new_command_continues_the_climb_rate_and_bounds_the_slew_of_u_m() -> None:
     made = flying()
     made.take_target({"phi": 0.5, "climb": 2.0})

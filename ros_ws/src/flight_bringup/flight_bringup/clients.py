@@ -45,6 +45,7 @@ MODES = {float(mode): mode.name for mode in Mode}
 
 SERVICE_TIMEOUT = 10.0  # s
 TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at its ticks
+TARGET_PERIOD = 0.2  # s, between two equal targets
 FIRST_U = 30.0  # s: the nodes of a flight start, and the autopilot may send its first messages late
 AT_REST = 20  # so many equal samples of u in a row: it has reached trim
 
@@ -197,6 +198,7 @@ class TargetClient(_Client):
         self._guidance, self._decoder = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True), NamedDecoder()
         self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
         self._in_force: dict[str, float] = {}
+        self._sent = -TARGET_PERIOD  # monotonic time of the last target, s
 
     def send(self, values: Mapping[str, float]) -> str:
         """Publish commands by channel until guidance has them in force. Returns why they are not, or ""."""
@@ -209,8 +211,9 @@ class TargetClient(_Client):
         return ""
 
     def _published(self, values: Mapping[str, float]) -> bool:
-        message = to_message(time.time_ns(), [*values], np.array([*values.values()]), self._node.get_fully_qualified_name())
-        self._publisher.publish(message)
+        if time.monotonic() - self._sent > TARGET_PERIOD:
+            self._sent, sender = time.monotonic(), self._node.get_fully_qualified_name()
+            self._publisher.publish(to_message(time.time_ns(), [*values], np.array([*values.values()]), sender))
         return all(self._received().get(f"target.{name}") == value for name, value in values.items())
 
     def _received(self) -> dict[str, float]:

@@ -212,7 +212,9 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
     )
     if state is None or inputs.begin is Begin.HOLD:
         return begun
-    return begun._replace(lateral=state.lateral, vertical=state.vertical, target=state.target, leg=state.leg)
+    again = begun._replace(lateral=state.lateral, vertical=state.vertical, target=state.target, leg=state.leg)
+    # Up to its age limit the reference model still flies the last u_m.
+    return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
 
 
 def airspeed(y: tuple[float, ...], params: GuidanceParams) -> float:
