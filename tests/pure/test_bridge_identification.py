@@ -213,6 +213,15 @@ def test_a_written_map_has_the_trims_that_were_sent() -> None:
     assert written.outputs == MAP.outputs
 
 
+def test_the_bridge_releases_a_stale_y_before_the_controller_engages_again() -> None:
+    # a controller that engages again begins the excitation again
+    rows = {name: row.model_copy(update={"max_age": 1.0}) for name, row in MAP.outputs.items()}
+    patient = MAP.model_copy(update={"outputs": rows})
+    for channel_map in (MAP, patient):
+        planned = experiment(channel_map, SPEED, 0.2, "airframe.yaml").controller
+        assert planned.max_age > max(row.max_age for row in channel_map.outputs.values())
+
+
 def test_an_experiment_stays_within_a_part_of_the_limits_of_the_map() -> None:
     planned = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
     for name, amplitude in zip(planned.inputs, planned.amplitude, strict=True):

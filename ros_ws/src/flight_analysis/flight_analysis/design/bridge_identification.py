@@ -41,7 +41,11 @@ PAUSE = 1.5  # s, between the inputs
 REFERENCE_BANDWIDTH = 0.5  # of the loop: the reference model's natural frequency per bandwidth of a channel, at most
 MAX_NATURAL_FREQUENCY: Mapping[str, float] = {"q": 4.0, "p": 5.0, "r": 4.0, "V": 1.2}  # rad/s, those of `osprey_servo`
 FULL_RANGE_TIME = 1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
-MAX_AGE, HOLD, RAMP = 0.3, 0.5, 2.0  # s, failsafe of the controller; the bridge's own ages are shorter
+AGE, HOLD, RAMP = (
+    1.5,
+    0.5,
+    2.0,
+)  # failsafe of the controller: its age limit per largest one of the bridge, which acts first; s, s
 WAIT = 30.0  # s before the first command of the flight: the time to engage
 
 
@@ -260,7 +264,8 @@ def _controller(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[str, A
     rows = [channel_map.inputs[name] for name in pairing.inputs]
     limits = {"lower": [row.lower for row in rows], "upper": [row.upper for row in rows]}
     common = {"rate": RATE, "outputs": list(pairing.outputs), "inputs": list(pairing.inputs)}
-    return common | limits | {"max_age": MAX_AGE, "hold": HOLD, "ramp": RAMP}
+    max_age = AGE * max(row.max_age for row in channel_map.outputs.values())
+    return common | limits | {"max_age": max_age, "hold": HOLD, "ramp": RAMP}
 
 
 def _commands(outputs: Sequence[str], bandwidth: Mapping[str, float], speed: float, authority: float) -> dict[str, Any]:
