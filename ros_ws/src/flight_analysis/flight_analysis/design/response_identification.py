@@ -34,6 +34,7 @@ PRIOR = 10.0  # of a coefficient: it turns a typical y or u into so many typical
 MEMORY = 0.2  # s, decay of the coefficients of the predictor before the fit
 MIN_ROWS_PER_COEFFICIENT = 5.0
 MIN_SHARE = 0.9  # of the motion in a closed loop: then feedback of disturbances is too little to be taken for a response
+CLOSED_LOOP_ERRORS = 2.0  # times as large as estimated: up to a tenth of the motion is feedback, a bias as large as the errors
 LOOP_MEMORY, LOOP_FINE, PERIOD = 8.0, 6, 0.05  # s before an instant that the excitation has an effect, windows of PERIOD, s
 FOLDS, RIDGES = 6, (1e-4, 1e-2)  # the better ridge counts: few commands need the one, many disturbances the other
 LEAST_DELAY = 0.01  # s, in a closed loop: an earlier response is the reaction of u to y, for no servo is as fast
@@ -329,6 +330,7 @@ def _responses(
         columns.append(_column(t, responses[..., j], j) if usable else _no_column(len(outputs)))
         refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, moved, float(share[j])))
     counts = (share >= MIN_SHARE) & ~((share < 1.0) & (np.array([one.delay for one in columns]) < LEAST_DELAY))
+    counted = np.where(share < 1.0, counts / CLOSED_LOOP_ERRORS, counts)
     return Response(
         outputs,
         inputs,
@@ -341,7 +343,7 @@ def _responses(
         tuple(refusal),
         sum(len(one.y) for one in rows) * layout.period,
         share,
-        np.array([one.sign_ratio for one in columns]) * counts,
+        np.array([one.sign_ratio for one in columns]) * counted,
     )
 
 
