@@ -51,7 +51,7 @@ def test_every_sample_is_that_of_an_independent_reader(run: Path) -> None:
 def test_the_summary_is_equal_to_the_last_digit(run: Path) -> None:
     recorded = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     assert recorded["outcome"] == "completed"
-    assert json.loads(json.dumps(read_flight(run).summary)) == recorded
+    assert json.loads(json.dumps(read_flight(run).summary)) == recorded | {"guidance": None}  # a key that came later
 
 
 def test_every_bit_is_replayed(run: Path) -> None:
