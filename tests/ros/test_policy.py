@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The access control policy allows exactly the topics and services that the nodes have."""
 
+import json
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -14,6 +15,8 @@ from tests.ros.peer import Peer
 from autopilot_bridge.params import LIBRARY, load_map
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.clients import FlightMonitor
+from flight_bringup.graph import GUIDANCE, parameter_overrides
+from flight_bringup.scenarios import find_scenario
 
 POLICY = REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "security" / "flight.policy.xml"
 
@@ -98,6 +101,18 @@ def test_the_policy_allows_exactly_the_topics_and_services_of_nodes(start_node: 
     lockstep = discovered(peer_node, ROLES)
     for role in ROLES:
         assert real_time[role].merged(lockstep[role]) == policy[role], role
+
+
+def test_the_policy_allows_exactly_those_of_guidance(start: Start, tmp_path: Path, peer_node: Peer) -> None:
+    scenario, found = find_scenario("osprey_route"), Access(*[frozenset()] * 4)
+    for lockstep in (False, True):
+        overrides = parameter_overrides(GUIDANCE, scenario, tmp_path, 0.0, lockstep=lockstep)
+        words = (word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}"))
+        node = start("guidance.main", "--ros-args", "--params-file", str(scenario.path), *words).wait_for("ready", timeout=60.0)
+        found = found.merged(discovered(peer_node, ("guidance",))["guidance"])
+        node.interrupt()
+        node.end()
+    assert found == allowed()["guidance"]
 
 
 def test_the_policy_allows_exactly_those_of_the_flight_monitor(osprey_gust: Scenario, peer_node: Peer) -> None:
