@@ -311,6 +311,7 @@ def test_a_route_file_is_flown_and_stays_with_the_flight(tmp_path: Path) -> None
         (["target", "V=30", "V=31"], "target: found a command twice, expected each once"),
         (["fly", "--route", "a.gpx"], "route: found the file a.gpx, expected one that ends in .geojson"),
         (["fly", "--route", "a.kml", "--origin", "91,8"], "--origin: found '91,8', expected a latitude and a longitude"),
+        (["fly", "--in-process", "--origin", "47.4,8.5"], "--origin: found no --route, expected the file of a route"),
     ],
 )
 def test_bad_words_of_the_command_line_are_one_sentence(words: list[str], sentence: str) -> None:

@@ -68,6 +68,7 @@ def fly(
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     if route is not None:
         chosen = with_route(chosen, read_route(route, _origin(origin)))
+    require(origin is None or route is not None, "--origin", "no --route", "the file of a route: --route FILE")
     if autopilot is None:
         require_euler(chosen)
     run = new_run(chosen, runs)
