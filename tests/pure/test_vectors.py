@@ -50,6 +50,15 @@ def test_the_array_namespace_is_that_of_the_library_of_the_array() -> None:
     assert array_namespace(jnp.zeros(2)) is jnp
 
 
+def test_the_functions_of_a_python_float_are_those_of_the_array_at_that_value() -> None:
+    xp = array_namespace(0.5)
+    for name in ("acos", "asin", "atan", "sin", "cos", "tan", "sqrt"):
+        assert getattr(xp, name)(0.5) == pytest.approx(float(getattr(jnp, name)(0.5)), rel=1e-6), name  # JAX in 32 bit
+    for name in ("atan2", "hypot", "copysign", "minimum", "maximum"):
+        assert getattr(xp, name)(0.5, -2.0) == pytest.approx(float(getattr(jnp, name)(0.5, -2.0)), rel=1e-6), name
+    assert [xp.where(one, 1.0, 2.0) for one in (True, False)] == [1.0, 2.0]
+
+
 def test_the_namespace_of_numpy_1_has_concat() -> None:
     xp = _NumPy1()
     assert xp.concat((np.zeros(1), np.ones(2))).tolist() == [0.0, 1.0, 1.0]

@@ -2,39 +2,48 @@
 # SPDX-License-Identifier: Apache-2.0
 """Euler's kinematics of bank and pitch, and their inverse in a coordinated turn. Angles in rad, rates in rad/s, body axes FRD.
 
+Arguments are Python floats, or arrays with a value for each aircraft of a fleet.
 Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2, 3 and 9.
 """
 
 import math
 
 from flight_core.units import GRAVITY
+from flight_core.vectors import Scalar, array_namespace
 
 MAX_TILT = math.radians(80.0)
 """Limit of phi in cos(phi) and of theta in tan(theta), which are singular at 90 deg."""
 
 
-def euler_rates(phi: float, theta: float, p: float, q: float, r: float) -> tuple[float, float]:
+def euler_rates(phi: Scalar, theta: Scalar, p: Scalar, q: Scalar, r: Scalar) -> tuple[Scalar, Scalar]:
     """phi_dot = p + tan(theta) (q sin(phi) + r cos(phi)) and theta_dot = q cos(phi) - r sin(phi)."""
-    turn = q * math.sin(phi) + r * math.cos(phi)
-    return p + math.tan(tilt(theta)) * turn, q * math.cos(phi) - r * math.sin(phi)
+    xp = array_namespace(phi)
+    turn = q * xp.sin(phi) + r * xp.cos(phi)
+    return p + xp.tan(tilt(theta)) * turn, q * xp.cos(phi) - r * xp.sin(phi)
 
 
-def turn_rate(phi: float, theta: float, theta_dot: float, speed: float) -> float:
+def turn_rate(phi: Scalar, theta: Scalar, theta_dot: Scalar, speed: Scalar) -> Scalar:
     """R of a coordinated turn: psi_dot cos(phi) cos(theta) - theta_dot sin(phi), psi_dot = g tan(phi) / V; speed V in m/s."""
-    phi = tilt(phi)
-    return GRAVITY * math.tan(phi) / speed * math.cos(phi) * math.cos(theta) - theta_dot * math.sin(phi)
+    xp, phi = array_namespace(phi), tilt(phi)
+    return GRAVITY * xp.tan(phi) / speed * xp.cos(phi) * xp.cos(theta) - theta_dot * xp.sin(phi)
 
 
-def body_rates(phi: float, theta: float, phi_dot: float, theta_dot: float, r: float) -> tuple[float, float]:
+def body_rates(phi: Scalar, theta: Scalar, phi_dot: Scalar, theta_dot: Scalar, r: Scalar) -> tuple[Scalar, Scalar]:
     """P and q that turn the attitude at these rates beside r, the inverse of `euler_rates`:
 
     q = (theta_dot + r sin(phi)) / cos(phi),  p = phi_dot - tan(theta) (q sin(phi) + r cos(phi))
     """  # noqa: D400, D415 - what follows is an equation
-    phi = tilt(phi)
-    q = (theta_dot + r * math.sin(phi)) / math.cos(phi)
-    return phi_dot - math.tan(tilt(theta)) * (q * math.sin(phi) + r * math.cos(phi)), q
+    xp, phi = array_namespace(phi), tilt(phi)
+    q = (theta_dot + r * xp.sin(phi)) / xp.cos(phi)
+    return phi_dot - xp.tan(tilt(theta)) * (q * xp.sin(phi) + r * xp.cos(phi)), q
 
 
-def tilt(angle: float) -> float:
+def tilt(angle: Scalar) -> Scalar:
     """An angle within +-MAX_TILT."""
-    return min(max(angle, -MAX_TILT), MAX_TILT)
+    return clip(angle, MAX_TILT)
+
+
+def clip(value: Scalar, limit: Scalar) -> Scalar:
+    """A value within +-limit."""
+    xp = array_namespace(value)
+    return xp.minimum(xp.maximum(value, -limit), limit)

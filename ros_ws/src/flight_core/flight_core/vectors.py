@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Named vectors: values with their channel names. Channels are matched by name, never by position."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from flight_core.rates import seconds
 
 FloatArray = NDArray[np.float64]
 Array = Any  # an array of NumPy or of JAX
+Scalar = Any  # a Python float, or an array with a value for each aircraft of a fleet
 
 
 class _NumPy1:
@@ -26,9 +28,26 @@ class _NumPy1:
 _NUMPY: Any = np if hasattr(np, "concat") else _NumPy1()
 
 
-def array_namespace(array: Array) -> Any:
-    """The array namespace of an array, as the array API standard defines it. NumPy 1 arrays lack `__array_namespace__`."""
-    return _NUMPY if isinstance(array, (np.ndarray, np.generic)) else array.__array_namespace__()
+class _Floats:
+    """Elementary functions of the array API standard for Python floats."""
+
+    acos, asin, atan, atan2 = math.acos, math.asin, math.atan, math.atan2
+    sin, cos, tan, sqrt, hypot, copysign = math.sin, math.cos, math.tan, math.sqrt, math.hypot, math.copysign
+    minimum, maximum = min, max
+
+    @staticmethod
+    def where(condition: bool, one: float, other: float) -> float:
+        return one if condition else other
+
+
+def array_namespace(array: Scalar) -> Any:
+    """The array namespace of an array, as the array API standard defines it; `_Floats` for a Python float.
+
+    NumPy 1 arrays lack `__array_namespace__`.
+    """
+    if isinstance(array, (np.ndarray, np.generic)):
+        return _NUMPY
+    return _Floats if isinstance(array, (float, int)) else array.__array_namespace__()
 
 
 class StampedVector(NamedTuple):

@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Attitude: body rates that hold or reach a bank and a pitch, in a coordinated turn."""
 
-import math
 from typing import NamedTuple
 
 from flight_core.kinematics import body_rates as inverse
-from flight_core.kinematics import tilt, turn_rate
+from flight_core.kinematics import clip, tilt, turn_rate
 from flight_core.units import GRAVITY
+from flight_core.vectors import Scalar, array_namespace
 
 
 class AttitudeParams(NamedTuple):
@@ -17,20 +17,27 @@ class AttitudeParams(NamedTuple):
     k_theta: float  # 1/s, a quarter of that of q
     roll_rate: float  # largest phi_dot, rad/s
     load: float  # largest change of the load factor, 1
-    n_alpha: float  # slope of the load factor over the angle of attack, 1/rad
+    n_alpha: Scalar  # slope of the load factor over the angle of attack, 1/rad
     k_beta: float  # 1/s, 0 where beta is not measured
 
 
 class BodyRates(NamedTuple):
     """Commands of the reference model, rad/s, FRD."""
 
-    p: float
-    q: float
-    r: float
+    p: Scalar
+    q: Scalar
+    r: Scalar
 
 
 def body_rates(
-    phi_c: float, theta_c: float, phi: float, theta: float, r: float, beta: float, speed: float, params: AttitudeParams
+    phi_c: Scalar,
+    theta_c: Scalar,
+    phi: Scalar,
+    theta: Scalar,
+    r: Scalar,
+    beta: Scalar,
+    speed: Scalar,
+    params: AttitudeParams,
 ) -> BodyRates:
     """Rates that bring phi and theta to their commands, by the inverse of Euler's equations in a coordinated turn:
 
@@ -45,11 +52,6 @@ def body_rates(
     """  # noqa: D400, D415 - what follows is an equation
     phi_dot = clip(params.k_phi * (phi_c - phi), params.roll_rate)
     theta_dot = clip(params.k_theta * (theta_c - theta), params.load * GRAVITY / speed)
-    lead = phi_dot * math.tan(tilt(phi)) / params.n_alpha
+    lead = phi_dot * array_namespace(phi).tan(tilt(phi)) / params.n_alpha
     p, q = inverse(phi, theta, phi_dot, theta_dot + lead, r)
     return BodyRates(p, q, turn_rate(phi, theta, theta_dot, speed) + params.k_beta * beta)
-
-
-def clip(value: float, limit: float) -> float:
-    """A value within +-limit."""
-    return min(max(value, -limit), limit)

@@ -5,15 +5,17 @@
 import math
 from typing import NamedTuple
 
+from flight_core.kinematics import clip
 from flight_core.units import GRAVITY
+from flight_core.vectors import Scalar, array_namespace
 
 
 class PathError(NamedTuple):
     """Where the aircraft is beside a path."""
 
-    e: float  # cross-track error, m, positive to the right of the path
-    track: float  # course of the path at its nearest point, rad
-    curvature: float  # of the path there, 1/m, positive to the right
+    e: Scalar  # cross-track error, m, positive to the right of the path
+    track: Scalar  # course of the path at its nearest point, rad
+    curvature: Scalar  # of the path there, 1/m, positive to the right
 
 
 class PathParams(NamedTuple):
@@ -30,7 +32,7 @@ def course_acceleration(course_c: float, course: float, speed: float, k: float) 
     return k * speed * (math.sin(difference) if abs(difference) < math.pi / 2.0 else math.copysign(1.0, difference))
 
 
-def path_acceleration(error: PathError, course: float, ground_speed: float, params: PathParams) -> float:
+def path_acceleration(error: PathError, course: Scalar, ground_speed: Scalar, params: PathParams) -> Scalar:
     """Acceleration to the right that follows a path, m/s^2:
 
         x       = min(abs(e) / (v_g P zeta), 1),  look-ahead angle l = pi/2 (1 - x)^2
@@ -42,17 +44,19 @@ def path_acceleration(error: PathError, course: float, ground_speed: float, para
     Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp, without its adaptation to wind.
     """  # noqa: D400, D415 - what follows is an equation
     e, track, kappa = error
-    x = min(abs(e) / (ground_speed * params.period * params.damping), 1.0)
+    xp = array_namespace(e)
+    x = xp.minimum(abs(e) / (ground_speed * params.period * params.damping), 1.0)
     look_ahead = math.pi / 2.0 * (1.0 - x) ** 2
-    bearing = track - math.copysign(min(math.pi / 2.0 - look_ahead, params.capture), e)
-    feedback = 4.0 * math.pi * params.damping / params.period * ground_speed * math.sin(bearing - course)
-    bend = kappa / (1.0 - min(kappa * e, 0.5))
-    return feedback + math.sin(look_ahead) ** 2 * bend * ground_speed**2 * math.cos(course - track)
+    bearing = track - xp.copysign(xp.minimum(math.pi / 2.0 - look_ahead, params.capture), e)
+    feedback = 4.0 * math.pi * params.damping / params.period * ground_speed * xp.sin(bearing - course)
+    bend = kappa / (1.0 - xp.minimum(kappa * e, 0.5))
+    return feedback + xp.sin(look_ahead) ** 2 * bend * ground_speed**2 * xp.cos(course - track)
 
 
-def bank_for(acceleration: float, path_angle: float, limit: float) -> float:
+def bank_for(acceleration: Scalar, path_angle: Scalar, limit: float) -> Scalar:
     """Bank of a coordinated turn, rad: atan(a / (g cos(gamma))) within +-limit."""
-    return min(max(math.atan(acceleration / (GRAVITY * math.cos(path_angle))), -limit), limit)
+    xp = array_namespace(acceleration)
+    return clip(xp.atan(acceleration / (GRAVITY * xp.cos(path_angle))), limit)
 
 
 def least_period(speed: float, bank: float, roll_rate: float) -> float:

@@ -8,22 +8,27 @@ log, so that each sample of the log can be computed again from the one before.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import IntEnum
-from typing import NamedTuple
+from functools import partial, reduce
+from operator import or_
+from typing import Any, NamedTuple
 
-from flight_core.kinematics import euler_rates
+from flight_core.kinematics import clip, euler_rates
 from flight_core.rates import seconds
 from flight_core.units import GRAVITY
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, Scalar, array_namespace
 from guidance import path, protection
 from guidance.attitude import AttitudeParams, BodyRates, body_rates
-from guidance.lateral import PathParams, bank_for, course_acceleration, path_acceleration
-from guidance.path import Arc, Leg, Route
+from guidance.lateral import PathError, PathParams, bank_for, course_acceleration, path_acceleration
+from guidance.path import Arc, Leg, Point, Route
 from guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
 """Channels of `pose`: rad, m, m/s; beta is 0 where it is not measured."""
+
+STEEPEST = math.radians(89.0)
+"""Largest bank that a mode asks for, before protection."""
 
 
 class Mode(IntEnum):
@@ -219,7 +224,12 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
 
 def airspeed(y: tuple[float, ...], params: GuidanceParams) -> float:
     """True airspeed V0 + V, m/s, at least half of V0."""
-    return max(params.speed + y[params.outputs.index("V")], params.speed / 2.0)
+    return float(true_airspeed(y[params.outputs.index("V")], params))
+
+
+def true_airspeed(V: Scalar, params: GuidanceParams) -> Scalar:
+    """`airspeed` from the channel V of y, m/s."""
+    return array_namespace(V).maximum(params.speed + V, params.speed / 2.0)
 
 
 def step(
@@ -237,26 +247,42 @@ def step(
     dt = seconds(inputs.t_ns - state.t_ns)
     state = _with_attitude(state, inputs, dt, params)
     state = _with_commands(state, inputs, route)
-    pose, speed, limits = dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params), params.limits
-    flies = state.mode is Mode.ENGAGED
+    pose, y = dict(zip(POSE, inputs.pose, strict=True)), dict(zip(params.outputs, inputs.y, strict=True))
+    wanted, error, to_go = _bank(state, pose, airspeed(inputs.y, params), route, params)
+    state, commands = command(state, pose, y, wanted, dt, params)
+    return state._replace(t_ns=inputs.t_ns), commands._replace(xtrack=error, to_go=to_go)
+
+
+def command(
+    state: GuidanceState,
+    pose: Mapping[str, Scalar],
+    y: Mapping[str, Scalar],
+    phi_wanted: Scalar,
+    dt: float,
+    params: GuidanceParams,
+) -> tuple[GuidanceState, Commands]:
+    """Protection and u_m of `step`, from the bank that the lateral mode asks for, rad. `t_ns` of the state stays.
+
+    The values may be arrays, with one for each aircraft of a fleet; the modes are those of all of them.
+    """
+    speed, limits, flies = true_airspeed(y["V"], params), params.limits, state.mode is Mode.ENGAGED
     if flies:
         alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
         state = state._replace(alpha=alpha)
 
+    xp = array_namespace(speed)
     bank = protection.bank_limit(limits.bank, limits.stall_speed, speed)
-    V_wanted = max(state.target.V, limits.floor)
+    V_wanted = xp.maximum(state.target.V, limits.floor)
     V_c = slewed(state.V_c, V_wanted, params.slew[params.outputs.index("V")], dt)
 
-    phi_wanted, error, to_go = _bank(state, pose, speed, route, params) if flies else (0.0, 0.0, 0.0)
-    phi_c = min(max(phi_wanted, -bank), bank)
+    phi_c = clip(phi_wanted, bank)
     climb_c, climb_limited = _climb(state, pose, speed, dt, params) if flies else (0.0, False)
     theta_wanted = state.target.theta if flies and state.vertical is Vertical.THETA else pitch_for(climb_c, speed, state.alpha)
-    theta_c = min(max(theta_wanted, limits.least_pitch), limits.largest_pitch)
+    theta_c = xp.minimum(xp.maximum(theta_wanted, limits.least_pitch), limits.largest_pitch)
 
-    r = inputs.y[params.outputs.index("r")]
     attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
     beta = pose["beta"] if flies else 0.0
-    rates = body_rates(phi_c, theta_c, state.phi, state.theta, r, beta, speed, attitude)
+    rates = body_rates(phi_c, theta_c, state.phi, state.theta, y["r"], beta, speed, attitude)
     if state.mode is Mode.POSE_LOST:
         rates = BodyRates(0.0, 0.0, 0.0)
     wanted = {"V": V_c - params.speed, **rates._asdict()}
@@ -267,15 +293,13 @@ def step(
     commands = Commands(
         phi_c,
         theta_c,
-        error,
-        to_go,
-        bank_limited=phi_c != phi_wanted or abs(phi_c) == bank,
+        bank_limited=(phi_c != phi_wanted) | (abs(phi_c) == bank),
         theta_limited=theta_c != theta_wanted,
         climb_limited=climb_limited,
         V_limited=V_wanted != state.target.V,
-        slew_limited=any(one != wanted[name] for name, one in zip(params.outputs, u_m, strict=True)),
+        slew_limited=reduce(or_, (one != wanted[name] for name, one in zip(params.outputs, u_m, strict=True))),
     )
-    return state._replace(t_ns=inputs.t_ns, climb_c=climb_c, V_c=V_c, u_m=u_m), commands
+    return state._replace(climb_c=climb_c, V_c=V_c, u_m=u_m), commands
 
 
 def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: GuidanceParams) -> GuidanceState:
@@ -327,48 +351,65 @@ def _bank(
     state: GuidanceState, pose: Mapping[str, float], speed: float, route: Route | None, params: GuidanceParams
 ) -> tuple[float, float, float]:
     """Bank that the lateral mode asks for, rad; cross-track error and distance to the end of the leg, m."""
-    target, gamma, largest = state.target, path_angle(pose["climb"], speed), math.radians(89.0)
+    if state.mode is not Mode.ENGAGED:
+        return 0.0, 0.0, 0.0
+    target, gamma = state.target, path_angle(pose["climb"], speed)
     if state.lateral is Lateral.PHI:
         return target.phi, 0.0, 0.0
     if state.lateral is Lateral.HEADING:
-        return bank_for(course_acceleration(target.heading, pose["psi"], speed, params.k_chi), gamma, largest), 0.0, 0.0
-    v_north, v_east = pose["v_north"], pose["v_east"]
-    course, ground_speed = math.atan2(v_east, v_north), max(math.hypot(v_north, v_east), 1.0)
+        return bank_for(course_acceleration(target.heading, pose["psi"], speed, params.k_chi), gamma, STEEPEST), 0.0, 0.0
     if state.lateral is Lateral.COURSE:
-        return bank_for(course_acceleration(target.course, course, ground_speed, params.k_chi), gamma, largest), 0.0, 0.0
-    position, following = (pose["north"], pose["east"]), None
+        return bank_for(course_acceleration(target.course, *_over_ground(pose), params.k_chi), gamma, STEEPEST), 0.0, 0.0
     leg: Leg = Arc((target.north, target.east), target.radius)
+    following = None
     if state.lateral is Lateral.ROUTE and route is not None:
         leg = route.legs[state.leg]
         following = route.legs[state.leg + 1] if leg.end is not None else None
+    position = (pose["north"], pose["east"])
     error = path.error(leg, position)
-    if following is not None:
-        error = error._replace(curvature=_anticipated(error.curvature, leg, following, pose, ground_speed, params))
-    acceleration = path_acceleration(error, course, ground_speed, params.path)
-    return bank_for(acceleration, gamma, largest), error.e, path.to_go(leg, position)
+    entry = error.curvature if following is None else path.error(following, leg.end or (0.0, 0.0)).curvature
+    wanted = follow(error, entry, partial(path.passed, leg), pose, speed, params)
+    return wanted, error.e, path.to_go(leg, position)
 
 
-def _anticipated(
-    curvature: float, leg: Leg, following: Leg, pose: Mapping[str, float], ground_speed: float, params: GuidanceParams
-) -> float:
-    """Curvature of the following leg as early as the bank lags its command, else that of the leg; 1/m.
+def _over_ground(pose: Mapping[str, Scalar]) -> tuple[Scalar, Scalar]:
+    """Course, rad, and speed over ground, m/s, at least 1."""
+    v_north, v_east = pose["v_north"], pose["v_east"]
+    xp = array_namespace(v_north)
+    return xp.atan2(v_east, v_north), xp.maximum(xp.hypot(v_north, v_east), 1.0)
 
-    The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp, then the loop of the bank.
+
+def follow(
+    error: PathError,
+    entry: Scalar,
+    passed: Callable[[Point], Any],
+    pose: Mapping[str, Scalar],
+    speed: Scalar,
+    params: GuidanceParams,
+) -> Scalar:
+    """Bank that follows a path, rad, before protection. `entry` is the curvature of the following leg at its start, 1/m.
+
+    It takes the place of that of the leg as early as the bank lags its command: where `passed` says that the position then
+    lies beyond the end of the leg. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp, then
+    the loop of the bank.
     """
-    entry = path.error(following, leg.end or (0.0, 0.0)).curvature
-    banks = (math.atan(ground_speed**2 * each / GRAVITY) for each in (entry, -curvature))
-    lag = abs(sum(banks)) / (2.0 * params.attitude.roll_rate) + 0.5 / params.attitude.k_phi
+    course, ground_speed = _over_ground(pose)
+    xp = array_namespace(ground_speed)
+    change = xp.atan(ground_speed**2 * entry / GRAVITY) + xp.atan(ground_speed**2 * -error.curvature / GRAVITY)
+    lag = abs(change) / (2.0 * params.attitude.roll_rate) + 0.5 / params.attitude.k_phi
     ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
-    return entry if path.passed(leg, ahead) else curvature
+    error = error._replace(curvature=xp.where(passed(ahead), entry, error.curvature))
+    return bank_for(path_acceleration(error, course, ground_speed, params.path), path_angle(pose["climb"], speed), STEEPEST)
 
 
 def _climb(
-    state: GuidanceState, pose: Mapping[str, float], speed: float, dt: float, params: GuidanceParams
-) -> tuple[float, bool]:
+    state: GuidanceState, pose: Mapping[str, Scalar], speed: Scalar, dt: float, params: GuidanceParams
+) -> tuple[Scalar, Any]:
     """Commanded climb rate, m/s, and whether protection limits it."""
     if state.vertical is Vertical.THETA:
         return pose["climb"], False  # from here the other modes start
     vertical, target = params.vertical, state.target
     wanted = target.climb if state.vertical is Vertical.CLIMB else climb_for(target.altitude - pose["altitude"], vertical)
     largest = protection.climb_limit(vertical.climb, vertical.sink, speed, params.limits.floor)
-    return slewed(state.climb_c, min(wanted, largest), vertical.acceleration, dt), wanted > largest
+    climb_c = slewed(state.climb_c, array_namespace(speed).minimum(wanted, largest), vertical.acceleration, dt)
+    return climb_c, wanted > largest

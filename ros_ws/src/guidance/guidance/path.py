@@ -5,12 +5,13 @@
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from flight_core.parameters import require
+from flight_core.vectors import Scalar, array_namespace
 from guidance.lateral import PathError
 
-Point = tuple[float, float]  # north, east, m
+Point = tuple[Scalar, Scalar]  # north, east, m
 
 SHARPEST = math.radians(150.0)
 """Largest change of course at a waypoint: beyond it the fillet cuts the corner by more than 2.8 radii."""
@@ -50,14 +51,22 @@ def course_of(start: Point, end: Point) -> float:
 def error(leg: Leg, position: Point) -> PathError:
     """The cross-track error of a position, and course and curvature of the leg at its nearest point."""
     if isinstance(leg, Line):
-        track = course_of(leg.start, leg.end)
-        north, east = position[0] - leg.start[0], position[1] - leg.start[1]
-        return PathError(east * math.cos(track) - north * math.sin(track), track, 0.0)
-    side = math.copysign(1.0, leg.radius)
-    bearing = course_of(leg.centre, position)  # from the centre
-    return PathError(
-        side * (abs(leg.radius) - math.dist(leg.centre, position)), bearing + side * math.pi / 2.0, 1.0 / leg.radius
-    )
+        return line_error(leg.start, course_of(leg.start, leg.end), position)
+    return circle_error(leg.centre, leg.radius, position)
+
+
+def line_error(start: Point, track: Scalar, position: Point) -> PathError:
+    """`error` beside a line from a point on a course, rad."""
+    xp, north, east = array_namespace(track), position[0] - start[0], position[1] - start[1]
+    return PathError(east * xp.cos(track) - north * xp.sin(track), track, 0.0)
+
+
+def circle_error(centre: Point, radius: Scalar, position: Point) -> PathError:
+    """`error` beside a circle, radius in m, positive to the right."""
+    xp, north, east = array_namespace(radius), position[0] - centre[0], position[1] - centre[1]
+    side = xp.copysign(1.0, radius)
+    bearing = xp.atan2(east, north)  # from the centre
+    return PathError(side * (abs(radius) - xp.hypot(north, east)), bearing + side * math.pi / 2.0, 1.0 / radius)
 
 
 def end_course(leg: Leg) -> float:
@@ -66,16 +75,18 @@ def end_course(leg: Leg) -> float:
         return course_of(leg.start, leg.end)
     if leg.end is None:
         raise ValueError("an orbit has no end")
-    return error(leg, leg.end).track
+    return float(error(leg, leg.end).track)
 
 
 def passed(leg: Leg, position: Point) -> bool:
     """Whether a position lies beyond the half plane at the end of a leg, across its course there. Never for an orbit."""
-    if leg.end is None:
-        return False
-    course = end_course(leg)
-    north, east = position[0] - leg.end[0], position[1] - leg.end[1]
-    return north * math.cos(course) + east * math.sin(course) >= 0.0
+    return leg.end is not None and bool(beyond(leg.end, end_course(leg), position))
+
+
+def beyond(end: Point, course: Scalar, position: Point) -> Any:
+    """Whether a position lies beyond the half plane through a point across a course, rad."""
+    xp, north, east = array_namespace(course), position[0] - end[0], position[1] - end[1]
+    return north * xp.cos(course) + east * xp.sin(course) >= 0.0
 
 
 def to_go(leg: Leg, position: Point) -> float:
@@ -84,7 +95,7 @@ def to_go(leg: Leg, position: Point) -> float:
         return 0.0
     if isinstance(leg, Line):
         course = end_course(leg)
-        return (leg.end[0] - position[0]) * math.cos(course) + (leg.end[1] - position[1]) * math.sin(course)
+        return float((leg.end[0] - position[0]) * math.cos(course) + (leg.end[1] - position[1]) * math.sin(course))
     turn = course_of(leg.centre, leg.end) - course_of(leg.centre, position)
     return leg.radius * math.remainder(turn, 2.0 * math.pi)
 

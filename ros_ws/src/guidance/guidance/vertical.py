@@ -5,6 +5,9 @@
 import math
 from typing import NamedTuple
 
+from flight_core.kinematics import clip
+from flight_core.vectors import Scalar, array_namespace
+
 
 class VerticalParams(NamedTuple):
     """Gains and limits of the vertical loop."""
@@ -16,7 +19,7 @@ class VerticalParams(NamedTuple):
     alpha_time: float  # time constant of the angle of attack's low-pass, s
 
 
-def climb_for(error: float, params: VerticalParams) -> float:
+def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
     """Climb rate for an error of altitude (command less altitude, m), in m/s, within -sink and climb:
 
         k_h e  near,  sign(e) sqrt(a (abs(e) - e_l / 2))  from e_l = a / (2 k_h^2) on
@@ -25,16 +28,17 @@ def climb_for(error: float, params: VerticalParams) -> float:
     """  # noqa: D400, D415 - what follows is an equation
     k_h, a = params.k_h, params.acceleration
     near = a / (2.0 * k_h * k_h)
-    far = math.copysign(math.sqrt(a * max(abs(error) - near / 2.0, 0.0)), error)
-    return min(max(k_h * error if abs(error) <= near else far, -params.sink), params.climb)
+    xp = array_namespace(error)
+    far = xp.copysign(xp.sqrt(a * xp.maximum(abs(error) - near / 2.0, 0.0)), error)
+    return xp.minimum(xp.maximum(xp.where(abs(error) <= near, k_h * error, far), -params.sink), params.climb)
 
 
-def slewed(value: float, target: float, rate: float, dt: float) -> float:
+def slewed(value: Scalar, target: Scalar, rate: float, dt: float) -> Scalar:
     """A value moved towards a target by at most rate dt."""
-    return value + min(max(target - value, -rate * dt), rate * dt)
+    return value + clip(target - value, rate * dt)
 
 
-def alpha_estimate(alpha: float, theta: float, climb: float, speed: float, dt: float, params: VerticalParams) -> float:
+def alpha_estimate(alpha: Scalar, theta: Scalar, climb: Scalar, speed: Scalar, dt: float, params: VerticalParams) -> Scalar:
     """Low-pass of theta - gamma a step later, gamma = asin(climb / V).
 
         alpha+ = alpha + (1 - exp(-dt/T)) (theta - gamma - alpha)
@@ -44,11 +48,11 @@ def alpha_estimate(alpha: float, theta: float, climb: float, speed: float, dt: f
     return alpha + (1.0 - math.exp(-dt / params.alpha_time)) * (theta - path_angle(climb, speed) - alpha)
 
 
-def pitch_for(climb: float, speed: float, alpha: float) -> float:
+def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
     """Pitch for a climb rate, rad: theta_c = asin(climb / V) + alpha."""
     return path_angle(climb, speed) + alpha
 
 
-def path_angle(climb: float, speed: float) -> float:
+def path_angle(climb: Scalar, speed: Scalar) -> Scalar:
     """Flight path angle in the air mass, rad: asin(climb / V)."""
-    return math.asin(min(max(climb / speed, -1.0), 1.0))
+    return array_namespace(climb).asin(clip(climb / speed, 1.0))
