@@ -13,8 +13,10 @@ import argparse
 import math
 import sys
 import tempfile
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
+from contextlib import suppress
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,10 +28,13 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.outcome import COMPLETED
+from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
-from flight_core.vectors import FloatArray
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from guidance.guidance import Guidance
 from guidance.lateral import least_radius
+from guidance.modes import POSE, Lateral, Mode
 from guidance.params import GuidanceParameters
 from guidance.protection import FLOOR
 
@@ -40,6 +45,11 @@ WIND = 0.2  # of V0
 SIDES = (3.0, 2.5)  # of the rectangle, in radii
 LOW, LOW_WIND = 100.0, 10.9  # m and m/s at 20 ft, for an airframe without altitude: lateral intensity 1.5 m/s, MIL-F-8785C
 SWITCH_PERIOD = 5.0  # s
+FAULT = START + 10.0  # s, of a fault of pose, in a turn
+ANGLE_NOISE = math.radians(0.5)
+NOISE = dict.fromkeys(("phi", "theta", "beta"), ANGLE_NOISE) | {"psi": 2.0 * ANGLE_NOISE}
+NOISE |= dict.fromkeys(("north", "east", "altitude"), 0.5) | dict.fromkeys(("v_north", "v_east", "climb"), 0.2)
+"""Standard deviations of a poor estimator, rad, m and m/s, white."""
 
 
 class Air(NamedTuple):
@@ -58,6 +68,50 @@ class Figure(NamedTuple):
     limit: float
 
 
+class Pose(NamedTuple):
+    """How guidance receives pose. The fault lasts for `fault` s from FAULT on."""
+
+    every: int = 1  # one of so many
+    delay: float = 0.0  # s
+    noise: bool = False  # NOISE
+    fault: float = 0.0  # s
+    off: Mapping[str, float] | None = None  # what the fault adds; None: the last pose is repeated
+    stamped: bool = False  # whether the repeated pose has a new stamp
+    max_age: float = 0.2  # s, of the section
+
+
+class PoseReceiver(Guidance):
+    """Guidance that receives pose so. As the node does, it refuses a sample that is not newer or stands still, and goes on."""
+
+    def __init__(self, how: Pose, parameters: GuidanceParameters) -> None:
+        super().__init__(parameters)
+        self._how, self._number, self._generator = how, 0, np.random.default_rng(1)
+        self._sent: deque[StampedVector] = deque()
+
+    def take_pose(self, sample: StampedVector, now_ns: int) -> None:
+        """Take the poses that arrive now."""
+        how = self._how
+        if self._number % how.every == 0:
+            self._sent.append(self._measured(sample, now_ns))
+        self._number += 1
+        while self._sent and self._sent[0].stamp_ns <= now_ns - nanoseconds(how.delay):
+            with suppress(ChannelError):
+                super().take_pose(self._sent.popleft(), now_ns)
+
+    def _measured(self, sample: StampedVector, now_ns: int) -> StampedVector:
+        how, pose = self._how, sample.value.copy()
+        if how.noise:
+            pose += [NOISE[name] for name in POSE] * self._generator.standard_normal(len(POSE))
+        if 0.0 <= seconds(now_ns) - FAULT < how.fault:
+            if how.off is None:
+                last = self._pose or sample
+                return last._replace(stamp_ns=sample.stamp_ns) if how.stamped else last
+            pose += [how.off.get(name, 0.0) for name in POSE]
+        psi = POSE.index("psi")
+        pose[psi] = math.remainder(pose[psi], 2.0 * math.pi)
+        return StampedVector(sample.stamp_ns, pose)
+
+
 class Manoeuvre(NamedTuple):
     """A manoeuvre: the section of guidance and the duration, s; and its figures."""
 
@@ -65,6 +119,7 @@ class Manoeuvre(NamedTuple):
     figures: Callable[[Tape, GuidanceParameters, bool], Iterator[Figure]]  # the last: whether the air is calm
     winds: tuple[float, ...] = (0.0,)
     turbulent: bool = True
+    pose: Pose = Pose()
 
 
 def program(**channels: float) -> dict[str, Any]:
@@ -104,6 +159,18 @@ def of_heading(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[
     yield Figure("overshoot (%)", 100.0 * (np.unwrap(psi).max() / TURN - 1.0), 2.0 if calm else 5.0)
     yield Figure("altitude (m)", np.abs(altitude - altitude[0]).max(), 5.0 if calm else 15.0)
     yield Figure("V (m/s)", np.abs(V).max(), 2.0 if calm else 5.0)
+
+
+def of_pose(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+    """Heading and altitude as received over the last 10 s, the true bank then, and how long the wings were levelled."""
+    end = tape.time("guidance")[-1] - 10.0
+    psi, altitude, wanted, lateral = after(tape, end, "pose.psi", "pose.altitude", "target.altitude", "mode.lateral")
+    if lateral[0] == Lateral.HEADING:  # not after a loss of pose
+        yield Figure("heading (deg)", math.degrees(abs(float(np.mean(np.mod(psi, 2.0 * math.pi))) - math.pi)), 1.0)
+    yield Figure("altitude (m)", abs(float(np.mean(altitude - wanted))), 1.0)
+    yield Figure("bank at the end (deg)", math.degrees(np.abs(tape["pose"]["phi"][tape.time("pose") > end]).max()), 5.0)
+    stale = after(tape, 0.0, "mode")[0] != Mode.ENGAGED
+    yield Figure("pose stale (s)", float(stale.sum()) * seconds(section.params().period_ns), math.inf)
 
 
 def of_altitude(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
@@ -158,10 +225,11 @@ RANGES: dict[str, float] = {}
 """Range of each input of the aircraft that flies."""
 
 
-def of_limits(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+def of_limits(tape: Tape, section: GuidanceParameters, calm: bool, pose: Pose) -> Iterator[Figure]:
     """How far the bank is beyond its limit, and the airspeed below nine tenths of the floor, in any manoeuvre."""
-    phi, V = after(tape, 0.0, "pose.phi", "y.V")
-    yield Figure("bank beyond (deg)", math.degrees(np.abs(phi).max() - section.bank), 2.0 if calm else 3.0)
+    phi, V = tape["pose"]["phi"], tape["guidance"]["y.V"]
+    limit = 2.0 if calm else 3.0
+    yield Figure("bank beyond (deg)", math.degrees(np.abs(phi).max() - section.bank), limit if pose == Pose() else LATE)
     floor = section.params().limits.stall_speed * FLOOR
     yield Figure("V below 0.9 floor (m/s)", 0.9 * floor - (section.speed + V.min()), 0.0)
 
@@ -188,6 +256,26 @@ SWITCHES: tuple[dict[str, float], ...] = (
     {"heading": 1.0, "altitude": 0.0},
 )
 """Commands one after another; altitude and theta count from those of trim."""
+
+
+def turn_round(section: GuidanceParameters) -> tuple[dict[str, Any], float]:
+    """A turn to the right onto the heading at which psi jumps, 180 deg."""
+    duration = math.pi * section.speed / (GRAVITY * math.tan(section.bank)) + 40.0
+    return {"program": {"heading": {"start": [START, START + 5.0], "value": [TURN, math.pi]}}}, FAULT + duration
+
+
+POSES: Mapping[str, Pose] = {
+    "5 Hz": Pose(every=10),
+    "0.2 s late": Pose(delay=0.2),
+    "noisy": Pose(noise=True),
+    "5 Hz, 0.2 s late, noisy": Pose(every=10, delay=0.2, noise=True, max_age=0.5),
+    "frozen for 8 s": Pose(fault=8.0),
+    "frozen for 8 s, new stamps": Pose(fault=8.0, stamped=True),
+    "frozen for 20 s": Pose(fault=20.0),
+    "jump": Pose(fault=math.inf, off={"psi": math.radians(30.0), "north": 100.0, "east": 100.0, "altitude": 30.0}),
+    "one sample off": Pose(fault=0.02, off={"phi": 1.0, "theta": 0.3, "psi": math.pi, "altitude": 100.0, "climb": 20.0}),
+}
+"""A pose worse than the true one."""
 
 
 def switching(section: GuidanceParameters) -> tuple[dict[str, Any], float]:
@@ -229,6 +317,7 @@ MANOEUVRES: Mapping[str, Manoeuvre] = {
         of_orbit,
     ),
     "switch": Manoeuvre(switching, of_switch, turbulent=False),
+    **{f"pose: {name}": Manoeuvre(turn_round, of_pose, turbulent=False, pose=pose) for name, pose in POSES.items()},
 }
 
 
@@ -270,6 +359,7 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
         raise ValueError(f"{scenario.name} has no guidance")
     speed, altitude = guidance.speed, scenario.aircraft.altitude or 0.0
     section, duration = manoeuvre.plan(guidance.model_copy(update={"wind": air.across * speed}))
+    section |= {"wind": air.across * speed, "max_age": manoeuvre.pose.max_age}
     for name in ("altitude", "theta"):
         if name in section.get("program", {}):
             offset = altitude if name == "altitude" else trim_pitch(scenario)
@@ -282,20 +372,20 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
     if air.seed is not None:
         low = {"altitude": LOW, "wind": LOW_WIND} if altitude == 0.0 else {"altitude": altitude, "sigma": SIGMA}
         aircraft["turbulence"] = low | {"seed": air.seed}
-    varied = scenario.vary(flight={"duration": duration}, aircraft=aircraft, guidance=section | {"wind": air.across * speed})
+    varied = scenario.vary(flight={"duration": duration}, aircraft=aircraft, guidance=section)
     controller = scenario.controller
     RANGES.clear()
     if controller.lower and controller.upper:
         RANGES.update(
             {name: high - low for name, low, high in zip(controller.inputs, controller.lower, controller.upper, strict=True)}
         )
-    tape = simulate(varied)
+    tape = simulate(varied, guide=partial(PoseReceiver, manoeuvre.pose))
     if tape.outcome != COMPLETED:
         yield Figure(f"lost: {tape.outcome}", math.inf, 0.0)
         return
     calm = air.seed is None
     yield from manoeuvre.figures(tape, guidance, calm)
-    yield from of_limits(tape, guidance, calm)
+    yield from of_limits(tape, guidance, calm, manoeuvre.pose)
 
 
 def trim_pitch(scenario: Scenario) -> float:
@@ -305,6 +395,8 @@ def trim_pitch(scenario: Scenario) -> float:
 
 EXEMPT = {("f16", "heading", "altitude (m)"): 40.0, ("f16", "orbit", "rms (s)"): 0.05}
 """Limits of an aircraft whose rudder is at its stop in turns: its own yaw damper feeds r back without a washout."""
+LATE = 8.0
+"""Limit of the bank beyond its limit with a poor pose, deg: 0.2 s at p_max = 0.35 rad/s are 4 deg, and so are 5 Hz."""
 
 
 class Row(NamedTuple):

@@ -9,6 +9,8 @@ import pytest
 from benchmarks import guidance as benchmark
 
 from flight_core.tape import Signal, Tape
+from flight_core.vectors import StampedVector
+from guidance.modes import POSE
 
 
 def test_a_step_of_the_bank_is_flown_within_its_limits() -> None:
@@ -29,3 +31,27 @@ def test_a_known_step_has_the_figures_that_it_must_have() -> None:
     assert overshoot.value == pytest.approx(10.0)
     assert settled.value == pytest.approx(3.0, abs=0.03)  # within 1 deg = 5 %
     assert math.isclose(benchmark.lap(section), 2.0 * math.pi * section.least_radius() / 25.0)
+
+
+@pytest.mark.parametrize(
+    ("pose", "stale"),
+    [("5 Hz, 0.2 s late, noisy", 0.0), ("frozen for 8 s, new stamps", 7.8), ("jump", 0.0), ("one sample off", 0.0)],
+)
+def test_a_poor_pose_is_flown_across_180_deg_and_a_frozen_one_levels_the_wings(pose: str, stale: float) -> None:
+    rows = list(benchmark.rows(["osprey_servo"], [f"pose: {pose}"], seeds=0))
+    for row in rows:
+        assert row.figure.value <= row.figure.limit, row
+    assert {row.figure.name: row.figure.value for row in rows}["pose stale (s)"] == pytest.approx(stale)
+    assert rows[0].figure.name == "heading (deg)"  # held again at the end
+
+
+def test_a_delayed_pose_keeps_its_stamp_and_one_that_comes_late_is_stale() -> None:
+    section = benchmark.aircraft_of("osprey_servo").guidance
+    assert section is not None
+    made = benchmark.PoseReceiver(benchmark.Pose(delay=0.3), section)
+    for k in range(20):
+        made.take_pose(StampedVector(20_000_000 * k, np.full(len(POSE), float(k))), 20_000_000 * k)
+    assert made.ages(380_000_000)["pose"] == pytest.approx(0.3)
+    assert made.pose()["north"] == 4.0
+    made.take_y(StampedVector(380_000_000, np.zeros(4)), 380_000_000)
+    assert made.step(380_000_000, 380_000_000) is None  # it does not begin with a pose older than 0.2 s

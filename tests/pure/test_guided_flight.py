@@ -29,7 +29,7 @@ from guidance.route_file import Waypoint, read_route
 ROUTE = find_scenario("osprey_route")
 SECTION: dict[str, Any] = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0, "throttle_authority": [3.0, 3.0]}
 MS = 1_000_000  # ns
-LEVEL = (0.1, 0.05, 0.3, 0.0, 0.0, 100.0, 25.0 * math.cos(0.3), 25.0 * math.sin(0.3), 0.0, 0.0)  # a bank of 0.1 rad
+BANKED = (0.1, 0.05, 0.3, 0.0, 0.0, 100.0, 25.0 * math.cos(0.3), 25.0 * math.sin(0.3), 0.0, 0.0)  # a bank of 0.1 rad
 
 
 def calm(duration: float, **section: Any) -> Scenario:
@@ -91,10 +91,15 @@ def test_each_step_follows_from_the_log_to_the_last_bit() -> None:
         state = logged
 
 
+def pose(stamp_ns: int) -> StampedVector:
+    """A pose in a bank of 0.1 rad, on the way to the north."""
+    return StampedVector(stamp_ns, np.array([*BANKED[:3], 25e-9 * stamp_ns, *BANKED[4:]]))
+
+
 def flying(**section: Any) -> Guidance:
     """Guidance after its first step, in a bank of 0.1 rad to the right."""
     made = Guidance(GuidanceParameters.validate_mapping(SECTION | section, "guidance"))
-    made.take_pose(StampedVector(0, np.array(LEVEL)), 0)
+    made.take_pose(pose(0), 0)
     made.take_y(StampedVector(0, np.zeros(4)), 0)
     assert made.step(0, 0) is not None
     return made
@@ -122,7 +127,7 @@ def test_a_stale_pose_levels_the_wings_by_dead_reckoning_then_stops_all_rates() 
     assert abs(math.degrees(phi[200])) < 1.0  # 4 s
     assert mode[-1] == Mode.POSE_LOST
     assert signal["u_m.p"][-1] == signal["u_m.q"][-1] == signal["u_m.r"][-1] == 0.0
-    made.take_pose(StampedVector(6000 * MS, np.array(LEVEL)), 6000 * MS)
+    made.take_pose(pose(6000 * MS), 6000 * MS)
     made.take_y(StampedVector(6000 * MS, np.zeros(4)), 6000 * MS)
     assert made.step(6000 * MS, 6000 * MS) is not None
     state = made.state
@@ -135,7 +140,10 @@ def test_without_fresh_y_there_is_no_command_and_a_frozen_pose_is_refused() -> N
     made = flying()
     assert made.step(400 * MS, 400 * MS) is None
     with pytest.raises(ChannelError, match="sample: stamp 0 s before the last one"):
-        made.take_pose(StampedVector(0, np.array(LEVEL)), 400 * MS)
+        made.take_pose(pose(0), 400 * MS)
+    still = pose(0)._replace(stamp_ns=400 * MS)
+    with pytest.raises(ChannelError, match="pose: found every value as before"):
+        made.take_pose(still, 400 * MS)
 
 
 @pytest.mark.parametrize(("gap", "continues"), [(5, True), (50, False)])
@@ -148,7 +156,7 @@ def test_after_a_short_pause_the_commands_go_on_from_the_last_ones(gap: int, con
     assert made.step(20 * MS * 9, 20 * MS * 9) is None
     made.pause(paused=False, forget=False)
     number = 9 + gap
-    made.take_pose(StampedVector(20 * MS * number, np.array(LEVEL)), 20 * MS * number)
+    made.take_pose(pose(20 * MS * number), 20 * MS * number)
     after_pause = run(made, number, number + 1, np.zeros(4))
     assert after_pause["target.phi"][0] == 0.5
     jump = abs(after_pause["u_m.p"][0] - before["u_m.p"][-1])

@@ -67,11 +67,12 @@ class Flight:
 
     def __init__(self, start: Start, peer_node: Peer, scenario: Path) -> None:
         self.peer, self.process = peer_node, start("guidance.main", "--ros-args", "--params-file", str(scenario))
-        self.mode = ControllerMode.ENGAGED
+        self.mode, self.rng = ControllerMode.ENGAGED, np.random.default_rng(1)
 
     def send(self, sender: str = "/aircraft#1") -> None:
         """One y, one pose and one sample of internals, stamped now."""
         now_ns, pose = time.time_ns(), np.array([LEVEL.get(name, 0.0) for name in POSE])
+        pose[POSE.index("v_east")] = self.rng.normal(0.0, 0.01)  # a pose that stands still is refused
         self.peer.publish("y", to_message(now_ns, OUTPUTS, np.zeros(4), sender))
         self.peer.publish("pose", to_message(now_ns, POSE, pose, sender))
         self.peer.publish("internals", to_message(now_ns, ["mode"], np.array([float(self.mode)]), "/controller#1"))

@@ -144,11 +144,17 @@ class Guidance:
         return self._state
 
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
-        """Take a pose in the order of `modes.POSE`. Raises ChannelError for a stamp that is not newer, or in the future."""
-        self._pose = self._newest(self._pose, sample, now_ns)
+        """Take a pose in the order of `modes.POSE`.
+
+        Raises ChannelError for a stamp that is not newer or in the future, and for values that are all those of the last pose.
+        """
+        last, newest = self._pose, self._newest(self._pose, sample, now_ns)
+        if last is not None and np.array_equal(last.value, newest.value):
+            raise ChannelError("frozen", "pose: found every value as before, expected an aircraft that moves")
+        self._pose = newest
 
     def take_y(self, sample: StampedVector, now_ns: int) -> None:
-        """Take a y in the order of the parameters' outputs, as `take_pose` does."""
+        """Take a y in the order of the parameters' outputs. Raises ChannelError for a stamp that is old or in the future."""
         self._y = self._newest(self._y, sample, now_ns)
 
     def _newest(self, last: StampedVector | None, sample: StampedVector, now_ns: int) -> StampedVector:

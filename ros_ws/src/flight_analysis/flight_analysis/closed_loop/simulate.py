@@ -15,6 +15,7 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from guidance.guidance import ATTITUDE, Guidance
+from guidance.params import GuidanceParameters
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
 
@@ -36,8 +37,14 @@ class _SignalBuilder:
         return Signal(np.array(self.stamps[: len(values)], dtype=np.int64), self.names, values)
 
 
-def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None) -> Tape:  # noqa: PLR0912 - one a node
+def simulate(  # noqa: PLR0912 - one a node
+    scenario: Scenario,
+    progress: Callable[[float], None] | None = None,
+    guide: Callable[[GuidanceParameters], Guidance] = Guidance,
+) -> Tape:
     """Fly a scenario and return its tape. `progress` is called with the flight time once per simulated second.
+
+    `guide` makes the guidance of a scenario that has it: another one may receive another pose than the true one.
 
     Order at each instant: y of the aircraft, y_m of the reference model, u_m of guidance, u of the controller. The aircraft
     holds u until the next one. A lost sample of y is not on the tape; a delayed one has its own stamp. A flight that diverges
@@ -46,7 +53,7 @@ def simulate(scenario: Scenario, progress: Callable[[float], None] | None = None
     require_euler(scenario)
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     reference, controller = Reference(scenario.reference_model), Controller(scenario.controller)
-    guidance = None if scenario.guidance is None else Guidance(scenario.guidance)
+    guidance = None if scenario.guidance is None else guide(scenario.guidance)
     signals = {
         "y": _SignalBuilder(tuple(scenario.aircraft.channels().outputs)),
         "y_m": _SignalBuilder(scenario.reference_model.outputs),
