@@ -11,6 +11,7 @@ from aircraft_sim import actuators, jsbsim_trim, pose, turbulence
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, one_minus_cosine
 from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
+from aircraft_sim.params import AircraftParameters
 from aircraft_sim.plant import DIVERGENCE_LIMIT
 from flight_core.outcome import FlightEnded
 from flight_core.rates import divide, seconds
@@ -60,7 +61,6 @@ class JsbsimModel:
         )
         self._engines = [self._node(jsbsim_trim.running_property(i)) for i in range(engines)]
         self._actuator_model, self._wind_model = actuator_model, wind_model
-        self._no_wind = wind_model.turbulence is None and not wind_model.gusts.speed.any()
         self._z = None if wind_model.turbulence is None else turbulence.initial_state(wind_model.turbulence)
         self._position = np.zeros(len(INPUTS))
         self._apply_wind(self._wind(0))
@@ -93,7 +93,7 @@ class JsbsimModel:
             if filters is not None:
                 self._z = turbulence.step(self._z, normals[k], filters)
             after_ns = t_ns + (k + 1) * step_ns
-            if not self._no_wind:
+            if self._wind_model.turbulence is not None or self._wind_model.gusts.speed.any():
                 self._apply_wind(self._wind(after_ns))
             try:
                 self._fdm.run()
@@ -128,6 +128,11 @@ class JsbsimModel:
     def diverged(self) -> bool:
         """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
         return not bool(np.all(np.abs(self._x) < DIVERGENCE_LIMIT))
+
+    def retune(self, t_ns: int, parameters: AircraftParameters) -> None:
+        """See `simulator.FlightDynamicsModel`."""
+        self._actuator_model = parameters.actuator_model()
+        self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))
 
     def _deviations(self) -> FloatArray:
         return np.array([node.get_double_value() * si for node, si in self._state_nodes]) - self.trim.states

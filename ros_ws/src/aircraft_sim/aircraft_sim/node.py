@@ -58,6 +58,10 @@ class AircraftNode(FlightNode[AircraftParameters]):
     def start_ns(self) -> int:
         return nanoseconds(self.parameters.start_time)
 
+    def on_parameters(self, parameters: AircraftParameters) -> None:
+        """Begin and end faults between two samples."""
+        self._simulator.retune(parameters)
+
     def tick(self, tick: Tick, now_ns: int) -> None:
         scale = self.parameters.failsafe_scale(self._publisher_lock.age_ns(now_ns))
         self._publish(tick.number, now_ns - tick.number * self.period_ns(), self._u if scale == 1.0 else scale * self._u)

@@ -180,6 +180,14 @@ class AircraftParameters(KeyedParameters):
     hold: float = Field(default=0.5, ge=0, le=1e6, description="failsafe: how long the last u is then held, s")
     ramp: float = Field(default=2.0, ge=0, le=1e6, description="failsafe: how long the ramp to trim then takes, s")
 
+    @classmethod
+    def tunable(cls) -> frozenset[str]:
+        """Faults that may begin and end in flight: of actuators, of sensors, and gusts."""
+        gusts = {f"gusts.{axis}.{key}" for axis in AXES for key in Gust.model_fields}
+        return frozenset(
+            gusts | {"actuators.stuck_at", "actuators.lost_at", "sensors.bias", "sensors.noise", "sensors.dropout"}
+        )
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         period = period_ns(self.rate, "rate")
@@ -283,7 +291,7 @@ class AircraftParameters(KeyedParameters):
             airframe.matrix_c(),
             airframe.matrix_gravity(),
             airframe.matrix_gusts(),
-            self._gust_arrays(list(airframe.gusts)),
+            self.gust_arrays(list(airframe.gusts)),
             np.array(airframe.speed),
             Coupling(self.inertial_coupling * gain, first, second) if self.inertial_coupling > 0.0 else None,
             Bias(*_by_state(biases, Bias._fields, airframe)) if biases else None,
@@ -309,9 +317,10 @@ class AircraftParameters(KeyedParameters):
 
     def wind_model(self) -> WindModel:
         """The wind of an aircraft of JSBSim, on all axes."""
-        return WindModel(self._gust_arrays(AXES), self._turbulence(self.flight_condition().speed, AXES))
+        return WindModel(self.gust_arrays(AXES), self._turbulence(self.flight_condition().speed, AXES))
 
-    def _gust_arrays(self, axes: Sequence[str]) -> Gusts:
+    def gust_arrays(self, axes: Sequence[str]) -> Gusts:
+        """The gusts as arrays, along these axes."""
         gusts = [self.gusts.get(axis, STILL_AIR) for axis in axes]
         return Gusts(*(np.array([getattr(gust, key) for gust in gusts]) for key in Gusts._fields))
 

@@ -15,6 +15,7 @@ from aircraft_sim.dynamics import Forcing
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.sensors import DelayLine
 from flight_core.outcome import FlightEnded
+from flight_core.parameters import require
 from flight_core.rates import divide, period_ns, seconds
 from flight_core.vectors import FloatArray
 
@@ -45,6 +46,9 @@ class FlightDynamicsModel(Protocol):
     def diverged(self) -> bool:
         """Whether the state is not finite or too large for a flight."""
 
+    def retune(self, t_ns: int, parameters: AircraftParameters) -> None:
+        """Take the actuator faults and the gusts of these parameters from t on."""
+
 
 class StateSpaceModel:
     """Equation (1) with the matrices of an airframe, behind its actuators.
@@ -63,6 +67,7 @@ class StateSpaceModel:
         self.truth_names = truth.names(airframe)
         states = list(airframe.states)
         self._places = [states.index(name) if name in states else None for name in POSE_STATES]
+        self._axes = list(airframe.gusts)
         self._speed, self._euler = airframe.speed, parameters.kinematics == "euler"
         self._psi, self._position = 0.0, [0.0, 0.0, 0.0]  # north, east, altitude
         self._psi_dot, self._velocity = self._heading_rate(self._states()), self._air_velocity(self._states())
@@ -118,6 +123,12 @@ class StateSpaceModel:
         """See FlightDynamicsModel."""
         return plant.diverged(self._state)
 
+    def retune(self, t_ns: int, parameters: AircraftParameters) -> None:
+        """See FlightDynamicsModel."""
+        aircraft = self._plant.aircraft._replace(gusts=parameters.gust_arrays(self._axes))
+        self._plant = self._plant._replace(aircraft=aircraft, actuators=parameters.actuator_model())
+        self._block_ns, self._block = t_ns, plant.forcing(t_ns, BLOCK, self._plant)
+
 
 class Simulator:
     """A flight dynamics model and its sensors, sample by sample."""
@@ -133,7 +144,7 @@ class Simulator:
             self._model = JsbsimModel(parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model())
         else:
             self._model = StateSpaceModel(parameters)
-        self._wind = parameters.wind
+        self._wind, self._gusts, self._speed = parameters.wind, parameters.gusts, channels.speed
         self.pose_every = pose.every(parameters.rate)
         self._sensors = parameters.sensor_arrays()
         self.truth_names = ("t", *self._model.truth_names, *(f"noise.{name}" for name in self.outputs))
@@ -141,6 +152,21 @@ class Simulator:
         self._delay_line: DelayLine = ()
         self._error = np.zeros(len(self.outputs))
         self._number = 0
+
+    def retune(self, parameters: AircraftParameters) -> None:
+        """Take faults and gusts of these parameters from now on. Raises ParameterError where a gust would change the past."""
+        now_ns = self._number * self.period_ns
+        t = seconds(now_ns)
+        for axis, gust in parameters.gusts.items():
+            old = self._gusts.get(axis)
+            if gust == old:
+                continue
+            require(gust.start >= t, f"gusts.{axis}.start", f"{gust.start:g} s", f"at least t = {t:g} s")
+            end = old.start + 2.0 * old.length / self._speed if old is not None and old.speed else t
+            over = old is None or t <= old.start or end <= t
+            require(over, f"gusts.{axis}", "a change of a gust that acts", f"one after its end at t = {end:g} s")
+        self._gusts, self._sensors = parameters.gusts, parameters.sensor_arrays()
+        self._model.retune(now_ns, parameters)
 
     def sample(self, number: int, u: FloatArray) -> DelayLine:
         """Advance to sample `number`, at number periods of flight time, with u held since the last sample, and measure.

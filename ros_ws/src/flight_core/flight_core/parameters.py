@@ -78,7 +78,7 @@ class NodeParameters(Parameters):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Names of the parameters that may change in flight; a group is named by its first part."""
+        """Parameters that may change in flight: dotted names, or names of groups of which all members may."""
         return frozenset()
 
 

@@ -109,7 +109,7 @@ class FlightNode(Node, Generic[P]):
         """Called once when the node ends, also after an error."""
 
     def on_parameters(self, parameters: P) -> None:
-        """Called with a valid new set in flight, before it becomes `self.parameters`."""
+        """Called with a valid new set in flight, before it becomes `self.parameters`. A ParameterError refuses it."""
 
     # Used by a subclass
 
@@ -188,10 +188,10 @@ class FlightNode(Node, Generic[P]):
         """Accept a change of tunable parameters as a whole, or reject it with a sentence and change nothing."""
         try:
             parameters = changed(self, self.parameters, changes)
+            self.on_parameters(parameters)
         except ParameterError as error:
             self.get_logger().warning(f"parameters rejected: {error}")
             return SetParametersResult(successful=False, reason=str(error))
-        self.on_parameters(parameters)
         for change in changes:
             old = self.get_parameter_or(change.name).value
             self.get_logger().info(f"{change.name}: {old} -> {change.value}")

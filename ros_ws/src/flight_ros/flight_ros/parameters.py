@@ -25,15 +25,14 @@ def read_parameters(node: Node, schema: type[P]) -> P:
     descriptions = {name: field.description or "" for name, field in type(parameters).model_fields.items()}
     for name, value in flatten(parameters.model_dump()):
         group = name.split(".")[0]
+        read_only = group not in tunable and name not in tunable
         # dynamic_typing: the set validates the types and accepts an integer as a float
-        descriptor = ParameterDescriptor(
-            description=descriptions.get(group, ""), read_only=group not in tunable, dynamic_typing=True
-        )
+        descriptor = ParameterDescriptor(description=descriptions.get(group, ""), read_only=read_only, dynamic_typing=True)
         if node.has_parameter(name):
             node.set_descriptor(name, descriptor)
         elif value != ():
             node.declare_parameter(name, value, descriptor)
-    for name in tunable:
+    for name in sorted(tunable):
         if not node.has_parameter(name):  # an optional parameter without an override, which may be set in flight
             node.declare_parameter(name, None, ParameterDescriptor(description=descriptions.get(name, ""), dynamic_typing=True))
     return parameters
