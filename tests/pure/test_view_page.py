@@ -5,7 +5,7 @@
 import asyncio
 import math
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,16 @@ import numpy as np
 import pytest
 from tests.browser import CHROMIUM, Browser
 from tests.joint_states import JOINT_STATE, vector
+from tests.view_link import NodesInMemory
 
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.design.gain_selection import margins
 from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.disk import try_lock
 from flight_log.tape_writer import write_run
+from flight_view.control import Control
 from flight_view.flight import Flight
 from flight_view.server import Server
 
@@ -37,14 +41,15 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @contextmanager
-def serving(*runs: Path) -> Iterator[str]:
+def serving(*runs: Path, control: Callable[[Flight], Control] | None = None) -> Iterator[str]:
     """Serve runs from a thread of this process; the address with the token."""
     ready, address = threading.Event(), ""
     loop = asyncio.new_event_loop()
 
     async def serve() -> None:
         nonlocal address
-        server = Server([Flight(run) for run in runs], TOKEN)
+        flights = [Flight(run) for run in runs]
+        server = Server(flights, TOKEN, control(flights[0]) if control else None)
         server.listen(0)
         address = f"http://127.0.0.1:{server.port}/?token={TOKEN}"
         ready.set()
@@ -66,9 +71,9 @@ def serving(*runs: Path) -> Iterator[str]:
 
 
 @contextmanager
-def shown(browser: Browser, *runs: Path) -> Iterator[str]:
+def shown(browser: Browser, *runs: Path, control: Callable[[Flight], Control] | None = None) -> Iterator[str]:
     """Serve finished runs and open the page; leave it before the server ends."""
-    with serving(*runs) as address:
+    with serving(*runs, control=control) as address:
         try:
             browser.open(address)
             browser.wait_for(f"{DRAWN} > 1 && {STATE} === 'ENDED'")
@@ -314,3 +319,56 @@ def test_a_guided_flight_shows_its_route_and_its_modes(browser: Browser, tmp_pat
         titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
         assert titles == ["phi over its command", "theta over its command", "cross-track"]
         assert browser.console == []
+
+
+# Control
+
+
+def test_gains_are_pending_until_they_are_applied_and_can_be_undone(
+    browser: Browser, recorded: Path, osprey_gust: Scenario
+) -> None:
+    nodes = NodesInMemory(osprey_gust, "aircraft", "controller", "guidance")
+    controls: list[Control] = []
+    before = nodes.values["controller"]["k_g"]
+
+    def control(flight: Flight) -> Control:
+        controls.append(Control(flight, nodes, "ABCD-EFGH", assess=margins))
+        return controls[0]
+
+    def said(text: str) -> str:
+        return f"document.getElementById('control-said').textContent.includes('{text}')"
+
+    def take(key: str) -> None:
+        browser.run(f"document.getElementById('control-typed').value = '{key}'")
+        browser.run("void document.getElementById('control-take').click()")
+
+    with shown(browser, recorded, control=control):
+        browser.wait_for("!document.getElementById('control').hidden")
+        assert browser.run("document.getElementById('control-desk').hidden")
+        take("abcd-efgx")
+        browser.wait_for(said("the control key is wrong"))
+        browser.wait_for("new Promise(resume => setTimeout(() => resume(true), 1000))")  # as long as the next key is refused
+        take("abcd-efgh")
+        browser.wait_for("document.querySelectorAll('#control-gains tr').length > 10")
+        slider = "document.querySelector('#control-gains [data-gain=k_g]')"
+        browser.run(f"{slider}.value = {1.5 * before}; void {slider}.dispatchEvent(new Event('input'))")
+        browser.wait_for("document.getElementById('control-margins').textContent.includes('pending: delay margin')")
+        assert browser.run("document.getElementById('control-apply').textContent") == "Apply 1"
+        assert nodes.values["controller"]["k_g"] == before  # a slider sends nothing
+        browser.run("void document.getElementById('control-apply').click()")
+        browser.wait_for(said("applied"))
+        assert nodes.values["controller"]["k_g"] == pytest.approx(1.5 * before, rel=0.01)  # three digits
+        browser.wait_for("document.getElementById('control-logged').textContent === 'not in the log yet'")  # a recorded one
+        browser.run("void document.getElementById('control-undo').click()")
+        browser.wait_for(said("undone"))
+        assert nodes.values["controller"]["k_g"] == before
+        browser.run("document.getElementById('control-target').value = 0.1")
+        browser.run("void document.getElementById('control-command').click()")
+        browser.wait_for(said("in force"))
+        assert nodes.done == [("target", {"phi": pytest.approx(math.radians(0.1))})]
+        browser.run("void document.getElementById('control-gust').click()")
+        browser.wait_for(said("gust begins"))
+        assert nodes.values["aircraft"]["gusts.vertical.speed"] == 3.0
+        refused = [one for one in browser.console if "403" not in str(one)]  # the wrong key
+        assert refused == []
+    controls[0].close()

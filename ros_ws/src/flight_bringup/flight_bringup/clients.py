@@ -3,16 +3,24 @@
 """ROS clients of the command line: a monitor of a flight, clients of controller, bridge and guidance, a player of a log."""
 
 import os
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Self
 
 import numpy as np
 import rclpy
+from geometry_msgs.msg import Point, Pose, PoseStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from nav_msgs.msg import Path
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
@@ -30,6 +38,8 @@ from flight_ros.topics import (
     NODE_STATE,
     PUBLISH,
     RECORDED,
+    ROUTE,
+    STATE,
     STATES,
     TARGET,
     Y_M,
@@ -39,7 +49,7 @@ from flight_ros.topics import (
 )
 from rise_di_controller.guard import Mode
 
-__all__ = ["EngagementClient", "FlightMonitor", "Player", "TargetClient"]
+__all__ = ["ControlClient", "EngagementClient", "FlightMonitor", "Player", "TargetClient"]
 
 MODES = {float(mode): mode.name for mode in Mode}
 
@@ -51,13 +61,16 @@ AT_REST = 20  # so many equal samples of u in a row: it has reached trim
 
 
 class _Client:
-    """A node in the default context. A context manager, so that the middleware always shuts down."""
+    """A node in the default context, or the `node` of another client. A context manager: the middleware always shuts down."""
 
-    def __init__(self, name: str, namespace: str = "") -> None:
-        transport.prepare()
-        # The command handles SIGINT, not rclpy.
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False)
+    def __init__(self, name: str, namespace: str = "", node: Node | None = None) -> None:
+        if node is None:
+            transport.prepare()
+            # The command handles SIGINT, not rclpy.
+            rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+            node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False)
+        self._node = node
+        self._cancelled = threading.Event()
 
     def __enter__(self) -> Self:
         return self
@@ -69,9 +82,22 @@ class _Client:
     def _spin_until(self, condition: Callable[[], bool], message: str, timeout: float = SERVICE_TIMEOUT) -> None:
         deadline = time.monotonic() + timeout
         while not condition():
+            if self._cancelled.is_set():
+                raise ParameterError("cancelled by a later request")
             if time.monotonic() > deadline:
                 raise ParameterError(message)
             rclpy.spin_once(self._node, timeout_sec=0.02)
+
+    def _call(self, kind: Any, name: str, request: Any, expected: str = "a flight") -> Any:
+        client = self._node.create_client(kind, name)
+        try:
+            service = f"service {client.srv_name}"
+            self._spin_until(client.service_is_ready, f"{service} not available, expected {expected} in this domain")
+            future = client.call_async(request)
+            self._spin_until(future.done, f"{service}: no response, expected one within {SERVICE_TIMEOUT:g} s")
+            return future.result()
+        finally:
+            self._node.destroy_client(client)
 
 
 class FlightMonitor(_Client):
@@ -127,8 +153,8 @@ class FlightMonitor(_Client):
 class EngagementClient(_Client):
     """Engages and disengages a running bridge without a jump of u (bumpless transfer)."""
 
-    def __init__(self, namespace: str) -> None:
-        super().__init__("engage", namespace)
+    def __init__(self, namespace: str, node: Node | None = None) -> None:
+        super().__init__("engage", namespace, node)
         self._u: list[tuple[float, ...]] = []
         self._phases: list[tuple[str, str]] = []
         self._waits_for = ""  # the last reason that was reported
@@ -155,7 +181,7 @@ class EngagementClient(_Client):
         return self._set_engaged(engaged=False)
 
     def _set_engaged(self, *, engaged: bool) -> str:
-        return str(self._call(SetBool, "bridge/engage", SetBool.Request(data=engaged)).message)
+        return str(self._call(SetBool, "bridge/engage", SetBool.Request(data=engaged), "a flight with a bridge").message)
 
     def _received_u(self) -> list[tuple[float, ...]]:
         for received in self._u_subscription.take():
@@ -181,20 +207,12 @@ class EngagementClient(_Client):
         self._received_u()
         return len(self._u) >= AT_REST and len(set(self._u[-AT_REST:])) == 1
 
-    def _call(self, kind: Any, name: str, request: Any) -> Any:
-        client = self._node.create_client(kind, name)
-        service = f"service {client.srv_name}"
-        self._spin_until(client.service_is_ready, f"{service} not available, expected a flight with a bridge in this domain")
-        future = client.call_async(request)
-        self._spin_until(future.done, f"{service}: no response, expected one within {SERVICE_TIMEOUT:g} s")
-        return future.result()
-
 
 class TargetClient(_Client):
     """Commands the guidance of a running flight."""
 
-    def __init__(self, namespace: str) -> None:
-        super().__init__("operator", namespace)
+    def __init__(self, namespace: str, node: Node | None = None) -> None:
+        super().__init__("operator", namespace, node)
         self._guidance, self._decoder = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True), NamedDecoder()
         self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
         self._in_force: dict[str, float] = {}
@@ -222,3 +240,90 @@ class TargetClient(_Client):
             with suppress(ChannelError):
                 self._in_force = self._decoder.decode(received.message).channels
         return self._in_force
+
+
+class ControlClient(_Client):
+    """Changes a running flight for `rise-di watch --control`. Each method but `cancel` may wait, and is called by one thread.
+
+    Methods return why something is refused, or "". They raise ParameterError where a node or its answer is missing.
+    """
+
+    NODES = ("aircraft", "bridge", "controller", "guidance")
+
+    def __init__(self, namespace: str) -> None:
+        super().__init__("control", namespace)
+        self._targets: TargetClient | None = None
+        self._engagement: EngagementClient | None = None
+        self._route = self._node.create_publisher(ROUTE.type, ROUTE.name, STATE)
+
+    def nodes(self) -> list[str]:
+        """The nodes of the flight that can be commanded and are in the graph."""
+        namespace = self._node.get_namespace()
+        found = {name for name, where in self._node.get_node_names_and_namespaces() if where == namespace}
+        return [name for name in self.NODES if name in found]
+
+    def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
+        """Values of a node's parameters; one that is not set is left out."""
+        values = self._call(GetParameters, f"{node}/get_parameters", GetParameters.Request(names=list(names))).values
+        found = {name: parameter_value_to_python(value) for name, value in zip(names, values, strict=False)}
+        lists = {name: value.tolist() if hasattr(value, "tolist") else value for name, value in found.items()}
+        return {name: value for name, value in lists.items() if value is not None}
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
+        """Set parameters of a node together, or none of them."""
+        request = SetParametersAtomically.Request()
+        request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        result = self._call(SetParametersAtomically, f"{node}/set_parameters_atomically", request).result
+        return "" if result.successful else str(result.reason)
+
+    def activate(self, *, active: bool) -> str:
+        """Activate or deactivate the controller."""
+        number = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
+        request = ChangeState.Request(transition=Transition(id=number))
+        response = self._call(ChangeState, "controller/change_state", request)
+        return "" if response.success else f"the controller is {'active' if active else 'inactive'} already"
+
+    def send_target(self, values: Mapping[str, float]) -> str:
+        """Command guidance, as `rise-di target`."""
+        self._targets = self._targets or TargetClient("", self._node)
+        return self._targets.send(values)
+
+    def send_route(self, points: Sequence[Sequence[float]]) -> str:
+        """Publish a route of waypoints, each north, east and altitude in m."""
+        places = [Point(x=float(east), y=float(north), z=float(altitude)) for north, east, altitude in points]
+        route = Path(poses=[PoseStamped(pose=Pose(position=place)) for place in places])
+        route.header.frame_id = "map"
+        subscribed = f"{self._route.topic_name}: no subscriber, expected a flight with guidance in this domain"
+        self._spin_until(lambda: bool(self._route.get_subscription_count()), subscribed)
+        self._route.publish(route)
+        return ""
+
+    def hold(self) -> str:
+        """Hold heading, altitude and airspeed of now."""
+        return str(self._call(Trigger, "guidance/hold", Trigger.Request(), "a flight with guidance").message)
+
+    def skip(self) -> str:
+        """Fly the next leg."""
+        return str(self._call(Trigger, "guidance/skip", Trigger.Request(), "a flight with guidance").message)
+
+    def engage(self) -> str:
+        """Engage the bridge, as `rise-di engage`."""
+        self._engagement = self._engagement or EngagementClient("", self._node)
+        self._engagement._cancelled = self._cancelled
+        return self._engagement.engage(lambda reason: None)
+
+    def disengage(self) -> str:
+        """Disengage the bridge."""
+        return str(self._call(SetBool, "bridge/engage", SetBool.Request(data=False), "a flight with a bridge").message)
+
+    def cancel(self) -> None:
+        """End the wait of the method that runs, from another thread."""
+        self._cancelled.set()
+
+    def resume(self) -> None:
+        """Wait again, after `cancel`."""
+        self._cancelled.clear()
+
+    def note(self, text: str) -> None:
+        """Write a line to the log of the flight."""
+        self._node.get_logger().info(text)

@@ -4,7 +4,7 @@
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
@@ -29,6 +29,13 @@ def watch(
     ] = None,
     wait: Annotated[bool, typer.Option("--wait", help="Wait for the log of RUN where there is none yet.")] = False,
     text: Annotated[bool, typer.Option("--text", help="Show the flight in the terminal, without a browser.")] = False,
+    control: Annotated[
+        bool, typer.Option("--control", help="Let the page command the flight, with a key that this command prints.")
+    ] = False,
+    control_real: Annotated[
+        bool, typer.Option("--control-real", help="As --control, and gains also while a bridge sends to an autopilot.")
+    ] = False,
+    namespace: Annotated[str, typer.Option(help="With --control: the namespace of the flight.")] = "",
     runs: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("runs"),
 ) -> None:
     """See a flight on a page: charts, horizon, scene and timeline, live while it is recorded, or again later.
@@ -40,11 +47,39 @@ def watch(
     for one in chosen:
         if not wait:
             require_log(one)
+    ports = (DEFAULT_PORT, 0) if port is None else (port,)
     if text:
         require(ghost is None, "--text", "two runs", "one run")
+        require(not (control or control_real), "--text", "--control beside it", "one of the two")
         show(Flight(chosen[0]))
-        return
-    serve(chosen, (DEFAULT_PORT, 0) if port is None else (port,), lambda line: print(line, flush=True))
+    elif control or control_real:
+        _serve_with_control(chosen, ports, namespace, real=control_real)
+    else:
+        serve(chosen, ports, _announce)
+
+
+def _announce(line: str) -> None:
+    print(line, flush=True)
+
+
+def _serve_with_control(runs: Sequence[Path], ports: Sequence[int], namespace: str, *, real: bool) -> None:
+    from flight_analysis.design.gain_selection import margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
+    from flight_bringup.clients import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
+    from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
+
+    with ControlClient(namespace) as client:
+        key, controls = new_key(), []
+
+        def control(flight: Flight) -> Control:
+            controls.append(Control(flight, client, key, real=real, assess=margins))
+            return controls[0]
+
+        _announce(f"control key: {key}")
+        try:
+            serve(runs, ports, _announce, control)
+        finally:
+            for one in controls:
+                one.close()
 
 
 @contextmanager

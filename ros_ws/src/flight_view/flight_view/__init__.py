@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight on a page, live or recorded. It follows the growing log and joins no ROS graph.
+"""A flight on a page, live or recorded. It follows the growing log and joins no ROS graph, except for control where asked.
 
 | module | does |
 |---|---|
 | `series` | keeps the samples of one topic in bounded memory |
 | `flight` | follows the log of a run: samples, events, state |
 | `server` | serves the page and the samples to browsers on this host |
+| `control` | checks and carries out what the page commands, over a link to the nodes |
 | `watch` | finds the run, serves it until Ctrl-C |
 | `text` | shows a flight in a terminal |
 | `page/` | the page: markup, style, scripts |

@@ -47,6 +47,7 @@ GROUPS = {
 """Channels and groups of channels that are kept; of the other topics all."""
 
 LOG, LOG_TYPE, WARN = "/rosout", "rcl_interfaces/msg/Log", 30  # rcl_interfaces/msg/Log: WARN=30
+CONTROL = "control"  # name of the node that carries out the requests of a page
 MAX_EVENTS, MAX_NOTES, MAX_CHANNELS = 5000, 50, 200
 BATCH = 2000  # messages that are decoded together
 MAX_TEXT = 400  # characters of a text from the log
@@ -57,7 +58,7 @@ class Event(NamedTuple):
     """An event of the flight. `stamp_ns` as in the samples, or by the clock of the host."""
 
     stamp_ns: int
-    kind: str  # "mode", "warning", "error", "parameter" or "bridge"
+    kind: str  # "mode", "warning", "error", "parameter", "bridge" or "control"
     text: str
 
 
@@ -85,6 +86,8 @@ class Flight:
             "modes": {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind in modes.items()},
         }
         self.notes: list[str] = []
+        self.scenario: Scenario | None = None  # once it is read
+        self.digest = 0  # of the controller's parameters in the newest tick; exact, as float32 it would not be
         self.bands: dict[str, float] = {}  # half-widths of the settling bands, SI
         self._follower = Follower(run, self._rate_of)
         self._topics: dict[str, _Topic] = {}  # by full name
@@ -191,9 +194,8 @@ class Flight:
                 path = Path(folder) / "scenario.yaml"
                 path.write_bytes(record.data)
                 try:
-                    self.description |= _described(
-                        load_scenario(path)
-                    )  # reads the airframe, which may be a file of another machine
+                    self.scenario = load_scenario(path)
+                    self.description |= _described(self.scenario)  # reads the airframe, maybe a file of another machine
                 except ParameterError as error:
                     self._note(f"units, limits and commands are unknown: {error}")
 
@@ -239,6 +241,12 @@ class Flight:
             self._start_ns = flight_start_ns(int(stamp_ns[0]), float(values[0, names.index("t")]))
         if topic.name == "internals" and "mode" in names:
             self._take_modes(stamp_ns, values[:, names.index("mode")])
+        if (
+            topic.name == "internals"
+            and "parameters" in names
+            and math.isfinite(digest := values[-1, names.index("parameters")])
+        ):
+            self.digest = int(digest)
         samples.append(stamp_ns, values[:, topic.columns])
 
     def _take_modes(self, stamp_ns: NDArray[np.int64], modes: NDArray[np.float64]) -> None:
@@ -261,8 +269,12 @@ class Flight:
                 if message.level >= WARN:
                     kind = "warning" if message.level == WARN else "error"
                     self._add_event(Event(sent_ns, kind, f"{message.name}: {message.msg}"))
+                elif message.name.rpartition(".")[2] == CONTROL:
+                    self._add_event(Event(sent_ns, CONTROL, message.msg.removeprefix(f"{CONTROL}: ")))
             elif messages.type_name == PARAMETER_EVENT:
-                changed = {one.name: parameter_value(one.value) for one in message.changed_parameters}
+                # Before the first sample, nodes that start declare theirs.
+                new = message.new_parameters if self._first_ns is not None else []
+                changed = {one.name: parameter_value(one.value) for one in (*new, *message.changed_parameters)}
                 text = ", ".join(f"{name} = {value}" for name, value in changed.items())
                 if text:
                     self._add_event(Event(sent_ns, "parameter", f"{message.node.rpartition('/')[2]}: {text}"))

@@ -4,7 +4,7 @@
 
 A browser asks for what is new, and draws the answer before it asks again: nothing queues for a slow one. Only GET is answered,
 for a fixed list of names. The Host header has to name this host, against DNS rebinding. The token of the address is kept in a
-cookie, against other users of this host.
+cookie, against other users of this host. With `Control` there is one POST, which takes a second key and the origin of the page.
 """
 
 import asyncio
@@ -26,6 +26,7 @@ from tornado.web import Application, HTTPError, RequestHandler
 
 from flight_analysis.report.summary import finite_or_null
 from flight_core.rates import NANOSECONDS
+from flight_view.control import Control, RefusedError
 from flight_view.flight import Flight
 
 ADDRESS = "127.0.0.1"
@@ -54,14 +55,15 @@ BUDGET = 0.05  # s of reading between two answers
 class Server:
     """The server of one or two flights, and the task that follows their logs."""
 
-    def __init__(self, flights: Sequence[Flight], token: str) -> None:
+    def __init__(self, flights: Sequence[Flight], token: str, control: Control | None = None) -> None:
         self.flights = flights
+        self.control = control
         self.token = token
         self.port = 0
         self._news = asyncio.Event()
         self._http = _LimitedServer(
             Application(
-                [(r"/(|[a-z]+\.[a-z]+)", _File), (r"/data/([01])", _Data)],
+                [(r"/(|[a-z]+\.[a-z]+)", _File), (r"/data/([01])", _Data), *([(r"/control", _Control)] if control else [])],
                 default_handler_class=_Handler,
                 log_function=lambda handler: None,
                 flight_server=self,
@@ -105,7 +107,7 @@ class Server:
                 await asyncio.wait_for(self._news.wait(), min(rest, STATE_PERIOD))
             except TimeoutError:
                 continue
-        return answer(flight, known, ghost=len(self.flights) > 1)
+        return answer(flight, known, ghost=len(self.flights) > 1, control=self.control is not None)
 
 
 def _epoch(flight: Flight) -> str:
@@ -131,7 +133,7 @@ def has_news(flight: Flight, known: Mapping[str, str]) -> bool:
     )
 
 
-def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False) -> bytes:
+def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False, control: bool = False) -> bytes:
     """What a browser lacks: the length of a head as uint32, the head as JSON, then columns for each topic of it.
 
     Little endian; the head ends at a multiple of 8 bytes. Columns of a topic with `count` rows: flight time in s as float64,
@@ -151,6 +153,7 @@ def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False) -> 
         "epoch": _epoch(flight),
         "state": flight.state(),
         "ghost": ghost,
+        "control": control,
         "faults": flight.faults(),
         "bands": finite_or_null(flight.bands),
         "topics": topics,
@@ -246,3 +249,35 @@ class _Data(_Handler):
         self.set_header("Content-Type", "application/octet-stream")
         with suppress(StreamClosedError):  # the browser has left
             await self.finish(content)
+
+
+class _Control(_Handler):
+    """Requests of a page that commands the flight: JSON, from the page's own origin, with the key that a user has typed."""
+
+    def get(self, *_: str) -> None:
+        raise HTTPError(HTTPStatus.METHOD_NOT_ALLOWED)
+
+    async def post(self) -> None:
+        if self.request.headers.get_list("Origin") != [f"http://{self.request.host}"]:
+            raise HTTPError(HTTPStatus.FORBIDDEN, reason="A request of another page")
+        if self.request.headers.get("Content-Type") != "application/json":
+            raise HTTPError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE)
+        try:
+            request = json.loads(self.request.body, parse_constant=_refuse_constant)
+        except (ValueError, RecursionError):
+            raise HTTPError(HTTPStatus.BAD_REQUEST, reason="Not JSON") from None
+        headers = self.request.headers
+        assert self.server.control is not None  # noqa: S101 - the route exists with it alone
+        try:
+            result = await self.server.control.answer(
+                request, headers.get("X-Control-Key", ""), headers.get("X-Control-Lease", "")
+            )
+        except RefusedError as error:
+            self.set_status(error.status)
+            result = {"refused": error.sentence}
+        with suppress(StreamClosedError):
+            await self.finish(finite_or_null(result))
+
+
+def _refuse_constant(text: str) -> float:
+    raise ValueError(text)  # NaN and Infinity are no JSON

@@ -15,6 +15,7 @@ from flight_core.files import is_folder
 from flight_core.parameters import ParameterError, require
 from flight_log.disk import is_locked
 from flight_log.rosbag2_metadata import bag_files
+from flight_view.control import Control
 from flight_view.flight import Flight
 from flight_view.server import ADDRESS, Server
 
@@ -39,18 +40,31 @@ def require_log(run: Path) -> None:
     require(bool(bag_files(run)), str(run), "no .mcap file", "the folder of a run or an MCAP file")
 
 
-def serve(runs: Sequence[Path], ports: Sequence[int], announce: Callable[[str], None]) -> None:
+def serve(
+    runs: Sequence[Path],
+    ports: Sequence[int],
+    announce: Callable[[str], None],
+    control: Callable[[Flight], Control] | None = None,
+) -> None:
     """Serve a run, and a second one as its ghost, on the first free port, until SIGINT or SIGTERM.
 
-    `announce` gets two lines for the user. Raises ParameterError where all ports are taken, or a log cannot be read.
+    `announce` gets two lines for the user. `control` lets the page command the first flight.
+
+    Raises ParameterError where all ports are taken, or a log cannot be read.
     """
     with suppress(OSError):
         os.nice(NICE)
-    asyncio.run(_serve(runs, ports, announce))
+    asyncio.run(_serve(runs, ports, announce, control))
 
 
-async def _serve(runs: Sequence[Path], ports: Sequence[int], announce: Callable[[str], None]) -> None:
-    server = Server([Flight(run) for run in runs], secrets.token_urlsafe(16))
+async def _serve(
+    runs: Sequence[Path],
+    ports: Sequence[int],
+    announce: Callable[[str], None],
+    control: Callable[[Flight], Control] | None,
+) -> None:
+    flights = [Flight(run) for run in runs]
+    server = Server(flights, secrets.token_urlsafe(16), None if control is None else control(flights[0]))
     for port in ports:
         try:
             server.listen(port)

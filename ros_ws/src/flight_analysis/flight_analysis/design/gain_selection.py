@@ -16,7 +16,7 @@ from jinja2 import Environment, StrictUndefined, Template
 from numpy.typing import NDArray
 
 from aircraft_sim import dynamics
-from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.params import Gust
@@ -463,6 +463,23 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
     return GainAssessment(controller, theorem, conditions, bounds, margin, each)
 
 
+def margins(scenario: Scenario, controller: ControllerParameters) -> dict[str, Any]:
+    """Delay margin, s, of the nominal linear loop in all channels, by output in one alone, and the least that it should be.
+
+    Empty without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the loop is unstable with its own lag.
+    """
+    literal = isinstance(controller, RiseDiParameters) and controller.sampled_sign()[0] is Sign.LITERAL
+    if scenario.aircraft.is_jsbsim or literal:
+        return {}
+    airframe = load_airframe(scenario.aircraft.airframe)
+    rows, columns = law_order(airframe, controller)
+    A, B, C = airframe.matrix_a() + airframe.matrix_gravity(), airframe.matrix_b()[:, columns], airframe.matrix_c()[rows]
+    plant, loop = LinearPlant(A, B, C), _loop(controller)
+    linear = linear_law(controller.tuned_law(), len(rows), loop.period)
+    each = {name: delay_margin(plant, linear, loop, channel) for channel, name in enumerate(controller.outputs)}
+    return {"delay_margin": delay_margin(plant, linear, loop), "channels": each, "least": loop.period}
+
+
 def stable_speed_ratio(study: Study, controller: RiseDiParameters) -> float:
     """Airspeed over that of the trim up to which the delay margin lasts with fixed gains; 0 without one at trim.
 
@@ -480,7 +497,7 @@ def stable_speed_ratio(study: Study, controller: RiseDiParameters) -> float:
     return math.inf
 
 
-def _loop(controller: RiseDiParameters) -> Loop:
+def _loop(controller: ControllerParameters) -> Loop:
     return Loop(np.array(controller.lag, dtype=np.float64), controller.delay, 1.0 / controller.rate)
 
 

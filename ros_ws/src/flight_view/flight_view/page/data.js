@@ -102,8 +102,8 @@ export class Flight { // one flight of the server
       if (head.events.length) this.events.sort((one, other) => one.t - other.t); // topics arrive one behind another
     }
     if (head.flight) this.info = {...this.info, ...head.flight};
-    const {state, faults, bands, described, ghost} = head;
-    this.head = {state, faults, bands, described, ghost};
+    const {state, faults, bands, described, ghost, control} = head;
+    this.head = {state, faults, bands, described, ghost, control};
     return head.topics.length > 0;
   }
 

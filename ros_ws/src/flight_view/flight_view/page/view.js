@@ -1,6 +1,7 @@
 // The page: asks the server for news, keeps the time and the view, draws what has changed.
 import {Flight, indexAt} from "./data.js";
 import {chartsOf, drawChart, drawTimeline, MODE_COLOURS, timeAt, timelineTime} from "./charts.js";
+import {offer} from "./control.js";
 import {drawHorizon, poseAt, Scene} from "./scene.js";
 
 const SPEEDS = [0.1, 0.2, 0.5, 1, 2, 5, 10];
@@ -67,6 +68,7 @@ function taken() { // a recording is followed at its end; a log that has ended s
     clock.t = end();
     clock.live = flight.head.state !== "ended";
   }
+  if (flight.head.control) offer();
   if (flight.head.ghost && !ghost) {
     ghost = new Flight(1);
     follow(ghost);
@@ -308,7 +310,7 @@ function start() {
   $("cameras").addEventListener("click", ({target}) => { if (target.dataset.camera) setCamera(target.dataset.camera); });
   addEventListener("keydown", event => {
     const action = ACTIONS[event.key];
-    if (!action || event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select") || (event.key === " " && event.target.closest("button"))) return;
+    if (!action || event.ctrlKey || event.metaKey || event.altKey || event.target.closest("select, input, textarea") || (event.key === " " && event.target.closest("button"))) return;
     event.preventDefault();
     action(event);
   });

@@ -1,0 +1,400 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Control of a flight from its page: who may command it, what may be commanded, and in which order. It needs no ROS.
+
+A `Link` reaches the nodes. One page at a time holds the lease. Requests run one after another on a thread of their own.
+"""
+
+import asyncio
+import hmac
+import math
+import secrets
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any, Protocol
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.parameters import ParameterError, flatten, nest, short_repr
+from flight_core.rates import NANOSECONDS
+from flight_view.flight import Flight
+from guidance.modes import TARGETS
+from rise_di_controller.params import ControllerParameters
+
+RANGE = (0.5, 2.0)  # of a gain in the scenario: what the page may set
+LEASE = 5.0  # s that a page controls after its last request
+RATE, BURST = 5.0, 10.0  # requests a second, and at once
+KEY_PERIOD = 1.0  # s between two wrong keys
+MAX_WAYPOINTS = 200
+GUST_LEAD = 0.2  # s from the request to the begin of a gust
+SYSTEM_TIME_NS = 10**17  # stamps above are of the system clock, those of a lockstep flight begin at 0
+
+Assess = Callable[[Scenario, ControllerParameters], dict[str, Any]]
+
+
+class Link(Protocol):
+    """What reaches the nodes of a flight. Methods return why something is refused, or "", and may raise ParameterError."""
+
+    def nodes(self) -> list[str]:
+        """Nodes that can be commanded: those of aircraft, bridge, controller, guidance that run."""
+
+    def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
+        """Values of parameters that are set."""
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
+        """Set parameters together, or none."""
+
+    def activate(self, *, active: bool) -> str:
+        """Activate or deactivate the controller."""
+
+    def send_target(self, values: Mapping[str, float]) -> str:
+        """Command guidance."""
+
+    def send_route(self, points: Sequence[Sequence[float]]) -> str:
+        """Publish a route."""
+
+    def hold(self) -> str:
+        """Hold what is flown now."""
+
+    def skip(self) -> str:
+        """Fly the next leg."""
+
+    def engage(self) -> str:
+        """Engage the bridge."""
+
+    def disengage(self) -> str:
+        """Disengage the bridge."""
+
+    def cancel(self) -> None:
+        """End the wait of a method that runs on another thread."""
+
+    def resume(self) -> None:
+        """Wait again, after `cancel`."""
+
+    def note(self, text: str) -> None:
+        """Write a line to the log of the flight."""
+
+
+class RefusedError(Exception):
+    """A request that is refused: the status and a sentence."""
+
+    def __init__(self, status: HTTPStatus, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status, self.sentence = status, sentence
+
+
+def new_key() -> str:
+    """A key to type by hand: eight letters and digits, 40 bits."""
+    text = "".join(secrets.choice("ABCDEFGHJKLMNPQRSTUVWXYZ23456789") for _ in range(8))
+    return f"{text[:4]}-{text[4:]}"
+
+
+class Control:
+    """Answers the requests of the controlling page. Values are SI."""
+
+    def __init__(
+        self,
+        flight: Flight,
+        link: Link,
+        key: str,
+        *,
+        real: bool = False,
+        assess: Assess | None = None,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._flight, self._link, self._key, self._real, self._assess, self._now = flight, link, key, real, assess, now
+        self._worker = ThreadPoolExecutor(max_workers=1)
+        self._lease, self._lease_end = "", -math.inf
+        self._wrong_key, self._requests, self._refilled = -math.inf, BURST, now()
+        self._undo: list[dict[str, Any]] = []  # earlier values, the last change at the end
+        self._digest = 0  # of the controller's parameters, as far as known
+        self._values: dict[str, Any] = {}  # the controller's tunable parameters that are set
+        self._actions: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+            "state": self._refresh,
+            "gains": self._set_gains,
+            "undo": self._undo_gains,
+            "fault": self._set_faults,
+            "gust": self._begin_gust,
+            "target": self._send_target,
+            "route": self._send_route,
+            "hold": lambda _: self._link.hold(),
+            "skip": lambda _: self._link.skip(),
+            "activate": lambda _: self._link.activate(active=True),
+            "deactivate": lambda _: self._link.activate(active=False),
+            "engage": self._engage,
+            "disengage": lambda _: self._link.disengage(),
+        }
+
+    async def answer(self, request: Any, key: str, lease: str) -> dict[str, Any]:
+        """Carry out a request and answer with the state. Raises RefusedError."""
+        self._require_key(key)
+        self._require_rate()
+        action = request.get("do") if isinstance(request, dict) else None
+        if not isinstance(action, str) or action not in {*self._actions, "check"}:
+            raise RefusedError(
+                HTTPStatus.BAD_REQUEST, f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}"
+            )
+        self._take_lease(lease)
+        if action in {"disengage", "deactivate"}:  # at once, also while an engagement waits
+            self._link.cancel()
+        return await asyncio.get_running_loop().run_in_executor(self._worker, self._carry_out, action, request)
+
+    def close(self) -> None:
+        """End the request that runs, and take no further one."""
+        self._link.cancel()
+        self._worker.shutdown(cancel_futures=True)
+
+    # Who may command
+
+    def _require_key(self, key: str) -> None:
+        if self._now() - self._wrong_key < KEY_PERIOD:
+            raise RefusedError(HTTPStatus.TOO_MANY_REQUESTS, f"a wrong key less than {KEY_PERIOD:g} s ago")
+        if not hmac.compare_digest(_plain(key), _plain(self._key)):
+            self._wrong_key = self._now()
+            raise RefusedError(HTTPStatus.FORBIDDEN, "the control key is wrong: type the one that rise-di watch printed")
+
+    def _require_rate(self) -> None:
+        now = self._now()
+        self._requests = min(self._requests + RATE * (now - self._refilled), BURST)
+        self._refilled = now
+        if self._requests < 1.0:
+            raise RefusedError(HTTPStatus.TOO_MANY_REQUESTS, f"more than {RATE:g} requests a second")
+        self._requests -= 1.0
+
+    def _take_lease(self, lease: str) -> None:
+        now = self._now()
+        if now < self._lease_end and not hmac.compare_digest(lease.encode(), self._lease.encode()):
+            raise RefusedError(
+                HTTPStatus.LOCKED, f"another page controls the flight; its lease ends {LEASE:g} s after it is closed"
+            )
+        if now >= self._lease_end:
+            self._lease = secrets.token_urlsafe(16)
+        self._lease_end = now + LEASE
+
+    # What may be commanded
+
+    def _carry_out(self, action: str, request: Mapping[str, Any]) -> dict[str, Any]:
+        self._link.resume()
+        try:
+            if action == "check":
+                return self._check(request)
+            before, refusal = dict(self._values), self._actions[action](request)
+            if refusal:
+                raise RefusedError(HTTPStatus.UNPROCESSABLE_ENTITY, refusal)
+            if action != "state":
+                what = {name: value for name, value in request.items() if name != "digest"}
+                changes = {
+                    name: f"{before.get(name)} -> {value}" for name, value in self._values.items() if before.get(name) != value
+                }
+                self._link.note(f"control: {short_repr(what | changes)}")
+            return self.state()
+        except ParameterError as error:
+            raise RefusedError(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from None
+
+    def state(self) -> dict[str, Any]:
+        """What the page shows: lease, nodes, gains with their ranges, digests, faults, the bridge."""
+        nodes, scenario = self._link.nodes(), self._flight.scenario
+        found: dict[str, Any] = {"lease": self._lease, "nodes": nodes, "undo": len(self._undo), "targets": list(TARGETS)}
+        if scenario is not None and "controller" in nodes:
+            found |= {"gains": self._gains(scenario), "digest": f"{self._digest:012x}", "logged": f"{self._flight.digest:012x}"}
+        if scenario is not None and "aircraft" in nodes:
+            channels = scenario.aircraft.channels()
+            truth = self._flight.samples.get("truth")
+            axes = [] if truth is None else [name.partition(".")[2] for name in truth.names if name.startswith("gust.")]
+            found["aircraft"] = {"outputs": list(channels.outputs), "inputs": list(channels.inputs), "axes": axes}
+        if "bridge" in nodes:
+            found["bridge"] = {"map": self._map(), "sends": self._sends()}
+        return found
+
+    def _controller(self) -> ControllerParameters:
+        if self._flight.scenario is None:
+            raise RefusedError(HTTPStatus.CONFLICT, "the log has no scenario, so the gains have no range")
+        return self._flight.scenario.controller
+
+    def _gains(self, scenario: Scenario) -> list[dict[str, Any]]:
+        return [
+            {
+                "name": name,
+                "values": list(_as_list(self._values.get(name, base))),
+                "ranges": [_range(one) for one in _as_list(base)],
+            }
+            for name, base in gains_of(scenario.controller).items()
+        ]
+
+    def _refresh(self, request: Mapping[str, Any]) -> str:
+        """Read the controller's parameters where the log shows others than those that are known."""
+        if self._flight.scenario is not None and self._flight.digest != self._digest and "controller" in self._link.nodes():
+            self._read()
+        return ""
+
+    def _read(self) -> None:
+        base = self._controller()
+        self._values = self._link.parameters("controller", sorted(base.tunable()))
+        self._digest = self._with(self._values).digest()
+
+    def _with(self, values: Mapping[str, Any]) -> ControllerParameters:
+        """The controller's parameters with others. Raises ParameterError."""
+        base = self._controller()
+        content = {**dict(flatten(base.model_dump(exclude_none=True))), **values}
+        return type(base).validate_mapping(nest(content), "controller")
+
+    def _set_gains(self, request: Mapping[str, Any]) -> str:
+        values, gains = _mapping(request, "values"), gains_of(self._controller())
+        for name, value in values.items():
+            if name not in gains:
+                raise RefusedError(HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no gain, expected one of {', '.join(gains)}")
+            _require_range(name, value, gains[name])
+        return self._apply(request, {name: _like(gains[name], value) for name, value in values.items()}, undo=True)
+
+    def _undo_gains(self, request: Mapping[str, Any]) -> str:
+        if not self._undo:
+            return "there is nothing to undo"
+        refusal = self._apply(request, self._undo[-1], undo=False)
+        if not refusal:
+            self._undo.pop()
+        return refusal
+
+    def _apply(self, request: Mapping[str, Any], values: Mapping[str, Any], *, undo: bool) -> str:
+        """Compare and set: refused where the parameters are not those that the page has seen."""
+        self._require_simulated()
+        self._read()
+        if request.get("digest") != f"{self._digest:012x}":
+            raise RefusedError(
+                HTTPStatus.CONFLICT, "the parameters have been changed meanwhile: look at them, then apply again"
+            )
+        before = {name: self._values[name] for name in values if name in self._values}
+        digest = self._with({**self._values, **values}).digest()
+        if refusal := self._link.set_parameters("controller", values):
+            return refusal
+        self._values, self._digest = {**self._values, **values}, digest
+        if undo:
+            self._undo.append(before)
+        return ""
+
+    def _check(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Margins of the gains in flight with some changed."""
+        if self._assess is None or self._flight.scenario is None:
+            return {}
+        values, gains = _mapping(request, "values"), gains_of(self._controller())
+        chosen = {name: _like(gains[name], value) for name, value in values.items() if name in gains}
+        return self._assess(self._flight.scenario, self._with(self._values | chosen))
+
+    def _map(self) -> str:
+        """The name of the channel map of the bridge."""
+        return Path(str(self._link.parameters("bridge", ["map"]).get("map", ""))).stem
+
+    def _sends(self) -> bool:
+        """Whether the bridge of the flight may send to an autopilot."""
+        return self._link.parameters("bridge", ["dry_run"]).get("dry_run") is not True
+
+    def _require_simulated(self) -> None:
+        if not self._real and "bridge" in self._link.nodes() and self._sends():
+            raise RefusedError(
+                HTTPStatus.FORBIDDEN, "the bridge sends to an autopilot: gains need rise-di watch --control-real"
+            )
+
+    def _set_faults(self, request: Mapping[str, Any]) -> str:
+        if self._flight.scenario is None:
+            return "the log has no scenario"
+        known = {name for name in type(self._flight.scenario.aircraft).tunable() if not name.startswith("gusts.")}
+        values = _mapping(request, "values")
+        for name in values:
+            if name not in known:
+                raise RefusedError(
+                    HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no fault, expected one of {', '.join(sorted(known))}"
+                )
+        return self._link.set_parameters("aircraft", {name: _numbers(name, value) for name, value in values.items()})
+
+    def _begin_gust(self, request: Mapping[str, Any]) -> str:
+        axis = str(request.get("axis"))
+        speed, length = (_number(key, request.get(key)) for key in ("speed", "length"))
+        flight = self._flight
+        real = flight.start_ns > SYSTEM_TIME_NS
+        start = GUST_LEAD + ((time.time_ns() - flight.start_ns) / NANOSECONDS if real else flight.end)
+        values = {f"gusts.{axis}.{key}": value for key, value in (("start", start), ("speed", speed), ("length", length))}
+        return self._link.set_parameters("aircraft", values)
+
+    def _send_target(self, request: Mapping[str, Any]) -> str:
+        values = _mapping(request, "values")
+        for name in values:
+            if name not in TARGETS:
+                raise RefusedError(
+                    HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no target, expected one of {', '.join(TARGETS)}"
+                )
+        return self._link.send_target({name: _number(name, value) for name, value in values.items()})
+
+    def _send_route(self, request: Mapping[str, Any]) -> str:
+        points = request.get("points")
+        if not isinstance(points, list) or not 2 <= len(points) <= MAX_WAYPOINTS:
+            raise RefusedError(HTTPStatus.BAD_REQUEST, f"points: expected 2 to {MAX_WAYPOINTS} of north, east, altitude")
+        waypoints = [_numbers("points", point) for point in points]
+        if any(not isinstance(point, list) or len(point) != len(("north", "east", "altitude")) for point in waypoints):
+            raise RefusedError(HTTPStatus.BAD_REQUEST, "points: expected north, east and altitude of each")
+        return self._link.send_route(waypoints)
+
+    def _engage(self, request: Mapping[str, Any]) -> str:
+        if request.get("map") != (name := self._map()):
+            raise RefusedError(
+                HTTPStatus.BAD_REQUEST, f"map: found {short_repr(request.get('map'))}, expected {name}, that of the bridge"
+            )
+        return self._link.engage()
+
+
+def gains_of(controller: ControllerParameters) -> dict[str, Any]:
+    """The numeric parameters of a law, by name: a number, or one for each channel."""
+    own = [name for name in type(controller).model_fields if name not in ControllerParameters.model_fields]
+    values = {name: getattr(controller, name) for name in own}
+    return {name: value for name, value in values.items() if all(isinstance(one, float) for one in _as_list(value))}
+
+
+def _plain(key: str) -> bytes:
+    return key.replace("-", "").strip().upper().encode()
+
+
+def _as_list(value: Any) -> Sequence[Any]:
+    return value if isinstance(value, list | tuple) else [value]
+
+
+def _range(value: float) -> list[float]:
+    return sorted(factor * value for factor in RANGE)
+
+
+def _require_range(name: str, value: Any, base: Any) -> None:
+    values, bases = _as_list(_numbers(name, value)), _as_list(base)
+    if len(values) != len(bases):
+        raise RefusedError(HTTPStatus.BAD_REQUEST, f"{name}: found {len(values)} values, expected {len(bases)}")
+    for one, middle in zip(values, bases, strict=True):
+        low, high = _range(middle)
+        if not low <= one <= high:
+            raise RefusedError(
+                HTTPStatus.BAD_REQUEST,
+                f"{name}: found {one:g}, expected {low:g} to {high:g}, {RANGE[0]:g} to {RANGE[1]:g} times that of the scenario",
+            )
+
+
+def _like(base: Any, value: Any) -> Any:
+    """A value as a float or a list, as its parameter has it."""
+    values = [float(one) for one in _as_list(value)]
+    return values if isinstance(base, tuple) else values[0]
+
+
+def _mapping(request: Mapping[str, Any], key: str) -> dict[str, Any]:
+    found = request.get(key)
+    if not isinstance(found, dict) or not found:
+        raise RefusedError(HTTPStatus.BAD_REQUEST, f"{key}: expected values by name")
+    return found
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise RefusedError(HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: found {short_repr(value)}, expected a number")
+    return float(value)
+
+
+def _numbers(name: str, value: Any) -> Any:
+    """A number, or a list of them; null in a list stands for never, infinity."""
+    if not isinstance(value, list):
+        return _number(name, value)
+    return [math.inf if one is None else _number(name, one) for one in value]

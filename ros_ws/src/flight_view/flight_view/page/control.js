@@ -1,0 +1,251 @@
+// Control of the flight: a pending list of gains, targets, the bridge, faults. Nothing is sent before a button is pressed.
+
+const RENEW = 1500; // ms; the lease lasts 5 s
+const HOLD = 1000; // ms that the button of an engagement is held
+const CHECK = 400; // ms after the last change of a slider
+const ANGLES = ["phi", "theta", "heading", "course"]; // shown in degrees
+const DEGREE = Math.PI / 180;
+
+const $ = id => document.getElementById(id);
+let lease = "", key = "", state = null, margins = null, timer = 0, checking = 0;
+const pending = new Map(); // by gain: its values
+
+async function send(request) {
+  const headers = {"Content-Type": "application/json", "X-Control-Key": key, "X-Control-Lease": lease};
+  try {
+    const response = await fetch("control", {method: "POST", headers, body: JSON.stringify(request), signal: AbortSignal.timeout(60_000)});
+    const text = await response.text();
+    const found = text.startsWith("{") ? JSON.parse(text) : {refused: text.trim()};
+    if (response.ok) return found;
+    say(found.refused, true);
+    if ([401, 403, 423].includes(response.status) && !state) stop();
+  } catch (error) {
+    say(`no answer: ${error.message}`, true);
+  }
+  return null;
+}
+
+async function act(request, done) {
+  const found = await send(request);
+  if (!found) return false;
+  take(found);
+  if (done) say(done, false);
+  return true;
+}
+
+function take(found) {
+  const first = !state;
+  lease = found.lease;
+  state = found;
+  $("control-key").hidden = true;
+  $("control-desk").hidden = false;
+  if (first) build();
+  show();
+}
+
+function stop() {
+  clearInterval(timer);
+  state = null;
+  $("control-key").hidden = false;
+  $("control-desk").hidden = true;
+}
+
+function say(text, refused) {
+  $("control-said").textContent = text;
+  $("control-said").className = refused ? "error" : "";
+}
+
+function element(tag, properties = {}, ...children) {
+  const node = Object.assign(document.createElement(tag), properties);
+  node.append(...children);
+  return node;
+}
+
+const button = (text, action, properties = {}) => {
+  const node = element("button", {textContent: text, ...properties});
+  node.addEventListener("click", action);
+  return node;
+};
+
+// ---- What the nodes of the flight offer
+
+function build() {
+  const parts = [];
+  if (state.gains) parts.push(gains());
+  if (state.nodes.includes("controller") && !state.nodes.includes("bridge")) {
+    parts.push(row("Controller", button("Deactivate", () => act({do: "deactivate"}, "deactivated")), button("Activate", () => act({do: "activate"}, "activated"))));
+  }
+  if (state.nodes.includes("bridge")) parts.push(bridge());
+  if (state.nodes.includes("guidance")) parts.push(guidance());
+  if (state.aircraft) parts.push(faults());
+  if (!parts.length) parts.push(element("p", {textContent: "No node of a flight runs in this domain."}));
+  $("control-parts").replaceChildren(...parts);
+}
+
+const row = (label, ...nodes) => element("div", {className: "row"}, element("b", {textContent: label}), ...nodes);
+
+function gains() {
+  const body = element("tbody", {id: "control-gains"});
+  for (const {name, values, ranges} of state.gains) {
+    values.forEach((_, k) => {
+      const [low, high] = ranges[k];
+      const slider = element("input", {type: "range", min: low, max: high, step: "any", disabled: low === high});
+      slider.setAttribute("aria-label", `${name} ${values.length > 1 ? k + 1 : ""}`);
+      slider.dataset.gain = name;
+      slider.dataset.place = k;
+      slider.addEventListener("input", () => change(name, k, Number(slider.value)));
+      const label = values.length > 1 ? `${name} [${k + 1}]` : name;
+      body.append(element("tr", {}, element("td", {textContent: label}), element("td", {}, slider), element("td"), element("td")));
+    });
+  }
+  return element("details", {open: true}, element("summary", {textContent: "Gains"}),
+    element("table", {}, element("thead", {}, element("tr", {}, ...["", "0.5 to 2 times the scenario", "in flight", "pending"].map(one => element("th", {textContent: one})))), body),
+    element("p", {id: "control-margins"}),
+    element("div", {className: "row"},
+      button("Apply", apply, {id: "control-apply"}), button("Discard", discard, {id: "control-discard"}), button("Undo", undo, {id: "control-undo"}), element("span", {id: "control-logged"})));
+}
+
+function change(name, place, value) {
+  const gain = state.gains.find(one => one.name === name);
+  const values = [...(pending.get(name) ?? gain.values)];
+  values[place] = Number(value.toPrecision(3));
+  const [low, high] = gain.ranges[place];
+  values[place] = Math.min(Math.max(values[place], low), high);
+  if (values.every((one, k) => one === gain.values[k])) pending.delete(name); else pending.set(name, values);
+  margins = null;
+  clearTimeout(checking);
+  checking = setTimeout(check, CHECK);
+  show();
+}
+
+async function check() {
+  margins = pending.size ? await send({do: "check", values: Object.fromEntries(pending)}) : null;
+  show();
+}
+
+async function apply() {
+  const values = Object.fromEntries(pending);
+  if (await act({do: "gains", digest: state.digest, values}, "applied")) discard();
+  else await act({do: "state"});
+}
+
+function discard() {
+  pending.clear();
+  margins = null;
+  show();
+}
+
+async function undo() {
+  if (!(await act({do: "undo", digest: state.digest}, "undone"))) await act({do: "state"});
+}
+
+function bridge() {
+  const name = element("input", {placeholder: `name of the map: ${state.bridge.map}`, id: "control-map"}), hold = button(`Engage (hold ${HOLD / 1e3} s)`, () => {});
+  let held = 0;
+  hold.addEventListener("pointerdown", () => { held = setTimeout(() => act({do: "engage", map: name.value}, "engaged"), HOLD); });
+  for (const kind of ["pointerup", "pointerleave", "pointercancel"]) hold.addEventListener(kind, () => clearTimeout(held));
+  return row(`Bridge ${state.bridge.map}${state.bridge.sends ? "" : " (dry run)"}`, button("Disengage", () => act({do: "disengage"}, "disengaged")), name, hold);
+}
+
+function guidance() {
+  const choice = element("select", {}, ...state.targets.map(one => new Option(ANGLES.includes(one) ? `${one} (deg)` : one, one)));
+  const value = element("input", {type: "number", step: "any", id: "control-target"});
+  choice.setAttribute("aria-label", "Target");
+  value.setAttribute("aria-label", "Value of the target");
+  const list = new Map();
+  const listed = element("span"), add = () => {
+    if (value.value === "") return;
+    list.set(choice.value, Number(value.value));
+    listed.textContent = [...list].map(([name, one]) => `${name} ${one}`).join(", ");
+  };
+  const command = async () => {
+    if (!list.size) add();
+    const values = Object.fromEntries([...list].map(([name, one]) => [name, ANGLES.includes(name) ? one * DEGREE : one]));
+    if (await act({do: "target", values}, "in force")) { list.clear(); listed.textContent = ""; }
+  };
+  const route = element("textarea", {rows: 3, placeholder: "north east altitude, in m, a line a waypoint"});
+  route.setAttribute("aria-label", "Route");
+  const fly = () => act({do: "route", points: route.value.trim().split(/\n+/).map(line => line.trim().split(/[\s,;]+/).map(Number))}, "sent; the events say if guidance refuses it");
+  return element("details", {open: true}, element("summary", {textContent: "Guidance"}),
+    element("div", {className: "row"}, choice, value, button("Add", add), listed, button("Command", command, {id: "control-command"})),
+    element("div", {className: "row"}, button("Hold", () => act({do: "hold"}, "holds")), button("Next leg", () => act({do: "skip"}, "next leg"))),
+    route, element("div", {className: "row"}, button("Fly this route", fly)));
+}
+
+function faults() {
+  const {inputs, outputs, axes} = state.aircraft, kinds = inputs.map(() => "");
+  const never = kind => kinds.map(one => (one === kind ? 0 : null));
+  const actuators = inputs.map((name, k) => {
+    const choice = element("select", {}, ...[["", "works"], ["stuck", "stuck"], ["lost", "lost"]].map(([value, text]) => new Option(text, value)));
+    choice.setAttribute("aria-label", `Actuator ${name}`);
+    choice.addEventListener("change", () => {
+      kinds[k] = choice.value;
+      act({do: "fault", values: {"actuators.stuck_at": never("stuck"), "actuators.lost_at": never("lost")}}, `${name}: ${choice.selectedOptions[0].text}`);
+    });
+    return element("label", {}, `${name} `, choice);
+  });
+  const numbers = kind => outputs.map(name => {
+    const input = element("input", {type: "number", step: "any", value: 0});
+    input.setAttribute("aria-label", `${kind} of ${name}`);
+    return element("label", {}, `${name} `, input);
+  });
+  const sensor = (kind, title) => {
+    const fields = numbers(kind), values = () => fields.map(field => Number(field.lastChild.value));
+    return row(title, ...fields, button("Set", () => act({do: "fault", values: {[`sensors.${kind}`]: values()}}, `${kind} set`)));
+  };
+  const dropout = element("input", {type: "number", min: 0, max: 0.99, step: 0.05, value: 0});
+  dropout.setAttribute("aria-label", "Loss of samples");
+  const parts = [
+    row("Actuators", ...actuators), sensor("bias", "Bias (SI)"), sensor("noise", "Noise (SI)"),
+    row("Loss of samples", dropout, button("Set", () => act({do: "fault", values: {"sensors.dropout": Number(dropout.value)}}, "loss set"))),
+  ];
+  if (axes.length) {
+    const axis = element("select", {}, ...axes.map(one => new Option(one, one)));
+    axis.setAttribute("aria-label", "Axis of the gust");
+    const speed = element("input", {type: "number", value: 3}), length = element("input", {type: "number", value: 30});
+    parts.push(row("Gust", axis, element("label", {}, "m/s ", speed), element("label", {}, "H in m ", length),
+      button("Now", () => act({do: "gust", axis: axis.value, speed: Number(speed.value), length: Number(length.value)}, "gust begins"), {id: "control-gust"})));
+  }
+  return element("details", {open: true}, element("summary", {textContent: "Faults of the simulated aircraft"}), ...parts);
+}
+
+// ---- What changes
+
+function show() {
+  const body = $("control-gains");
+  if (!state || !body) return;
+  for (const line of body.children) {
+    const slider = line.querySelector("input"), {gain, place} = slider.dataset;
+    const now = state.gains.find(one => one.name === gain).values[place], next = pending.get(gain)?.[place];
+    if (document.activeElement !== slider || next === undefined) slider.value = next ?? now;
+    line.children[2].textContent = now.toPrecision(4);
+    line.children[3].textContent = next === undefined || next === now ? "" : next.toPrecision(4);
+  }
+  $("control-apply").textContent = `Apply ${pending.size || ""}`;
+  $("control-apply").disabled = $("control-discard").disabled = !pending.size;
+  $("control-undo").disabled = !state.undo;
+  $("control-logged").textContent = state.logged === state.digest ? "as in the log" : "not in the log yet";
+  const shown = one => (one === null ? "over 500 ms" : `${(1e3 * one).toFixed(1)} ms`);
+  $("control-margins").textContent = !pending.size ? "" : margins?.channels
+    ? `pending: delay margin ${shown(margins.delay_margin)}, at least ${shown(margins.least)}; alone: ${Object.entries(margins.channels).map(([name, one]) => `${name} ${shown(one)}`).join(", ")}`
+    : margins ? "no linear loop: no delay margin" : "delay margin ...";
+  $("control-margins").className = margins?.channels && margins.delay_margin !== null && margins.delay_margin < margins.least ? "error" : "";
+}
+
+// Offer control where the server has it.
+export function offer() {
+  if (!$("control").hidden) return;
+  $("control").hidden = false;
+  const begin = async () => {
+    key = $("control-typed").value;
+    if (!(await act({do: "state"}, ""))) return;
+    say("", false);
+    clearInterval(timer);
+    timer = setInterval(async () => {
+      const found = await send({do: "state"});
+      if (found) take(found);
+    }, RENEW);
+  };
+  $("control-take").addEventListener("click", begin);
+  $("control-typed").addEventListener("keydown", event => { if (event.key === "Enter") begin(); });
+}

@@ -1,0 +1,304 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Control from the page without ROS: who is refused, what is bounded, compare and set, undo, the lease."""
+
+import asyncio
+import json
+import math
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.view_link import NodesInMemory
+from tornado.httpclient import AsyncHTTPClient, HTTPResponse
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.design.gain_selection import check_gains, manoeuvre, margins, study_airframe
+from flight_bringup.scenarios import find_scenario
+from flight_view.control import BURST, LEASE, Control, RefusedError, gains_of, new_key
+from flight_view.flight import Flight
+from flight_view.server import Server
+
+KEY, TOKEN = "ABCD-EFGH", "a-token"
+ALL = ("aircraft", "controller", "guidance")
+
+
+class Desk:
+    """A control of a recorded flight, with its nodes in memory, at a time that a test sets."""
+
+    def __init__(self, run: Path, scenario: Scenario, *names: str, dry_run: bool = True, real: bool = False) -> None:
+        self.time = 0.0
+        self.flight, self.nodes = Flight(run), NodesInMemory(scenario, *(names or ALL), dry_run=dry_run)
+        self.flight.update()
+        self.control = Control(self.flight, self.nodes, KEY, real=real, assess=margins, now=lambda: self.time)
+        self.lease = ""
+
+    async def ask(self, do: str, key: str = KEY, lease: str | None = None, **request: Any) -> dict[str, Any]:
+        """The answer to a request, a second after the one before."""
+        self.time += 1.0
+        found = await self.control.answer({"do": do, **request}, key, self.lease if lease is None else lease)
+        self.lease = found.get("lease", self.lease)
+        return found
+
+    async def refused(self, do: str, **request: Any) -> tuple[int, str]:
+        """Status and sentence of a refusal."""
+        with pytest.raises(RefusedError) as caught:
+            await self.ask(do, **request)
+        return int(caught.value.status), caught.value.sentence
+
+
+def with_desk(desk: Desk, steps: Callable[[Desk], Coroutine[Any, Any, None]]) -> None:
+    """Run the steps of a test, and end the desk."""
+    try:
+        asyncio.run(asyncio.wait_for(steps(desk), 60.0))
+    finally:
+        desk.control.close()
+
+
+@pytest.fixture
+def desk(recorded: Path, osprey_gust: Scenario) -> Desk:
+    return Desk(recorded, osprey_gust)
+
+
+def test_gains_are_set_together_seen_in_the_log_and_undone(desk: Desk, osprey_gust: Scenario) -> None:
+    base = osprey_gust.controller
+
+    async def steps(desk: Desk) -> None:
+        state = await desk.ask("state")
+        assert {one["name"]: tuple(one["values"]) for one in state["gains"]}["beta"] == base.beta  # type: ignore[attr-defined]
+        assert {one["name"]: one["ranges"] for one in state["gains"]}["k_g"] == [[0.5 * base.k_g, 2.0 * base.k_g]]  # type: ignore[attr-defined]
+        assert state["digest"] == state["logged"] == f"{base.digest():012x}"
+        changed = await desk.ask("gains", digest=state["digest"], values={"k_g": [1.2 * base.k_g], "softening": [2.0]})  # type: ignore[attr-defined]
+        assert (changed["undo"], changed["logged"]) == (1, state["digest"])  # the log is that of before
+        assert changed["digest"] != state["digest"]
+        assert desk.nodes.values["controller"]["k_g"] == 1.2 * base.k_g  # type: ignore[attr-defined]
+        assert desk.nodes.notes[-1].startswith("control: ")
+        assert "k_g" in desk.nodes.notes[-1]
+        undone = await desk.ask("undo", digest=changed["digest"])
+        assert (undone["undo"], undone["digest"]) == (0, state["digest"])
+        assert await desk.refused("undo", digest=undone["digest"]) == (422, "there is nothing to undo")
+
+    with_desk(desk, steps)
+
+
+def test_a_set_on_top_of_the_change_of_another_program_is_refused(desk: Desk) -> None:
+    async def steps(desk: Desk) -> None:
+        digest = (await desk.ask("state"))["digest"]
+        desk.nodes.values["controller"]["k_g"] *= 1.1
+        status, sentence = await desk.refused("gains", digest=digest, values={"k_g": [1.0]})
+        assert (status, sentence) == (409, "the parameters have been changed meanwhile: look at them, then apply again")
+        assert desk.nodes.notes == []
+
+    with_desk(desk, steps)
+
+
+def test_a_gain_beyond_its_range_of_no_such_name_or_no_number_is_refused(desk: Desk, osprey_gust: Scenario) -> None:
+    k_g = gains_of(osprey_gust.controller)["k_g"]
+
+    async def steps(desk: Desk) -> None:
+        digest, before = (await desk.ask("state"))["digest"], dict(desk.nodes.values["controller"])
+        for values, expected in (
+            ({"k_g": [2.1 * k_g]}, f"k_g: found {2.1 * k_g:g}, expected {0.5 * k_g:g} to {2 * k_g:g}"),
+            ({"k_g": [-1.0]}, "k_g: found -1, expected"),
+            ({"k_g": [True]}, "'k_g': found True, expected a number"),
+            ({"k_g": [k_g, k_g]}, "k_g: found 2 values, expected 1"),
+            ({"D": [1, 1, 1, 1]}, "'D': no gain, expected one of"),
+            ({}, "values: expected values by name"),
+        ):
+            status, sentence = await desk.refused("gains", digest=digest, values=values)
+            assert status == 400
+            assert sentence.startswith(expected)
+        assert desk.nodes.values["controller"] == before
+
+    with_desk(desk, steps)
+
+
+def test_the_margins_of_pending_gains_are_those_of_the_gain_check(desk: Desk, osprey_gust: Scenario) -> None:
+    airframe, _ = osprey_gust.aircraft.load()
+    found = check_gains(osprey_gust, study_airframe(airframe, manoeuvre(osprey_gust, airframe), 0.0, 1))
+
+    async def steps(desk: Desk) -> None:
+        await desk.ask("state")
+        same = await desk.ask("check", values={"k_g": [desk.nodes.values["controller"]["k_g"]]})
+        assert same["delay_margin"] == found.delay_margin
+        assert tuple(same["channels"].values()) == found.channel_margins
+        assert desk.nodes.notes == []
+
+    with_desk(desk, steps)
+
+
+def test_a_wrong_key_is_refused_and_delays_the_next_one(desk: Desk) -> None:
+    async def steps(desk: Desk) -> None:
+        assert (await desk.refused("state", key="ABCD-EFGX"))[0] == 403
+        desk.time -= 1.0  # the next request comes at the same time
+        assert (await desk.refused("state"))[0] == 429
+        assert await desk.ask("state", key="abcdefgh")  # as typed
+
+    with_desk(desk, steps)
+    assert len({new_key() for _ in range(100)}) == 100
+
+
+def test_one_page_controls_until_its_lease_ends(desk: Desk) -> None:
+    async def steps(desk: Desk) -> None:
+        first = (await desk.ask("state"))["lease"]
+        assert (await desk.refused("state", lease="another"))[0] == 423
+        assert (await desk.ask("hold"))["lease"] == first
+        desk.time += LEASE
+        assert (await desk.ask("state", lease="another"))["lease"] != first
+
+    with_desk(desk, steps)
+
+
+def test_more_than_five_requests_a_second_are_refused(desk: Desk) -> None:
+    async def steps(desk: Desk) -> None:
+        await desk.ask("state")
+        for _ in range(int(BURST) - 1):
+            await desk.control.answer({"do": "state"}, KEY, desk.lease)
+        with pytest.raises(RefusedError, match="more than 5 requests a second"):
+            await desk.control.answer({"do": "state"}, KEY, desk.lease)
+        await desk.ask("state")  # a second later
+
+    with_desk(desk, steps)
+
+
+def test_targets_routes_and_services_reach_guidance_and_refusals_come_back(desk: Desk) -> None:
+    async def steps(desk: Desk) -> None:
+        await desk.ask("target", values={"heading": 1.5, "altitude": 60})
+        await desk.ask("route", points=[[0, 0, 50], [500, 0, 60.5]])
+        await desk.ask("hold")
+        assert desk.nodes.done == [
+            ("target", {"heading": 1.5, "altitude": 60.0}), ("route", [[0.0, 0.0, 50.0], [500.0, 0.0, 60.5]]), ("hold", None),
+        ]  # fmt: skip
+        assert await desk.refused("skip") == (422, "no route is flown")
+        assert (await desk.refused("target", values={"bank": 1.0}))[0] == 400
+        for points in ([[0, 0, 0]], [[0, 0], [1, 1]], "north", [["a", 0, 0], [0, 0, 0]]):
+            assert (await desk.refused("route", points=points))[0] == 400
+        assert (await desk.refused("fly"))[0] == 400
+
+    with_desk(desk, steps)
+
+
+def test_faults_and_gusts_become_parameters_of_the_aircraft(desk: Desk) -> None:
+    async def steps(desk: Desk) -> None:
+        state = await desk.ask("state")
+        assert state["aircraft"]["axes"] == ["vertical", "lateral", "longitudinal"]
+        stuck: list[float | None] = [0, None, None, None]
+        await desk.ask("fault", values={"actuators.stuck_at": stuck, "sensors.dropout": 0.2})
+        assert desk.nodes.values["aircraft"]["actuators.stuck_at"] == [0.0, math.inf, math.inf, math.inf]
+        assert desk.nodes.values["aircraft"]["sensors.dropout"] == 0.2
+        await desk.ask("gust", axis="lateral", speed=3, length=20)
+        assert desk.nodes.values["aircraft"]["gusts.lateral.start"] == pytest.approx(desk.flight.end + 0.2)
+        for do, request, expected in (
+            ("fault", {"values": {"sensors.dropout": 2.0}}, 422),
+            ("fault", {"values": {"rate": 100.0}}, 400),
+            ("gust", {"axis": "sideways", "speed": 3, "length": 20}, 422),
+            ("gust", {"axis": "lateral", "speed": None, "length": 20}, 400),
+        ):
+            assert (await desk.refused(do, **request))[0] == expected
+
+    with_desk(desk, steps)
+
+
+def test_gains_of_a_bridge_that_sends_need_a_further_option(recorded: Path, osprey_gust: Scenario) -> None:
+    async def steps(desk: Desk) -> None:
+        state = await desk.ask("state")
+        assert state["bridge"] == {"map": "plane", "sends": True}
+        status, sentence = await desk.refused("gains", digest=state["digest"], values={"k_g": [1.0]})
+        assert (status, sentence) == (403, "the bridge sends to an autopilot: gains need rise-di watch --control-real")
+
+    async def allowed(desk: Desk) -> None:
+        state = await desk.ask("state")
+        gain = desk.nodes.values["controller"]["k_g"]
+        await desk.ask("gains", digest=state["digest"], values={"k_g": [0.9 * gain]})
+
+    with_desk(Desk(recorded, osprey_gust, "bridge", "controller", dry_run=False), steps)
+    with_desk(Desk(recorded, osprey_gust, "bridge", "controller", dry_run=True), allowed)
+    with_desk(Desk(recorded, osprey_gust, "bridge", "controller", dry_run=False, real=True), allowed)
+
+
+def test_a_bridge_engages_by_the_name_of_its_map_and_disengages_while_it_waits(recorded: Path, osprey_gust: Scenario) -> None:
+    async def steps(desk: Desk) -> None:
+        await desk.ask("state")
+        assert (await desk.refused("engage", map="copter"))[0] == 400
+        waiting = asyncio.ensure_future(desk.refused("engage", map="plane"))
+        await asyncio.get_running_loop().run_in_executor(None, desk.nodes.blocked.wait, 20.0)
+        await desk.ask("disengage")
+        assert await waiting == (422, "cancelled by a later request")
+        assert desk.nodes.done == [("disengage", None)]
+
+    with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
+
+
+# Over HTTP
+
+
+async def post(server: Server, body: object, **headers: str) -> HTTPResponse:
+    """A request of the page, with some headers changed; one that is empty is left out."""
+    own = {
+        "Cookie": f"rise_di_{server.port}={TOKEN}",
+        "Origin": f"http://127.0.0.1:{server.port}",
+        "Content-Type": "application/json",
+        "X-Control-Key": KEY,
+    }
+    given = {name: value for name, value in (own | headers).items() if value}
+    return await AsyncHTTPClient(force_instance=True).fetch(
+        f"http://127.0.0.1:{server.port}/control",
+        method="POST",
+        headers=given,
+        body=body if isinstance(body, str) else json.dumps(body),
+        raise_error=False,
+        request_timeout=20.0,
+    )
+
+
+def test_a_request_needs_token_origin_type_and_key(desk: Desk) -> None:
+    async def steps(desk: Desk) -> None:
+        server = Server([desk.flight], TOKEN, desk.control)
+        server.listen(0)
+        port, state = server.port, {"do": "state"}
+        try:
+            for body, headers, expected in (
+                (state, {"Cookie": ""}, 401),
+                (state, {"Origin": ""}, 403),
+                (state, {"Origin": "null"}, 403),
+                (state, {"Origin": f"http://127.0.0.1.evil.example:{port}"}, 403),
+                (state, {"Origin": f"http://127.0.0.1:{port + 1}"}, 403),
+                (state, {"Origin": f"https://127.0.0.1:{port}"}, 403),
+                (state, {"Origin": f"http://localhost:{port}"}, 403),  # the page has the other name
+                (state, {"Content-Type": "text/plain"}, 415),
+                (state, {"Content-Type": "application/x-www-form-urlencoded"}, 415),
+                ("{", {}, 400),
+                ("[" * 5000, {}, 400),
+                ('{"do": NaN}', {}, 400),
+                ([], {}, 400),
+                (state, {"X-Control-Key": ""}, 403),
+            ):
+                assert (await post(server, body, **headers)).code == expected, (body, headers)
+            desk.time += 10.0
+            good = await post(server, state)
+            assert (good.code, json.loads(good.body)["nodes"]) == (200, list(ALL))
+            held = await post(server, state)
+            assert (held.code, "another page" in json.loads(held.body)["refused"]) == (423, True)
+            assert (await post(server, state, **{"X-Control-Lease": json.loads(good.body)["lease"]})).code == 200
+        finally:
+            await server.close()
+
+    with_desk(desk, steps)
+
+
+def test_without_control_there_is_nothing_to_post_to(desk: Desk) -> None:
+    async def steps(desk: Desk) -> None:
+        server = Server([desk.flight], TOKEN)
+        server.listen(0)
+        try:
+            assert (await post(server, {"do": "state"})).code == 405
+        finally:
+            await server.close()
+
+    with_desk(desk, steps)
+
+
+def test_every_scenario_offers_its_gains() -> None:
+    for name in ("osprey_gust", "osprey_observer", "jsbsim_c172p"):
+        assert {"k_g", "k_d", "Lambda", "beta"} <= set(gains_of(find_scenario(name).controller))

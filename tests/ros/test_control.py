@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Control of a real flight over the page's server: gains, faults, a gust, the controller; in the log, and replayed."""
+
+import json
+import time
+import urllib.request
+from http.cookiejar import CookieJar
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+
+from tests.ros.conftest import Process, Start
+from tests.ros.test_lockstep import scenario_file
+
+from flight_log.stored_messages import parameter_changes
+from flight_log.tape_reader import read_run
+
+
+class Page:
+    """Posts requests as a page does."""
+
+    def __init__(self, address: str, key: str) -> None:
+        self._base = address.partition("?")[0]
+        self._opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
+        self._opener.open(address).read()
+        self._headers = {"Origin": self._base.rstrip("/"), "Content-Type": "application/json", "X-Control-Key": key}
+
+    def post(self, do: str, **request: Any) -> tuple[int, dict[str, Any]]:
+        """Status and answer of a request; at most five a second."""
+        time.sleep(0.2)  # the rate limit
+        body = json.dumps({"do": do, **request}).encode()
+        try:
+            sent = urllib.request.Request(f"{self._base}control", body, self._headers)  # noqa: S310 - http of this host
+            with self._opener.open(sent) as response:
+                status, content = response.status, json.loads(response.read())
+        except HTTPError as error:
+            return error.code, json.loads(error.read())
+        self._headers["X-Control-Lease"] = content.get("lease", self._headers.get("X-Control-Lease", ""))
+        return status, content
+
+    def until(self, flight: Process, **expected: Any) -> dict[str, Any]:
+        """Ask for the state until it has these values."""
+        found: dict[str, Any] = {}
+
+        def as_expected() -> bool:
+            nonlocal found
+            found = self.post("state")[1]
+            return found | expected == found
+
+        flight.until(as_expected, 60.0)
+        return found
+
+
+def test_a_flight_is_commanded_from_its_page_recorded_and_replayed(start: Start, tmp_path: Path) -> None:
+    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 120.0, "osprey_gust")))  # ended below
+    flight.wait_for_log(tmp_path / "runs", 50_000)
+    run = next(path for path in (tmp_path / "runs").iterdir() if path.is_dir() and not path.is_symlink())
+    watch = start("flight_cli.cli", "watch", str(run), "--control", "--port", "0").wait_for("http://")
+    key = next(line for line in watch.lines if line.startswith("control key: ")).rpartition(" ")[2]
+    page = Page(next(line for line in watch.lines if line.startswith("http://")), key)
+    state = page.until(flight, nodes=["aircraft", "controller"])
+    state = page.until(flight, logged=state["digest"])
+    k_g = next(one["values"][0] for one in state["gains"] if one["name"] == "k_g")
+
+    status, changed = page.post("gains", digest=state["digest"], values={"k_g": [1.2 * k_g], "softening": [2.5]})
+    assert (status, changed["undo"]) == (200, 1), changed
+    page.until(flight, logged=changed["digest"])  # the controller flies them
+    assert page.post("gains", digest=state["digest"], values={"k_g": [k_g]})[0] == 409
+    assert page.post("gains", digest=changed["digest"], values={"k_g": [3.0 * k_g]})[0] == 400
+    status, undone = page.post("undo", digest=changed["digest"])
+    assert (status, undone["digest"]) == (200, state["digest"])
+    page.until(flight, logged=state["digest"])
+
+    assert page.post("fault", values={"sensors.bias": [0.01, 0.0, 0.0, 0.0]})[0] == 200
+    assert page.post("fault", values={"actuators.stuck_at": [None, None, None, 0]})[0] == 200
+    assert page.post("gust", axis="vertical", speed=3.0, length=10.0)[0] == 200
+    status, refused = page.post("fault", values={"sensors.dropout": 2.0})
+    assert (status, "sensors.dropout" in refused["refused"]) == (422, True)
+    assert page.post("deactivate")[0] == 200
+    assert page.post("activate")[0] == 200
+    time.sleep(1.5)  # the gust of 10 m at 25 m/s
+    flight.interrupt()
+    assert flight.end(timeout=60.0) == 130, flight.output
+    assert watch.interrupt().end() == 0, watch.output
+
+    changes = parameter_changes(run, "aircraft", {"actuators": None, "sensors": None, "gusts": None})
+    assert [sorted(one) for one in changes[-3:]] == [
+        ["sensors.bias"], ["actuators.stuck_at"], ["gusts.vertical.length", "gusts.vertical.speed", "gusts.vertical.start"],
+    ]  # fmt: skip
+    tape = read_run(run).tape
+    assert abs(tape["truth"]["gust.vertical"]).max() > 2.0
+    assert abs(tape["truth"]["noise.q"][-1] - 0.01) < 1e-9
+    replayed = start("flight_cli.cli", "replay", str(run), "--json")
+    assert replayed.end(60.0) == 0, replayed.output
+    assert json.loads(replayed.output)["equal"]

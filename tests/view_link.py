@@ -1,0 +1,89 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes of a flight in memory, behind the `Link` of the page's control."""
+
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.parameters import ParameterError, flatten, nest
+
+
+class NodesInMemory:
+    """Controller, aircraft, guidance and bridge that keep what they are told."""
+
+    def __init__(self, scenario: Scenario, *names: str, dry_run: bool = True) -> None:
+        self.names = list(names)
+        self.schemas = {"controller": type(scenario.controller), "aircraft": type(scenario.aircraft)}
+        self.values: dict[str, dict[str, Any]] = {
+            "controller": dict(flatten(scenario.controller.model_dump(exclude_none=True))),
+            "aircraft": dict(flatten(scenario.aircraft.model_dump(exclude_none=True))),
+            "bridge": {"map": "maps/plane.yaml", "dry_run": dry_run},
+        }
+        self.done: list[tuple[str, Any]] = []
+        self.notes: list[str] = []
+        self.blocked, self.cancelled = threading.Event(), threading.Event()
+
+    def nodes(self) -> list[str]:
+        """The nodes that run."""
+        return self.names
+
+    def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
+        """Those that are set."""
+        return {name: self.values[node][name] for name in names if name in self.values[node]}
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
+        """As a node: the whole set is valid, or nothing changes."""
+        try:
+            self.schemas[node].validate_mapping(nest(self.values[node] | dict(values)), node)
+        except ParameterError as error:
+            return str(error)
+        self.values[node] |= values
+        return ""
+
+    def _keep(self, name: str, value: Any = None) -> str:
+        self.done.append((name, value))
+        return ""
+
+    def activate(self, *, active: bool) -> str:
+        """Kept."""
+        return self._keep("activate", active)
+
+    def send_target(self, values: Mapping[str, float]) -> str:
+        """Kept."""
+        return self._keep("target", values)
+
+    def send_route(self, points: Sequence[Sequence[float]]) -> str:
+        """Kept."""
+        return self._keep("route", points)
+
+    def hold(self) -> str:
+        """Kept."""
+        return self._keep("hold")
+
+    def skip(self) -> str:
+        """Refused."""
+        return "no route is flown"
+
+    def engage(self) -> str:
+        """Waits until it is cancelled."""
+        self.blocked.set()
+        self.cancelled.wait(20.0)
+        raise ParameterError("cancelled by a later request")
+
+    def disengage(self) -> str:
+        """Kept."""
+        return self._keep("disengage")
+
+    def cancel(self) -> None:
+        """End the wait of `engage`."""
+        self.cancelled.set()
+
+    def resume(self) -> None:
+        """Let `engage` wait again."""
+        self.cancelled.clear()
+
+    def note(self, text: str) -> None:
+        """Kept."""
+        self.notes.append(text)
