@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures for real processes over real DDS. Each test has its own domain; its processes are killed afterwards."""
 
+import fcntl
 import itertools
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +24,7 @@ from tests.ros.peer import Peer, peer
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_log.scan import Scan
 
-_numbers = itertools.count(os.getpid())
+_numbers = itertools.count(os.getpid())  # a domain is used again late: processes may take a while to leave it
 
 Start = Callable[..., "Process"]
 
@@ -108,12 +110,29 @@ class Process:
         return status
 
 
+@contextmanager
+def reserved_domain() -> Iterator[int]:
+    """A ROS domain that no other test of this host has until the block is left, also of another worker or checkout.
+
+    The ports of domains 1 to 100 are below the ephemeral ports of Linux.
+    """
+    for number in (1 + next(_numbers) % 100 for _ in range(100)):
+        with (Path(tempfile.gettempdir()) / f"ros_domain_{number}.lock").open("a") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield number
+            return
+    pytest.fail("ROS domains 1 to 100: all reserved by other tests, expected a free one")
+
+
 @pytest.fixture(autouse=True)
-def domain(monkeypatch: pytest.MonkeyPatch) -> int:
-    """A ROS domain of this test alone. The ports of domains 1 to 100 are below the ephemeral ports of Linux."""
-    number = 1 + next(_numbers) % 100
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    return number
+def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
+    """A ROS domain of this test alone."""
+    with reserved_domain() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        yield number
 
 
 @pytest.fixture

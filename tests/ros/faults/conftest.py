@@ -3,7 +3,6 @@
 """Fixtures of the fault tests: one flight for all faults, replaced when a fault ended it."""
 
 import json
-import os
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
@@ -11,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from tests.ros.conftest import reserved_domain
 from tests.ros.faults.flight import Flight
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -26,12 +26,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--faults-times", type=int, default=1, help="how often each fault is injected in a row; seeds count up")
 
 
+@pytest.fixture(scope="module")
+def flight_domain() -> Iterator[int]:
+    with reserved_domain() as number:
+        yield number
+
+
 @pytest.fixture(autouse=True)
-def domain(monkeypatch: pytest.MonkeyPatch) -> int:
+def domain(flight_domain: int, monkeypatch: pytest.MonkeyPatch) -> int:
     """One ROS domain for all fault tests: they share a flight."""
-    number = 1 + os.getpid() % 100
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    return number
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(flight_domain))
+    return flight_domain
 
 
 @pytest.fixture(scope="session")
