@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Every command of every page exists: `rise-di` parses it, `make` has the target, ROS 2 the executable, Python the module."""
+
+import re
+import runpy
+import shlex
+import sys
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+import typer
+from tests import launch_stand_in
+from tests.conftest import REPOSITORY
+
+from flight_cli.cli import COMMANDS, application
+
+FOLDERS = ("docs", "docker", "examples", "ros_ws/src")
+PAGES = sorted([*REPOSITORY.glob("*.md"), *(page for one in FOLDERS for page in (REPOSITORY / one).rglob("*.md"))])
+SHELL = re.compile(r"^```sh\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"^    (?:\$ )?(\S.*)$", re.MULTILINE)
+SPAN = re.compile(r"(?<!`)`rise-di (\w[\w-]*)([^`]*)`(?!`)")
+
+SOURCES = REPOSITORY / "ros_ws" / "src"
+RISE_DI = typer.main.get_command(application([*COMMANDS]))
+
+
+def rise_di(words: list[str]) -> None:
+    """The command and its options exist, and their values have the right types."""
+    with suppress(typer.Exit), RISE_DI.make_context("rise-di", [*words]) as context:  # --help and --version exit
+        name, command, rest = RISE_DI.resolve_command(context, [*context._protected_args, *context.args])  # type: ignore[attr-defined]
+        command.make_context(name, rest, parent=context)
+
+
+def make(words: list[str]) -> None:
+    """The target exists."""
+    folder = REPOSITORY
+    if words[:1] == ["-C"]:
+        folder, words = folder / words[1], words[2:]
+    targets = re.findall(r"^([\w.-]+):(?!=)", (folder / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    asked = [word for word in words if "=" not in word]
+    assert asked == [] or asked[0] in targets
+
+
+def ros2(words: list[str]) -> None:
+    """The executable is in a package of this workspace, the launch file there has the arguments."""
+    if words[0] == "run":
+        assert f'"{words[2]} = ' in (SOURCES / words[1] / "setup.py").read_text(encoding="utf-8")
+    elif words[0] == "launch":
+        with patch.dict(sys.modules, launch_stand_in.modules()):
+            launch = runpy.run_path(str(SOURCES / words[1] / "launch" / words[2]))["generate_launch_description"]()
+        known = {one.name for one in launch.entities if isinstance(one, launch_stand_in.DeclareLaunchArgument)}
+        assert {word.partition(":=")[0] for word in words[3:] if not word.startswith("--")} <= known
+    else:
+        assert words[0] in {"bag", "pkg", "security", "service", "topic"}
+
+
+def python(words: list[str]) -> None:
+    """The module can be imported."""
+    if words[0] == "-m":
+        assert find_spec(words[1]) is not None
+        assert all(Path(word).exists() for word in words[2:] if word.startswith("tests/"))
+
+
+CHECKS = {"rise-di": rise_di, "make": make, "ros2": ros2, "python": python, "python3": python}
+
+
+def lines(page: Path) -> list[str]:
+    """The lines of the blocks of a page."""
+    text = page.read_text(encoding="utf-8")
+    return [*(line for block in SHELL.findall(text) for line in block.splitlines()), *INDENTED.findall(text)]
+
+
+def commands(line: str) -> list[list[str]]:
+    """The words of each command of CHECKS in a line of shell."""
+    lexer = shlex.shlex(line, posix=True, punctuation_chars=";&|<>()")
+    lexer.whitespace_split = True
+    found: list[list[str]] = []
+    begins = True
+    for word in lexer:
+        if set(word) <= set(";&|<>()"):
+            begins = True
+        elif begins and "=" not in word:  # else a variable of its environment
+            found.append([Path(word).name])
+            begins = False
+        elif not begins:
+            found[-1].append(word)
+    return [words for words in found if words[0] in CHECKS]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(REPOSITORY)))
+def test_every_command_of_a_page_exists(page: Path) -> None:
+    for line in lines(page):
+        if any(f"{name} " in f"{line} " for name in CHECKS):
+            for name, *words in commands(line):
+                try:
+                    CHECKS[name](words)
+                except Exception as error:
+                    raise AssertionError(f"{line}: {error}") from error
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(REPOSITORY)))
+def test_every_option_of_rise_di_that_a_page_names_exists(page: Path) -> None:
+    for name, rest in SPAN.findall(page.read_text(encoding="utf-8")):
+        command = RISE_DI.commands[name]  # type: ignore[attr-defined]
+        known = {option for parameter in command.params for option in parameter.opts}
+        assert set(re.findall(r"(?<!\S)--[a-z-]+", rest)) <= known, name
+
+
+def test_an_unknown_command_option_target_or_module_is_found() -> None:
+    for line in (
+        "rise-di fly --fast",
+        "rise-di flies",
+        "rise-di fly --duration long",
+        "make tests",
+        "python -m benchmarks.none",
+    ):
+        ((name, *words),) = commands(f"A=1 .venv/bin/{line}  # why; make all")
+        with pytest.raises(Exception):  # noqa: B017, PT011 - of several kinds
+            CHECKS[name](words)
