@@ -23,9 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from autopilot_bridge.params import load_map
+from autopilot_bridge.params import ChannelMap, load_map
+from control_laws.excitation import ExcitationParameters
 from flight_analysis.design.bridge_identification import channel_pairs, experiment
 from flight_analysis.design.response_identification import MIN_RATIO, identify_response
+from flight_analysis.design.sign_check import check
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
 from flight_log.engagements import Engagement
@@ -41,7 +43,8 @@ EXAMPLE = REPOSITORY / "examples" / "arduplane" / "scenario.yaml"
 PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
 ENGAGEMENTS, LARGEST_STEP = 20, 0.02  # of the range of a setpoint
 WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
-EXPERIMENT = 37.0  # s of the experiments on signs
+PERIODS = {"elevator": 4.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}  # s, of the multisines of the experiments on signs
+STRONGER_ELEVATOR = 2.0  # `check-signs` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
 TURBULENCE = (0.0, 0.25, 0.5, 1.0)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
 DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
 
@@ -168,22 +171,29 @@ def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
 
 
 def signs(experiments: int = 20) -> dict[str, Any]:
-    """Omega_ii and its standard errors in short experiments, open loop, each in other turbulence."""
+    """Short experiments, open loop, each in other turbulence, and what `check-signs` says of each; earlier ones are kept.
+
+    The simulator draws its turbulence from one stream of random numbers without a seed: each experiment has another part of it.
+    """
     with arduplane(0.03) as plane:
         channel_map = plane.patient_map("ardupilot")
         loaded = load_map(channel_map)
-        pairing, expected = channel_pairs(loaded)
         airframe, scenario = plane.folder / "signs_airframe.yaml", plane.folder / "signs.yaml"
         planned = experiment(loaded, 24.0, 0.2, str(airframe))
         airframe.write_text(planned.airframe, encoding="utf-8")
         content = yaml.safe_load(planned.scenario)
-        content["/**/controller"]["ros__parameters"]["period"] = [6.0 if name == "V" else 3.0 for name in pairing.outputs]
+        controller = content["/**/controller"]["ros__parameters"]
+        controller["pause"] = 1.0
+        controller["period"] = [PERIODS[name] for name in controller["inputs"]]
+        place = controller["inputs"].index("elevator")
+        controller["amplitude"][place] *= STRONGER_ELEVATOR
         scenario.write_text(yaml.safe_dump(content), encoding="utf-8")
+        duration = ExcitationParameters.validate_mapping(controller, "controller").duration
         plane.say("param", "SIM_WIND_SPD", "5")
         flown = plane.fly(scenario, channel_map, 1000.0, "--send")
         flown.wait_for("DISENGAGED")
-        used = []
-        for number in range(experiments):
+        earlier, used = stored("signs").get("experiments", []), []
+        for number in range(len(earlier), len(earlier) + experiments):
             used.append(TURBULENCE[number % len(TURBULENCE)])
             plane.say("param", "SIM_WIND_TURB", f"{used[-1]:g}")
             plane.level()
@@ -191,23 +201,36 @@ def signs(experiments: int = 20) -> dict[str, Any]:
             while plane.start("engage").end() != 0:  # outside of the envelope, by a gust
                 plane.level()
                 plane.hand_over()
-            time.sleep(EXPERIMENT)
+            time.sleep(duration)
             plane.start("engage", "--off").succeed()
         plane.say("param", "SIM_WIND_TURB", "0")
         plane.level()
         flown.interrupt()
         flown.end(60.0)
-        log, found = read_run(plane.run), []
-        tape = log.tape
-        for turbulence, one in zip(used, log.engagements or [], strict=True):
-            span = (one.start_ns, one.stop_ns or int(tape["y"].stamp_ns[-1]))
-            response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=[span])
-            effect = np.diag(response.Omega) * expected
-            sure = response.sign_ratio >= MIN_RATIO
-            verdicts = np.where(sure, np.where(effect > 0.0, "right", "wrong"), "unsure")
-            ended = {"turbulence": turbulence, "reason": one.reason, "seconds": seconds(span[1] - span[0])}
-            found.append(ended | dict(zip(pairing.inputs, verdicts.tolist(), strict=True)))
-        return {"experiments": found}
+    log = read_run(plane.run)
+    found = [judged(loaded, log.tape, one) for one in log.engagements or []]
+    return {"experiments": [*earlier, *({"turbulence": one} | rest for one, rest in zip(used, found, strict=True))]}
+
+
+def judged(channel_map: ChannelMap, tape: Tape, engaged: Engagement) -> dict[str, Any]:
+    """What `check-signs` says of every sign, and of each one flipped alone: its column of the recorded u has the other sign."""
+    pairing, expected = channel_pairs(channel_map)
+    columns = [list(channel_map.inputs).index(name) for name in pairing.inputs]
+    rows = [list(channel_map.outputs).index(name) for name in pairing.outputs]
+    Omega = np.zeros((len(rows), len(columns)))
+    Omega[rows, columns] = expected
+    span, u = (engaged.start_ns, engaged.stop_ns or int(tape["y"].stamp_ns[-1])), tape["u"]
+
+    def verdicts(flipped: str) -> dict[str, str]:
+        turned = Signal(u.stamp_ns, u.names, u.values * [-1.0 if name == flipped else 1.0 for name in u.names])
+        response = identify_response(tape["y"], turned, pairing.outputs, pairing.inputs, engaged=[span])
+        D = tuple(int(one) for one in expected)
+        checked = check(channel_map, Omega, pairing.outputs, pairing.inputs, D, response)
+        shown = ((one.input, one.ratio or 0.0, (one.measured or 0.0) * one.effect) for one in checked.channels)
+        return {name: "unsure" if ratio < MIN_RATIO else "right" if agrees > 0.0 else "wrong" for name, ratio, agrees in shown}
+
+    ended = {"reason": engaged.reason, "seconds": seconds(span[1] - span[0])}
+    return ended | {"as flown": verdicts(""), "flipped": {name: verdicts(name) for name in pairing.inputs}}
 
 
 def pose() -> dict[str, Any]:
@@ -232,10 +255,16 @@ MEASUREMENTS: dict[str, Callable[[], dict[str, Any]]] = {
 # The page
 
 
+def stored(name: str) -> dict[str, Any]:
+    """The stored result of a measurement; empty where there is none."""
+    file = FOLDER / f"{name}.json"
+    return dict(json.loads(file.read_text(encoding="utf-8"))["result"]) if file.is_file() else {}
+
+
 def page() -> str:
     """The text of the page from the stored results."""
-    stored = {name: FOLDER / f"{name}.json" for name in MEASUREMENTS}
-    results = {name: json.loads(file.read_text(encoding="utf-8")) for name, file in stored.items() if file.is_file()}
+    files = {name: FOLDER / f"{name}.json" for name in MEASUREMENTS}
+    results = {name: json.loads(file.read_text(encoding="utf-8")) for name, file in files.items() if file.is_file()}
     parts = [HEAD]
     for name, (title, table) in TABLES.items():
         parts.append(f"## {title}\n")
@@ -277,16 +306,23 @@ def table_of_engagements(result: dict[str, Any]) -> str:
 
 
 def table_of_signs(result: dict[str, Any]) -> str:
-    """Verdicts by turbulence. A sign that is right and certain would be found if it were flipped: the estimate is odd in it."""
-    rows = ["| SIM_WIND_TURB | experiments | signs found | unsure | wrong |", "| ---: | ---: | ---: | ---: | ---: |"]
-    for turbulence in sorted({one["turbulence"] for one in result["experiments"]}):
-        some = [one for one in result["experiments"] if one["turbulence"] == turbulence]
-        verdicts = [verdict for one in some for verdict in one.values() if verdict in {"right", "unsure", "wrong"}]
-        counts = " | ".join(str(verdicts.count(verdict)) for verdict in ("right", "unsure", "wrong"))
-        rows.append(f"| {turbulence:g} | {len(some)} | {counts} |")
-    return "\n".join(
-        [*rows, "\nEach sign flipped gives the opposite response, so that as many are found, and none is sure and wrong.\n"]
-    )
+    """Verdicts by turbulence: of the signs as flown, and of each flipped alone."""
+    heading = "right signs: found right, unsure, called wrong | one flipped: found, unsure, missed | others then called wrong"
+    rows = [f"| SIM_WIND_TURB | experiments | {heading} |", "| ---: | ---: | ---: | ---: | ---: |"]
+    experiments = result["experiments"]
+    for turbulence in sorted({one["turbulence"] for one in experiments}):
+        some = [one for one in experiments if one["turbulence"] == turbulence]
+        as_flown = [verdict for one in some for verdict in one["as flown"].values()]
+        flipped = [given[name] for one in some for name, given in one["flipped"].items()]
+        others = [given[key] for one in some for name, given in one["flipped"].items() for key in given if key != name]
+        right = ", ".join(str(as_flown.count(verdict)) for verdict in ("right", "unsure", "wrong"))
+        found = ", ".join(str(flipped.count(verdict)) for verdict in ("wrong", "unsure", "right"))
+        rows.append(f"| {turbulence:g} | {len(some)} | {right} | {found} | {others.count('wrong')} |")
+    clean = sum(set(one["as flown"].values()) == {"right"} for one in experiments)
+    caught = sum(all(given[name] == "wrong" for name, given in one["flipped"].items()) for one in experiments)
+    count = len(experiments)
+    rows.append(f"\n{clean} of {count} show every sign, right; {caught} find each single sign that is flipped.\n")
+    return "\n".join(rows)
 
 
 def table_of_pose(result: dict[str, Any]) -> str:
@@ -318,7 +354,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sitl", type=Path, help="folder of the kit")
     parser.add_argument("--only", action="append", choices=MEASUREMENTS, help="repeatable")
-    parser.add_argument("--experiments", type=int, default=20, help="number of those on signs, 45 s each")
+    parser.add_argument("--experiments", type=int, default=20, help="number of further ones on signs, 40 s each")
     parser.add_argument("--render", action="store_true", help="no flight")
     arguments = parser.parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)

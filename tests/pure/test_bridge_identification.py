@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import yaml
+from scipy.signal import cont2discrete, dlsim
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.params import AircraftParameters
@@ -19,6 +20,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import open_loop_fit
 from flight_analysis.design.bridge_identification import (
     Channels,
+    channel_models,
     channel_pairs,
     experiment,
     flying_scenario,
@@ -32,7 +34,8 @@ from flight_analysis.design.response_identification import Response, identify_re
 from flight_analysis.metrics import best_error, error_metrics
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
-from flight_core.tape import Signal
+from flight_core.tape import Signal, Tape
+from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 
 MAP, SPEED, DELAY = load_map("ardupilot"), 25.0, 0.05  # m/s; s, by which y is late
@@ -66,10 +69,9 @@ def identified(tmp_path_factory: pytest.TempPathFactory) -> Identified:
     folder = tmp_path_factory.mktemp("experiment")
     planned = experiment(MAP, SPEED, 0.15, str(folder / "experiment_airframe.yaml"), wait=1.0)
     tape = simulate(loaded(folder, "experiment", planned.airframe, planned.scenario))
-    pairing, sign = channel_pairs(MAP)
-    y, u = tape["y"], tape["u"]
-    response = identify_response(y, u, pairing.outputs, pairing.inputs)
-    models = [fit_channel(y, u, *channel) for channel in zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True)]
+    pairing, _ = channel_pairs(MAP)
+    response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs)
+    models = channel_models(MAP, tape, [(0, 10**18)], SPEED)
     return Identified(response, models, join(MAP, response, models))
 
 
@@ -179,6 +181,23 @@ def test_noise_as_large_as_the_response_leaves_a_model_with_standard_errors() ->
     assert abs(phase.value + np.angle(known)) < 3.0 * phase.deviation
 
 
+def test_a_lag_that_a_zero_cancels_is_not_taken_for_the_lag_of_the_channel() -> None:
+    # Two complex poles without a lag: the second order fits them with a lag of up to 1 s and a zero at its pole, and the loop's
+    # bandwidth follows from the lag. The first order has one of 1/12 s or less: 23 1/s is the sum of both poles.
+    t = np.arange(0.0, 14.0, 0.01)
+    arrays = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller.law_params()
+    u = np.array([(arrays.amplitude * excitation.signal(one, arrays))[0] for one in t])
+    plant = np.array([[0.0, 1.0], [-267.0, -23.0]]), np.array([[0.0], [1120.0]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
+    _, y, _ = dlsim((*cont2discrete(plant, 0.01)[:4], 0.01), np.concatenate([np.zeros(7), u[:-7]]))
+    stamps = np.round(t * 1e9).astype(np.int64)
+    noise = 0.01 * np.random.default_rng(1).standard_normal(y.shape)
+    model = fit_channel(Signal(stamps, ("q",), y + noise), Signal(stamps, ("elevator",), u[:, None]), "q", "elevator", 1.0)
+    assert model is not None
+    assert model.usable
+    assert model.lag < 0.09
+    assert model.delay + model.lag == pytest.approx(0.07 + 0.005 + 0.04, abs=0.03)  # s; a lag of 0.04 s is the slower real part
+
+
 def test_the_fast_oscillation_of_a_light_airplane_is_found() -> None:
     # that of PX4's airplane in yaw: 480 / s^2 is 3.5 Hz, and its response returns to 0 within 0.15 s
     known = Known(Omega=500.0, damping=24.0, stiffness=480.0, lag=0.01, delay=0.02)
@@ -191,6 +210,51 @@ def test_the_fast_oscillation_of_a_light_airplane_is_found() -> None:
 def test_noise_far_above_the_response_leaves_no_model() -> None:
     model = fit_channel(*Known().measured(noise=5.0), "q", "elevator", 1.0)
     assert model is None or not model.usable
+
+
+def thrust_with_phugoid(amplitude: float) -> Tape:
+    """V by thrust in Lanchester's phugoid, behind a servo of 0.1 s, and the climb of the pose; noise as of an airspeed sensor.
+
+    V_dot = -0.5 V + 14 v - g gamma,   gamma_dot = 2 g V / SPEED^2: weight is lift at SPEED, and lift grows with its square.
+    Source: F. W. Lanchester, "Aerodonetics", 1908; undamped, its frequency is sqrt(2) g / SPEED, here 0.09 Hz.
+    """
+    params = experiment(MAP, SPEED, amplitude, "airframe.yaml").controller
+    arrays, step = params.law_params(), 0.01  # s, exact for a u that is held so long
+    place = params.inputs.index("thrust")
+    t = np.arange(0.0, params.duration, step)
+    u = np.array([(arrays.amplitude * excitation.signal(one, arrays))[place] for one in t])
+    A = np.array([[-0.5, -GRAVITY, 14.0], [2.0 * GRAVITY / SPEED**2, 0.0, 0.0], [0.0, 0.0, -10.0]])
+    plant = A, np.array([[0.0], [0.0], [10.0]]), np.eye(3), np.zeros((3, 1))
+    _, states, _ = dlsim((*cont2discrete(plant, step)[:4], step), u)
+    noise = 0.02 * np.random.default_rng(1).standard_normal(len(t))  # m/s
+    stamps = np.round(t * 1e9).astype(np.int64)
+    y = np.zeros((len(t), 4))
+    y[:, list(MAP.outputs).index("V")] = states[:, 0] + noise
+    held = np.zeros((len(t), 4))
+    held[:, place] = u
+    pose = Signal(stamps, ("climb",), SPEED * states[:, 1:2])
+    return Tape({"y": Signal(stamps, tuple(MAP.outputs), y), "u": Signal(stamps, params.inputs, held), "pose": pose})
+
+
+def test_thrust_is_told_from_the_phugoid_by_the_climb() -> None:
+    tape, whole = thrust_with_phugoid(0.2), [(0, 10**18)]
+    place = channel_pairs(MAP)[0].outputs.index("V")
+    model = channel_models(MAP, tape, whole, SPEED)[place]
+    assert model is not None
+    assert model.usable
+    np.testing.assert_allclose([model.Omega, model.damping], [14.0, 0.5], rtol=0.05)
+    assert model.lag + model.delay == pytest.approx(0.1, abs=0.03)  # s: a bandwidth of 1.5 rad/s turns 30 ms into 3 degrees
+    of_log_alone = fit_channel(tape["y"], tape["u"], "V", "thrust", 1.0)
+    assert of_log_alone is not None
+    assert of_log_alone.Omega > 1.5 * 14.0, "the phugoid is large enough to matter"
+
+
+def test_speed_has_no_model_where_no_climb_is_measured() -> None:
+    tape, place = thrust_with_phugoid(0.2), channel_pairs(MAP)[0].outputs.index("V")
+    level = Signal(tape["pose"].stamp_ns, ("theta",), tape["pose"].values)
+    for signals in ({"pose": level}, {}):
+        blind = Tape({"y": tape["y"], "u": tape["u"], **signals})
+        assert channel_models(MAP, blind, [(0, 10**18)], SPEED)[place] is None
 
 
 def test_a_map_without_an_envelope_is_refused() -> None:

@@ -15,6 +15,7 @@ from flight_analysis.design.bridge_identification import (
     Channels,
     Experiment,
     Flyable,
+    channel_models,
     channel_pairs,
     experiment,
     flying_scenario,
@@ -23,7 +24,7 @@ from flight_analysis.design.bridge_identification import (
     measured_trims,
     require_envelope,
 )
-from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
+from flight_analysis.design.open_loop_fit import ChannelModel
 from flight_analysis.design.response_identification import Response, identify_response
 from flight_analysis.report.run_folder import link_latest, new_run
 from flight_analysis.report.summary import finite_or_null
@@ -48,13 +49,11 @@ def identify_behind_bridge(
         require_envelope(channel_map)
     run = _excite(console, channel_map, map_name, speed, folder, amplitude, runs) if log is None else log
     tape, spans = _engaged(run)
-    pairing, sign = channel_pairs(channel_map)
+    pairing, _ = channel_pairs(channel_map)
     trims = measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
     response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans)
     _show_response(console, channel_map.name, response, trims)
-    y, u = tape["y"].within(spans), tape["u"].within(spans)
-    channels = zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True)
-    models = [fit_channel(y, u, output, name, one) for output, name, one in channels]
+    models = channel_models(channel_map, tape, spans, speed)
     _show_models(console, response, models)
     found = join(channel_map, response, models)
     airframe = folder / "airframe.yaml"

@@ -21,11 +21,12 @@ from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import bandwidths
 from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre
 from flight_analysis.design.identification import SOFTENING, reference_parameters
-from flight_analysis.design.open_loop_fit import ChannelModel
-from flight_analysis.design.response_identification import MIN_RATIO, Response
+from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
+from flight_analysis.design.response_identification import MIN_RATIO, Response, Spans
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Signal
+from flight_core.tape import Signal, Tape
+from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelParameters
 from rise_di_controller.linear_loop import Loop
@@ -118,6 +119,28 @@ def experiment(channel_map: ChannelMap, speed: float, amplitude: float, airframe
         scenario_text(heading, airframe_file, wait + controller.duration, none, controller.model_dump(exclude_defaults=True)),
         controller,
     )
+
+
+def channel_models(channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float) -> list[ChannelModel | None]:
+    """The model of each channel of a map from the log of its experiment, engaged in `spans`; None where there is none.
+
+    V has no model without a measured climb: the phugoid, which thrust excites too, would be taken for a response to thrust.
+    """
+    pairing, sign = channel_pairs(channel_map)
+    y, u = tape["y"].within(spans), tape["u"].within(spans)
+    gravity = gravity_along_path(tape["pose"], speed) if "pose" in tape else None
+    return [
+        None if output == "V" and gravity is None else fit_channel(y, u, output, name, one, gravity if output == "V" else None)
+        for output, name, one in zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True)
+    ]
+
+
+def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
+    """V_dot by gravity, -g climb / speed, m/s^2, at the stamps of a pose; None without a climb."""
+    if "climb" not in pose.names:
+        return None
+    known = np.isfinite(pose["climb"])
+    return Signal(pose.stamp_ns[known], ("V",), -GRAVITY / speed * pose["climb"][known, None]) if known.any() else None
 
 
 class Channels(NamedTuple):

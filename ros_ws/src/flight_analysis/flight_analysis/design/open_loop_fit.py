@@ -7,6 +7,12 @@
 The output error is fitted: the model is simulated from u alone, and y less its output is smallest in the squares. Without
 stiffness the response does not tell lag from 1 / damping: the lag is the smaller of the two, that of the faster pole. Source:
 L. Ljung, "System Identification", 1999, 4.2 and 10.2.
+
+Thrust also moves the airspeed by the climb that follows it, the phugoid. With the climb measured the model of V is without it:
+
+    V_dot = -damping V + Omega v - g climb / speed
+
+Source: B. Etkin, L. D. Reid, "Dynamics of Flight", 1996, 4.9 (the X equation along the flight path).
 """
 
 from typing import Any, NamedTuple
@@ -23,6 +29,7 @@ STEP = 0.004  # s, of the simulation
 BEFORE, AFTER = 0.3, 0.5  # s around the excitation of an input
 MIN_CERTAINTY = 5.0  # standard errors: those from which on a sign of Omega is certain too
 LOOP_FREQUENCY = 0.5  # of 1 / (delay + lag): about where the loops of `rise-di gains` cross 1
+MAX_ZERO_LAG = 0.5  # zero times lag; at 1 they cancel
 MIN_GAIN = 0.85  # of the misfit, by which a second order has to lower it: noise alone does not in 10 s
 # Delay s, lag s, damping 1/s, stiffness 1/s^2, zero 1/s: a slow response to slow servos, a short-period or Dutch roll mode of a
 # transport and that of a model aircraft
@@ -84,10 +91,13 @@ class ChannelModel(NamedTuple):
         return Estimate(float(np.exp(found.real)), gain * float(np.exp(found.real))), Estimate(-found.imag, phase)
 
 
-def fit_channel(y: Signal, u: Signal, output: str, name: str, sign: float) -> ChannelModel | None:
+def fit_channel(
+    y: Signal, u: Signal, output: str, name: str, sign: float, gravity: Signal | None = None
+) -> ChannelModel | None:
     """The model from the time in which an input is excited, of the lowest order that explains it; None where it never is.
 
-    The search begins with an Omega of this sign, and may end with the other one.
+    The search begins with an Omega of this sign, and may end with the other one. `gravity` is a measured part of y_dot that is
+    not of u itself, one channel: then the model is of first order.
     """
     excited = np.flatnonzero(u[name] != 0.0)
     if not len(excited):
@@ -98,21 +108,42 @@ def fit_channel(y: Signal, u: Signal, output: str, name: str, sign: float) -> Ch
     t = (measured.stamp_ns - first) / NANOSECONDS
     t_u = (u.stamp_ns - first) / NANOSECONDS
     impulse = np.concatenate([[0.0], np.cumsum(u[name][:-1] * np.diff(t_u))])
-    trend, _ = np.linalg.qr(np.stack([np.ones(len(t)), t], axis=1))
-    values = measured[output] - trend @ (trend.T @ measured[output])
+    trend = [np.ones(len(t)), t]
+    if gravity is not None:
+        t_g = (gravity.stamp_ns - first) / NANOSECONDS
+        gained = np.concatenate([[0.0], np.cumsum(gravity.values[:-1, 0] * np.diff(t_g))])
+
+    def response(theta: FloatArray) -> FloatArray:
+        """Of the model to u, less that to gravity."""
+        to_u = _simulated(t, t_u, impulse, np.concatenate([theta, np.zeros(6 - len(theta))]))
+        if gravity is None:
+            return to_u
+        return to_u + _simulated(t, t_g, gained, np.array([0.0, LOWER[1], 1.0, theta[3], 0.0, 0.0]))
 
     def residuals(theta: FloatArray) -> FloatArray:
-        e = measured[output] - _simulated(t, t_u, impulse, np.concatenate([theta, np.zeros(6 - len(theta))]))
-        return np.asarray(e - trend @ (trend.T @ e))
+        decay = [] if gravity is None else [_decay(t, theta[3])]
+        q, _ = np.linalg.qr(np.stack(trend + decay, axis=1))
+        e = measured[output] - response(theta)
+        return np.asarray(e - q @ (q.T @ e))
 
-    fits = [_search(residuals, values, order, sign * float(np.max(np.abs(u[name])))) for order in ORDERS]
+    orders = ORDERS if gravity is None else ORDERS[:1]
+    values = residuals(np.array([0.0, 1.0, 0.0, 0.0]))
+    fits = [_search(residuals, values, order, sign * float(np.max(np.abs(u[name])))) for order in orders]
     misfits = [float(np.linalg.norm(fit.fun) / np.linalg.norm(values)) for fit in fits]
-    chosen = 1 if misfits[1] < MIN_GAIN * misfits[0] and _has_stable_zero(fits[1].x) else 0
+    chosen = 1 if misfits[-1] < MIN_GAIN * misfits[0] and _has_zero_of_its_own(fits[-1].x) else 0
     return _model(fits[chosen], misfits[chosen], float(np.median(np.diff(t))))
 
 
-def _has_stable_zero(theta: FloatArray) -> bool:
-    return bool(theta[2] * theta[5] >= 0.0)
+def _decay(t: FloatArray, damping: float) -> FloatArray:
+    """Beside a constant and t: the decay of a first value, exp(-damping t), which is t^2 where the damping is 0."""
+    x = damping * t
+    return np.where(x > 1e-4, (np.expm1(-x) + x) / max(damping, 1e-9) ** 2, 0.5 * t**2)
+
+
+def _has_zero_of_its_own(theta: FloatArray) -> bool:
+    """Whether the zero of a second order is stable, and slow enough not to cancel the lag, which then would be none."""
+    _, lag, Omega, _, _, slow = theta
+    return bool(0.0 <= slow * Omega * lag <= MAX_ZERO_LAG * Omega**2)
 
 
 def _simulated(t: FloatArray, t_u: FloatArray, impulse: FloatArray, theta: FloatArray) -> FloatArray:
