@@ -468,6 +468,16 @@ def test_a_y_that_is_slower_than_the_law_counts_as_delay() -> None:
     assert delays == pytest.approx([0.062817, 0.04], abs=1e-6)
 
 
+def test_the_age_limit_of_the_law_lasts_for_three_messages_of_a_slow_y(tmp_path: Path) -> None:
+    """The airspeed of PX4 comes at 9.9 Hz: a limit of 0.1 s is over before the next one."""
+    ages = []
+    for rate in ("9.9", "139"):
+        path = tmp_path / f"{rate}.yaml"
+        assert rise_di("gains", "osprey", "--samples", "2", "--y-rate", rate, "--write", str(path)).exit_code == 0
+        ages.append(yaml.safe_load(path.read_text(encoding="utf-8"))["/**/controller"]["ros__parameters"]["max_age"])
+    assert ages == pytest.approx([3.0 / 9.9, find_scenario("osprey_servo").controller.max_age], abs=1e-5)
+
+
 @pytest.mark.parametrize(
     ("option", "value", "expected"),
     [

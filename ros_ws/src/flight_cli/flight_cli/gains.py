@@ -42,6 +42,7 @@ MEANINGS = {
     "response": "how much one unit of scaled input changes y_dot, abs(Omega_ii) input_scale; bandwidth = K x response",
 }
 """Terms of the table and their meaning."""
+MESSAGES = 3.0  # of y: the age limit of the law, at least
 HEADER = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
 
 
@@ -51,7 +52,8 @@ def gains(
     scenario: Annotated[str, typer.Option(help="Scenario with the commands, the gusts and the loop.")] = "osprey_servo",
     rate: Annotated[float | None, typer.Option(help="Rate of the law in Hz; by default that of the scenario.")] = None,
     y_rate: Annotated[
-        float | None, typer.Option(help="Rate of y in Hz where it is below that of the law: its longer period counts as delay.")
+        float | None,
+        typer.Option(help="Rate of y in Hz: a period above that of the law counts as delay, and y is stale after three."),
     ] = None,
     lag: Annotated[str | None, typer.Option(help="Lags of the actuators in s, in the airframe's order: 0.02,0.1")] = None,
     delay: Annotated[float | None, typer.Option(help="Pure delay in s; by default that of the scenario.")] = None,
@@ -94,6 +96,8 @@ def gains(
     loop: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
     paired = tuple(inputs.split(",")) if inputs else ()
     setting = gain_selection.loop_setting(chosen, gamma_2)._replace(inputs=paired, feedforward=feedforward, **loop)
+    age = max(setting.base.max_age, MESSAGES / (y_rate or math.inf))
+    setting = setting._replace(base=setting.base.model_copy(update={"max_age": age}))
     if check:
         for option, given in (("--write", write is not None), ("--feedforward", feedforward), ("--observer", observer)):
             require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
