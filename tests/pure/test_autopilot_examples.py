@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The examples of autopilots: airframe, scenario and map fit together. docs/autopilots.md says how they flew."""
 
+from dataclasses import replace
+
 import pytest
 from tests.conftest import REPOSITORY
 
@@ -9,6 +11,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.sign_check import require_signs
 from flight_bringup.graph import find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError
 
 EXAMPLES = {"arduplane": "ardupilot", "px4_airplane": str(REPOSITORY / "examples" / "px4_airplane" / "map.yaml")}
 
@@ -26,3 +29,14 @@ def test_an_example_has_the_signs_and_the_limits_of_its_map_and_tracks_in_simula
     y, y_m = tape["y"], tape["y_m"]
     for output, largest in {"q": 0.1, "V": 1.0, "p": 0.2, "r": 0.2}.items():  # an aircraft that is lost leaves them at once
         assert abs(y[output][: len(y_m.stamp_ns)] - y_m[output][: len(y.stamp_ns)]).max() < largest, output
+
+
+def test_limits_of_u_beyond_those_of_the_map_are_refused_before_a_flight_that_sends() -> None:
+    """The bridge would clip u, and the integrals of the law would go on."""
+    scenario = find_scenario(str(REPOSITORY / "examples" / "px4_airplane" / "scenario.yaml"))
+    wide = replace(scenario, controller=scenario.controller.model_copy(update={"upper": (0.13, 0.14, 0.13, 0.202)}))
+    with pytest.raises(
+        ParameterError, match=r"controller\.upper: found 0\.14, expected at most 0\.13, the upper limit of aileron"
+    ):
+        require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=False), wide)
+    require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=True), wide)
