@@ -183,6 +183,19 @@ def test_y_is_returned_once_per_rate_sample_and_only_while_all_channels_are_fres
     assert bridge.y(at(0.25)) is None
 
 
+def test_a_low_pass_answers_a_step_as_first_order_does_at_any_spacing_of_samples() -> None:
+    content = CHANNEL_MAP.model_dump()
+    content["outputs"]["q"]["low_pass"] = 0.05
+    bridge = new_bridge(ChannelMap.validate_mapping(content, "map"))
+    receive_outputs(bridge, 0.0)
+    for t in (0.001, 0.02, 0.05, 0.1):
+        receive_outputs(bridge, t, raw=1.0)
+        sample = bridge.y(at(t))
+        assert sample is not None
+        step = np.abs(sample.value[[OUTPUTS.index("q"), OUTPUTS.index("p")]])  # the row of q has sign -1, that of p no filter
+        assert step == pytest.approx([1.0 - np.exp(-t / 0.05), 1.0])
+
+
 def test_stamps_of_another_clock_and_samples_out_of_order_are_refused() -> None:
     bridge = new_bridge(load_map("mavros"))
     with pytest.raises(ChannelError, match="stamp: arrival") as refused:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from autopilot_bridge.channel_map import to_channel, to_raw
-from autopilot_bridge.params import ROUNDING, ChannelMap, ConditionRow, InputRow, MeasuredRow
+from autopilot_bridge.params import ROUNDING, ChannelMap, ConditionRow, InputRow, MeasuredRow, OutputRow
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer
 
@@ -79,10 +79,12 @@ class Bridge:
         if abs(now_ns - stamp_ns) > nanoseconds(row.max_age):
             hint = "" if row.stamp == "arrival" else "; set stamp: arrival in the map if the autopilot has another clock"
             raise ChannelError("stamp", f"{name} is stamped {seconds(now_ns - stamp_ns):.3f} s before now{hint}")
-        last = self._readings.get(name)
+        last, value = self._readings.get(name), to_channel(raw, row.line)
         if last is not None:
             require_newer(stamp_ns, last.stamp_ns, name)
-        self._readings[name] = Reading(stamp_ns, to_channel(raw, row.line))
+            if isinstance(row, OutputRow) and row.low_pass > 0.0:
+                value = last.value - math.expm1(-seconds(stamp_ns - last.stamp_ns) / row.low_pass) * (value - last.value)
+        self._readings[name] = Reading(stamp_ns, value)
 
     def take_u(self, u: FloatArray, sender: str, now_ns: int) -> None:
         """Take u, shape (m,) in the map's order. Raises ChannelError, reason "sender", for a conflicting publisher."""

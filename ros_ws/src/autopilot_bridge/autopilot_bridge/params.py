@@ -100,6 +100,9 @@ class OutputRow(MeasuredRow, MovingRow):
     captured: bool = Field(
         default=False, description="whether the channel begins at 0 at each engagement, in place of the trim in `offset`"
     )
+    low_pass: NonNegative = Field(
+        default=0.0, description="time constant of a low-pass filter of first order, s: y is later by it; 0 without"
+    )
 
 
 class InputRow(MovingRow):
