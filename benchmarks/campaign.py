@@ -3,6 +3,7 @@
 """Monte Carlo campaign: speed relative to the simulation in one process, integration error, memory.
 
 python -m benchmarks.campaign                     # 10,000 aircraft of osprey_servo, a minute on two cores
+python -m benchmarks.campaign --scenario osprey_route --aircraft 2000 --exact 1        # missions
 """
 
 import json
@@ -81,6 +82,7 @@ def integration_error(scenario: Scenario, count: int) -> tuple[float, FloatArray
 
 
 def main(
+    scenario: Annotated[str, typer.Option(help="Name of a scenario; one with guidance flies missions.")] = "osprey_servo",
     aircraft: Annotated[int, typer.Option(min=1, help="Aircraft of the campaign.")] = 10_000,
     chunk: Annotated[int, typer.Option(min=1, help="How many fly at once.")] = 1000,
     workers: Annotated[int, typer.Option(min=1, help="Threads.")] = psutil.cpu_count() or 1,
@@ -88,13 +90,15 @@ def main(
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to a file.")] = None,
 ) -> None:
     """Print speed, ratio to the simulation in one process, memory, and integration error."""
-    scenario = find_scenario("osprey_servo")
-    many = speed(scenario, aircraft, chunk, workers)
-    single_speed, errors = integration_error(scenario, exact)
+    chosen = find_scenario(scenario)
+    many = speed(chosen, aircraft, chunk, workers)
+    single_speed, errors = integration_error(chosen, exact)
     table = new_table(
-        f"osprey_servo, 60 s, +-{100 * UNCERTAINTY:g} %, {workers} threads, chunks of {chunk}", ("figure", "value"), texts=1
+        f"{scenario}, {chosen.flight.duration:g} s, +-{100 * UNCERTAINTY:g} %, {workers} threads, chunks of {chunk}",
+        ("figure", "value"),
+        texts=1,
     )
-    shares = dict(zip(scenario.controller.outputs, errors.tolist(), strict=True))
+    shares = dict(zip(chosen.controller.outputs, errors.tolist(), strict=True))
     rows = {
         f"{aircraft} aircraft, all in": f"{many.whole:,.0f} aircraft-s/s",
         "after the first chunks": f"{many.flown:,.0f} aircraft-s/s",

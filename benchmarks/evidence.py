@@ -53,7 +53,8 @@ FUZZ, REPLAY = ((PYTHON, "-m", "benchmarks.evidence", "--do", task, "--json", FI
 QUICK_CAMPAIGN = (*CAMPAIGN, "--aircraft", "2000", "--chunk", "200", "--exact", "1")
 SECURITY = (*PYTEST, "tests/ros/test_security.py")
 READERS = "readers of files and messages, coverage-guided fuzzing"
-FLEET = ("rise-di", "campaign", "osprey_servo", "--uncertainty", "0.3", "--seed", "7", "--json", "--aircraft")
+CAMPAIGN_OF = ("rise-di", "campaign", "--uncertainty", "0.3", "--seed", "7", "--json")
+FLEET, MISSIONS = ((*CAMPAIGN_OF, name, "--aircraft") for name in ("osprey_servo", "osprey_route"))
 COMPARE = ("rise-di", "compare", "osprey_servo", "--tuning", "gust,gust_turbulence,delay", "--json", FILE, "--aircraft")
 
 MEASUREMENTS = (
@@ -64,6 +65,7 @@ MEASUREMENTS = (
     Measurement("fuzz-coverage", (*FUZZ, "--seconds", "120"), (*FUZZ, "--seconds", "5"), READERS, "12 min"),
     Measurement("campaign", CAMPAIGN, QUICK_CAMPAIGN, "speed and accuracy of campaigns", "3 min", timed=True),
     Measurement("campaign-fleet", (*FLEET, "10000"), (*FLEET, "1000"), "uncertain aircraft flown by the same law", "1 min"),
+    Measurement("campaign-missions", (*MISSIONS, "5000"), (*MISSIONS, "200"), "uncertain aircraft on a route", "3 min"),
     Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), "other laws on the same aircraft and course", "5 min"),
     Measurement("replay", REPLAY, (*REPLAY, "--seconds", "5"), "every scenario flown and replayed", "2 min"),
 )

@@ -21,6 +21,7 @@ from tests.closed_loop import error
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.guided import control_errors
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk_figures
@@ -108,23 +109,46 @@ def test_an_aircraft_of_a_campaign_has_the_same_score_in_the_single_process_simu
     assert worst.score == pytest.approx(score(rms, unit)[0], rel=1e-3)  # as of single flights: tests of fleets
 
 
+ROUTE = find_scenario("osprey_route")
+CORNER = ROUTE.vary(
+    flight={"duration": 18.0},
+    guidance={"route": {"north": [0.0, 300.0, 300.0], "east": [0.0, 0.0, 300.0], "altitude": [0.0, 5.0, 0.0]}},
+)
+"""A corner after 120 m: a change of leg, a bank to the limit, a climb."""
+
+MISSIONS = {
+    "turbulence and wind": CORNER,
+    "late and lost y": CORNER.vary(aircraft={"rate": 100.0, "sensors": {"delay": 0.02, "dropout": 0.2, "seed": 3}}),
+}
+
+
 @pytest.fixture(scope="module")
 def mission() -> Definition:
-    """Two aircraft on the first seconds of the osprey's route."""
-    return define(find_scenario("osprey_route").vary(flight={"duration": 6.0}), 2, 0.3, 7, 2)
+    """Two aircraft on the first seconds of a route."""
+    return define(CORNER, 2, 0.3, 7, 2)
 
 
-def test_a_campaign_of_a_guided_scenario_flies_missions(mission: Definition) -> None:
-    chunk = fly_chunk_figures(mission.model_dump_json(), (0, 0))
+@pytest.mark.parametrize("name", MISSIONS)
+def test_each_mission_of_a_campaign_flies_as_in_the_single_process_simulation(name: str) -> None:
+    # As of fleets without guidance: the nonlinear remainder is held over a tick (10 ms). Where u holds a lost y, the node's
+    # extrapolation of y_m differs: 1e-2 there.
+    definition, within = define(MISSIONS[name], 2, 0.3, 7, 2), 1e-2 if "lost" in name else 1e-3
+    chunk = fly_chunk_figures(definition.model_dump_json(), (0, 0))
     assert not chunk.diverged.any()
-    for number in (0, 1):
-        tape = simulate(mission.aircraft_scenario(number))
-        log, figures = tape["guidance"], {name: values[number] for name, values in chunk.figures.items()}
-        largest = np.max(np.abs(log["xtrack"]))
-        assert figures["max.xtrack"] == largest
-        assert figures["score"] == pytest.approx(largest / 12.5)  # half a second of flight at 25 m/s
-        assert figures["max.phi"] == np.max(np.abs(log["pose.phi"]))
-        assert figures["rms.q"] == pytest.approx(np.sqrt(np.mean(error(tape)["q"] ** 2)))
+    figures = {key: values[1] for key, values in chunk.figures.items()}
+    tape = simulate(definition.aircraft_scenario(1))
+    log, errors, true = tape["guidance"], control_errors(tape), error(tape)
+    assert log["leg"].max() == 2  # the fillet has been reached, the orbit has not
+    xtrack = errors["xtrack"]
+    expected = {
+        "max.xtrack": np.abs(xtrack).max(),
+        "rms.xtrack": np.sqrt(np.mean(xtrack**2)),
+        "score": np.abs(xtrack).max() / 12.5,  # half a second of flight at 25 m/s
+        "rms.altitude": np.sqrt(np.mean(errors["altitude"] ** 2)),
+        "max.phi": np.abs(log["pose.phi"]).max(),
+        **{f"rms.{name}": np.sqrt(np.mean(true[name][true.stamp_ns % 10_000_000 == 0] ** 2)) for name in ("q", "p", "r", "V")},
+    }
+    assert {key: figures[key] for key in expected} == pytest.approx(expected, rel=within)
     assert chunk.figures["score"][0] != chunk.figures["score"][1]  # each has its own A and B
 
 
@@ -138,10 +162,28 @@ def test_the_report_of_missions_says_what_their_score_counts(mission: Definition
     assert "max phi (deg)" in page
 
 
+REFUSED_MISSIONS: dict[str, dict[str, Any]] = {
+    r"controller.rate: found .* a period of guidance": {"controller": {"rate": 125.0}},
+    r"guidance.program: found heading, expected a route alone": {
+        "guidance": {"program": {"heading": {"start": [1.0], "value": [1.0]}}}
+    },
+    r"reference_model.live.bounds: found bounds, expected none": {
+        "reference_model": {"live": {"speed": 25.0, "bounds": {"p": 1.0}}}
+    },
+    r"reference_model: found a profile of commands, expected none": {
+        "reference_model": {"pulses": {"q": {"start": [1.0], "stop": [2.0], "value": [0.1]}}}
+    },
+}
+
+
+@pytest.mark.parametrize("sentence", REFUSED_MISSIONS)
+def test_a_mission_that_a_fleet_cannot_fly_is_refused(sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        define(CORNER.vary(**REFUSED_MISSIONS[sentence]), 2, 0.3, 7, 2)
+
+
 def test_missions_need_a_route_and_an_airframe_with_matrices() -> None:
-    route = find_scenario("osprey_route")
-    assert route.guidance is not None
-    program = route.vary(guidance={"route": None, "program": {"heading": {"start": [1.0], "value": [1.0]}}})
+    program = ROUTE.vary(guidance={"route": None, "program": {"heading": {"start": [1.0], "value": [1.0]}}})
     with pytest.raises(ParameterError, match=r"guidance.route: found none, expected a route"):
         define(program, 2, 0.3, 7, 2)
     with pytest.raises(ParameterError, match=r"airframe: found jsbsim:c172p, expected an airframe with matrices"):

@@ -73,6 +73,7 @@ VARIATIONS: dict[str, dict[str, Any]] = {
     "servos, noise, gusts": {},
     "gusts with the published effect": {"aircraft": {"uncertainty": {"wind": "published"}}},
     "products of states": {"aircraft": {"inertial_coupling": 1.0}},
+    "nonlinear kinematics": {"aircraft": {"kinematics": "euler"}},
     "feedforward": {"controller": with_feedforward(SERVO.controller, load_airframe("osprey")).model_dump()},
     "turbulence": {"aircraft": {"turbulence": {"altitude": 100.0, "wind": 7.7}}, "flight": {"duration": 6.0}},
     "bias, drift, coarse and late y": {

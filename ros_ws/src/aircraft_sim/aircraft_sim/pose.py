@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, Scalar, array_namespace
 
 CHANNELS = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
 """rad (body FRD in NED, psi from true north in (-pi, pi]), m, m/s over ground, and the sideslip in rad."""
@@ -30,23 +30,28 @@ def wrapped(angle: float) -> float:
     return angle - 2.0 * math.pi * math.ceil(angle / (2.0 * math.pi) - 0.5)
 
 
-def velocity(speed: float, alpha: float, beta: float, phi: float, theta: float, psi: float) -> tuple[float, float, float]:
+def velocity(
+    speed: Scalar, alpha: Scalar, beta: Scalar, phi: Scalar, theta: Scalar, psi: Scalar
+) -> tuple[Scalar, Scalar, Scalar]:
     """Velocity to the north, to the east and up, m/s, of an aircraft with this airspeed, m/s, and these angles, rad.
 
         [v_north, v_east, -climb] = R_z(psi) R_y(theta) R_x(phi) V [cos(alpha) cos(beta), sin(beta), sin(alpha) cos(beta)]
 
     Source: B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed. (2003), eqs. (1.3-20), (2.3-6).
     """
-    u, v, w = speed * math.cos(alpha) * math.cos(beta), speed * math.sin(beta), speed * math.sin(alpha) * math.cos(beta)
-    right, down = v * math.cos(phi) - w * math.sin(phi), v * math.sin(phi) + w * math.cos(phi)
-    forward, climb = u * math.cos(theta) + down * math.sin(theta), u * math.sin(theta) - down * math.cos(theta)
-    north, east = math.cos(psi), math.sin(psi)
+    xp = array_namespace(phi)
+    sin, cos = xp.sin, xp.cos
+    u, v, w = speed * cos(alpha) * cos(beta), speed * sin(beta), speed * sin(alpha) * cos(beta)
+    right, down = v * cos(phi) - w * sin(phi), v * sin(phi) + w * cos(phi)
+    forward, climb = u * cos(theta) + down * sin(theta), u * sin(theta) - down * cos(theta)
+    north, east = cos(psi), sin(psi)
     return forward * north - right * east, forward * east + right * north, climb
 
 
-def psi_dot(phi: float, theta: float, q: float, r: float) -> float:
+def psi_dot(phi: Scalar, theta: Scalar, q: Scalar, r: Scalar) -> Scalar:
     """Rate of the heading, rad/s: (q sin(phi) + r cos(phi)) / cos(theta). Source: Stevens, Lewis, eq. (1.3-22)."""
-    return (q * math.sin(phi) + r * math.cos(phi)) / math.cos(theta)
+    xp = array_namespace(phi)
+    return (q * xp.sin(phi) + r * xp.cos(phi)) / xp.cos(theta)
 
 
 def over_ground(pose: FloatArray, t: float, wind: Sequence[float]) -> FloatArray:

@@ -19,7 +19,6 @@ from aircraft_sim.uncertainty import WindEffect, gust_directions, sampled_matric
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
-from flight_campaign.missions import fly_mission, require_mission
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.files import writing
 from flight_core.parameters import ParameterError, Parameters, require
@@ -28,6 +27,7 @@ from rise_di_controller.control_law import TunedLaw
 
 if TYPE_CHECKING:
     from flight_campaign.fleet import Vehicle
+    from flight_campaign.missions import Mission
 
 DEFINITION, CHUNKS = "campaign.json", "chunks"
 SWEPT = ("k_g", "k_d", "Lambda", "beta", "input_scale", "omega", "softening")
@@ -104,7 +104,9 @@ def define(
         require(sweep.parameter in SWEPT, "--sweep", sweep.parameter, f"a parameter of the controller: {names}")
         require(all(factor > 0.0 for factor in sweep.factors), "--sweep", sweep.factors, "factors above 0")
     if scenario.guidance is not None:
-        require_mission(scenario)
+        from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
+
+        missions.build(scenario, build_course(scenario))
     published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
     values = {
         "name": scenario.name,
@@ -138,39 +140,49 @@ def fly_chunk(text: str, job: Job) -> str:
 
 
 def fly_chunk_figures(text: str, job: Job) -> Chunk:
-    """Fly a chunk of a campaign, aircraft by aircraft. One of a guided scenario flies missions."""
+    """Fly a chunk of a campaign. One of a guided scenario flies missions."""
     from flight_campaign import fleet  # noqa: PLC0415 - JAX, which the command needs only for flights
 
     definition = Definition.model_validate_json(text)
     case, chunk = job
     first, count, part = chunk * definition.chunk, definition.size(job), definition.uncertainty
-    if "guidance" in definition.sections:
-        flown = [fly_mission(definition.aircraft_scenario(number, case)) for number in range(first, first + count)]
-        by_name = {name: np.array([one.figures[name] for one in flown]) for name in flown[0].figures}
-        return Chunk(first, np.array([one.diverged for one in flown]), by_name)
-    scenario, course, vehicle, law = _prepare(text, case)
+    scenario, course, vehicle, law, mission = _prepare(text, case)
     # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft are dropped.
     airframe = load_airframe(scenario.aircraft.airframe)
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, definition.chunk)
     directions = gust_directions(airframe, A, definition.wind)
     aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
-    result = fleet.fly(aircraft, vehicle, course, law.control_law, law.params)
+    result = fleet.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
-    figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs))}
+    if result.mission is None:
+        figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs))}
+    else:
+        figures = {name: np.asarray(values)[:count] for name, values in result.mission.items()}
     for kind, names, values in (("rms", outputs, rms), ("max", outputs, largest), ("slew", inputs, slew)):
         figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
     return Chunk(first, np.asarray(result.diverged)[:count], figures)
 
 
-@lru_cache(maxsize=8)
-def _prepare(text: str, case: int) -> tuple[Scenario, Course, "Vehicle", TunedLaw]:
+class _Shared(NamedTuple):
     """Data that all chunks of a case share."""
-    from flight_campaign import fleet  # noqa: PLC0415 - as above
+
+    scenario: Scenario
+    course: Course
+    vehicle: "Vehicle"
+    law: TunedLaw
+    mission: "Mission | None"
+
+
+@lru_cache(maxsize=8)
+def _prepare(text: str, case: int) -> _Shared:
+    """Data that all chunks of a case share."""
+    from flight_campaign import fleet, missions  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
-    law = scenario.controller.tuned_law()
-    return scenario, build_course(scenario), fleet.vehicle(scenario), law._replace(params=fleet.shared(law.params))
+    law, course = scenario.controller.tuned_law(), build_course(scenario)
+    mission = None if scenario.guidance is None else missions.build(scenario, course)
+    return _Shared(scenario, course, fleet.vehicle(scenario), law._replace(params=fleet.shared(law.params)), mission)
 
 
 class Campaign:

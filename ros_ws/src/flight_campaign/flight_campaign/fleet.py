@@ -21,7 +21,9 @@ from aircraft_sim.actuators import Actuators
 from aircraft_sim.dynamics import Aircraft, Coupling
 from aircraft_sim.plant import DIVERGENCE_LIMIT, PlantParams
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_campaign import missions
 from flight_campaign.benchmark_course import Course, Segments
+from flight_campaign.missions import Mission
 from flight_core.integrators import rk4
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
@@ -97,6 +99,7 @@ class FleetResult(NamedTuple):
     max: Array  # (m, N)
     slew: Array  # (m, N) mean abs(u_dot), units of u / s
     diverged: Array  # (N,) bool: the state exceeded DIVERGENCE_LIMIT, the other figures are invalid
+    mission: dict[str, Array] | None = None  # of `missions.figures`; None without guidance
 
 
 def assemble(
@@ -155,25 +158,34 @@ def remainder_rows(aircraft: Aircraft) -> NDArray[np.int64]:
     acts = aircraft.gravity.any(axis=1)
     if aircraft.coupling is not None:
         acts = acts | aircraft.coupling.gain.any(axis=1)
+    if aircraft.kinematics is not None:
+        acts = acts | aircraft.kinematics.into.any(axis=1)
     return np.flatnonzero(acts)
 
 
 def remainder_of(states: Array, aircraft: Aircraft) -> Array:
-    """Nonlinear remainder of f_state, (q, N): gravity @ (sin(x) - x) + gain @ (x[first] x[second])."""
+    """Nonlinear remainder of f_state, (q, N): gravity @ (sin(x) - x) + gain @ (x[first] x[second]) + kinematics(x)."""
     return dynamics.f_state(states, aircraft) - aircraft.gravity @ states
 
 
 def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
     """Indices of the states in the remainder, and the aircraft reduced to them and to `remainder_rows`."""
-    rows, coupling = remainder_rows(aircraft), aircraft.coupling
+    rows, coupling, kinematics = remainder_rows(aircraft), aircraft.coupling, aircraft.kinematics
     in_remainder = aircraft.gravity.any(axis=0)
     if coupling is not None:
         in_remainder[[*coupling.first, *coupling.second]] = True
+    if kinematics is not None:
+        in_remainder = in_remainder | kinematics.select.any(axis=0) | kinematics.linear.any(axis=0)
     states = np.flatnonzero(in_remainder)
     if coupling is not None:
         first, second = (np.searchsorted(states, place) for place in (coupling.first, coupling.second))
         coupling = Coupling(coupling.gain[rows], first, second)
-    return states, aircraft._replace(gravity=aircraft.gravity[np.ix_(rows, states)], coupling=coupling)
+    if kinematics is not None:
+        kinematics = kinematics._replace(
+            select=kinematics.select[:, states], into=kinematics.into[rows], linear=kinematics.linear[:, states]
+        )
+    gravity = aircraft.gravity[np.ix_(rows, states)]
+    return states, aircraft._replace(gravity=gravity, coupling=coupling, kinematics=kinematics)
 
 
 def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
@@ -183,8 +195,15 @@ def _blocks(moves: NDArray[np.bool_]) -> tuple[StateBlock, ...]:
     return tuple(StateBlock(tuple(row.tolist()), tuple(np.flatnonzero(moves[row].any(axis=0)).tolist())) for row in rows)
 
 
-def fly(fleet: Fleet, vehicle: Vehicle, course: Course, control_law: ControlLaw, params: Any) -> FleetResult:
-    """Fly N aircraft through the course under one law, from trim at rest.
+def fly(
+    fleet: Fleet,
+    vehicle: Vehicle,
+    course: Course,
+    control_law: ControlLaw,
+    params: Any,
+    mission: Mission | None = None,
+) -> FleetResult:
+    """Fly N aircraft through the course under one law, from trim at rest; on a mission guidance commands the reference.
 
     At each tick: sensors, step of the law (or engagement, or a missed sample, by the course's phase), actuators over the K
     steps to the next tick, aircraft. The remainder s at the middle of a tick is extrapolated from this tick and the previous.
@@ -192,7 +211,8 @@ def fly(fleet: Fleet, vehicle: Vehicle, course: Course, control_law: ControlLaw,
     """
     static = {"control_law": control_law, "blocks": fleet.blocks, "steps": course.steps, "y_late": course.late}
     arrays, segments = fleet._replace(blocks=()), jax.tree.map(jnp.asarray, course.segments)
-    return _fly(arrays, vehicle, segments, params, course.period, u_late=int(np.max(np.asarray(fleet.late))), **static)
+    u_late = int(np.max(np.asarray(fleet.late)))
+    return _fly(arrays, vehicle, segments, params, course.period, mission, u_late=u_late, **static)
 
 
 class LoopState(NamedTuple):
@@ -209,6 +229,7 @@ class LoopState(NamedTuple):
     max: Array
     travel: Array  # sum of abs(u - previous u)
     bounded: Array  # (N,) whether the state stayed below DIVERGENCE_LIMIT
+    mission: Any  # MissionState; None without guidance
 
 
 @partial(jax.jit, static_argnames=("control_law", "blocks", "steps", "y_late", "u_late"))
@@ -218,6 +239,7 @@ def _fly(
     segments: Segments,
     params: Any,
     period: Array,
+    mission: Mission | None,
     *,
     control_law: ControlLaw,
     blocks: tuple[StateBlock, ...],
@@ -225,38 +247,44 @@ def _fly(
     y_late: int,
     u_late: int,
 ) -> FleetResult:
-    n, count, m = len(fleet.forced), len(fleet.wind), len(vehicle.outputs)
     places = np.argsort([row for block in blocks for row in block.rows])  # of the states in the order of the blocks
 
-    def measure(now: LoopState, y: Array, segment: Segments) -> Measurements:
+    def measure(now: LoopState, y: Array, segment: Segments, y_m: Array, y_m_dot: Array) -> Measurements:
         x = now.x.at[vehicle.outputs].set(y)
         forced = _product(fleet.forced_rate, segment.forcing_now)
         moving = _product(fleet.rate, [*now.x, *now.position]) + fleet.wind * forced
         position = now.position[vehicle.inputs]
-        reference = (segment.sampled_y_m[:, None], segment.sampled_y_m_dot[:, None], segment.u_ff[:, None] + 0.0 * y)
-        return Measurements(y, *reference, now.u, position, x, x - fleet.wind * segment.air[:, None], moving)
+        u_trim, x_air = segment.u_ff[:, None] + 0.0 * y, x - fleet.wind * segment.air[:, None]
+        return Measurements(y, y_m, y_m_dot, u_trim, now.u, position, x, x_air, moving)
 
     # Each branch calls `measure`: the compiler then removes the measurements that its law does not use.
-    def engage(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
-        started = control_law.engage(measure(now, y, segment), params)
+    def engage(now: LoopState, *measured: Any) -> tuple[Any, Array]:
+        started = control_law.engage(measure(now, *measured), params)
         return jax.tree.map(lambda one, like: jnp.broadcast_to(one, like.shape).astype(like.dtype), started, now.law), now.u
 
-    def step(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
-        law, _, u = control_law.limited(now.law, measure(now, y, segment), segment.dt, params, vehicle.limits)
+    def step(now: LoopState, y: Array, segment: Segments, *reference: Array) -> tuple[Any, Array]:
+        law, _, u = control_law.limited(now.law, measure(now, y, segment, *reference), segment.dt, params, vehicle.limits)
         return law, u
 
-    def hold(now: LoopState, y: Array, segment: Segments) -> tuple[Any, Array]:
-        return control_law.missed(now.law, measure(now, y, segment), params), now.u
+    def hold(now: LoopState, *measured: Any) -> tuple[Any, Array]:
+        return control_law.missed(now.law, measure(now, *measured), params), now.u
 
-    def tick(now: LoopState, segment: Segments) -> tuple[LoopState, None]:
-        true = now.x[vehicle.outputs]
-        e = true - segment.y_m[:, None]
+    def tick(now: LoopState, at_tick: tuple[Segments, Array | None]) -> tuple[LoopState, None]:
+        segment, action = at_tick
+        true, flown = now.x[vehicle.outputs], now.mission
+        if mission is None:
+            y_m, *reference = (one[:, None] for one in (segment.y_m, segment.sampled_y_m, segment.sampled_y_m_dot))
+        else:
+            flown, y_m, *reference = missions.reference(flown, mission)
+        e = true - y_m
         y = true + segment.error[:, None]
         if vehicle.quantum is not None:
             y = sensors.quantised(y, vehicle.quantum)
         arriving = jnp.concatenate([y[None], now.y_before])
         y, y_before = arriving[-1], arriving[:-1]
-        law, u = jax.lax.switch(segment.phase, (hold, engage, step), now, y, segment)
+        if mission is not None:
+            flown = missions.guide(flown, now.x, y, segment, action, mission)
+        law, u = jax.lax.switch(segment.phase, (hold, engage, step), now, y, segment, *reference)
         history = jnp.concatenate([u[None], now.u_before])
         acting = u if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
         command, position, positions = acting[jnp.argsort(vehicle.inputs)], now.position, []
@@ -270,6 +298,8 @@ def _fly(
         x = jax.lax.cond(
             jnp.any(segment.forcing != 0.0), lambda x: x + fleet.wind * _product(fleet.forced, segment.forcing), lambda x: x, x
         )
+        if mission is not None:
+            flown = missions.advance(flown, x, mission)
         after = LoopState(
             x,
             position,
@@ -282,12 +312,28 @@ def _fly(
             jnp.maximum(now.max, jnp.abs(e)),
             now.travel + jnp.abs(u - now.u),
             now.bounded & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # False for NaN too
+            flown,
         )
         return after, None
 
+    first, none = jax.tree.map(lambda segment: segment[0], segments), jnp.zeros((len(vehicle.outputs), len(fleet.wind)))
+    begin = _in_trim(fleet, vehicle, y_late, u_late, mission)
+    measured = measure(begin, none, first, none, none)
+    states = jax.eval_shape(
+        lambda: control_law.limited(control_law.engage(measured, params), measured, first.dt, params, vehicle.limits)[0]
+    )
+    begin = begin._replace(law=jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), states))
+    end, _ = jax.lax.scan(tick, begin, (segments, None if mission is None else mission.action))
+    of_mission = None if mission is None else missions.figures(end.mission, mission)
+    ticks = len(segments.t)
+    return FleetResult(jnp.sqrt(end.squares / ticks), end.max, end.travel / ((ticks - 1) * period), ~end.bounded, of_mission)
+
+
+def _in_trim(fleet: Fleet, vehicle: Vehicle, y_late: int, u_late: int, mission: Mission | None) -> LoopState:
+    """The state of the closed loop before the first tick, without that of the law."""
+    n, count, m = len(fleet.forced), len(fleet.wind), len(vehicle.outputs)
     none = jnp.zeros((m, count))
-    first = jax.tree.map(lambda segment: segment[0], segments)
-    begin = LoopState(
+    return LoopState(
         jnp.zeros((n, count)),
         none,
         jnp.zeros((len(vehicle.remainder.gravity), count)),
@@ -299,15 +345,8 @@ def _fly(
         none,
         none,
         jnp.ones(count, dtype=bool),
+        None if mission is None else missions.initial_state(count, y_late, mission),
     )
-    measured = measure(begin, none, first)
-    states = jax.eval_shape(
-        lambda: control_law.limited(control_law.engage(measured, params), measured, first.dt, params, vehicle.limits)[0]
-    )
-    begin = begin._replace(law=jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), states))
-    end, _ = jax.lax.scan(tick, begin, segments)
-    ticks = len(segments.t)
-    return FleetResult(jnp.sqrt(end.squares / ticks), end.max, end.travel / ((ticks - 1) * period), ~end.bounded)
 
 
 def _product(matrices: Array, vector: Any) -> Array:

@@ -1,63 +1,302 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Missions: uncertain aircraft fly the route of a guided scenario, one at a time in one process."""
+"""Missions of a fleet: the aircraft of a guided scenario fly its route, with reference model, pose and guidance of each.
 
+The last axis of every array is the aircraft. The equations are those of the nodes: `guidance.modes.follow` and `command`,
+`aircraft_sim.pose`, `reference_model.model`.
+"""
+
+from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import numpy as np
+from jax import numpy as jnp
+from numpy.typing import NDArray
 
+from aircraft_sim import pose as pose_model
+from aircraft_sim.simulator import POSE_STATES
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import CAPTURE_TIME, best_error, error_metrics
-from flight_analysis.report.guided import control_errors
-from flight_core.outcome import COMPLETED
-from flight_core.parameters import require
-from flight_core.tape import Tape
-from guidance.modes import Lateral
-
-MISSION_CHUNK = 10
-"""Aircraft in a chunk of a campaign of missions: three minutes of flight take about 20 s each."""
-
-
-class Mission(NamedTuple):
-    """Result of one flight. The figures of one that diverged are not valid."""
-
-    diverged: bool
-    figures: dict[str, float]
+from flight_analysis.metrics import CAPTURE_TIME
+from flight_campaign.benchmark_course import ENGAGE, HOLD, STEP, Course, Segments
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import divide, period_ns, seconds
+from flight_core.vectors import Array, FloatArray
+from guidance import modes, path
+from guidance.lateral import PathError
+from guidance.modes import GuidanceParams, GuidanceState, Lateral, Mode, Target, Vertical
+from guidance.params import GuidanceParameters
+from guidance.path import Line, Route
+from reference_model import model
 
 
-def require_mission(scenario: Scenario) -> None:
-    """Raise ParameterError for a guided scenario that a campaign cannot judge: without a route, or of an aircraft of JSBSim."""
-    route = scenario.guidance is not None and scenario.guidance.route is not None
-    require(route, "guidance.route", "none", "a route, whose cross-track error is the score of a campaign of missions")
-    aircraft = scenario.aircraft
+class Legs(NamedTuple):
+    """The L legs of a route, (L,) each, points (2, L): north, east, m."""
+
+    is_line: Array
+    origin: Array  # start of a line, centre of an arc
+    track: Array  # course of a line, rad; 0 of an arc
+    radius: Array  # of an arc, m, positive to the right; 1 of a line
+    end: Array
+    end_course: Array  # rad
+    has_end: Array  # all but the orbit round the last waypoint
+    entry: Array  # curvature of the following leg, 1/m; of the orbit its own
+    altitude: Array  # m
+    V: Array  # m/s
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("action", "legs", "Phi", "Gamma", "C", "wind"),
+    meta_fields=("guidance", "outputs", "states", "speed", "period"),
+)
+@dataclass(frozen=True)
+class Mission:
+    """What all aircraft of a fleet share. m outputs, in the reference model's order; n states of the reference model."""
+
+    action: Array  # (T,) of guidance at the ticks: HOLD, ENGAGE or STEP
+    legs: Legs
+    Phi: Array  # (n, n): x_m a tick later, with u_m held
+    Gamma: Array  # (n, m)
+    C: Array  # (m, n), rows in the law's order
+    wind: Array  # (2,) steady, to the north and to the east, m/s
+    # Constants of the compiled loop:
+    guidance: GuidanceParams
+    outputs: tuple[str, ...]  # in the law's order
+    states: tuple[int | None, ...]  # the POSE_STATES in x; None: the airframe has no such state
+    speed: float  # trim speed V0, m/s
+    period: float  # s, of the ticks
+
+
+class MissionState(NamedTuple):
+    """State of the N missions from tick to tick."""
+
+    x_m: Array  # (n, N)
+    y_m_before: Array  # (late, m, N) newest first
+    y_m: Array  # (m, N) the reference of the law at the last tick
+    y: Array  # (m, N) the last one that arrived
+    u_m: Array  # (m, N)
+    alpha: Array  # (N,) as in GuidanceState
+    alpha_trim: Array
+    climb_c: Array
+    V_c: Array
+    leg: Array
+    psi: Array  # rad
+    position: Array  # (3, N) north, east, up, relative to the air, m
+    psi_dot: Array
+    velocity: Array  # (3, N)
+    samples: Array  # (N,) on the route
+    xtrack_max: Array
+    xtrack_squares: Array
+    altitude_squares: Array
+    phi_max: Array
+
+
+def require_mission(scenario: Scenario) -> GuidanceParameters:
+    """The section `guidance` of a scenario. Raises ParameterError where a campaign of missions cannot fly or judge it."""
+    guidance, aircraft, reference = scenario.guidance, scenario.aircraft, scenario.reference_model
+    if guidance is None or guidance.route is None:
+        expected = "a route, whose cross-track error is the score of a campaign of missions"
+        raise ParameterError(f"guidance.route: found none, expected {expected}")
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices, which a campaign varies")
+    without_feedforward = scenario.controller.nominal() is None
+    require(without_feedforward, "controller.feedforward", "a model", "none where guidance commands the reference")
+    require(not guidance.program, "guidance.program", ", ".join(guidance.program), "a route alone in a campaign of missions")
+    require(not reference.live.bounds, "reference_model.live.bounds", "bounds", "none in a campaign of missions")
+    profile = reference.profile()
+    commanded = bool(profile.change.any() or profile.amplitude.any())
+    require(not commanded, "reference_model", "a profile of commands", "none beside guidance in a campaign of missions")
+    return guidance
 
 
-def fly_mission(scenario: Scenario) -> Mission:
-    """Fly a guided scenario. The score is the largest cross-track error on the route, in half seconds of flight at V0."""
-    tape = simulate(scenario)
-    return Mission(tape.outcome != COMPLETED, figures_of(tape, scenario))
+def build(scenario: Scenario, course: Course) -> Mission:
+    """The mission of a guided scenario over a course.
 
-
-def figures_of(tape: Tape, scenario: Scenario) -> dict[str, float]:
-    """Score, cross-track error and altitude error on the route, largest bank, errors of the law. SI.
-
-    The orbit round the last waypoint is left out: it begins at its centre.
+    Raises ParameterError for what `require_mission` refuses, and for a rate of guidance that does not meet the ticks.
     """
-    log, errors = tape["guidance"], control_errors(tape)
-    guidance = scenario.guidance
-    legs = () if guidance is None else guidance.plan(guidance.waypoints()).legs
-    orbit = len(legs) - 1
-    on_route = (log["mode.lateral"] == Lateral.ROUTE) & (log["leg"] < orbit)
-    xtrack, true = error_metrics(errors["xtrack"][on_route]), best_error(tape)[1]
-    law = {name: error_metrics(true[name]) for name in scenario.controller.outputs}
+    guidance, aircraft, reference = require_mission(scenario), scenario.aircraft, scenario.reference_model
+    params, names = guidance.params(), scenario.controller.outputs
+    tick_ns = period_ns(scenario.controller.rate, "controller.rate")
+    every = divide(params.period_ns, tick_ns, "controller.rate", "a period of guidance")
+
+    action = np.full(len(course.segments.t), HOLD, dtype=np.int32)
+    first = int(np.argmax(course.segments.phase == ENGAGE))
+    begins = -(-first // every) * every
+    action[begins::every] = STEP
+    action[begins] = ENGAGE
+
+    reference_ns = period_ns(reference.rate, "reference_model.rate")
+    matrices = reference.model()
+    stepper = model.stepper(seconds(reference_ns), matrices)
+    n, m = matrices.B_m.shape
+    Phi, Gamma, held = np.eye(n), np.zeros((n, m)), stepper.Gamma @ np.tile(np.eye(m), (3, 1))
+    for _ in range(divide(tick_ns, reference_ns, "reference_model.rate", "a tick")):
+        Phi, Gamma = stepper.Phi @ Phi, stepper.Phi @ Gamma + held
+    order = [reference.outputs.index(name) for name in names]
+    legs = legs_of(guidance.plan(guidance.waypoints()))
+    airframe = aircraft.load()[0]
+    states = list(airframe.states)
+    places = tuple(states.index(name) if name in states else None for name in POSE_STATES)
+    shared = (Phi, Gamma, matrices.C[order], np.array(aircraft.wind))
+    return Mission(action, legs, *shared, params, tuple(names), places, float(airframe.speed), seconds(tick_ns))
+
+
+def legs_of(route: Route) -> Legs:
+    """A route as arrays."""
+
+    def points(chosen: list[path.Point]) -> FloatArray:
+        return np.array(chosen, dtype=np.float64).T
+
+    legs = route.legs
+    following = [*legs[1:], legs[-1]]
+    lines: NDArray[np.bool_] = np.array([isinstance(leg, Line) for leg in legs])
+    ends = [leg.end is not None for leg in legs]
+    return Legs(
+        lines,
+        points([leg.start if isinstance(leg, Line) else leg.centre for leg in legs]),
+        np.array([path.course_of(leg.start, leg.end) if isinstance(leg, Line) else 0.0 for leg in legs]),
+        np.array([1.0 if isinstance(leg, Line) else leg.radius for leg in legs]),
+        points([leg.end or (0.0, 0.0) for leg in legs]),
+        np.array([path.end_course(leg) if leg.end is not None else 0.0 for leg in legs]),
+        np.array(ends),
+        np.array([0.0 if isinstance(leg, Line) else 1.0 / leg.radius for leg in following]),
+        np.array(route.altitude),
+        np.array(route.V),
+    )
+
+
+def initial_state(count: int, late: int, mission: Mission) -> MissionState:
+    """N aircraft in trim, heading north, y of them `late` ticks old."""
+    n, m = mission.Gamma.shape
+    none, zeros = jnp.zeros(count), jnp.zeros((m, count))
+    velocity = jnp.zeros((3, count)).at[0].set(mission.speed)
+    return MissionState(
+        jnp.zeros((n, count)),
+        jnp.zeros((late, m, count)),
+        zeros,
+        zeros,
+        zeros,
+        none,
+        none,
+        none,
+        none,
+        jnp.zeros(count, dtype=np.int64),
+        none,
+        jnp.zeros((3, count)),
+        none,
+        velocity,
+        *(none,) * 5,
+    )
+
+
+def reference(state: MissionState, mission: Mission) -> tuple[MissionState, Array, Array, Array]:
+    """The state with y_m of a tick; y_m at the tick, y_m at the stamp of y, and its slope since the last tick; (m, N) each."""
+    y_m = mission.C @ state.x_m
+    arriving = jnp.concatenate([y_m[None], state.y_m_before])
+    sampled = arriving[-1]
+    slope = (sampled - state.y_m) / mission.period
+    return state._replace(y_m_before=arriving[:-1], y_m=sampled), y_m, sampled, slope
+
+
+def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Array, mission: Mission) -> MissionState:
+    """The state after guidance at a tick, from x (n, N), and y in the law's order, (m, N), where one arrives."""
+    y = jnp.where(segment.phase == HOLD, state.y, y)
+    state = state._replace(y=y)
+    pose, params = _pose(state, x, segment.t, mission), mission.guidance
+    y_of = dict(zip(mission.outputs, y, strict=True))
+    speed = modes.true_airspeed(y_of["V"], params)
+    position = (pose["north"], pose["east"])
+
+    def at(numbers: Array) -> Legs:
+        return jax.tree.map(lambda values: jnp.asarray(values)[..., numbers], mission.legs)
+
+    def passed(leg: Legs, place: path.Point) -> Array:
+        return leg.has_end & path.beyond((leg.end[0], leg.end[1]), leg.end_course, place)
+
+    def fly(before: GuidanceState, number: Array) -> MissionState:
+        leg = at(number)
+        origin = (leg.origin[0], leg.origin[1])
+        line, circle = path.line_error(origin, leg.track, position), path.circle_error(origin, leg.radius, position)
+        error = PathError(*(jnp.where(leg.is_line, one, other) for one, other in zip(line, circle, strict=True)))
+        wanted = modes.follow(error, leg.entry, lambda place: passed(leg, place), pose, speed, params)
+        target = Target(altitude=leg.altitude, V=leg.V)
+        flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.ALTITUDE, target=target)
+        after, _ = modes.command(flies, pose, y_of, wanted, seconds(params.period_ns), params)
+        off = pose["altitude"] - leg.altitude
+        return state._replace(
+            u_m=jnp.stack(after.u_m),
+            alpha=after.alpha,
+            alpha_trim=after.alpha_trim,
+            climb_c=after.climb_c,
+            V_c=after.V_c,
+            leg=number,
+            samples=state.samples + leg.has_end,
+            xtrack_max=jnp.maximum(state.xtrack_max, jnp.where(leg.has_end, jnp.abs(error.e), 0.0)),
+            xtrack_squares=state.xtrack_squares + jnp.where(leg.has_end, error.e**2, 0.0),
+            altitude_squares=state.altitude_squares + jnp.where(leg.has_end, off**2, 0.0),
+            phi_max=jnp.maximum(state.phi_max, jnp.abs(pose["phi"])),
+        )
+
+    def begin() -> MissionState:
+        return fly(modes.holding(0, pose, speed, params), 0 * state.leg)
+
+    def step() -> MissionState:
+        before = modes.holding(0, pose, speed, params)._replace(
+            alpha=state.alpha,
+            alpha_trim=state.alpha_trim,
+            climb_c=state.climb_c,
+            V_c=state.V_c,
+            u_m=tuple(state.u_m),
+        )
+        return fly(before, jnp.where(passed(at(state.leg), position), state.leg + 1, state.leg))
+
+    return jax.lax.switch(action, (lambda: state, begin, step))
+
+
+def advance(state: MissionState, x: Array, mission: Mission) -> MissionState:
+    """The state a tick later, from x then: reference model, and pose by the trapezoidal rule."""
+    V, alpha, beta, phi, theta, q, r = _states(x, mission)
+    half, psi_dot = mission.period / 2.0, pose_model.psi_dot(phi, theta, q, r)
+    psi = state.psi + half * (state.psi_dot + psi_dot)
+    velocity = jnp.stack(pose_model.velocity(mission.speed + V, alpha, beta, phi, theta, psi))
+    return state._replace(
+        x_m=mission.Phi @ state.x_m + mission.Gamma @ state.u_m,
+        psi=psi,
+        psi_dot=psi_dot,
+        position=state.position + half * (state.velocity + velocity),
+        velocity=velocity,
+    )
+
+
+def _states(x: Array, mission: Mission) -> list[Array]:
+    """The POSE_STATES, deviations from trim, (N,) each."""
+    return [0.0 * x[0] if place is None else x[place] for place in mission.states]
+
+
+def _pose(state: MissionState, x: Array, t: Array, mission: Mission) -> dict[str, Array]:
+    """The pose over ground by channel of `guidance.modes.POSE`, (N,) each; psi is not wrapped."""
+    _, _, beta, phi, theta, *_ = _states(x, mission)
+    north, east, altitude = state.position
+    v_north, v_east, climb = state.velocity
+    values = (
+        *(phi, theta, state.psi, north + mission.wind[0] * t, east + mission.wind[1] * t, altitude),
+        *(v_north + mission.wind[0], v_east + mission.wind[1], climb, beta),
+    )
+    return dict(zip(modes.POSE, values, strict=True))
+
+
+def figures(state: MissionState, mission: Mission) -> dict[str, Array]:
+    """Score, cross-track error and altitude error on the route, largest bank, (N,) each, SI.
+
+    The score is the largest cross-track error in half seconds of flight at V0. The orbit round the last waypoint is left out:
+    it begins at its centre.
+    """
+    samples = jnp.maximum(state.samples, 1.0)
     return {
-        "score": xtrack.max / (CAPTURE_TIME * scenario.aircraft.channels().speed),
-        "max.xtrack": xtrack.max,
-        "rms.xtrack": xtrack.rms,
-        "rms.altitude": error_metrics(errors["altitude"][on_route]).rms,
-        "max.phi": float(np.max(np.abs(log["pose.phi"]), initial=0.0)),
-        **{f"rms.{name}": one.rms for name, one in law.items()},
-        **{f"max.{name}": one.max for name, one in law.items()},
+        "score": state.xtrack_max / (CAPTURE_TIME * mission.speed),
+        "max.xtrack": state.xtrack_max,
+        "rms.xtrack": jnp.sqrt(state.xtrack_squares / samples),
+        "rms.altitude": jnp.sqrt(state.altitude_squares / samples),
+        "max.phi": state.phi_max,
     }

@@ -19,7 +19,6 @@ from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import Campaign, Definition, Sweep, define
 from flight_campaign.campaign_report import WIND_EFFECTS, write_page
-from flight_campaign.missions import MISSION_CHUNK
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
 from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, SHOWN_COLUMN, display_path, new_table, parse_numbers, progress_bar
 from flight_core.parameters import require
@@ -52,7 +51,7 @@ def campaign(
     duration: Annotated[float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")] = None,
     chunk: Annotated[
         int | None,
-        typer.Option(min=1, help="Aircraft computed at once; 1000, or 10 where they fly a route. Use more on a GPU."),
+        typer.Option(min=1, help="Aircraft computed at once. Use more on a GPU."),
     ] = None,
     engine: Annotated[EngineName, typer.Option(help="Threads of this process, or processes and hosts of dask.")] = (
         EngineName.THREADS
@@ -73,7 +72,7 @@ def campaign(
         monte_carlo = Campaign.resume(resume)
     else:
         chosen = find_scenario(str(scenario), duration)
-        size = chunk or (CHUNK if chosen.guidance is None else MISSION_CHUNK)
+        size = chunk or CHUNK
         definition = define(chosen, aircraft, uncertainty, seed, size, None if sweep is None else _parse_sweep(sweep), wind)
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)

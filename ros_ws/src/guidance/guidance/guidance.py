@@ -184,7 +184,7 @@ class Guidance:
         if self.mode is not Mode.ENGAGED or self._pose is None or self._y is None:
             return False
         speed = modes.airspeed(tuple(self._y.value.tolist()), self._params)
-        self.take_target(modes.hold(tuple(self._pose.value.tolist()), speed, self._params))
+        self.take_target(modes.hold(self.pose(), speed, self._params))
         return True
 
     def skip(self) -> bool:

@@ -188,36 +188,40 @@ def read_target(values: Mapping[str, float], params: GuidanceParams, what: str =
         raise ChannelError("bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}")
 
 
-def hold(pose: tuple[float, ...], speed: float, params: GuidanceParams) -> dict[str, float]:
+def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> dict[str, Scalar]:
     """Commands that hold the heading, the altitude and the airspeed of now; no airspeed below the floor."""
-    named = dict(zip(POSE, pose, strict=True))
-    return {"heading": named["psi"], "altitude": named["altitude"], "V": max(speed, params.limits.floor)}
+    floor = array_namespace(speed).maximum(speed, params.limits.floor)
+    return {"heading": pose["psi"], "altitude": pose["altitude"], "V": floor}
+
+
+def holding(t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> GuidanceState:
+    """The state before the first step, at t: it holds the heading, the altitude and the airspeed of now."""
+    alpha = pose["theta"] - path_angle(pose["climb"], speed)
+    return GuidanceState(
+        t_ns - params.period_ns,
+        Mode.ENGAGED,
+        Lateral.HEADING,
+        Vertical.ALTITUDE,
+        Target()._replace(**hold(pose, speed, params)),
+        0,
+        pose["phi"],
+        pose["theta"],
+        alpha,
+        array_namespace(alpha).maximum(alpha, 0.0),
+        pose["climb"],
+        speed,
+        (0.0,) * len(params.outputs),
+    )
 
 
 def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -> GuidanceState:
     """The state before a step, its filters at what is measured where they begin."""
     if state is not None and inputs.begin is Begin.NO:
         return state
-    pose, speed = dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params)
-    alpha = pose["theta"] - path_angle(pose["climb"], speed)
-    begun = GuidanceState(
-        inputs.t_ns - params.period_ns,
-        Mode.ENGAGED,
-        Lateral.HEADING,
-        Vertical.ALTITUDE,
-        Target()._replace(**hold(inputs.pose, speed, params)),
-        0,
-        pose["phi"],
-        pose["theta"],
-        alpha,
-        max(alpha, 0.0),
-        pose["climb"],
-        speed,
-        (0.0,) * len(params.outputs),
-    )
+    held = holding(inputs.t_ns, dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params), params)
     if state is None or inputs.begin is Begin.HOLD:
-        return begun
-    again = begun._replace(lateral=state.lateral, vertical=state.vertical, target=state.target, leg=state.leg)
+        return held
+    again = held._replace(lateral=state.lateral, vertical=state.vertical, target=state.target, leg=state.leg)
     # Up to its age limit the reference model still flies the last u_m.
     return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
 
