@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import welch
 from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis import metrics
@@ -230,6 +231,16 @@ def test_the_spectrum_of_a_sine_peaks_at_its_frequency_and_has_its_variance() ->
     frequency, density = metrics.spectra(u, 10 * MS)
     assert frequency[np.argmax(density["elevator"])] == pytest.approx(5.0, abs=0.1)
     assert np.sum(density["elevator"] ** 2) * (frequency[1] - frequency[0]) == pytest.approx(2.0, rel=0.01)
+
+
+@pytest.mark.parametrize("samples", [300, 2560, 6005])  # a window of the whole, an even and an odd one
+def test_a_spectrum_is_that_of_scipy(samples: int) -> None:
+    values = np.random.default_rng(1).standard_normal((samples, 2)).cumsum(axis=0)
+    frequency, density = metrics.spectra(Signal(EPOCH + np.arange(samples) * 10 * MS, ("a", "b"), values), 10 * MS)
+    expected, power = welch(values, fs=100.0, nperseg=max(samples // 10, min(samples, 256)), axis=0)
+    assert frequency == pytest.approx(expected[1:], rel=1e-12)
+    for name, column in zip(("a", "b"), power[1:].T, strict=True):
+        assert density[name] == pytest.approx(np.sqrt(column), rel=1e-9)  # rounding
 
 
 def test_a_spectrum_bridges_missing_samples() -> None:
