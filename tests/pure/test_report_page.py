@@ -3,6 +3,7 @@
 """The report page in a browser: it draws without errors, in light and dark, and a zoom shows all samples."""
 
 import base64
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -102,6 +103,28 @@ def test_a_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, 
     again, _ = curve(browser, 0, "y")
     assert len(again) < len(t)
     assert [again[0], again[-1]] == pytest.approx([0.0, 7.0], abs=0.01)  # to a bin
+    assert browser.console == []
+
+
+def test_the_replay_shows_the_pose_and_the_surfaces_of_the_flight(browser: Browser, page: Path, servo: RecordedFlight) -> None:
+    open_page(browser, page)
+    browser.wait_for("document.getElementById('replay').dataset.drawn === '0'")
+    place = "document.getElementById('replay-time')"
+
+    def seek(t: float) -> bytes:
+        browser.run(f"void ({place}.value = {t}, {place}.dispatchEvent(new Event('input')))")
+        browser.wait_for(f"Number(document.getElementById('replay').dataset.drawn) === {t}")
+        return base64.b64decode(browser.run("document.getElementById('replay-horizon').toDataURL()").partition(",")[2])
+
+    assert seek(0.5) != seek(5.0)  # level, then in a roll
+    assert "ENGAGED" in browser.run("document.getElementById('replay-now').textContent")
+    assert "grid" in browser.run("document.getElementById('replay-legend').textContent")
+    stored = page.read_text(encoding="utf-8")
+    topics = json.loads(stored.partition('id="replay-data">')[2].partition("</script>")[0])["topics"]
+    figures = stored.partition('id="replay-data">')[0] + stored.partition("replay-code")[2]
+    assert all(f'"v":"{place}"' in figures for place, _ in topics["truth"]["channels"].values())  # stored once, for the figure
+    browser.run("void document.getElementById('replay-play').click()")
+    browser.wait_for("Number(document.getElementById('replay').dataset.drawn) > 5.2")
     assert browser.console == []
 
 

@@ -290,7 +290,7 @@ def test_a_zoomed_out_line_keeps_its_peaks(page: Browser) -> None:
         const chosen = c.rows(series, series.column('a'), [0, 1000], 500);
         return [chosen.length, Math.max(...chosen.map(k => a[k])), Math.min(...chosen.map(k => a[k]))];
     })()"""
-    count, largest, least = page.run(f"import('./data.js').then(d => import('./charts.js').then(c => {peaks}))")
+    count, largest, least = page.run(f"import('./series.js').then(d => import('./charts.js').then(c => {peaks}))")
     assert count <= 1000
     assert (largest, least) == (7, -5)
 

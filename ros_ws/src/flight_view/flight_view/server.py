@@ -16,6 +16,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from http import HTTPStatus
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,9 @@ from flight_view.flight import Flight
 
 ADDRESS = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
+SCENE = Path(str(files("flight_analysis.report"))) / "scene"  # shared with the report
 TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
-FILES = {path.name: path for path in sorted(PAGE.iterdir()) if path.suffix in TYPES}
+FILES = {path.name: path for path in sorted([*PAGE.iterdir(), *SCENE.iterdir()]) if path.suffix in TYPES}
 HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src data:;"

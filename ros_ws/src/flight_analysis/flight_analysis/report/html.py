@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from flight_analysis.report import comparison, figures, guided_figures, plotting, tables
 from flight_analysis.report.plotting import SampleStore, pack
+from flight_analysis.report.replay import Replay, replay
 from flight_analysis.report.summary import INPUT_COLUMNS, RecordedFlight, display_units, format_value, parts_legend
 from flight_core.outcome import COMPLETED
 
@@ -55,6 +56,7 @@ class Page(NamedTuple):
     sections: Sequence[Section]
     samples: SampleStore
     notes: Sequence[str] = ()
+    replay: Replay | None = None
 
 
 def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
@@ -73,6 +75,7 @@ def _flight_page(flight: RecordedFlight) -> Page:
         _sections(flight, context),
         context.samples,
         flight.summary["notes"],
+        replay(flight, context),
     )
 
 
@@ -175,7 +178,7 @@ def page_html(page: Page) -> str:
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"script_json": script_json, "ratio": format_ratio}
+    environment.filters |= {"script_json": script_json, "ratio": format_ratio, "css": Markup}
     return environment.get_template("page.html.jinja").render(
         page=page,
         completed=COMPLETED,

@@ -138,11 +138,16 @@ function print() { // light colours, width of a sheet; synchronous, for the brow
   }
 }
 
+async function run(id) { // a packed script
+  const script = document.createElement("script");
+  script.textContent = new TextDecoder().decode(await unpack(id));
+  document.head.append(script);
+}
+
 async function start() {
-  const library = document.createElement("script");
-  library.textContent = new TextDecoder().decode(await unpack("library"));
-  document.head.append(library);
+  await run("library");
   await showAll();
+  if (document.getElementById("replay-code")) await run("replay-code");
   scheme.addEventListener("change", showAll);
   addEventListener("beforeprint", print);
   addEventListener("afterprint", showAll);

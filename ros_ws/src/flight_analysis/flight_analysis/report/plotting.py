@@ -63,7 +63,7 @@ def pack(content: bytes, width: int = 1) -> str:
     hardly differ, so the stream is a fifth shorter.
     """
     shuffled = np.frombuffer(content, dtype=np.uint8).reshape(-1, width).T.tobytes()
-    return base64.b64encode(zlib.compress(shuffled)).decode()
+    return base64.b64encode(zlib.compress(shuffled, level=9)).decode()
 
 
 class Interval(NamedTuple):
@@ -169,7 +169,7 @@ def add_line(
 
 
 def _trace(context: PlotContext, curve: Curve, channel: str, factor: float, most: int) -> go.Scatter:
-    t_ns, values = _break_at_gaps(curve.signal.stamp_ns - context.tape.start_ns, curve.signal[channel] * factor, curve.steps)
+    t_ns, values = _drawn(context, curve.signal, channel, factor, curve.steps)
     style = {"color": curve.colour, "width": curve.width, "shape": "hv" if curve.steps else "linear"}
     trace = go.Scatter(
         mode="lines",
@@ -179,6 +179,18 @@ def _trace(context: PlotContext, curve: Curve, channel: str, factor: float, most
     if len(values) <= most:
         return trace.update(x=t_ns / NANOSECONDS, y=values)
     return trace.update(meta={"t": context.samples.times(t_ns), "v": context.samples.values(values), "most": most})
+
+
+def stored(context: PlotContext, signal: Signal, channel: str, factor: float) -> tuple[str, str]:
+    """Where the page has the times and the values of a channel, times a factor. Those of a long curve are there once."""
+    t_ns, values = _drawn(context, signal, channel, factor, steps=False)
+    return context.samples.times(t_ns), context.samples.values(values)
+
+
+def _drawn(
+    context: PlotContext, signal: Signal, channel: str, factor: float, steps: bool
+) -> tuple[NDArray[np.int64], FloatArray]:
+    return _break_at_gaps(signal.stamp_ns - context.tape.start_ns, signal[channel] * factor, steps)
 
 
 def _break_at_gaps(t_ns: NDArray[np.int64], values: FloatArray, steps: bool) -> tuple[NDArray[np.int64], FloatArray]:

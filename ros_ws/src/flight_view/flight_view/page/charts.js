@@ -1,23 +1,9 @@
 // Charts over time on canvases: lines decimated to the minimum and maximum of each pixel, bands, limits, one cursor.
-import {indexAt} from "./data.js";
+import {MODE_COLOURS, prepared} from "./canvas.js";
+import {indexAt} from "./series.js";
 
 const LEFT = 58, RIGHT = 10, TOP = 17, BOTTOM = 4;
 const LIMIT_VIEW_RATIO = 3; // a limit is in view where it is at most this many times the largest value
-
-export const MODE_COLOURS = {0: "#b0b0b0", 1: "#2f9e6e", 2: "#f2c230", 3: "#ef7d17", 4: "#8a63b8", 5: "#5f6b73"};
-
-// A canvas at the resolution of the screen: its context, and its width and height in CSS pixels.
-export function prepared(canvas) {
-  const scale = devicePixelRatio || 1, {clientWidth: width, clientHeight: height} = canvas;
-  if (canvas.width !== Math.round(width * scale) || canvas.height !== Math.round(height * scale)) {
-    canvas.width = Math.round(width * scale);
-    canvas.height = Math.round(height * scale);
-  }
-  const ctx = canvas.getContext("2d");
-  ctx.setTransform(scale, 0, 0, scale, 0, 0);
-  ctx.clearRect(0, 0, width, height);
-  return {ctx, width, height};
-}
 
 // Ticks at multiples of 1, 2 or 5 times a power of ten, at most `most` of them.
 export function ticks(low, high, most) {

@@ -1,8 +1,10 @@
 // The page: asks the server for news, keeps the time and the view, draws what has changed.
-import {Flight, indexAt} from "./data.js";
-import {chartsOf, drawChart, drawTimeline, MODE_COLOURS, timeAt, timelineTime} from "./charts.js";
+import {MODE_COLOURS} from "./canvas.js";
+import {chartsOf, drawChart, drawTimeline, timeAt, timelineTime} from "./charts.js";
 import {offer} from "./control.js";
+import {Flight} from "./data.js";
 import {drawHorizon, poseAt, Scene} from "./scene.js";
+import {indexAt} from "./series.js";
 
 const SPEEDS = [0.1, 0.2, 0.5, 1, 2, 5, 10];
 const WINDOW = 20; // s

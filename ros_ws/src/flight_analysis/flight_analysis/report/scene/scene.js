@@ -1,7 +1,7 @@
 // The aircraft in three dimensions on a 2-D canvas, and the artificial horizon. No WebGL.
 // World: north, east, down (m). Body: forward, right, down. Angles in rad; matrices are rows.
-import {indexAt} from "./data.js";
-import {MODE_COLOURS, prepared} from "./charts.js";
+import {MODE_COLOURS, prepared} from "./canvas.js";
+import {indexAt} from "./series.js";
 
 const SPAN = 3; // m, least drawn span
 const RELATIVE_SPAN = 0.13; // of the distance of the camera: the aircraft stays visible from afar
@@ -9,6 +9,8 @@ const NEAR = 0.2; // m, nothing closer to the camera is drawn
 const FULL_DEFLECTION = 25 * Math.PI / 180; // rad, of an input that is given as a fraction
 const WHOLE = 2.3; // distance of the map over that of the farthest point of the path
 const MAX_TRAIL = 1500; // points
+const MAX_GAP = 0.5; // s between two poses, above which nothing is interpolated
+const WRAPPED = new Set(["phi", "psi"]); // in (-pi, pi]
 const MAX_WIND = 10; // m/s, drawn as one span
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -64,7 +66,8 @@ export function project(eye, point, focal, width, height) {
   return [width / 2 + focal * dot(from, eye.side) / depth, height / 2 + focal * dot(from, eye.down) / depth, depth];
 }
 
-// The pose of a flight at a time, world coordinates; null where the log has none. Without a place it stays at the origin.
+// The pose of a flight at a time, interpolated, world coordinates; null where the log has none. Without a place it stays at the
+// origin.
 // A log without the topic has the attitude of `truth`, for an airframe the deviation from trim.
 export function poseAt(flight, t) {
   const pose = flight.get("pose"), row = pose ? indexAt(pose.t, pose.count, t) : -1;
@@ -73,7 +76,15 @@ export function poseAt(flight, t) {
     return attitude ? {row, phi, theta, psi: 0, attitude, place: [0, 0, 0]} : null;
   }
   if (row < 0) return null;
-  const value = name => pose.column(name)?.[row] ?? NaN, finite = name => (Number.isFinite(value(name)) ? value(name) : 0);
+  const next = Math.min(row + 1, pose.count - 1), gap = pose.t[next] - pose.t[row];
+  const part = gap > 0 && gap < (pose.gap ?? MAX_GAP) ? Math.min((t - pose.t[row]) / gap, 1) : 0;
+  const value = name => {
+    const column = pose.column(name);
+    if (!column) return NaN;
+    const step = column[next] - column[row];
+    return column[row] + part * (WRAPPED.has(name) ? step - 2 * Math.PI * Math.round(step / (2 * Math.PI)) : step);
+  };
+  const finite = name => (Number.isFinite(value(name)) ? value(name) : 0);
   const [phi, theta, psi] = [value("phi"), value("theta"), finite("psi")];
   return {
     row, phi, theta, psi, attitude: Number.isFinite(phi) && Number.isFinite(theta),

@@ -1,0 +1,82 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The 3-D replay of a report page: the scene of the live view, with samples that the page holds for its figures."""
+
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_analysis.report.guided_figures import flown_route
+from flight_analysis.report.plotting import PlotContext, pack, stored
+from flight_analysis.report.summary import NO_UNIT, RecordedFlight
+from flight_core.tape import Signal
+from guidance.path import route_outline
+from rise_di_controller.guard import Mode
+
+HERE = Path(__file__).parent
+SCENE = HERE / "scene"
+SCRIPTS = (SCENE / "canvas.js", SCENE / "series.js", SCENE / "scene.js", HERE / "replay.js")
+
+POSE = ("phi", "theta", "psi", "north", "east", "altitude")
+POSE_RATE = 10.0  # Hz; the page interpolates
+MAX_POSES = 6000
+
+
+class Replay(NamedTuple):
+    """What a page needs for the replay beside its samples."""
+
+    data: dict[str, Any]
+    code: str  # packed
+    style: str
+
+
+def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
+    """The replay of a flight whose attitude is in its log, else None. Adds the poses to the samples of the page."""
+    tape, topics = flight.tape, {}
+    truth = tape.signals.get("truth")
+    if (pose := tape.signals.get("pose")) is not None:
+        topics["pose"] = _topic(context, _thinned(pose), {name: name for name in POSE})
+    attitude = () if pose is not None else ("x.phi", "x.theta")
+    if truth is not None:
+        groups = [name for name in truth.names if name.startswith(("actuator.", "gust.")) or name in attitude]
+        topics["truth"] = _topic(context, truth, {name: name.partition(".")[2] for name in groups})
+    if not {"phi", "x.phi"} & {name for topic in topics.values() for name in topic["channels"]}:
+        return None
+    if "internals" in tape:
+        topics["internals"] = _topic(context, tape["internals"], {"mode": ""})
+    route = flown_route(flight.scenario, tape) if flight.summary["guidance"] is not None else None
+    info = {
+        "units": {name: {"unit": unit.unit} for name, unit in context.units.items()},
+        "modes": {int(mode): mode.name for mode in Mode},
+        "route": [] if route is None else route_outline(route),
+    }
+    return Replay({"topics": topics, "info": info}, pack(_code().encode()), (SCENE / "scene.css").read_text(encoding="utf-8"))
+
+
+def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> dict[str, Any]:
+    """Where times and values of channels are, with the factors of their units; `channels` maps names to those of the units."""
+    found, times = {}, ""
+    for name, quantity in channels.items():
+        if name in signal.names:
+            factor = context.units.get(quantity, NO_UNIT).factor
+            times, values = stored(context, signal, name, factor)
+            found[name] = [values, factor]
+    return {"t": times, "channels": found}
+
+
+def _thinned(pose: Signal) -> Signal:
+    """The channels of a pose at POSE_RATE, at most MAX_POSES rows."""
+    count = len(pose.stamp_ns)
+    span = (pose.stamp_ns[-1] - pose.stamp_ns[0]) / 1e9 if count > 1 else 0.0
+    rows = np.unique(np.linspace(0, max(count - 1, 0), min(count, MAX_POSES, int(span * POSE_RATE) + 2)).astype(int))
+    names = tuple(name for name in POSE if name in pose.names)
+    return Signal(pose.stamp_ns[rows], names, np.column_stack([pose[name][rows] for name in names]))
+
+
+def _code() -> str:
+    """The scripts as one function that runs at once: modules without imports, exports, comment lines and indentation."""
+    text = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
+    text = re.sub(r"^(import |\s*//).*\n|^\s+", "", text, flags=re.MULTILINE)
+    return "(() => {\n" + re.sub(r"^export ", "", text, flags=re.MULTILINE) + "})();\n"
