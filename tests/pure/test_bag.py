@@ -26,7 +26,7 @@ from flight_log.engagements import Engagement
 from flight_log.message_definitions import definition
 from flight_log.named_vectors import decoder
 from flight_log.scan import Scan
-from flight_log.tape_reader import read_run
+from flight_log.tape_reader import ROSBAG2, read_run
 from flight_log.tape_writer import write_run
 
 
@@ -214,6 +214,17 @@ def record(
 
 
 SAMPLES = [vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k)) for k in range(50)]
+
+
+def test_a_flight_that_rosbag2_recorded_is_read_with_the_scenario_beside_it(osprey_gust: Scenario, tmp_path: Path) -> None:
+    """As the launch files leave it: a log without messages, and the bag in a folder of its own."""
+    with BagWriter(tmp_path / "run") as bag:
+        bag.add_attachments(LogAttachments(osprey_gust.path), 1)
+    record(tmp_path / "run" / ROSBAG2, {"/y": SAMPLES}, StoragePlugin.MCAP)
+    back = read_run(tmp_path / "run")
+    assert back.scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
+    assert back.tape["y"]["q"].tolist() == [0.1 * k for k in range(50)]
+    assert back.tape.notes == ()
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)

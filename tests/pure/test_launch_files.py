@@ -27,6 +27,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError, Parameters
 from flight_log.bag import LogAttachments
+from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 from flight_ros.topics import NodeState
 from flight_ros.transport import DISCOVERY_VARIABLE, PROFILE_VARIABLE
@@ -260,6 +261,31 @@ def test_the_live_page_is_served_where_it_is_asked_for_and_may_end(name: str, gi
     assert page.cmd == [stand_in.ExecutableInPackage(package="flight_cli", executable="rise-di"), "watch", run, "--wait"]
     assert page.on_exit is None
     assert nodes(all_ready(actions, context))
+
+
+@pytest.mark.parametrize(("name", "given"), [("fly", {}), ("bridge", {"map": "ardupilot"})])
+def test_rosbag2_records_the_topics_of_the_recorder_in_its_place(name: str, given: dict[str, str], tmp_path: Path) -> None:
+    actions, context = started(name, **given, recorder="rosbag2", namespace="one", runs=tmp_path)
+    (process,) = every(ExecuteProcess, actions)
+    (run,) = tmp_path.iterdir()
+    *command, output, option = process.cmd[: process.cmd.index("/one/y")]
+    assert command == ["ros2", "bag", "record", "--storage", "mcap", "--output"]  # options of Jazzy's ros2bag
+    assert (output, option) == (str(run / "rosbag2"), "--topics")
+    topics = process.cmd[process.cmd.index("/one/y") :]
+    assert {"/one/y_m", "/one/u", "/one/internals", "/one/pose", "/diagnostics", "/rosout", "/parameter_events"} <= {*topics}
+    assert ("/one/bridge/engagement" in topics) is (name == "bridge")
+    assert len({*topics}) == len(topics)
+    assert process.on_exit is not None
+    assert "recorder" not in nodes(actions)
+    assert nodes(all_ready(actions, context, "/one"))  # the second stage does not wait for it
+    with pytest.raises(ParameterError, match=f"{run}: found no sample on any topic"):
+        read_run(run)  # until there is a bag
+
+
+def test_rosbag2_is_not_for_lockstep(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="recorder: found rosbag2 in lockstep, expected true"):
+        started("fly", recorder="rosbag2", lockstep="true", runs=tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_bridge_is_a_dry_run_by_default_and_its_topics_are_recorded(tmp_path: Path) -> None:

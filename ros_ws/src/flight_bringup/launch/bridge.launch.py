@@ -22,6 +22,7 @@ from flight_analysis.report.run_folder import new_run
 from flight_bringup.graph import (
     CONTROLLER,
     FIRST_STAGE,
+    RECORDER,
     NodeSpec,
     find_autopilot,
     parameter_overrides,
@@ -35,6 +36,8 @@ from flight_bringup.launch.stages import (
     end_with_launch,
     flight_node,
     namespace_argument,
+    recorder_argument,
+    rosbag2,
     runs_argument,
     scenario_argument,
     start_in_stages,
@@ -54,7 +57,7 @@ def generate_launch_description() -> LaunchDescription:
             boolean_argument(
                 "dry_run", True, "true: publish on bridge/would_send, send nothing; false: send once the bridge is engaged"
             ),
-            boolean_argument("recorder", True, "record the flight"),
+            recorder_argument("false"),
             DeclareLaunchArgument("duration", default_value="", description="seconds to fly; empty flies until Ctrl-C"),
             runs_argument(),
             watch_argument(),
@@ -70,7 +73,8 @@ def _fly(context: LaunchContext) -> list[Action]:
     autopilot = find_autopilot(argument(context, "map"), dry_run=argument(context, "dry_run") == "true")
     require_signs(autopilot.channel_map, scenario)
     require_limits(autopilot, scenario)
-    recorded = argument(context, "recorder") == "true"
+    recorder = argument(context, "recorder")
+    recorded = recorder != "false"
     run = new_run(scenario, Path(argument(context, "runs"))) if recorded else Path()
     end_with_launch(context)
 
@@ -83,4 +87,9 @@ def _fly(context: LaunchContext) -> list[Action]:
         return [*end, *(node(spec, start_time) for spec in second_stage(scenario, bridge=True))]
 
     page = watch_page(context, run) if recorded else []
-    return page + start_in_stages(context, {spec: node(spec) for spec in (FIRST_STAGE if recorded else (CONTROLLER,))}, follow)
+    first = FIRST_STAGE if recorder == "true" else (CONTROLLER,)
+    actions = page + start_in_stages(context, {spec: node(spec) for spec in first}, follow)
+    if recorder == "rosbag2":
+        overrides = parameter_overrides(RECORDER, scenario, run, math.inf, lockstep=False, autopilot=autopilot)
+        actions.append(rosbag2(context, scenario, overrides))
+    return actions

@@ -16,7 +16,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, TimerAction
 from launch_ros.actions import Node
 
 from flight_analysis.report.run_folder import new_run
-from flight_bringup.graph import AIRCRAFT, FIRST_STAGE, NodeSpec, parameter_overrides, second_stage
+from flight_bringup.graph import AIRCRAFT, CONTROLLER, FIRST_STAGE, RECORDER, NodeSpec, parameter_overrides, second_stage
 from flight_bringup.launch.stages import (
     BOOLEAN,
     argument,
@@ -25,6 +25,8 @@ from flight_bringup.launch.stages import (
     flight_node,
     namespace_argument,
     on_state,
+    recorder_argument,
+    rosbag2,
     runs_argument,
     scenario_argument,
     start_in_stages,
@@ -32,6 +34,7 @@ from flight_bringup.launch.stages import (
     watch_page,
 )
 from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import require
 from flight_ros.topics import NodeState
 from launch import LaunchContext, LaunchDescription
 
@@ -48,6 +51,7 @@ def generate_launch_description() -> LaunchDescription:
                 choices=["", *BOOLEAN],
                 description="true: as fast as the machine allows, repeatable to the byte; empty: the value in the scenario",
             ),
+            recorder_argument(),
             runs_argument(),
             watch_argument(),
             namespace_argument(),
@@ -59,6 +63,10 @@ def generate_launch_description() -> LaunchDescription:
 def _fly(context: LaunchContext) -> list[Action]:
     scenario = find_scenario(argument(context, "scenario"), yaml.safe_load(argument(context, "duration")))
     lockstep = scenario.flight.lockstep if (value := argument(context, "lockstep")) == "" else value == "true"
+    by_rosbag2 = argument(context, "recorder") == "rosbag2"
+    require(
+        not (by_rosbag2 and lockstep), "recorder", "rosbag2 in lockstep", "true: the aircraft waits for the stack's recorder"
+    )
     run = new_run(scenario, Path(argument(context, "runs")))
     end_with_launch(context)
 
@@ -72,4 +80,9 @@ def _fly(context: LaunchContext) -> list[Action]:
             end = TimerAction(period=lead + scenario.flight.duration, actions=complete(run))
         return [end, *(node(spec, start_time) for spec in second_stage(scenario))]
 
-    return watch_page(context, run) + start_in_stages(context, {spec: node(spec) for spec in FIRST_STAGE}, follow)
+    first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
+    actions = watch_page(context, run) + start_in_stages(context, {spec: node(spec) for spec in first}, follow)
+    if by_rosbag2:
+        overrides = parameter_overrides(RECORDER, scenario, run, math.inf, lockstep=False)
+        actions.append(rosbag2(context, scenario, overrides))
+    return actions

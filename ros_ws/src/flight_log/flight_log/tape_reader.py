@@ -28,6 +28,9 @@ from flight_log.scan import Scan
 BATCH = 4096  # messages that are decoded together
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace with one of these topics is that of an aircraft
 
+ROSBAG2 = "rosbag2"
+"""In the folder of a run: the bag of `ros2 bag record` where that recorded the flight. A log beside it has the attachments."""
+
 SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w.-]{0,99}\.yaml")
 """Names under which the scenario of a log may be written beside it: not metadata.yaml, and no path to another folder."""
 
@@ -196,6 +199,14 @@ class _Log:
 
 def _read(run: Path) -> _Log:
     log = _Log()
+    _add(run, log)
+    if is_folder(run / ROSBAG2):
+        _add(run / ROSBAG2, log)
+    return log
+
+
+def _add(run: Path, log: _Log) -> None:
+    """Add the content of a bag."""
     files = bag_files(run)
     information = _bag_metadata(run, log) if files and is_folder(run) else {}
     compressed = str(information.get("compression_mode") or "none").lower() != "none"
@@ -205,7 +216,6 @@ def _read(run: Path) -> _Log:
         require(bool(files), str(run), "no .mcap file", "the folder of a run or an MCAP file")
         for file in files:
             _read_mcap(file, log)
-    return log
 
 
 def _bag_metadata(run: Path, log: _Log) -> Mapping[str, Any]:

@@ -32,8 +32,10 @@ from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_bringup.graph import NodeSpec, start_lead
 from flight_bringup.processes import READY_TIMEOUT, end_with_parent
 from flight_bringup.scenarios import scenarios
+from flight_log.bag import BagWriter, LogAttachments
+from flight_log.tape_reader import ROSBAG2
 from flight_ros import transport
-from flight_ros.topics import NODE_STATE, STATES, NodeState
+from flight_ros.topics import FLIGHT, NODE_STATE, STATES, NodeState
 from launch import Event, EventHandler, LaunchContext
 
 BOOLEAN = ["true", "false"]
@@ -64,6 +66,14 @@ def boolean_argument(name: str, default: bool, description: str) -> DeclareLaunc
 def runs_argument() -> DeclareLaunchArgument:
     """The argument `runs`."""
     return DeclareLaunchArgument("runs", default_value="runs", description="folder in which the folder of the run is created")
+
+
+def recorder_argument(*further: str) -> DeclareLaunchArgument:
+    """The argument `recorder`."""
+    description = "true: the stack's recorder; rosbag2: `ros2 bag record` into the folder rosbag2 of the run"
+    return DeclareLaunchArgument(
+        "recorder", default_value="true", choices=["true", "rosbag2", *further], description=description
+    )
 
 
 def watch_argument() -> DeclareLaunchArgument:
@@ -105,6 +115,24 @@ def flight_node(spec: NodeSpec, scenario: Scenario, overrides: ParameterOverride
         output="screen",
         on_exit=fail_on_exit,
     )
+
+
+def rosbag2(context: LaunchContext, scenario: Scenario, overrides: ParameterOverrides) -> ExecuteProcess:
+    """`ros2 bag record` in the place of the stack's recorder, with the same topics. `overrides` are those of the recorder.
+
+    What the recorder attaches to its log is a log of its own in the folder of the run.
+    """
+    run = Path(overrides["directory"])
+    with BagWriter(run) as bag:
+        files = LogAttachments(
+            Path(overrides["scenario_file"]), tuple(map(Path, overrides["attach"])), Path(overrides["metadata_file"])
+        )
+        bag.add_attachments(files, time.time_ns())
+    further = overrides.get("topics", scenario.recorder.topics)
+    topics = [*(topic.name for topic in FLIGHT), "/rosout", "/parameter_events", *further]
+    names = dict.fromkeys(name if name.startswith("/") else f"{_namespace(context)}/{name}" for name in topics)
+    command = ["ros2", "bag", "record", "--storage", "mcap", "--output", str(run / ROSBAG2), "--topics", *names]
+    return ExecuteProcess(cmd=command, name="recorder", output="screen", on_exit=fail_on_exit)
 
 
 def fail_on_exit(event: ProcessExited, context: LaunchContext) -> None:
