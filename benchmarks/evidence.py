@@ -62,7 +62,7 @@ MEASUREMENTS = (
     Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), "faults injected into a flight over DDS", "20 min", timed=True),
     Measurement("security", (*SECURITY, "tests/ros/test_policy.py"), SECURITY, "who can receive y and command u", "2 min"),
     Measurement("fuzz", (*PYTEST, "tests/fuzz"), (*PYTEST, "tests/fuzz"), "external input, fuzzed by hypothesis", "2 min"),
-    Measurement("fuzz-coverage", (*FUZZ, "--seconds", "120"), (*FUZZ, "--seconds", "5"), READERS, "12 min"),
+    Measurement("fuzz-coverage", (*FUZZ, "--seconds", "60"), (*FUZZ, "--seconds", "5"), READERS, "11 min"),
     Measurement("campaign", CAMPAIGN, QUICK_CAMPAIGN, "speed and accuracy of campaigns", "3 min", timed=True),
     Measurement("campaign-fleet", (*FLEET, "10000"), (*FLEET, "1000"), "uncertain aircraft flown by the same law", "1 min"),
     Measurement("campaign-missions", (*MISSIONS, "5000"), (*MISSIONS, "200"), "uncertain aircraft on a route", "3 min"),

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coverage-guided fuzzing of all readers of external input (tests/fuzz/targets.py), with atheris.
 
-python -m benchmarks.fuzz mcap --seconds 60          # mcap, metadata, scenario, airframe, map, message or route
+python -m benchmarks.fuzz mcap --seconds 60          # or any other target of tests/fuzz/targets.py
 python -m benchmarks.fuzz mcap --replay FILE ...     # each input once, under the same limits, without atheris
 
 A fuzzer starts from outputs of the stack's own writers and from tests/corpus/<target>/. At an input that raises, hangs or takes
@@ -25,13 +25,16 @@ FINDINGS = REPOSITORY / "runs" / "fuzz"
 TIMEOUT = 20  # s an input of a few kB; processor time in a replay, wall time when fuzzing
 MEMORY_MB = 1500  # of the process; the libraries of the readers take 250
 MAX_LENGTH = 16 * 1024  # bytes of an input
-STACK = ["aircraft_sim", "autopilot_bridge", "flight_analysis", "flight_core", "flight_log", "flight_recorder", "guidance"]
+STACK = [
+    *("aircraft_sim", "autopilot_bridge", "flight_analysis", "flight_core", "flight_log", "flight_recorder", "flight_view"),
+    *("guidance", "rise_di_controller"),
+]
 
 
 def main() -> None:
     """Fuzz, or replay."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("target", help="mcap, metadata, scenario, airframe, map, message or route")
+    parser.add_argument("target", help="mcap, metadata, scenario, airframe, map, message, route, targets, control or page")
     parser.add_argument("--seconds", type=int, default=60, help="how long to fuzz")
     parser.add_argument("--replay", type=Path, nargs="*", help="read each of these inputs once instead of fuzzing")
     parser.add_argument("--keep", action="store_true", help="keep new inputs in runs/fuzz/<target>/inputs for the next run")

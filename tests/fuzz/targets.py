@@ -6,14 +6,24 @@ A target returns for input that is read or rejected with one sentence. It raises
 inputs of each target, made by the writers of the stack; tests/corpus/<target>/ holds the findings.
 """
 
+import asyncio
+import json
+import logging
+import math
+import struct
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import lru_cache
 from io import BytesIO
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 from tests.joint_states import JOINT_STATE, STORE, vector
+from tests.view_link import NodesInMemory
 
 from aircraft_sim.airframe import LIBRARY as AIRFRAMES
 from aircraft_sim.airframe import load_airframe
@@ -23,8 +33,9 @@ from autopilot_bridge.params import LIBRARY as MAPS
 from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.replay import recorded_parameters, replay
 from flight_analysis.closed_loop.scenario import load_scenario
-from flight_bringup.scenarios import share
+from flight_bringup.scenarios import find_scenario, share
 from flight_core.parameters import ParameterError
+from flight_core.vectors import ChannelError, StampedVector
 from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
 from flight_log.named_vectors import decoder
 from flight_log.playback import read_playback
@@ -32,8 +43,13 @@ from flight_log.repair import repair
 from flight_log.rosbag2_metadata import FileContents, TopicCount, bag_metadata_yaml, read_bag_metadata
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
 from flight_log.tape_reader import read_run
+from flight_view.control import Control, RefusedError
 from flight_view.flight import Flight
-from flight_view.server import answer
+from flight_view.server import ADDRESS, Server, answer
+from guidance.guidance import Guidance
+from guidance.modes import POSE
+from guidance.modes import TARGETS as MODE_TARGETS
+from guidance.params import GuidanceParameters
 from guidance.route_file import READERS, Origin, read_route
 from rise_di_controller.controller import Controller
 from rise_di_controller.rise_di import RiseDiParameters
@@ -148,6 +164,95 @@ def route(data: bytes, folder: Path) -> None:
         rejected(lambda path=path: read_route(path, Origin(47.4, 8.5)))  # type: ignore[misc]  # bound in the loop
 
 
+def targets(data: bytes, folder: Path) -> None:
+    """Poses, y and targets of guidance, as 64 bit numbers. What a step commands is finite and inside its slew limits."""
+    guidance, params, now_ns, before = Guidance(_guided()), _guided().params(), 0, None
+    values = [value for (value,) in struct.iter_unpack("<d", data[: len(data) // 8 * 8]) if math.isfinite(value)]
+    while len(values) > GUIDED_NUMBERS:
+        part, values = values[:GUIDED_NUMBERS], values[GUIDED_NUMBERS:]
+        now_ns += params.period_ns
+        with suppress(ChannelError):
+            guidance.take_pose(StampedVector(now_ns, np.array(part[: len(POSE)])), now_ns)
+            guidance.take_y(StampedVector(now_ns, np.array(part[len(POSE) :][:4])), now_ns)
+        with suppress(ChannelError):
+            guidance.take_target({MODES[int(abs(part[-2]) % len(MODES))]: part[-1]})
+        if (output := guidance.step(now_ns, now_ns)) is None:
+            continue
+        assert np.isfinite(output.u_m).all(), output.u_m
+        if before is not None:
+            V = params.outputs.index("V")
+            moved = np.delete(np.abs(output.u_m - before)[:4], V)
+            assert (moved <= np.delete(params.slew, V) * params.period_ns / 1e9 * (1.0 + 1e-9) + 1e-12).all(), moved
+        before = output.u_m
+
+
+def control(data: bytes, folder: Path) -> None:
+    """The body of a request that commands a flight from its page."""
+    loop, _, desk, _ = _page()
+    try:
+        request = json.loads(data)
+    except (ValueError, RecursionError):
+        return
+    sentence = "no refusal"
+    try:
+        json.dumps(loop.run_until_complete(desk.answer(request, KEY, "")))
+    except RefusedError as error:
+        sentence = error.sentence
+    assert sentence.strip()
+    assert len(sentence) < MAX_SENTENCE_LENGTH
+
+
+def page(data: bytes, folder: Path) -> None:
+    """Bytes to the server of the page. It logs no exception, and answers the next browser."""
+    loop, server, _, failed = _page()
+    loop.run_until_complete(_exchange(server, data.replace(b"PORT", str(server.port).encode())))
+    assert not failed, failed.pop()
+
+
+async def _exchange(server: Server, data: bytes) -> None:
+    reader, writer = await asyncio.open_connection(ADDRESS, server.port)
+    writer.write(data)
+    with suppress(TimeoutError, ConnectionError):
+        await asyncio.wait_for(reader.read(1 << 16), 0.02)  # the answer to a whole request takes 2 ms
+    writer.close()
+    with suppress(ConnectionError):
+        await writer.wait_closed()
+
+
+KEY, TOKEN = "ABCD-EFGH", "a-token"
+GUIDED_NUMBERS = len(POSE) + 6
+MODES = [name for name in MODE_TARGETS if name not in {"north", "east", "radius"}]  # an orbit takes three together
+
+
+@lru_cache(maxsize=1)
+def _guided() -> GuidanceParameters:
+    guidance = find_scenario("osprey_route").guidance
+    assert guidance is not None
+    return guidance
+
+
+@lru_cache(maxsize=1)
+def _page() -> tuple[asyncio.AbstractEventLoop, Server, Control, list[str]]:
+    """A server with control of nodes in memory, its event loop, and the exceptions that it has logged."""
+    run = write_run(Path(tempfile.mkdtemp(prefix="fuzz")), log(_flight()))
+    scenario, loop, times = find_scenario("osprey_servo"), asyncio.new_event_loop(), count()
+    flight = Flight(run)
+    flight.update()
+    nodes = NodesInMemory(scenario, "aircraft", "controller", "guidance", dry_run=True)
+    desk = Control(flight, nodes, KEY, now=lambda: 10.0 * next(times))  # each request has its allowance, and a new lease
+    failed: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: failed.append(record.getMessage())  # type: ignore[method-assign]
+    logging.getLogger("tornado.application").addHandler(handler)
+
+    async def start() -> Server:
+        server = Server([flight], TOKEN, desk)
+        server.listen(0)
+        return server
+
+    return loop, loop.run_until_complete(start()), desk, failed
+
+
 TARGETS: Mapping[str, Target] = {
     "mcap": mcap,
     "metadata": metadata,
@@ -156,6 +261,9 @@ TARGETS: Mapping[str, Target] = {
     "map": channel_map,
     "message": message,
     "route": route,
+    "targets": targets,
+    "control": control,
+    "page": page,
 }
 
 
@@ -262,6 +370,34 @@ _ROUTES = [
     b"<kml><Point><altitudeMode>absolute</altitudeMode><coordinates>8.5,47.4,500</coordinates></Point></kml>",
 ]
 
+_HEAD = b"GET / HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\nCookie: rise_di_PORT=a-token\r\n\r\n"
+_REQUESTS = [
+    _HEAD,
+    _HEAD.replace(b"/ ", b"/data/0?epoch=0.0&y=3&state=ended ", 1),
+    _HEAD.replace(b"/ ", b"/?token=a-token ", 1),
+    _HEAD.replace(b"GET / ", b"POST /control ").replace(
+        b"\r\n\r\n",
+        b"\r\nOrigin: http://127.0.0.1:PORT\r\nContent-Type: application/json\r\nX-Control-Key: ABCD-EFGH\r\n"
+        b'Content-Length: 14\r\n\r\n{"do":"state"}',
+    ),
+]
+_BODIES = [
+    {"do": "state"},
+    {"do": "gains", "values": {"k_g": 2.0}, "digest": "0"},
+    {"do": "check", "values": {"k_g": 2.0, "beta": [1.0, 2.0, 3.0, 4.0]}},
+    {"do": "fault", "values": {"actuators.stuck_at": [None, 2.0, None, None], "sensors.dropout": 0.1}},
+    {"do": "gust", "axis": "vertical", "speed": 10.0, "length": 15.0},
+    {"do": "target", "values": {"heading": 1.0, "altitude": 100.0}},
+    {"do": "route", "points": [[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]]},
+    {"do": "engage", "map": "px4"},
+]
+
+
+def _numbers() -> list[bytes]:
+    level = [0.1, 0.0, 1.0, 0.0, 0.0, 100.0, 25.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0]
+    return [struct.pack(f"<{4 * GUIDED_NUMBERS}d", *[*level, float(k), 1.0] * 4) for k in range(len(MODES))]
+
+
 SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "mcap": _mcaps,
     "metadata": _metadata,
@@ -270,4 +406,7 @@ SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "map": lambda: _files(MAPS),
     "message": lambda: [_SAMPLE, _event(), vector(1, (), ())],
     "route": lambda: _ROUTES,
+    "targets": _numbers,
+    "control": lambda: [json.dumps(body).encode() for body in _BODIES],
+    "page": lambda: _REQUESTS,
 }

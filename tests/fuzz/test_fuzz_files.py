@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fuzzing of file readers: any content is read or rejected with one sentence, in bounded time and memory."""
 
+import json
 import os
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -42,7 +44,7 @@ def test_the_corpus_is_small() -> None:
 
 # Bytes: truncated, changed, moved
 
-BINARY = {name: SEEDS[name]() for name in ("mcap", "message", "route")}
+BINARY = {name: SEEDS[name]() for name in ("mcap", "message", "route", "targets", "page")}
 
 
 @st.composite
@@ -83,8 +85,12 @@ VALUES = st.recursive(
 )
 
 
+def to_yaml(tree: Any) -> str:
+    return str(yaml.safe_dump(tree, allow_unicode=True))
+
+
 @st.composite
-def edited(draw: st.DrawFn, seeds: list[Any]) -> bytes:
+def edited(draw: st.DrawFn, seeds: list[Any], write: Callable[[Any], str] = to_yaml) -> bytes:
     """A valid file with some other values or keys."""
     tree = yaml.safe_load(draw(st.sampled_from(seeds)))
     for _ in range(draw(st.integers(1, 3))):
@@ -104,7 +110,7 @@ def edited(draw: st.DrawFn, seeds: list[Any]) -> bytes:
                         node.pop(key)
                 break
             node = deeper
-    return yaml.safe_dump(tree, allow_unicode=True).encode("utf-8", "surrogatepass")
+    return write(tree).encode("utf-8", "surrogatepass")
 
 
 INPUTS = {
@@ -113,6 +119,10 @@ INPUTS = {
     "route": damaged("route") | edited(SEEDS["route"]()[:3]),
     **{name: edited(SEEDS[name]()) for name in ("scenario", "airframe", "map")},
     "metadata": edited(SEEDS["metadata"]()) | st.binary(max_size=100),
+    "targets": damaged("targets")
+    | st.lists(st.floats(), max_size=200).map(lambda values: struct.pack(f"<{len(values)}d", *values)),
+    "control": edited(SEEDS["control"](), write=json.dumps),
+    "page": damaged("page") | st.binary(max_size=200),
 }
 
 

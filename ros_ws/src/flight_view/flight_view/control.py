@@ -278,7 +278,7 @@ class Control:
         if self._assess is None or self._flight.scenario is None:
             return {}
         values, gains = _mapping(request, "values"), gains_of(self._controller())
-        chosen = {name: _like(gains[name], value) for name, value in values.items() if name in gains}
+        chosen = {name: _like(gains[name], _numbers(name, value)) for name, value in values.items() if name in gains}
         return self._assess(self._flight.scenario, self._with(self._values | chosen))
 
     def _map(self) -> str:
@@ -388,9 +388,13 @@ def _mapping(request: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 
 def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    try:
+        number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+    except OverflowError:  # an integer of hundreds of digits
+        number = math.inf
+    if not math.isfinite(number):
         raise RefusedError(HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: found {short_repr(value)}, expected a number")
-    return float(value)
+    return number
 
 
 def _numbers(name: str, value: Any) -> Any:

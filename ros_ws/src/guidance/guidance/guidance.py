@@ -146,7 +146,8 @@ class Guidance:
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
         """Take a pose in the order of `modes.POSE`.
 
-        Raises ChannelError for a stamp that is not newer or in the future, and for values that are all those of the last pose.
+        Raises ChannelError for a stamp that is not newer or in the future, for a value beyond `modes.LARGEST`, and for values
+        that are all those of the last pose.
         """
         last, newest = self._pose, self._newest(self._pose, sample, now_ns)
         if last is not None and np.array_equal(last.value, newest.value):
@@ -154,13 +155,15 @@ class Guidance:
         self._pose = newest
 
     def take_y(self, sample: StampedVector, now_ns: int) -> None:
-        """Take a y in the order of the parameters' outputs. Raises ChannelError for a stamp that is old or in the future."""
+        """Take a y in the order of the parameters' outputs. Raises ChannelError as `take_pose` does, but for equal values."""
         self._y = self._newest(self._y, sample, now_ns)
 
     def _newest(self, last: StampedVector | None, sample: StampedVector, now_ns: int) -> StampedVector:
         require_not_future(sample.stamp_ns, now_ns, self._params.max_age_ns)
         if last is not None:
             require_newer(sample.stamp_ns, last.stamp_ns)
+        if (largest := float(np.max(np.abs(sample.value)))) > modes.LARGEST:
+            raise ChannelError("bounds", f"found a value of {largest:g}, expected at most {modes.LARGEST:g} in SI")
         return sample
 
     def take_target(self, values: Mapping[str, float]) -> None:

@@ -27,6 +27,9 @@ from guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_an
 POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
 """Channels of `pose`: rad, m, m/s; beta is 0 where it is not measured."""
 
+LARGEST = 1e9
+"""Largest value of pose, y and target, SI. The squares of larger ones overflow; the orbit of the moon is 4e8 m away."""
+
 STEEPEST = math.radians(89.0)
 """Largest bank that a mode asks for, before protection."""
 
@@ -173,6 +176,9 @@ def read_target(values: Mapping[str, float], params: GuidanceParams, what: str =
         raise ChannelError("name", f"{what}: found {', '.join(values)}, expected one lateral and one vertical command at most")
     if Lateral.ORBIT in modes[0] and not {"north", "east", "radius"} <= set(values):
         raise ChannelError("name", f"{what}: found {', '.join(values)}, expected north, east and radius of an orbit together")
+    for name, value in values.items():
+        if abs(value) > LARGEST:
+            raise ChannelError("bounds", f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way")
     limits, vertical = params.limits, params.vertical
     for name, least, largest in (
         ("phi", -limits.bank, limits.bank),
