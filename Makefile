@@ -6,6 +6,7 @@
 # make test-sitl   fly a real autopilot in software: docs/autopilots.md
 # make docs   write the site of docs/ to site/; make docs ARGS=serve shows it while it is written
 # make evidence   measure what has not been measured yet, write docs/evidence.md     make evidence ARGS="--again speed"
+# make foxglove   what `rise-di watch --foxglove` needs
 # make messages PACKAGE=... SOURCE=...   build a message package of an autopilot for the stack: docs/autopilots.md
 # make setup   what flying and its report need: .venv/, the workspace built, .venv/bin/rise-di; make setup-all: campaigns and tests too
 
@@ -25,7 +26,7 @@ ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group docs --gro
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
 
-.PHONY: fly test test-sitl check docs evidence messages setup setup-all lock clean
+.PHONY: fly test test-sitl check docs evidence foxglove messages setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
@@ -37,6 +38,9 @@ test: check
 
 test-sitl: setup-all
 	$(BIN)/python -m pytest tests/sitl $(ARGS)
+
+foxglove: setup
+	$(INSTALL) --group foxglove
 
 check: setup-all
 	$(BIN)/ruff check .
@@ -88,7 +92,7 @@ setup-all: .venv/.all .venv/.workspace
 lock: | .venv/.uv
 	$(BIN)/uv pip compile --quiet --upgrade $(LOCK)
 
-LOCK := $(ALL_GROUPS) --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
+LOCK := $(ALL_GROUPS) --group foxglove --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
   --custom-compile-command "make lock" --output-file requirements.lock
 
 clean:

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from flight_bringup.processes import end_with_parent
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from flight_view.flight import Flight
 from flight_view.text import show
 from flight_view.watch import DEFAULT_PORT, newest_run, require_log, serve
@@ -29,6 +29,9 @@ def watch(
     ] = None,
     wait: Annotated[bool, typer.Option("--wait", help="Wait for the log of RUN where there is none yet.")] = False,
     text: Annotated[bool, typer.Option("--text", help="Show the flight in the terminal, without a browser.")] = False,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Serve a flight in progress to Foxglove, Lichtblick and PlotJuggler instead.")
+    ] = False,
     control: Annotated[
         bool, typer.Option("--control", help="Let the page command the flight, with a key that this command prints.")
     ] = False,
@@ -52,6 +55,9 @@ def watch(
         require(ghost is None, "--text", "two runs", "one run")
         require(not (control or control_real), "--text", "--control beside it", "one of the two")
         show(Flight(chosen[0]))
+    elif foxglove:
+        require(ghost is None and not (control or control_real), "--foxglove", "a ghost or --control beside it", "RUN alone")
+        _serve_foxglove(chosen[0], port)
     elif control or control_real:
         _serve_with_control(chosen, ports, namespace, real=control_real)
     else:
@@ -60,6 +66,16 @@ def watch(
 
 def _announce(line: str) -> None:
     print(line, flush=True)
+
+
+def _serve_foxglove(run: Path, port: int | None) -> None:
+    try:
+        from flight_view import foxglove_server  # noqa: PLC0415 - an extra
+    except ModuleNotFoundError as error:
+        if error.name != "foxglove":
+            raise
+        raise ParameterError("--foxglove: the package foxglove-sdk is not installed, expected it: make foxglove") from None
+    foxglove_server.serve(run, foxglove_server.DEFAULT_PORT if port is None else port, _announce)
 
 
 def _serve_with_control(runs: Sequence[Path], ports: Sequence[int], namespace: str, *, real: bool) -> None:

@@ -64,6 +64,7 @@ class Follower:
         self.damaged = 0  # records that could not be read
         self.complete = False  # the end of the data has been read
         self.fault = ""  # why nothing more of the log can be read
+        self.definitions: dict[str, str] = {}  # of the message types that have occurred, ros2msg, by name
         self._rate_of = rate_of
         self._read_files: list[Path] = []
         self._pending: deque[Messages | Attachment | Metadata] = deque()
@@ -212,6 +213,7 @@ class Follower:
     def _learn(self, record: object) -> None:
         if isinstance(record, Schema):
             self._schemas[record.id] = record.name
+            self.definitions[record.name] = record.data.decode(errors="replace")
         elif isinstance(record, Channel):
             type_name = self._schemas.get(record.schema_id, "")
             if record.id not in self._channels:

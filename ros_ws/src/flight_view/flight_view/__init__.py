@@ -8,6 +8,7 @@
 | `flight` | follows the log of a run: samples, events, state |
 | `server` | serves the page and the samples to browsers on this host |
 | `control` | checks and carries out what the page commands, over a link to the nodes |
+| `foxglove_server` | serves a log to viewers of the Foxglove protocol, an extra |
 | `watch` | finds the run, serves it until Ctrl-C |
 | `text` | shows a flight in a terminal |
 | `page/` | the page: markup, style, scripts |

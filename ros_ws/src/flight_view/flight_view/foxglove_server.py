@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Serves a flight that is recorded to viewers of the Foxglove protocol: Foxglove, Lichtblick, PlotJuggler. From its log, too.
+
+The messages are those of the log, byte for byte, from the connection on. A viewer can send nothing.
+"""
+
+import math
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import foxglove
+
+from flight_core.parameters import ParameterError, require
+from flight_log.follow import Follower, Messages
+from flight_view.server import ADDRESS, POLL_PERIOD
+
+DEFAULT_PORT = 8765  # of the protocol
+BACKLOG = 4096  # messages that wait for a slow viewer; the oldest is dropped
+
+
+def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
+    """Serve a run until its recording ends, SIGINT or SIGTERM. `announce` gets a line for the user.
+
+    Raises ParameterError where the port is taken, or the recording has ended before.
+    """
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    follower = Follower(run, lambda topic, type_name: math.inf)
+    before = list(follower.read())
+    require(
+        not follower.complete,
+        f"--foxglove: {run}",
+        "a recording that has ended",
+        "one in progress; viewers open its .mcap file",
+    )
+    context = foxglove.Context()
+    channels: dict[str, foxglove.Channel] = {}
+    try:
+        server = foxglove.start_server(
+            name=run.name, host=ADDRESS, port=port, capabilities=[], context=context, message_backlog_size=BACKLOG
+        )
+    except RuntimeError:
+        raise ParameterError(f"--port: {port} cannot be used, expected a free port of this host") from None
+    announce(f"ws://{ADDRESS}:{server.port} for Foxglove, Lichtblick and PlotJuggler")
+    try:
+        for one in before:
+            _channel(one, follower, channels, context)
+        while not ended.wait(POLL_PERIOD) and not follower.complete:
+            for one in follower.read():
+                if (channel := _channel(one, follower, channels, context)) is not None and isinstance(one, Messages):
+                    for sent_ns, data in zip(one.sent_ns, one.data, strict=True):
+                        channel.log(data, log_time=sent_ns)
+    finally:
+        server.stop()
+
+
+def _channel(
+    one: object, follower: Follower, channels: dict[str, foxglove.Channel], context: foxglove.Context
+) -> foxglove.Channel | None:
+    """The channel of messages, which is advertised with the first ones."""
+    if not isinstance(one, Messages):
+        return None
+    if one.topic not in channels:
+        definition = follower.definitions.get(one.type_name, "").encode()
+        schema = foxglove.Schema(name=one.type_name, encoding="ros2msg", data=definition)
+        channels[one.topic] = foxglove.Channel(one.topic, schema=schema, message_encoding="cdr", context=context)
+    return channels[one.topic]
