@@ -24,6 +24,7 @@ from guidance import guidance, modes
 from guidance.guidance import Guidance
 from guidance.modes import Mode, Vertical
 from guidance.params import GuidanceParameters
+from guidance.protection import climb_range
 from guidance.route_file import Waypoint, read_route
 
 ROUTE = find_scenario("osprey_route")
@@ -326,3 +327,25 @@ def test_bad_words_of_the_command_line_are_one_sentence(words: list[str], senten
     result = CliRunner().invoke(application([*COMMANDS]), words)
     assert isinstance(result.exception, ParameterError)
     assert sentence in str(result.exception)
+
+
+def test_a_climb_that_the_throttle_cannot_sustain_slows_and_leaves_the_airspeed() -> None:
+    # An engine that has lost most of its power gives 0.3 m/s^2 in place of 3.
+    weak = calm(40.0, program=program(climb=2.5)).vary(aircraft={"actuators": {"upper": [0.5, 0.05, 0.5, 0.5]}})
+    tape = simulate(weak)
+    V, limited, climb = (
+        channel[after(tape, 25.0)] for channel in channels(tape["guidance"], "y.V", "limited.climb", "pose.climb")
+    )
+    assert limited.all()
+    assert V.min() > -3.5  # without the limit V falls by 5.1 m/s, below the floor of 20 m/s
+    assert np.ptp(V) < 0.1  # no limit cycle
+    assert climb.min() > 1.5
+
+
+@pytest.mark.parametrize(
+    ("shortfall", "expected"), [(0.0, (-3, 2)), (1.96, (-3, 2)), (2.94, (-3, 1)), (9, (-3, 0)), (-9.0, (0, 2))]
+)
+def test_climb_and_sink_fall_with_the_departure_of_the_airspeed_from_its_command(
+    shortfall: float, expected: tuple[float, float]
+) -> None:
+    assert climb_range(2.0, 3.0, shortfall, 25.0) == pytest.approx(expected, abs=5e-3)  # d = 9.81 x 2 / (0.4 x 25) = 1.96

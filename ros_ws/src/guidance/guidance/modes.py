@@ -420,6 +420,8 @@ def _climb(
         return pose["climb"], False  # from here the other modes start
     vertical, target = params.vertical, state.target
     wanted = target.climb if state.vertical is Vertical.CLIMB else climb_for(target.altitude - pose["altitude"], vertical)
-    largest = protection.climb_limit(vertical.climb, vertical.sink, speed, params.limits.floor)
-    climb_c = slewed(state.climb_c, array_namespace(speed).minimum(wanted, largest), vertical.acceleration, dt)
-    return climb_c, wanted > largest
+    least, largest = protection.climb_range(vertical.climb, vertical.sink, state.V_c - speed, params.speed)
+    xp = array_namespace(speed)
+    largest = xp.minimum(largest, protection.climb_limit(vertical.climb, vertical.sink, speed, params.limits.floor))
+    permitted = xp.minimum(xp.maximum(wanted, least), largest)
+    return slewed(state.climb_c, permitted, vertical.acceleration, dt), permitted != wanted

@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Protection: limits of bank, speed and climb, in that order, from the stall speed."""
+"""Protection: limits of bank, speed and climb, in that order, from the stall speed and the commanded airspeed."""
 
+from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
 
 STALL_MARGIN = 1.1
@@ -9,6 +10,9 @@ STALL_MARGIN = 1.1
 
 FLOOR = 1.15
 """Speed floor over the stall speed."""
+
+SHORTFALL = 0.05
+"""How far V may be from its command, over the trim speed, before the climb or sink falls: at twice of it, it is zero."""
 
 
 def bank_limit(limit: float, stall_speed: float, speed: Scalar) -> Scalar:
@@ -30,3 +34,16 @@ def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scala
     xp = array_namespace(speed)
     ratio = xp.minimum(xp.maximum((speed - 0.9 * floor) / (0.1 * floor), 0.0), 1.0)
     return ratio * climb - (1.0 - ratio) * sink
+
+
+def climb_range(climb: float, sink: float, shortfall: Scalar, speed: float) -> tuple[Scalar, Scalar]:
+    """Least and largest climb rate, m/s, by the shortfall V_c - V of the airspeed, m/s, for a throttle at its stop leaves V:
+
+        -sink clip(2 + shortfall / d, 0, 1),  climb clip(2 - shortfall / d, 0, 1),  d = max(0.05 V0, g climb / (0.4 V0))
+
+    `speed`: V0, m/s. With V_dot = -g climb / V the second term of d bounds the bandwidth of V by climb to 0.4 rad/s.
+    """  # noqa: D400, D415 - what follows is an equation
+    margins = (max(SHORTFALL * speed, GRAVITY * rate / (0.4 * speed)) for rate in (sink, climb))
+    xp, ratios = array_namespace(shortfall), (sign * shortfall / d for sign, d in zip((-1.0, 1.0), margins, strict=True))
+    least, largest = (xp.minimum(xp.maximum(2.0 - ratio, 0.0), 1.0) for ratio in ratios)
+    return -sink * least, climb * largest
