@@ -17,7 +17,7 @@ from guidance.path import Arc, Line
 from guidance.route_file import Waypoint, read_route
 
 CAN = Performance(
-    speed=40.0, stall_speed=25.0, bank=math.radians(30.0), roll_rate=0.3, climb=2.5, sink=4.0, wind=10.0
+    speed=40.0, stall_speed=25.0, bank=math.radians(30.0), roll_rate=0.45, climb=2.5, sink=4.0, wind=10.0
 )  # fmt: skip
 CORNER = (Waypoint(0, 0, 1000), Waypoint(3000, 0, 1050), Waypoint(3000, 3000, 1000))
 RADIUS, PERIOD = 580.0, 14.0  # m: (40 + 10)^2 / (g tan(24 deg)) = 572.6; s
@@ -60,8 +60,8 @@ def test_at_low_speed_the_stall_limits_the_bank_and_with_it_the_radius() -> None
 
 
 def test_a_period_below_the_rule_is_refused() -> None:
-    sentence = refusal(CORNER, roll_rate=0.15)  # 7 * 30 deg / 0.15 = 24.43
-    assert sentence == "guidance.period: found 14 s, expected at least 24.5 s at this speed, bank and roll rate"
+    sentence = refusal(CORNER, roll_rate=0.15)  # 11 * 30 deg / 0.15 = 38.40
+    assert sentence == "guidance.period: found 14 s, expected at least 38.4 s at this speed, bank and roll rate"
     assert flyable_legs(CORNER, RADIUS, number(sentence), CAN._replace(roll_rate=0.15))
 
 

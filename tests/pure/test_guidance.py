@@ -181,7 +181,7 @@ def test_rules_of_radius_and_period() -> None:
     bank = math.radians(30.0)
     # A circle of the least radius asks for 0.8 of the bank at the speed with the wind from behind.
     assert math.atan(56.0**2 / (GRAVITY * least_radius(46.0, 10.0, bank))) == pytest.approx(0.8 * bank)
-    assert least_period(46.0, bank, 0.15) == pytest.approx(7.0 * bank / 0.15)
+    assert least_period(46.0, bank, 0.15) == pytest.approx(11.0 * bank / 0.15)
     assert least_period(25.0, bank, 1.0) == 14.0
 
 

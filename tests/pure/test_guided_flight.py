@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
 from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, guidance_by_rule, load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.guided_figures import flown_routes
 from flight_bringup.graph import GUIDANCE, second_stage
 from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.cli import COMMANDS, application
@@ -20,6 +22,8 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_log.named_vectors import PATH, typestore
+from flight_log.tape_reader import read_run
 from guidance import guidance, modes
 from guidance.guidance import Guidance
 from guidance.modes import Mode, Vertical
@@ -201,7 +205,7 @@ def test_a_command_that_cannot_be_flown_is_refused_and_changes_nothing(values: d
 @pytest.mark.parametrize(
     ("section", "sentence"),
     [
-        ({"period": 13.0}, r"guidance.period: found 13.0 s, expected at least 14 s: max\(14 s"),
+        ({"period": 13.0}, r"guidance.period: found 13.0 s, expected at least 16.5 s: max\(14 s"),
         ({"outputs": ["q", "V", "p"]}, r"guidance.outputs: found q, V, p, expected q, V, p, r"),
         ({"stall_speed": 24.0}, r"guidance.stall_speed: found 24.0 m/s, expected a floor of 1.15 V_s below 25 m/s"),
         ({"program": program(bank=0.1)}, r"guidance.program.bank: found a channel, expected one of phi"),
@@ -294,6 +298,55 @@ def test_replay_leaves_a_route_that_arrived_in_flight_unchecked() -> None:
     result = replay_guidance(simulate(scenario), section)
     assert result.checked == 0
     assert result.notes == ("101 steps of guidance not checked: the log does not hold their route, or the state before them",)
+
+
+class RoutedInFlight(Guidance):
+    """Guidance that takes a route at 1 s."""
+
+    def __init__(self, parameters: GuidanceParameters) -> None:
+        super().__init__(parameters)
+        self._new = parameters.plan([Waypoint(*point) for point in WAYPOINTS])
+
+    def step(self, now_ns: int, t_ns: int) -> guidance.GuidanceOutput | None:
+        """See Guidance."""
+        if t_ns == 1000 * MS:
+            self.take_route(self._new)
+        return super().step(now_ns, t_ns)
+
+
+WAYPOINTS = [(0.0, 0.0, 0.0), (800.0, 0.0, 10.0)]
+
+
+def path_message(*points: tuple[float, float, float]) -> bytes:
+    """A serialised nav_msgs/Path through points (north, east, altitude), without a stamp."""
+    types: Any = typestore().types
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "map")
+    level = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    poses = [
+        types["geometry_msgs/msg/PoseStamped"](
+            header, types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](east, north, altitude), level)
+        )
+        for north, east, altitude in points
+    ]
+    return bytes(typestore().serialize_cdr(types[PATH](header, poses), PATH))
+
+
+def test_a_route_that_arrives_in_flight_is_read_from_the_log_replayed_and_drawn(tmp_path: Path) -> None:
+    scenario = calm(3.0)
+    section = scenario.guidance
+    assert section is not None
+    flown = simulate(scenario, guide=RoutedInFlight)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topic = bag.add_connection("/route", PATH, typestore=typestore())
+        for points in ([(0.0, 0.0, 0.0)], WAYPOINTS):  # the first one is refused
+            bag.write(topic, 1, path_message(*points))
+    read = read_run(tmp_path / "bag").tape["route"]
+    assert read.values.tolist() == [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [1.0, 800.0, 0.0, 10.0]]
+    tape = Tape({**flown.signals, "route": read})
+    result = replay_guidance(tape, section)
+    assert (result.steps, result.checked, result.differing) == (151, 151, 0)
+    assert flown_routes(scenario, tape) == [section.plan([Waypoint(*point) for point in WAYPOINTS])]
+    assert replay_guidance(flown, section).checked == 50  # without the route: those before it
 
 
 def test_a_route_file_is_flown_and_stays_with_the_flight(tmp_path: Path) -> None:

@@ -133,13 +133,13 @@ def curve(figure: go.Figure, name: str, row: int) -> FloatArray:
 
 
 def test_the_ground_track_has_equal_axes_and_arrows_of_the_wind() -> None:
-    figure = guided_figures.track_figure(log(pose__v_east=5.0), None, SPEED)
+    figure = guided_figures.track_figure(log(pose__v_east=5.0), [], SPEED)
     assert (figure.layout.yaxis.scaleanchor, figure.layout.yaxis.scaleratio) == ("x", 1.0)
     assert [trace.name for trace in figure.data] == ["flown", "wind, the longest arrow 5 m/s"]
     arrows = figure.layout.annotations
     assert len(arrows) == guided_figures.WIND_ARROWS
     assert (arrows[0].ax, arrows[0].ay) == pytest.approx((-guided_figures.ARROW_PIXELS, 0.0), abs=1e-9)  # points to the east
-    assert not guided_figures.track_figure(log(), None, SPEED).layout.annotations
+    assert not guided_figures.track_figure(log(), [], SPEED).layout.annotations
 
 
 def test_commands_and_limits_are_drawn_in_display_units() -> None:
@@ -186,8 +186,7 @@ def flight() -> RecordedFlight:
 
 
 def test_the_figures_of_a_flight_are_those_of_its_scenario(flight: RecordedFlight) -> None:
-    route = guided_figures.flown_route(flight.scenario, flight.tape)
-    assert route is not None
+    (route,) = guided_figures.flown_routes(flight.scenario, flight.tape)
     assert isinstance(route.legs[0], Line)
     assert isinstance(route.legs[1], Arc)
     bounds = guided_figures.bounds_of(flight.scenario)
@@ -200,9 +199,9 @@ def test_a_comparison_draws_all_ground_tracks_over_the_route(flight: RecordedFli
     write_page(tmp_path / "page.html", [flight, other])
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page.count("<h2>Ground track</h2>") == 1
-    route = guided_figures.flown_route(flight.scenario, flight.tape)
+    routes = guided_figures.flown_routes(flight.scenario, flight.tape)
     tracks = {"one": (flight.tape, "#000000"), "two": (flight.tape, "#111111")}
-    figure = guided_figures.tracks_figure(tracks, route)
+    figure = guided_figures.tracks_figure(tracks, routes)
     assert [trace.name for trace in figure.data] == ["route", "one", "two"]
 
 

@@ -13,6 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aircraft_sim.jsbsim_trim import trim_solution
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.identification import (
     AUTHORITY_FRACTION,
@@ -210,6 +211,15 @@ def test_the_shipped_scenario_is_what_the_command_writes(cessna: IdentifiedAircr
 def f15() -> IdentifiedAircraft:
     """An aircraft whose sideslip grows while p and r are held, under guidance by rule."""
     return identify("f15", 180.0, 4572.0, guided=True)
+
+
+def test_the_stall_speed_of_guidance_is_the_slowest_trim(f15: IdentifiedAircraft) -> None:
+    section, condition = f15.scenario().guidance, f15.condition
+    assert section is not None
+    assert section.stall_speed is not None
+    trim_solution(condition._replace(speed=section.stall_speed + 0.01))  # rounded to four digits
+    with pytest.raises(FlightEnded, match="does not trim"):
+        trim_solution(condition._replace(speed=section.stall_speed - 0.011 * condition.speed))
 
 
 def test_guidance_with_sideslip_feedback_flies_holds_and_turns_of_the_f15(f15: IdentifiedAircraft) -> None:

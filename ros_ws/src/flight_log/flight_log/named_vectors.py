@@ -21,6 +21,9 @@ from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.vectors import FloatArray
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
+PATH = "nav_msgs/msg/Path"
+WAYPOINT = ("number", "north", "east", "altitude")
+"""Channels of a sample of a route: the number of the waypoint in its message, and m."""
 
 STAMP = slice(4, 12)  # int32 seconds and uint32 nanoseconds, after the 4 bytes of the encapsulation
 MAX_FLIGHT_TIME = 1e9  # s. A larger value is not a flight time.
@@ -95,6 +98,21 @@ def _position(marked: bytes, marks: FloatArray) -> slice:
     """The place of the values in a message that was serialised with marks."""
     start = marked.index(marks.tobytes())
     return slice(start, start + marks.nbytes)
+
+
+def decode_routes(messages: Sequence[bytes]) -> Decoded:
+    """Routes of nav_msgs/Path in the frame map (east, north, up): a sample with the channels WAYPOINT for each waypoint."""
+    store, samples, unreadable = typestore(), [], 0
+    for message in messages:
+        try:
+            route: Any = store.deserialize_cdr(message, PATH)
+        except SerdeError:
+            unreadable += 1
+            continue
+        points = [stamped.pose.position for stamped in route.poses]
+        rows = np.array([(k, point.y, point.x, point.z) for k, point in enumerate(points)]).reshape(-1, len(WAYPOINT))
+        samples.append(Samples(WAYPOINT, np.full(len(rows), stamp_of(message)), rows))
+    return Decoded(samples, unreadable)
 
 
 class _JointStateDecoder:

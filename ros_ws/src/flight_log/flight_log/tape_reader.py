@@ -21,10 +21,11 @@ from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import latency
-from flight_log.named_vectors import STAMP, Decoder, decoder, flight_start_ns, stamp_of
+from flight_log.named_vectors import PATH, STAMP, Decoder, decode_routes, decoder, flight_start_ns, stamp_of
 from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
 from flight_log.scan import Scan
 
+ROUTE = "route"
 BATCH = 4096  # messages that are decoded together
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace with one of these topics is that of an aircraft
 
@@ -171,8 +172,9 @@ class _Log:
         return None
 
     def samples_of(self, topic: str, type_name: str) -> _TopicSamples | None:
-        """The samples of a topic; None for a type without named vectors."""
-        if topic not in self.topics and (decode := decoder(topic, type_name)) is not None:
+        """The samples of a topic; None for a type without named vectors that is no route."""
+        is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
+        if topic not in self.topics and (decode := decode_routes if is_route else decoder(topic, type_name)) is not None:
             self.topics[topic] = _TopicSamples(decode)
         return self.topics.get(topic)
 
@@ -273,4 +275,5 @@ def _start_ns(signals: Mapping[str, Signal]) -> int:
         start_ns = flight_start_ns(int(truth.stamp_ns[0]), float(truth["t"][0]))
         if start_ns is not None:
             return start_ns
-    return min(int(signal.stamp_ns[0]) for signal in signals.values())
+    stamps = {name: int(signal.stamp_ns[0]) for name, signal in signals.items()}
+    return min([stamp_ns for name, stamp_ns in stamps.items() if name != ROUTE] or stamps.values())  # a route may have no stamp

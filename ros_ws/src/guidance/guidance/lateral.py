@@ -60,11 +60,11 @@ def bank_for(acceleration: Scalar, path_angle: Scalar, limit: float) -> Scalar:
 
 
 def least_period(speed: float, bank: float, roll_rate: float) -> float:
-    """Least period of path following, s: max(14, 1.5 V / (g tan(phi_max)), 7 phi_max / p_max).
+    """Least period of path following, s: max(14, 1.5 V / (g tan(phi_max)), 11 phi_max / p_max).
 
-    A bank reversal takes 2 phi_max / p_max. With a period of four such times a path following fell into a limit cycle.
+    A bank reversal takes 2 phi_max / p_max. With a period of 3.5 such times the osprey cycled in turbulence; 5.5 are asked for.
     """
-    return max(14.0, 1.5 * speed / (GRAVITY * math.tan(bank)), 7.0 * bank / roll_rate)
+    return max(14.0, 1.5 * speed / (GRAVITY * math.tan(bank)), 11.0 * bank / roll_rate)
 
 
 def least_radius(speed: float, wind: float, bank: float) -> float:

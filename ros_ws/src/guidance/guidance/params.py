@@ -145,7 +145,7 @@ class GuidanceParameters(KeyedParameters):
         require(floor < self.speed, "stall_speed", f"{self.stall_speed} m/s", f"a floor of 1.15 V_s below {self.speed:g} m/s")
         least = math.ceil(self.least_period() * 10.0) / 10.0
         fits = self.period is None or self.period >= least
-        rule = f"at least {least:g} s: max(14 s, 1.5 V0 / (g tan(bank)), 7 bank / roll_rate)"
+        rule = f"at least {least:g} s: max(14 s, 1.5 V0 / (g tan(bank)), 11 bank / roll_rate)"
         require(fits, "period", f"{self.period} s", rule)
         params = self.params()
         for start, target in self.program_steps():

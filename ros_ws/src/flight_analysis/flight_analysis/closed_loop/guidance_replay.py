@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Replay of guidance: each step computed again from its logged inputs and the state that the sample before holds."""
 
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,8 @@ from flight_core.tape import Tape
 from guidance import guidance, modes
 from guidance.modes import Begin, GuidanceState
 from guidance.params import GuidanceParameters
+from guidance.path import Route
+from guidance.route_file import Waypoint
 
 
 class GuidanceReplay(NamedTuple):
@@ -28,20 +31,32 @@ class GuidanceReplay(NamedTuple):
         return self.differing == 0
 
 
+def known_routes(tape: Tape, parameters: GuidanceParameters) -> dict[int, Route]:
+    """The route of the section and those that arrived in flight on the topic `route`, by digest, as `guidance` logs it."""
+    lists = [list(parameters.waypoints())]
+    if "route" in tape:
+        received = tape["route"]
+        starts = np.flatnonzero(received["number"] == 0.0)[1:]
+        lists += [[Waypoint(*row[1:]) for row in rows.tolist()] for rows in np.split(received.values, starts)]
+    routes = []
+    for waypoints in filter(None, lists):
+        with suppress(ParameterError):  # guidance has refused it, too
+            routes.append(parameters.plan(waypoints))
+    return {guidance.digest(route): route for route in routes}
+
+
 def replay_guidance(tape: Tape, parameters: GuidanceParameters | None) -> GuidanceReplay:
     """Compute every step of the topic `guidance` again, and the u_m that was published at its instant.
 
-    The legs of a route that arrived in flight are not in the log's scenario: steps on it are not checked. Raises ParameterError
-    for a log without the scenario's section of guidance, and for channels of another version.
+    Steps on a route that the log does not hold are not checked. Raises ParameterError for a log without the scenario's section
+    of guidance, and for channels of another version.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
     signal, t, outputs = tape["guidance"], tape.time("guidance"), parameters.outputs
     names = guidance.names(outputs)
     require(signal.names == names, "guidance", "other channels", "those that this version records")
-    waypoints = parameters.waypoints()
-    route = parameters.plan(waypoints) if waypoints else None
-    legs = {guidance.digest(each): each for each in (None, route)}
+    legs = {guidance.digest(None): None} | known_routes(tape, parameters)
     published = {} if "u_m" not in tape else dict(zip(tape["u_m"].stamp_ns.tolist(), tape["u_m"].values, strict=True))
     params, checked, differing = parameters.params(), 0, 0
     first: Difference | None = None

@@ -20,7 +20,7 @@ from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import AXES, Gusts
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, FlightCondition, Trim, WindModel
 from aircraft_sim.jsbsim_model import JsbsimModel
-from aircraft_sim.jsbsim_trim import sideslip_zero
+from aircraft_sim.jsbsim_trim import sideslip_zero, trim_solution
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -256,15 +256,16 @@ def identify(
     f. 5. A simulation in moderate turbulence with K and Lambda alone: the slew of its u replaces that of the ideal control,
     and gives beta. With `observer_margin`, the delay margin in s of the loop on y_dot = Omega u, an extended-state observer and
     the gains beside it replace them. 6. Simulations of the result: in calm air, with a gust, in turbulence. With `guided` the
-    scenario has guidance by rule in place of the pulses: a turn by 90 degrees and a climb by 100 m. Its sideslip feedback
-    flies an aircraft whose `sideslip_zero` is positive, too.
+    scenario has guidance by rule in place of the pulses: a turn by 90 degrees and a climb by 100 m. Its stall speed is that
+    of `slowest_trim`, and its sideslip feedback flies an aircraft whose `sideslip_zero` is positive, too.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its outputs and inputs cannot be
-    paired.
+    paired, or if the speed is below guidance's speed floor.
     """
     condition = FlightCondition(name, speed, altitude, nanoseconds(STEP))
     progress("trim")
     trim = _vehicle(condition).trim
+    stall = slowest_trim(condition) if guided else None
 
     def fly(u: FloatArray, duration: float) -> FloatArray:
         vehicle = _vehicle(condition)
@@ -285,7 +286,7 @@ def identify(
     setting = _setting(trim, measured.lag)
 
     def scenario_text(selection: Selection) -> str:
-        return _text(condition, trim, measured, commands, selection, guided)
+        return _text(condition, trim, measured, commands, selection, stall)
 
     progress("slew of the inputs")
     first = gain_selection.select_gains(studied, setting)
@@ -297,6 +298,22 @@ def identify(
     text = scenario_text(chosen)
     flights = fly_all(_load(text), progress)
     return IdentifiedAircraft(condition, trim, measured, coupling(scaled), chosen, text, sideslip_zero(condition), flights)
+
+
+def slowest_trim(condition: FlightCondition) -> float:
+    """The slowest airspeed at which an aircraft trims in level flight at an altitude, within 1 % of the condition's, m/s.
+
+    Below it lift or thrust is not enough, so guidance takes it as the stall speed. By bisection, from 0.2 of the condition's.
+    """
+    slow, fast = 0.2 * condition.speed, condition.speed
+    while fast - slow > 0.01 * condition.speed:
+        middle = (slow + fast) / 2.0
+        try:
+            trim_solution(condition._replace(speed=middle))
+            fast = middle
+        except FlightEnded:
+            slow = middle
+    return fast
 
 
 def _with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
@@ -443,6 +460,7 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
 /**/guidance:                  # what is left out follows by rule: docs/guidance.md
   ros__parameters:
     rate: 50.0                 # Hz
+    stall_speed: {{ stall | digits(4) }}          # m/s, the slowest airspeed at which it trims in level flight there
     program:                   # s, rad, m
       heading: {{ program.heading | flow }}
       altitude: {{ program.altitude | flow }}
@@ -460,9 +478,9 @@ def _text(
     steps: Responses,
     commands: Mapping[str, Any],
     selection: Selection,
-    guided: bool,
+    stall: float | None,
 ) -> str:
-    """The scenario file."""
+    """The scenario file. `stall`: V_s, m/s; guided where it is not None."""
     return SCENARIO_YAML.render(
         condition=condition,
         trim=trim,
@@ -475,7 +493,8 @@ def _text(
         gust={"start": GUST_START, "speed": GUST_SPEED, "length": GUST_LENGTH},
         turbulence=moderate_turbulence(condition.altitude),
         commands=commands,
-        guided=guided,
+        guided=stall is not None,
+        stall=stall,
         program={
             "heading": {"start": [TURN_START], "value": [TURN]},
             "altitude": {"start": [CLIMB_START], "value": [condition.altitude + CLIMB]},

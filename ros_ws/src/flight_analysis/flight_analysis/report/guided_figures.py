@@ -3,11 +3,12 @@
 """Figures of a guided flight: ground track, altitude, airspeed and attitude over their commands, cross-track error."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
 
+from flight_analysis.closed_loop.guidance_replay import known_routes
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report.figures import END_STOP, ERROR, MODE_COLOURS, PLANT, REFERENCE, WIND
@@ -15,7 +16,6 @@ from flight_analysis.report.plotting import INTERVAL_OPACITY, Curve, Interval, P
 from flight_analysis.report.summary import QUANTITY_UNITS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from guidance.guidance import digest
 from guidance.modes import Lateral, Mode, Vertical
 from guidance.path import Route, route_outline
 from rise_di_controller import guard
@@ -53,26 +53,25 @@ def bounds_of(scenario: Scenario) -> Bounds:
     }
 
 
-def flown_route(scenario: Scenario, tape: Tape) -> Route | None:
-    """The route of the scenario, if the log says that it was flown."""
-    waypoints = scenario.guidance.waypoints() if scenario.guidance is not None else ()
-    if scenario.guidance is None or not waypoints:
-        return None
-    route = scenario.guidance.plan(waypoints)
-    return route if np.any(tape["guidance"]["route"] == digest(route)) else None
+def flown_routes(scenario: Scenario, tape: Tape) -> list[Route]:
+    """The routes that the log says were flown: that of the scenario and those that arrived in flight."""
+    if scenario.guidance is None:
+        return []
+    flown = set(tape["guidance"]["route"].tolist())
+    return [route for digest, route in known_routes(tape, scenario.guidance).items() if digest in flown]
 
 
-def track_figure(tape: Tape, route: Route | None, speed: float) -> go.Figure:
-    """Ground track over the route with its fillets, equal axes, and arrows of the wind. `speed`: trim speed V0, m/s."""
-    figure = tracks_figure({"flown": (tape, PLANT)}, route)
+def track_figure(tape: Tape, routes: Sequence[Route], speed: float) -> go.Figure:
+    """Ground track over the routes with their fillets, equal axes, and arrows of the wind. `speed`: trim speed V0, m/s."""
+    figure = tracks_figure({"flown": (tape, PLANT)}, routes)
     _add_wind(figure, tape, speed)
     return set_layout(figure, TRACK_HEIGHT, labels=16)
 
 
-def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], route: Route | None) -> go.Figure:
-    """Ground tracks over a route, equal axes: the tape of a guided flight and its colour by label."""
+def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> go.Figure:
+    """Ground tracks over routes, equal axes: the tape of a guided flight and its colour by label."""
     figure = go.Figure()
-    if route is not None:
+    for route in routes:
         line = {"color": REFERENCE, "width": 6.0}
         north, east, _ = (np.array(values, dtype=np.float32) for values in zip(*route_outline(route), strict=True))
         figure.add_trace(go.Scatter(x=east, y=north, mode="lines", name="route", line=line, hoverinfo="skip"))

@@ -104,9 +104,9 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     guided = {label: flight for label, flight in zip(colours, flights, strict=True) if flight.summary["guidance"] is not None}
     if guided:
         first = next(iter(guided.values()))
-        route = guided_figures.flown_route(first.scenario, first.tape)
+        routes = guided_figures.flown_routes(first.scenario, first.tape)
         tracks = {label: (flight.tape, colours[label]) for label, flight in guided.items()}
-        sections.insert(0, Section("Ground track", "", guided_figures.tracks_figure(tracks, route), over_time=False))
+        sections.insert(0, Section("Ground track", "", guided_figures.tracks_figure(tracks, routes), over_time=False))
     return Page(f"{len(flights)} flights compared", lines, groups, sections, context.samples)
 
 
@@ -155,12 +155,12 @@ def _guidance_sections(flight: RecordedFlight, context: plotting.PlotContext) ->
     if flight.summary["guidance"] is None:
         return []
     speed, bounds = flight.scenario.aircraft.channels().speed, guided_figures.bounds_of(flight.scenario)
-    route, context = guided_figures.flown_route(flight.scenario, flight.tape), guided_figures.guided_context(context)
+    routes, context = guided_figures.flown_routes(flight.scenario, flight.tape), guided_figures.guided_context(context)
     return [
         Section(
             "Ground track",
             "Arrows: mean wind over a part of the flight, from the velocities over ground and through the air.",
-            guided_figures.track_figure(flight.tape, route, speed),
+            guided_figures.track_figure(flight.tape, routes, speed),
             over_time=False,
         ),
         Section(
