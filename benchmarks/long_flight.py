@@ -51,15 +51,24 @@ def triangle(minutes: float) -> Scenario:
     )
 
 
-def fly(scenario: Path, runs: Path) -> dict[str, list[int]]:
-    """Fly in lockstep; the memory of each process that lives on, by its command, bytes every PERIOD."""
-    command = [sys.executable, "-m", "flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", str(runs)]
+def fly(scenario: Path, runs: Path, *, together: bool) -> dict[str, list[int]]:
+    """Fly in lockstep; the memory of each process by its command, bytes every PERIOD."""
+    command = [
+        sys.executable,
+        "-m",
+        "flight_cli.cli",
+        "fly",
+        str(scenario),
+        "--one-process" if together else "--lockstep",
+        "--runs",
+        str(runs),
+    ]
     memory: dict[str, list[int]] = {}
     with psutil.Popen(command, stdout=subprocess.DEVNULL) as flight:
         while flight.poll() is None:
-            for process in flight.children(recursive=True):
+            for process in (flight, *flight.children(recursive=True)):
                 with suppress(psutil.Error):
-                    modules = [word for word in process.cmdline() if word.endswith(".main")]
+                    modules = [word for word in process.cmdline() if word.endswith((".main", ".cli"))]
                     if modules:
                         memory.setdefault(modules[0], []).append(process.memory_info().rss)
             time.sleep(PERIOD)
@@ -100,7 +109,7 @@ def figures(run: Path, memory: Mapping[str, list[int]]) -> dict[str, Any]:
     replay = replay_guidance(tape, scenario.guidance)
     half = {name: values[len(values) // 2] for name, values in memory.items()}
     return {
-        "outcome": tape.outcome,
+        "outcome": json.loads((run / "summary.json").read_text(encoding="utf-8"))["outcome"],
         "minutes": round((tape["y"].stamp_ns[-1] - tape.start_ns) / NANOSECONDS / 60.0, 3),
         "legs": int(log["leg"].max()),
         "samples missing": missing(tape, scenario),
@@ -121,6 +130,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0, help="of flight time")
     parser.add_argument("--runs", type=Path, help="folder for the run; by default it is removed")
+    parser.add_argument("--one-process", action="store_true", help="all nodes in one process")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         runs = options.runs or Path(folder)
@@ -128,7 +138,7 @@ def main() -> None:
         path = runs / "flown.yaml"
         path.write_text(scenario_yaml(triangle(options.minutes)), encoding="utf-8")
         begin = time.monotonic()
-        memory = fly(path, runs)
+        memory = fly(path, runs, together=options.one_process)
         took = time.monotonic() - begin
         run = (runs / "latest").resolve()
         print(json.dumps({"minutes it took": round(took / 60.0, 1)} | figures(run, memory), indent=1))
