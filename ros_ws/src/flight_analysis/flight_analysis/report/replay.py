@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flight_analysis.report.guided_figures import flown_route
+from flight_analysis.report.guided_figures import flown_routes
 from flight_analysis.report.plotting import PlotContext, pack, stored
 from flight_analysis.report.summary import NO_UNIT, RecordedFlight
 from flight_core.tape import Signal
@@ -46,11 +46,11 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
         return None
     if "internals" in tape:
         topics["internals"] = _topic(context, tape["internals"], {"mode": ""})
-    route = flown_route(flight.scenario, tape) if flight.summary["guidance"] is not None else None
+    routes = flown_routes(flight.scenario, tape) if flight.summary["guidance"] is not None else []
     info = {
         "units": {name: {"unit": unit.unit} for name, unit in context.units.items()},
         "modes": {int(mode): mode.name for mode in Mode},
-        "route": [] if route is None else route_outline(route),
+        "route": [point for route in routes for point in route_outline(route)],
     }
     return Replay({"topics": topics, "info": info}, pack(_code().encode()), (SCENE / "scene.css").read_text(encoding="utf-8"))
 
