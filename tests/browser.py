@@ -91,6 +91,11 @@ class Browser:
             time.sleep(0.02)
 
     @property
+    def pid(self) -> int:
+        """The process of the browser."""
+        return self._process.pid
+
+    @property
     def console(self) -> list[dict[str, Any]]:
         """Exceptions, console messages and log entries of the page."""
         self.run("0")  # earlier events arrive before this result

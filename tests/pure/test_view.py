@@ -25,16 +25,20 @@ from tests.conftest import REPOSITORY
 from tests.joint_states import JOINT_STATE, vector
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPResponse
 
+from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
-from flight_log.bag import BagWriter
+from flight_log.bag import BagWriter, LogAttachments
 from flight_log.disk import try_lock
+from flight_log.named_vectors import typestore
 from flight_view import server as http
-from flight_view.flight import MAX_TEXT, Flight
+from flight_view.flight import MAX_TEXT, ROUTE_TYPE, Flight
 from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
 from flight_view.text import picture
 from flight_view.watch import newest_run, require_log
+from guidance.path import route_outline
+from guidance.route_file import Waypoint
 
 TOKEN = "a-token"  # noqa: S105 - of a test
 CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())
@@ -64,7 +68,7 @@ def followed(flight: Flight) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np
         for name, part in columns.items():
             parts.setdefault(name, []).append(part)
         rows = {name: str(sum(len(t) for t, _ in pieces)) for name, pieces in parts.items()}
-        known = {"epoch": head["epoch"], "state": head["state"], "described": "true", **rows}
+        known = {"epoch": head["epoch"], "state": head["state"], "described": str(head["described"]), **rows}
         if not columns:
             return head, {name: tuple(map(np.concatenate, zip(*pieces, strict=True))) for name, pieces in parts.items()}  # type: ignore[misc]
 
@@ -204,6 +208,30 @@ def test_names_and_texts_of_a_log_are_bounded_and_printable(tmp_path: Path) -> N
     assert head["topics"][0]["channels"][0].startswith("<img src=x onerror=alert(1)>\\x1b[2J")
     assert head["faults"] == ["another aircraft in the namespace /other is not shown"]
     assert max(map(len, head["topics"][0]["channels"])) <= MAX_TEXT
+
+
+def test_a_route_that_is_given_in_flight_replaces_that_of_the_scenario(tmp_path: Path) -> None:
+    scenario = find_scenario("osprey_route")
+    store, given = typestore(), [(0.0, 0.0, 50.0), (0.0, 600.0, 55.0), (400.0, 600.0, 55.0)]  # east, north, altitude
+    made = {name: store.types[name] for name in (ROUTE_TYPE, *map("geometry_msgs/msg/{}".format, ("PoseStamped", "Pose")))}
+    time, header = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    point, turn = (store.types[f"geometry_msgs/msg/{name}"] for name in ("Point", "Quaternion"))
+    head = header(time(0, 0), "map")
+    pose = made["geometry_msgs/msg/Pose"]
+    poses = [made["geometry_msgs/msg/PoseStamped"](head, pose(point(*one), turn(0.0, 0.0, 0.0, 1.0))) for one in given]
+    with BagWriter(tmp_path / "run") as bag:
+        bag.add_attachments(LogAttachments(scenario.path), 0)
+        route = bag.add_topic("/route", ROUTE_TYPE, "")
+        bag.write(route, 1, 1, 0, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses), ROUTE_TYPE)))
+        bag.write(route, 2, 2, 1, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses[:1]), ROUTE_TYPE)))  # cannot be flown
+    flight = Flight(tmp_path / "run")
+    flight.update()
+    head_of, _ = decoded(answer(flight, {"described": "1"}))
+    assert scenario.guidance is not None
+    expected = route_outline(scenario.guidance.plan([Waypoint(north, east, altitude) for east, north, altitude in given]))
+    assert [tuple(one) for one in head_of["flight"]["route"]] == expected
+    assert [(one.kind, one.text) for one in flight.events] == [("route", "3 waypoints")]
+    assert "flight" not in decoded(answer(flight, {"described": str(head_of["described"])}))[0]
 
 
 # The server

@@ -5,7 +5,7 @@
 import math
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +31,7 @@ from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parame
 from flight_view.series import Series
 from guidance import modes as guidance
 from guidance.path import route_outline
+from guidance.route_file import Waypoint
 from rise_di_controller.guard import Mode
 
 RATE = 50.0  # Hz
@@ -48,6 +49,7 @@ GROUPS = {
 
 LOG, LOG_TYPE, WARN = "/rosout", "rcl_interfaces/msg/Log", 30  # rcl_interfaces/msg/Log: WARN=30
 CONTROL = "control"  # name of the node that carries out the requests of a page
+ROUTE, ROUTE_TYPE = "route", "nav_msgs/msg/Path"
 MAX_EVENTS, MAX_NOTES, MAX_CHANNELS = 5000, 50, 200
 BATCH = 2000  # messages that are decoded together
 MAX_TEXT = 400  # characters of a text from the log
@@ -58,7 +60,7 @@ class Event(NamedTuple):
     """An event of the flight. `stamp_ns` as in the samples, or by the clock of the host."""
 
     stamp_ns: int
-    kind: str  # "mode", "warning", "error", "parameter", "bridge" or "control"
+    kind: str  # "mode", "warning", "error", "parameter", "route", "bridge" or "control"
     text: str
 
 
@@ -86,6 +88,7 @@ class Flight:
             "modes": {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind in modes.items()},
         }
         self.notes: list[str] = []
+        self.described = 0  # counts the changes of `description`
         self.scenario: Scenario | None = None  # once it is read
         self.digest = 0  # of the controller's parameters in the newest tick; exact, as float32 it would not be
         self.bands: dict[str, float] = {}  # half-widths of the settling bands, SI
@@ -171,6 +174,8 @@ class Flight:
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             return math.inf
         namespace, _, name = topic.rpartition("/")
+        if (name, type_name) == (ROUTE, ROUTE_TYPE):
+            return math.inf
         if type_name != JOINT_STATE or name not in RATES:
             return 0.0
         if self._namespace is None:
@@ -195,6 +200,7 @@ class Flight:
                 path.write_bytes(record.data)
                 try:
                     self.scenario = load_scenario(path)
+                    self.described += 1
                     self.description |= _described(self.scenario)  # reads the airframe, maybe a file of another machine
                 except ParameterError as error:
                     self._note(f"units, limits and commands are unknown: {error}")
@@ -278,8 +284,23 @@ class Flight:
                 text = ", ".join(f"{name} = {value}" for name, value in changed.items())
                 if text:
                     self._add_event(Event(sent_ns, "parameter", f"{message.node.rpartition('/')[2]}: {text}"))
+            elif messages.type_name == ROUTE_TYPE:
+                places = [one.pose.position for one in message.poses]
+                self._take_route(sent_ns, [Waypoint(one.y, one.x, one.z) for one in places])
             else:
                 self._add_event(Event(sent_ns, "bridge", f"{message.key} {message.value}".strip()))
+
+    def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
+        """A route that was given in flight replaces the one before, unless guidance refuses it."""
+        guided = None if self.scenario is None else self.scenario.guidance
+        if guided is None:
+            return
+        try:
+            self.description["route"] = route_outline(guided.plan(waypoints))
+        except ParameterError:
+            return  # guidance says so in the log
+        self.described += 1
+        self._add_event(Event(sent_ns, ROUTE, f"{len(waypoints)} waypoints"))
 
     def _add_event(self, event: Event) -> None:
         if len(self.events) < MAX_EVENTS:

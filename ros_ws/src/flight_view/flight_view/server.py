@@ -161,9 +161,9 @@ def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False, con
         "topics": topics,
         "first_event": first["events"],
         "events": events,
-        "described": "units" in flight.description,
+        "described": flight.described,
     }
-    if known.get("described") != str(head["described"]).lower():
+    if known.get("described") != str(flight.described):
         head["flight"] = flight.description
     text = json.dumps(head, allow_nan=False).encode()
     text += b" " * (-(len(text) + 4) % 8)
