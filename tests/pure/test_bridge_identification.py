@@ -111,6 +111,37 @@ def test_a_longer_delay_lowers_the_bandwidths(identified: Identified, tmp_path: 
     assert (bandwidths(channels._replace(delay=channels.delay + 0.1)) < bandwidths(channels)).all()
 
 
+def channels_of_first_order(stiff: str, damping: float, stiffness: float, zero: float) -> Channels:
+    """Channels y_dot = Omega u, all but one."""
+    one = np.array([1.0 if name == stiff else 0.0 for name in MAP.outputs])
+    Omega = np.diag([5.0 if name == "V" else 80.0 for name in MAP.outputs])
+    return Channels(
+        Omega, 0.0 * one, 0.0 * one + 0.02, 0.0 * one + 0.1, damping * one, stiffness * one, zero * one, 0.0 * one
+    )  # fmt: skip
+
+
+def test_a_stiff_channel_gets_an_integral_by_which_its_loop_crosses_one_at_its_bandwidth(tmp_path: Path) -> None:
+    # a light airplane: below 30 rad/s it answers the elevator with a pitch rate, not with its derivative
+    damping, stiffness, zero = 39.0, 1000.0, 25.0
+    found = channels_of_first_order(stiff="q", damping=damping, stiffness=stiffness, zero=zero)
+    controller, k = flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml")).controller, list(MAP.outputs).index("q")
+    params, i = controller.law_params(), controller.outputs.index("q")
+    gain = params.K[i] * params.input_scale[i] * found.Omega[k, k]
+    integral = params.Lambda[i] + params.beta[i] / (params.K[i] * params.eps[i])  # the softened sign is one too
+    s = 1j * gain
+    loop = gain * (s + integral) / s * (s + zero) / (s**2 + damping * s + stiffness)
+    assert abs(loop) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_the_feedforward_of_a_coordinated_turn_needs_no_rudder_against_a_sideslip(tmp_path: Path) -> None:
+    """Rates of a steady turn, without sideslip: the rudder of the feedforward is N_r r / N_rudder, closed form."""
+    found = channels_of_first_order(stiff="r", damping=22.0, stiffness=470.0, zero=2.0)
+    model = flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml")).controller.feedforward
+    assert model is not None
+    n, r = len(model.states), list(model.states).index("r")
+    np.testing.assert_allclose(np.reshape(model.A, (n, n))[r], np.where(np.arange(n) == r, -20.0, 0.0))
+
+
 def test_a_channel_of_which_nothing_is_certain_is_refused(identified: Identified) -> None:
     response, models, _ = identified
     refused = response._replace(refusal=("", "V by thrust: found no movement, expected one", "", ""))

@@ -42,6 +42,8 @@ PAUSE = 1.5  # s, between the inputs
 REFERENCE_BANDWIDTH = 0.5  # of the loop: the reference model's natural frequency per bandwidth of a channel, at most
 MAX_NATURAL_FREQUENCY: Mapping[str, float] = {"q": 4.0, "p": 5.0, "r": 4.0, "V": 1.2}  # rad/s, those of `osprey_servo`
 FULL_RANGE_TIME = 1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
+MAX_SENSITIVITY = 2.0  # of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
+INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)  # of the wanted one, those that are tried
 AGE, HOLD, RAMP = (
     1.5,
     0.5,
@@ -198,13 +200,14 @@ class Flyable(NamedTuple):
 def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airframe_file: str) -> Flyable:
     """Gains for identified channels, and the texts of the airframe and of the scenario that fly them.
 
-    The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega u. Integrals cancel the
-    damping. The feedforward has the airframe as its model.
+    The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega u. The integrals follow
+    from damping and stiffness. The feedforward has the airframe as its model, in coordinated turns without sideslip.
     """
     pairing, _ = channel_pairs(channel_map)
-    delay = float(np.max(found.delay))
+    delay = float(np.min(found.delay))
+    later = found.lag + found.delay - delay  # the controller has one delay: what a channel has beyond it counts as its lag
     products = np.array([gain_selection.CROSSOVER_LAG_PRODUCTS[name] for name in pairing.outputs])
-    loop = Loop(found.lag, delay, 1.0 / RATE)
+    loop = Loop(later, delay, 1.0 / RATE)
     bandwidth = dict(zip(pairing.outputs, bandwidths(loop, products).tolist(), strict=True))
     rows = {name: channel_map.inputs[name] for name in pairing.inputs}
     authority = (
@@ -212,7 +215,7 @@ def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airf
     )
     throttle = rows[pairing.inputs[pairing.outputs.index("V")]] if "V" in pairing.outputs else next(iter(rows.values()))
     commands = _commands(pairing.outputs, bandwidth, speed, authority * min(-throttle.lower, throttle.upper))
-    lag = dict(zip(pairing.inputs, found.lag.tolist(), strict=True))
+    lag = dict(zip(pairing.inputs, later.tolist(), strict=True))
     ones = [1.0] * len(pairing.inputs)
     base = RiseDiParameters.validate_mapping(
         _controller(channel_map, pairing)
@@ -235,25 +238,61 @@ def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airf
     studied = gain_selection.study_airframe(integrators, manoeuvre._replace(duration=1.0), samples=1)
     studied = studied._replace(slew=np.maximum(slew, range_rate))
     selection = gain_selection.select_gains(studied, LoopSetting(base, RATE, lag, delay, {}))
-    flown = _with_damping(selection.engineering.controller, pairing, found, loop)
-    flown = gain_selection.with_feedforward(flown, frame)
+    flown = _with_integrals(selection.engineering.controller, pairing, found, loop)
+    turning = found if commands["coordinated_turn"] is None else _without_sideslip(found, pairing)
+    model = airframe_yaml(channel_map, pairing, turning, speed, "identified in flight, without sideslip")
+    flown = gain_selection.with_feedforward(flown, Airframe.validate_mapping(yaml.safe_load(model), "airframe"))
     heading = f"The aircraft behind the map {channel_map.name}, with gains from its identified response."
     text = scenario_text(heading, airframe_file, manoeuvre.duration, commands, flown.model_dump(exclude_defaults=True))
     return Flyable(flown, selection.engineering.delay_margin, airframe, text)
 
 
-def _with_damping(controller: RiseDiParameters, pairing: ChannelPairing, found: Channels, loop: Loop) -> RiseDiParameters:
-    """The controller with integrals that cancel the damping of channels of first order: K (s + damping) / s over s + damping.
+def _without_sideslip(found: Channels, pairing: ChannelPairing) -> Channels:
+    """Channels whose r has its damping alone: what holds the nose in a straight flight turns it in a coordinated turn.
 
-    Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals. The loop K / s has the margins that
-    the gains were selected for. Source: K. J. Astrom, T. Hagglund, "Advanced PID Control", 2006, 6.5 (lambda tuning).
+    The stiffness of r is N_beta, and beta_dot = -r + g / V phi is 0 there: a rudder against it would skid.
+    """
+    turns = np.array([name == "r" for name in pairing.outputs])
+    damping = np.where(turns, found.damping - found.zero, found.damping)
+    return found._replace(
+        damping=damping, stiffness=np.where(turns, 0.0, found.stiffness), zero=np.where(turns, 0.0, found.zero)
+    )
+
+
+def _with_integrals(controller: RiseDiParameters, pairing: ChannelPairing, found: Channels, loop: Loop) -> RiseDiParameters:
+    """The controller with integrals by which the loop of each channel's model crosses 1 where that of y_dot = Omega u does.
+
+    Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals of K (s + integral) / s. For first
+    order the integral is the damping, and the loop is K / s. A stiff channel answers u with a rate and needs a larger one.
+    It is lower where the sensitivity would exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund, "Advanced PID
+    Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
     """
     places = [pairing.outputs.index(name) for name in controller.outputs]
-    first_order = (found.stiffness == 0.0) & (found.zero == 0.0)
+    params = controller.law_params()
+    crossover = params.K * params.input_scale * np.abs(np.diag(found.Omega)[places])
     of_sign = 1.0 / (np.broadcast_to(controller.softening, (len(places),)) * loop.total[places])
-    cancelled = np.where(first_order, found.damping, 0.0)[places] - of_sign
-    Lambda = np.maximum(controller.Lambda, cancelled).tolist()
+    Lambda = [
+        max(float(own), _integral(found, i, float(K), float(loop.total[i])) - float(slope))
+        for own, i, K, slope in zip(controller.Lambda, places, crossover, of_sign, strict=True)
+    ]
     return RiseDiParameters.validate_mapping(controller.model_dump() | {"Lambda": Lambda}, "controller")
+
+
+def _integral(found: Channels, i: int, crossover: float, total_lag: float) -> float:
+    """The integral of a channel, 1/s, by which its loop crosses 1 at `crossover`, rad/s, or the largest safe one below."""
+    omega = np.geomspace(0.1, 1e3, 400) * crossover
+
+    def response(omega: Any) -> Any:
+        """Of K times the model, without its delay."""
+        s = 1j * omega
+        return crossover * (s + found.zero[i]) / (s**2 + found.damping[i] * s + found.stiffness[i])
+
+    wanted = crossover * np.sqrt(max(0.0, abs(response(crossover)) ** -2 - 1.0))
+    delayed = response(omega) * np.exp(-1j * omega * total_lag)
+    safe = (
+        one for one in wanted * INTEGRALS if np.min(np.abs(1.0 + delayed * (1.0 - 1j * one / omega))) > 1.0 / MAX_SENSITIVITY
+    )
+    return float(next(safe, 0.0))
 
 
 def measured_trims(channel_map: ChannelMap, would_send: Signal, engaged_ns: int) -> dict[str, float]:
