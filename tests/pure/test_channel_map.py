@@ -112,6 +112,24 @@ def test_each_input_of_a_map_states_its_own_trim(name: str) -> None:
     assert inputs.count("\n    trim: ") == len(load_map(name).inputs)
 
 
+MEASURED = {  # Hz, as the stack receives them from PX4 1.16.0 and ArduPlane 4.8.0-dev in SITL
+    "px4": {"vehicle_odometry": 99.2, "airspeed_validated": 9.9, "vehicle_status_v1": 2.0},
+    "ardupilot": {"imu/experimental/data": 139.0, "airspeed": 28.4, "pose/filtered": 28.4, "rc": 9.6, "status": 1.9},
+}
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_a_lost_message_does_not_end_an_engagement(name: str) -> None:
+    """Each age limit is longer than two periods at the measured rate."""
+    channel_map = load_map(name)
+    rows = (*channel_map.outputs.values(), *channel_map.pose.values(), *channel_map.trims.values())
+    ages = [(row.topic, row.max_age) for row in rows] + [(row.topic, row.max_age) for row in channel_map.conditions.values()]
+    for topic, rate in MEASURED[name].items():
+        found = [age for full, age in ages if full.removeprefix("/fmu/out/").removeprefix("/ap/") == topic]
+        assert found, topic
+        assert min(found) > 2.0 / rate, topic
+
+
 @pytest.mark.parametrize("name", MAPS)
 def test_each_map_is_a_dry_run_by_default_and_names_the_source_of_each_row(name: str) -> None:
     channel_map = load_map(name)
