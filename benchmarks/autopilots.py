@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,16 +26,19 @@ import yaml
 
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationParameters
+from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.design.bridge_identification import channel_pairs, experiment
 from flight_analysis.design.response_identification import MIN_RATIO, identify_response
 from flight_analysis.design.sign_check import check
+from flight_analysis.metrics import errors_by_part
+from flight_analysis.report.summary import transients
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
 from flight_log.engagements import Engagement
 from flight_log.tape_reader import read_run
 
 if TYPE_CHECKING:
-    from tests.sitl.kit import ArduPlane, Autopilot
+    from tests.sitl.kit import ArduPlane, Autopilot, Px4
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "build" / "autopilots"
@@ -62,7 +66,7 @@ def arduplane(servo: float) -> Iterator["ArduPlane"]:
 
 
 @contextmanager
-def px4() -> Iterator["Autopilot"]:
+def px4() -> Iterator["Px4"]:
     """PX4's airplane in flight; without an offboard heartbeat it changes to Hold."""
     from tests.sitl.kit import Px4  # noqa: PLC0415 - as above
 
@@ -97,8 +101,18 @@ def gains_of_slow_servos() -> dict[str, Any]:
 
 def gains_of_px4() -> dict[str, Any]:
     """PX4's airplane, by its own identification."""
-    with px4() as airplane:
-        return identified(airplane, airplane.patient_map(str(PX4_MAP)), 11.5)
+    with px4() as airplane, airplane.watching_truth() as truth:
+        result = identified(airplane, airplane.patient_map(str(PX4_MAP)), 11.5)
+        return result if "refused" in result else result | {"true_rms": true_errors(airplane, truth())}
+
+
+def true_errors(autopilot: "Autopilot", truth: Signal) -> dict[str, float]:
+    """The rms of the simulator's own rates less y_m while commanded, rad/s."""
+    log = read_run(autopilot.run)
+    (one,) = log.engagements or []
+    tape = replace(log.tape, signals={"y": truth.within([(one.start_ns, one.stop_ns or 2**62)]), "y_m": log.tape["y_m"]})
+    events = transients(load_scenario(autopilot.run / "scenario.yaml"), log.tape)
+    return {name: parts["command"].rms for name, parts in errors_by_part(tape, events).items()}
 
 
 def identified(autopilot: "Autopilot", channel_map: str, speed: float) -> dict[str, Any]:
@@ -280,10 +294,12 @@ def table_of_flight(result: dict[str, Any]) -> str:
     """Errors, delays and margin of a flight with identified gains."""
     if "refused" in result:
         return "Refused:\n\n    " + "\n    ".join(result["refused"].splitlines()[-1:]) + "\n"
+    true_rms = result.get("true_rms", {})
     rows = ["| channel | rms while commanded | y behind y_m (s) |", "| --- | ---: | ---: |"]
     for name, rms in result["rms"].items():
         shown = f"{rms:.3f} m/s" if name == "V" else f"{1e3 * rms:.1f} mrad/s"
-        rows.append(f"| {name} | {shown} | {result['behind'][name]:.2f} |")
+        true = f", true {1e3 * true_rms[name]:.1f} mrad/s" if name in true_rms else ""
+        rows.append(f"| {name} | {shown}{true} | {result['behind'][name]:.2f} |")
     limited = ", ".join(f"{name} {100 * share:.0f} %" for name, share in result["limited"].items())
     (one,) = result["engaged"]
     stop = "the end of the flight" if one["stop"] is None else f"{one['stop']:.0f} s ({one['reason']})"

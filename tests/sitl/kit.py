@@ -10,6 +10,7 @@ default python3.
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +27,7 @@ from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
 
 from autopilot_bridge.params import find_map
+from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
 
@@ -357,7 +360,13 @@ class Px4(Autopilot):
             with suppress(AssertionError):  # not running yet, or refused until its estimator is ready
                 self.say("commander", "takeoff")
                 armed = self.state()["arming_state"] == ARMED
-        self.until(lambda state: state["alt"] > 20.0)
+
+        def climbed(state: dict[str, Any]) -> bool:
+            if state["nav_state"] == HOLD and state["alt"] < 5.0:  # armed before its estimator had a position
+                self.say("commander", "takeoff")
+            return bool(state["alt"] > 20.0)
+
+        self.until(climbed)
         self.say("param", "set", "FW_AIRSPD_MIN", "8")
         self.say("param", "set", "FW_AIRSPD_TRIM", "11.2")
 
@@ -371,6 +380,41 @@ class Px4(Autopilot):
     def tool(self, name: str, *arguments: str) -> Process:
         """Start a tool of the kit in the autopilot's network."""
         return self._module(name, *arguments, path=str(self.tools))
+
+    def parameter(self, name: str) -> float:
+        """The value of a parameter of PX4."""
+        return float(self.say("param", "show", "-q", name).splitlines()[-1])
+
+    def restart(self) -> None:
+        """End PX4 and start it again, on the ground."""
+        self.kill("px4")()
+
+    @contextmanager
+    def watching_truth(self) -> Iterator[Callable[[], Signal]]:
+        """Ask the simulator for its own p, q, r ten times a second. What is given returns them, rad/s, by the system clock."""
+        asked: list[tuple[float, FloatArray]] = []  # s of the system clock; p, q, r
+        ended = Event()
+
+        def ask() -> None:
+            command = (str(self.script), "say", str(self.folder), "listener", "vehicle_angular_velocity_groundtruth", "-n", "1")
+            while not ended.wait(POLL):
+                answer = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=False).stdout
+                now = time.time()  # the client ends with the answer; most of its time goes by before the question
+                found = re.search(r"timestamp: \d+ \(([\d.]+) .*xyz: \[(.*?)\]", answer, re.DOTALL)
+                if found is not None:
+                    asked.append((now - float(found[1]), np.array([float(one) for one in found[2].split(",")])))
+
+        def truth() -> Signal:
+            stamps = np.round(np.array([t for t, _ in asked]) * 1e9).astype(np.int64)
+            return Signal(stamps, ("p", "q", "r"), np.array([rates for _, rates in asked]))
+
+        asking = Thread(target=ask)
+        asking.start()
+        try:
+            yield truth
+        finally:
+            ended.set()
+            asking.join()
 
     def mode_changed(self) -> float:
         """When nav_state changed last, s of the monotonic clock."""
