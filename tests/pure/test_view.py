@@ -31,6 +31,7 @@ from flight_core.tape import Tape
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.disk import try_lock
 from flight_log.named_vectors import typestore
+from flight_view import flight as followed_flight
 from flight_view import server as http
 from flight_view.flight import MAX_TEXT, ROUTE_TYPE, Flight
 from flight_view.series import Series
@@ -139,11 +140,15 @@ def test_the_state_tells_a_slow_recorder_from_a_killed_one(recorded: Path, tmp_p
     assert flight.state() == "ended"
 
 
-def test_long_logs_are_read_in_slices(recorded: Path) -> None:
+@pytest.mark.parametrize(("backlog", "state"), [(0, "reading"), (10**9, "recording")])
+def test_long_logs_are_read_in_slices_and_a_short_backlog_is_live(
+    backlog: int, state: str, recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(followed_flight, "LIVE_BACKLOG", backlog)
     flight, slices = Flight(recorded), 0
     while flight.update(budget=0.0):
         slices += 1
-        assert flight.state() in {"reading", "ended"}
+        assert flight.state() in {state, "ended"} or not flight.samples
     assert slices > 10
     whole = Flight(recorded)
     whole.update()

@@ -85,6 +85,11 @@ class Follower:
             self._path = next((file for file in bag_files(self.run) if file not in self._read_files), None)
         return self._path
 
+    @property
+    def backlog(self) -> int:
+        """Bytes of the file that have not been read. Raises as `path` and OSError."""
+        return 0 if self.path is None else self.path.stat().st_size - self._position
+
     def skip(self, topics: Container[str]) -> None:
         """Read no more messages of these topics, by their full names, in this file."""
         for channel in self._channels.values():

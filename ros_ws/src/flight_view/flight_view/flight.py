@@ -50,6 +50,7 @@ GROUPS = {
 LOG, LOG_TYPE, WARN = "/rosout", "rcl_interfaces/msg/Log", 30  # rcl_interfaces/msg/Log: WARN=30
 CONTROL = "control"  # name of the node that carries out the requests of a page
 ROUTE, ROUTE_TYPE = "route", "nav_msgs/msg/Path"
+LIVE_BACKLOG = 200_000  # bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading"
 MAX_EVENTS, MAX_NOTES, MAX_CHANNELS = 5000, 50, 200
 BATCH = 2000  # messages that are decoded together
 MAX_TEXT = 400  # characters of a text from the log
@@ -144,7 +145,7 @@ class Flight:
         ]
 
     def update(self, budget: float = math.inf) -> bool:
-        """Read for at most about `budget` s. Whether there was anything to read.
+        """Read for at most about `budget` s. Whether there was anything to read; the next call reads on.
 
         Raises ParameterError where the log cannot be read, or for a folder with several bags.
         """
@@ -157,7 +158,7 @@ class Flight:
                 else:
                     self._take_record(record)
                 if time.monotonic() > deadline:
-                    self._behind = True
+                    self._behind = self._follower.backlog > LIVE_BACKLOG
                     break
         except OSError as error:
             raise ParameterError(f"{self.run}: cannot be read ({error.strerror}), expected the log of a flight") from None
