@@ -51,6 +51,8 @@ FAULTS = (PYTHON, "-m", "benchmarks.faults", "--json", FILE, "--times")
 CAMPAIGN = (PYTHON, "-m", "benchmarks.campaign", "--json", FILE)
 FUZZ, REPLAY = ((PYTHON, "-m", "benchmarks.evidence", "--do", task, "--json", FILE) for task in ("fuzz", "replay"))
 QUICK_CAMPAIGN = (*CAMPAIGN, "--aircraft", "2000", "--chunk", "200", "--exact", "1")
+VIEW = (PYTHON, "-m", "benchmarks.view", "--json", FILE)
+QUICK_VIEW = (*VIEW, "--hours", "0.05", "--seconds", "20", "--count", "2")
 SECURITY = (*PYTEST, "tests/ros/test_security.py")
 READERS = "readers of files and messages, coverage-guided fuzzing"
 CAMPAIGN_OF = ("rise-di", "campaign", "--uncertainty", "0.3", "--seed", "7", "--json")
@@ -67,6 +69,7 @@ MEASUREMENTS = (
     Measurement("campaign-fleet", (*FLEET, "10000"), (*FLEET, "1000"), "uncertain aircraft flown by the same law", "1 min"),
     Measurement("campaign-missions", (*MISSIONS, "5000"), (*MISSIONS, "200"), "uncertain aircraft on a route", "3 min"),
     Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), "other laws on the same aircraft and course", "5 min"),
+    Measurement("view", VIEW, QUICK_VIEW, "the page beside a flight, and a log of one hour on it", "8 min", timed=True),
     Measurement("replay", REPLAY, (*REPLAY, "--seconds", "5"), "every scenario flown and replayed", "2 min"),
 )
 

@@ -1,15 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The cost of watching a flight: opening a long log, the server beside a flight, the delay to the screen, missed ticks.
+"""The cost of watching a flight: opening a long log, the server beside a flight, delays to the screen, missed ticks.
 
 .venv/bin/python -m benchmarks.view                      # all
 .venv/bin/python -m benchmarks.view open --hours 1       # a log of that length, read by the server
 .venv/bin/python -m benchmarks.view live --seconds 30    # a flight in real time, a client, and a browser where there is one
+.venv/bin/python -m benchmarks.view frozen               # a page whose process stops for 10 s, and how it comes back
 .venv/bin/python -m benchmarks.view flights --count 10   # that many flights with a client and as many without, in turns
 """
 
 import argparse
+import itertools
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -32,6 +35,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.vectors import FloatArray
 from flight_log.bag import BagWriter
 from flight_log.named_vectors import JOINT_STATE, STAMP
 from flight_log.stored_messages import StoredMessage, stored_messages
@@ -42,6 +46,8 @@ PIECE = 60.0  # s of flight that are repeated to a long log
 FLUSH_PERIOD_NS = nanoseconds(0.1)  # as the recorder
 START_S = 1_795_000_000  # s, stamps of today
 POLLS = 20.0  # Hz, of the client
+FREEZE, RECOVERED = 10.0, 0.3  # s: a page stops for so long, and is back when it is less behind than that
+FLIGHT_SECONDS = 6.0  # of each of the flights whose ticks are compared
 RISE_DI = str(Path(sys.executable).parent / "rise-di")
 
 
@@ -121,7 +127,7 @@ class Client(threading.Thread):
         head: dict[str, Any] = {}
         rows: dict[str, int] = {}
         while not self._ended.wait(1.0 / POLLS):
-            known = {"epoch": head.get("epoch", ""), "state": head.get("state", ""), "described": "true", **rows}
+            known = {name: head.get(name, "") for name in ("epoch", "state", "described")} | rows
             query = urllib.parse.urlencode(known)
             try:
                 content = self._opener.open(f"{self._base}data/0?{query}").read()
@@ -176,6 +182,7 @@ MEASURE = """(start => {
         if (time.textContent !== before && state.textContent === 'LIVE') {
             before = time.textContent;
             delays.push(Date.now() / 1e3 - start - parseFloat(before.slice(4)));
+            (window.instants ??= []).push(Date.now() / 1e3);
         }
         requestAnimationFrame(look);
     })();
@@ -211,6 +218,40 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
     return shown | ({"to the screen": percentiles(drawn[len(drawn) // 5 :])} if browser else {})
 
 
+def frozen(seconds: float = FREEZE) -> dict[str, Any]:
+    """A page whose process stops for so long: the delay when it goes on, and the time until it is below RECOVERED again, s."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        flying(Path(folder), seconds + 60.0) as (flight, run),
+        watching(run) as (_, address),
+        Browser(Path(folder) / "profile") as page,
+    ):
+        client = Client(address)
+        page.open(address)
+        page.wait_for("document.getElementById('state')?.textContent === 'LIVE'")
+        page.run(f"{MEASURE}({start_of(client)})")
+        time.sleep(3.0)
+        renderers = [one for one in psutil.Process(page.pid).children(recursive=True) if "--type=renderer" in one.cmdline()]
+        for one in renderers:
+            one.suspend()
+        time.sleep(seconds)
+        resumed = time.time()
+        for one in renderers:
+            one.resume()
+        page.wait_for(f"window.delays.length > 0 && delays.at(-1) < {RECOVERED} && instants.at(-1) > {resumed}")
+        time.sleep(4.0)
+        instants, delays = page.run("[instants, delays]")
+        flight.terminate()
+        flight.communicate()
+    after = [(instant - resumed, delay) for instant, delay in zip(instants, delays, strict=True) if instant > resumed]
+    return {
+        "frozen": seconds,
+        "delay at first": after[0][1],
+        "recovered after": next((since for since, delay in after if delay < RECOVERED), None),
+        "afterwards": percentiles([delay for since, delay in after if since > 1.0]),
+    }
+
+
 def start_of(client: Client) -> float:
     """System time of t = 0, s, as the page has it."""
     content = client._opener.open(f"{client._base}data/0").read()
@@ -239,30 +280,54 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
                     output, _ = flight.communicate()
             ticks = json.loads(output)["ticks"]
             results.append((ticks["without_new_y"], ticks["late_p99"]))
-    return {
+    shown: dict[str, Any] = {
         kind: {"missed": [missed for missed, _ in results], "late p99": [late for _, late in results]}
         for kind, results in found.items()
     }
+    for name in ("missed", "late p99"):
+        without, beside = (shown[kind][name] for kind in ("without", "with"))
+        shown |= {f"median of {name}": [float(np.median(without)), float(np.median(beside))]}
+        shown |= {f"probability of {name}": probability(np.subtract(beside, without))}
+    return shown
+
+
+def probability(differences: FloatArray) -> float:
+    """Of a mean difference this large or larger by chance, where watching has no effect: all signs of the pairs are alike.
+
+    Exact permutation test of paired samples; Edgington, Randomization Tests, 4th edition, 5.
+    """
+    signs = np.array(list(itertools.product((1.0, -1.0), repeat=len(differences))))
+    return float(np.mean(signs @ differences >= np.sum(differences) - 1e-12))
 
 
 def main() -> None:
     """Measure, and print the figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", choices=["open", "live", "flights", []], help="all by default")
+    parser.add_argument("parts", nargs="*", choices=["open", "live", "frozen", "flights", []], help="all by default")
     parser.add_argument("--hours", type=float, default=1.0, help="length of the log")
     parser.add_argument("--seconds", type=float, default=30.0, help="length of the live flight")
     parser.add_argument("--count", type=int, default=10, help="flights with a client, and as many without")
     parser.add_argument("--no-browser", action="store_true", help="measure without a browser on this machine")
+    parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()
-    parts = arguments.parts or ["open", "live", "flights"]
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    parts = arguments.parts or ["open", "live", "frozen", "flights"]
+    browser = CHROMIUM is not None and not arguments.no_browser
+    found: dict[str, Any] = {}
     if "open" in parts:
-        print(json.dumps({"open": open_log(arguments.hours)}, indent=2))
+        found["open"] = open_log(arguments.hours)
     if "live" in parts:
-        print(json.dumps({"live": live(arguments.seconds, browser=False)}, indent=2))
-        if CHROMIUM is not None and not arguments.no_browser:
-            print(json.dumps({"live with a browser": live(arguments.seconds, browser=True)}, indent=2))
+        found["live"] = live(arguments.seconds, browser=False)
+        if browser:
+            found["live with a browser"] = live(arguments.seconds, browser=True)
+    if "frozen" in parts and browser:
+        found["frozen"] = frozen()
     if "flights" in parts:
-        print(json.dumps({"flights": flights(arguments.count, 10.0)}, indent=2))
+        found["flights"] = flights(arguments.count, FLIGHT_SECONDS)
+    text = json.dumps(found, indent=2)
+    print(text)
+    if arguments.json is not None:
+        arguments.json.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -52,6 +52,13 @@ COVERAGE = {"status": 0, "covered": 1234, "number_of_executed_units": 98765, "pe
 CAMPAIGN: dict[str, Any] = {"whole": 120_000.0, "flown": 150_000.0, "memory_early": 900.0, "memory": 905.0, "aircraft": 10_000}
 CAMPAIGN |= {"plain": 50.0, "integration": {"q": 0.0021, "V": 0.0005}}
 SHARE = {"count": 3, "share": 3e-4, "low": 1e-4, "high": 9e-4}
+DELAYS = {"p50": 0.052, "p99": 0.26}
+BESIDE = {"processor": 0.027, "memory": 76.0, "traffic": 22_000.0}
+PAIRS = {"missed": [3, 0], "late p99": [0.0005, 0.00123]}
+VIEW: dict[str, Any] = {"live": BESIDE, "live with a browser": {"to the screen": DELAYS}}
+VIEW |= {"frozen": {"frozen": 10.0, "recovered after": 0.4}}
+VIEW |= {"open": {"flight": 3600.0, "first samples": 0.4, "whole log": 5.0, "processor": 4.6, "memory": 157.0, "log": 626.0}}
+VIEW |= {"flights": {"without": PAIRS, "with": PAIRS, "probability of missed": 0.5, "probability of late p99": 1.0}}
 FLEET = {"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}
 RESULTS = {
     "speed-node": result("speed-node", {"seconds": 10.0, "rows": NODE}),
@@ -61,6 +68,7 @@ RESULTS = {
     "campaign": result("campaign", CAMPAIGN),
     "campaign-fleet": result("campaign-fleet", {"cases": [FLEET]}),
     "compare": result("compare", COMPARED | {"laws": [LAW, PI]}),
+    "view": result("view", VIEW),
     "replay": result("replay", {"osprey_gust": {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": True}}),
 }
 
@@ -78,7 +86,7 @@ def test_no_line_of_prose_is_longer_than_the_width_and_no_command_is_broken() ->
 
 def test_the_page_has_every_section() -> None:
     titles = re.findall(r"^## (.+)$", page(), re.MULTILINE)
-    assert titles == ["Faults", "Speed", "Security", "Campaign", "Other laws", "Log"]
+    assert titles == ["Faults", "Speed", "Security", "Campaign", "Other laws", "Live view", "Log"]
 
 
 def test_without_results_the_page_holds_no_figure_but_the_command_for_each() -> None:
