@@ -365,6 +365,14 @@ def test_connections_beyond_the_limit_are_closed_and_free_ones_serve_again(recor
     against(recorded)(client)
 
 
+async def rest_of(reader: asyncio.StreamReader) -> bytes:
+    """What arrives until the server closes; it resets a connection of which it leaves bytes unread."""
+    try:
+        return await reader.read()
+    except ConnectionResetError:
+        return b""
+
+
 def test_a_request_that_arrives_slowly_or_is_too_long_is_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.3)
 
@@ -377,12 +385,12 @@ def test_a_request_that_arrives_slowly_or_is_too_long_is_closed(recorded: Path, 
                 await asyncio.sleep(0.05)
 
         slow = asyncio.ensure_future(drip())
-        assert await reader.read() == b""
+        assert await rest_of(reader) == b""
         slow.cancel()
         writer.close()
         reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
         writer.write(b"GET /" + b"a" * (2 * http.MAX_REQUEST_BYTES) + b" HTTP/1.1\r\n")
-        assert (await reader.read())[:12] in {b"", b"HTTP/1.1 400"}
+        assert (await rest_of(reader))[:12] in {b"", b"HTTP/1.1 400"}
         writer.close()
 
     against(recorded)(client)
