@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Engines that run the chunks of a campaign: threads of this process, or dask workers. The results are the same."""
 
+import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -10,6 +11,9 @@ from itertools import islice
 from typing import Any
 
 from flight_core.parameters import ParameterError
+
+CONNECT, RECONNECT = 10.0, 60.0
+"""s to wait for a scheduler at the start, and after its loss."""
 
 AHEAD = 2  # queued chunks a worker: enough to keep it busy, few enough for constant memory
 
@@ -43,32 +47,47 @@ def threads(workers: int | None = None) -> Engine:
 
 
 def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
-    """Processes of this machine, or the workers of a scheduler. The chunks of a worker that dies run again."""
+    """Processes of this machine, or the workers of a scheduler. The chunks of a worker that dies run again.
+
+    The chunks that a scheduler had when it was lost are given to it again, if it is back within RECONNECT.
+    """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
-        from distributed import Client, LocalCluster, as_completed  # noqa: PLC0415 - half a second, only for this engine
+        from distributed import CancelledError, Client, LocalCluster, as_completed  # noqa: PLC0415 - half a second
+        from distributed.comm import CommClosedError  # noqa: PLC0415 - as above
 
-        waiting, count = iter(jobs), workers or os.cpu_count() or 1
-        with ExitStack() as stack:
-            try:
-                if scheduler is None:
-                    cluster = stack.enter_context(LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None))
-                client = stack.enter_context(Client(scheduler or cluster, timeout="10s"))
-            except OSError as error:
-                raise ParameterError(f"--scheduler: found {scheduler}, expected a reachable dask scheduler ({error})") from None
-            ahead = AHEAD * max(count, len(client.scheduler_info()["workers"]))
-
-            def submit(job: Job) -> Any:
-                return client.submit(work, job, pure=False)  # never a cached result
-
-            underway = {submit(job): job for job in islice(waiting, ahead)}
-            done = as_completed(list(underway))
-            for future in done:
-                job, result = underway.pop(future), future.result()
-                for other in islice(waiting, 1):
-                    more = submit(other)
-                    underway[more] = other
-                    done.add(more)
-                yield job, result
+        waiting, count, patience = iter(jobs), workers or os.cpu_count() or 1, CONNECT
+        for part in ("", ".client", ".nanny", ".scheduler", ".worker"):  # they log the loss of a peer as tracebacks
+            logging.getLogger(f"distributed{part}").setLevel(logging.CRITICAL)
+        lost: list[Job] = []
+        while True:
+            underway: dict[Any, Job] = {}
+            with ExitStack() as stack:
+                try:
+                    if scheduler is None:
+                        cluster = stack.enter_context(
+                            LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None)
+                        )
+                    client = stack.enter_context(Client(scheduler or cluster, timeout=f"{patience:g}s"))
+                    ahead = AHEAD * max(count, len(client.scheduler_info()["workers"]))
+                except OSError as error:
+                    where = f"found {scheduler}, expected a reachable dask scheduler"
+                    raise ParameterError(f"--scheduler: {where} ({error})") from None
+                try:
+                    for job in [*lost, *islice(waiting, max(ahead - len(lost), 0))]:
+                        underway[client.submit(work, job, pure=False)] = job  # never a cached result
+                    done = as_completed(list(underway))
+                    for future in done:
+                        result = future.result()
+                        job = underway.pop(future)
+                        for other in islice(waiting, 1):
+                            more = client.submit(work, other, pure=False)
+                            underway[more] = other
+                            done.add(more)
+                        yield job, result
+                except (CancelledError, CommClosedError):
+                    lost, patience = list(underway.values()), RECONNECT
+                else:
+                    return
 
     return fly
