@@ -69,8 +69,8 @@ CHECKS = {"rise-di": rise_di, "make": make, "ros2": ros2, "python": python, "pyt
 
 
 def lines(page: Path) -> list[str]:
-    """The lines of the blocks of a page."""
-    text = page.read_text(encoding="utf-8")
+    """The lines of the blocks of a page; one that ends with a backslash goes on with the next."""
+    text = re.sub(r"\\\n *", "", page.read_text(encoding="utf-8"))
     return [*(line for block in SHELL.findall(text) for line in block.splitlines()), *INDENTED.findall(text)]
 
 
