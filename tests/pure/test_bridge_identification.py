@@ -142,6 +142,15 @@ def test_the_feedforward_of_a_coordinated_turn_needs_no_rudder_against_a_sidesli
     np.testing.assert_allclose(np.reshape(model.A, (n, n))[r], np.where(np.arange(n) == r, -20.0, 0.0))
 
 
+def test_a_command_of_speed_needs_half_of_the_thrust_in_the_end(tmp_path: Path) -> None:
+    """V_dot = Omega u - damping V rests at Omega u / damping: 5 m/s^2 per 1 of thrust, half of its limit, 2 1/s."""
+    found = channels_of_first_order(stiff="V", damping=2.0, stiffness=0.0, zero=0.0)
+    content = yaml.safe_load(flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml")).scenario)
+    thrust = MAP.inputs["thrust"]
+    expected = 0.5 * 5.0 * min(-thrust.lower, thrust.upper) / 2.0
+    assert content["/**/reference_model"]["ros__parameters"]["pulses"]["V"]["value"] == [pytest.approx(expected)]
+
+
 def test_a_channel_of_which_nothing_is_certain_is_refused(identified: Identified) -> None:
     response, models, _ = identified
     refused = response._replace(refusal=("", "V by thrust: found no movement, expected one", "", ""))

@@ -41,6 +41,7 @@ PAUSE = 1.5  # s, between the inputs
 
 REFERENCE_BANDWIDTH = 0.5  # of the loop: the reference model's natural frequency per bandwidth of a channel, at most
 MAX_NATURAL_FREQUENCY: Mapping[str, float] = {"q": 4.0, "p": 5.0, "r": 4.0, "V": 1.2}  # rad/s, those of `osprey_servo`
+HELD_FRACTION = 0.5  # of the limit of thrust, which the command of V needs in the end; the rest is for disturbances
 FULL_RANGE_TIME = 1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
 MAX_SENSITIVITY = 2.0  # of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
 INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)  # of the wanted one, those that are tried
@@ -210,11 +211,13 @@ def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airf
     loop = Loop(later, delay, 1.0 / RATE)
     bandwidth = dict(zip(pairing.outputs, bandwidths(loop, products).tolist(), strict=True))
     rows = {name: channel_map.inputs[name] for name in pairing.inputs}
-    authority = (
-        abs(float(found.Omega[pairing.outputs.index("V"), pairing.outputs.index("V")])) if "V" in pairing.outputs else 1.0
-    )
-    throttle = rows[pairing.inputs[pairing.outputs.index("V")]] if "V" in pairing.outputs else next(iter(rows.values()))
-    commands = _commands(pairing.outputs, bandwidth, speed, authority * min(-throttle.lower, throttle.upper))
+    authority = held = 1.0  # m/s^2, m/s
+    if "V" in pairing.outputs:
+        thrust = pairing.outputs.index("V")
+        row = rows[pairing.inputs[thrust]]
+        authority = abs(float(found.Omega[thrust, thrust])) * min(-row.lower, row.upper)
+        held = HELD_FRACTION * authority / max(float(found.damping[thrust]), 1e-3)
+    commands = _commands(pairing.outputs, bandwidth, speed, authority, held)
     lag = dict(zip(pairing.inputs, later.tolist(), strict=True))
     ones = [1.0] * len(pairing.inputs)
     base = RiseDiParameters.validate_mapping(
@@ -330,8 +333,10 @@ def _controller(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[str, A
     return common | limits | {"max_age": max_age, "hold": HOLD, "ramp": RAMP}
 
 
-def _commands(outputs: Sequence[str], bandwidth: Mapping[str, float], speed: float, authority: float) -> dict[str, Any]:
-    """The manoeuvre of `reference_parameters` after WAIT, by a reference model that the loop can follow."""
+def _commands(
+    outputs: Sequence[str], bandwidth: Mapping[str, float], speed: float, authority: float, held: float
+) -> dict[str, Any]:
+    """The manoeuvre of `reference_parameters` after WAIT, by a reference model that the loop can follow; V to `held` m/s."""
     commands = reference_parameters(speed, authority)
     frequency = dict(zip(commands["outputs"], commands["second_order"]["natural_frequency"], strict=True))
     damping = dict(zip(commands["outputs"], commands["second_order"]["damping"], strict=True))
@@ -341,6 +346,8 @@ def _commands(outputs: Sequence[str], bandwidth: Mapping[str, float], speed: flo
         for name, pulse in commands["pulses"].items()
         if name in outputs
     }
+    if "V" in pulses:
+        pulses["V"]["value"] = [round(min(value, held), 4) for value in pulses["V"]["value"]]
     turns = commands["coordinated_turn"] if {"p", "r"} <= set(outputs) else None
     return commands | {
         "rate": RATE,
