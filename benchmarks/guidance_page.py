@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Results of guidance, stored in build/guidance, and the page docs/evidence_guidance.md that is written from them."""
+
+import json
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from benchmarks.guidance_grid import Point
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+FOLDER = REPOSITORY / "build" / "guidance"
+PAGE = REPOSITORY / "docs" / "evidence_guidance.md"
+INTRODUCTION = """\
+# Evidence: guidance
+
+`python -m benchmarks.guidance` and `python -m benchmarks.long_flight` fly guidance by rule and write this page; what they
+mean is in [guidance](guidance.md) and [experiments](experiments.md#guidance-by-rule). *Italics* miss their limit. In
+turbulence a figure is the worst of the seeds.
+"""
+
+
+def store(name: str, result: Any) -> None:
+    """Keep a result with its date, and write the page again."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    dated = {"date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "result": result}
+    (FOLDER / f"{name}.json").write_text(json.dumps(dated, indent=1), encoding="utf-8")
+    results = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(FOLDER.glob("*.json"))}
+    PAGE.write_text(page(results), encoding="utf-8")
+
+
+def page(results: Mapping[str, Mapping[str, Any]]) -> str:
+    """The page from the stored results by name: "flights NAME", "grid NAME" and "long flight"."""
+    parts, makers = [INTRODUCTION], {"flights": _flights, "grid": _grid, "long": _long}
+    for name, stored in results.items():
+        kind, _, aircraft = name.partition(" ")
+        title, command, lines = makers[kind](aircraft, stored["result"])
+        parts += [f"## {title}\n\n    {command}    # {stored['date']}\n", "\n".join(lines) + "\n"]
+    return "\n".join(parts)
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Lines of a table in Markdown; its first column is text."""
+    yield "| " + " | ".join(heads) + " |"
+    yield "| --- |" + " ---: |" * (len(heads) - 1)
+    for row in rows:
+        yield "| " + " | ".join(row) + " |"
+
+
+def _flights(aircraft: str, rows: Any) -> tuple[str, str, list[str]]:
+    """Rows (manoeuvre, air, figure, value, limit, seeds)."""
+    cells = []
+    for manoeuvre, air, figure, value, limit, seeds in rows:
+        shown = f"{value:.3g}" if value <= limit else f"*{value:.3g}*"
+        cells.append((f"{manoeuvre}: {figure}", air + (f", {seeds} seeds" if seeds else ""), shown, f"{limit:.3g}"))
+    title, command = f"Holds and paths, {aircraft}", f"python -m benchmarks.guidance --only {aircraft}"
+    return title, command, list(table(("figure", "air", "worst", "limit"), cells))
+
+
+def _grid(aircraft: str, points: Any) -> tuple[str, str, list[str]]:
+    """Points as `guidance_grid.Point`."""
+    flown = [Point(*point) for point in points]
+    speeds = sorted({point.speed for point in flown})
+    by_place = {(point.altitude, point.speed): point.result for point in flown}
+    rows = [
+        [f"{altitude:g}", *(by_place.get((altitude, speed), "-") for speed in speeds)]
+        for altitude in sorted({point.altitude for point in flown})
+    ]
+    lost = [point for point in flown if point.result == "lost"]
+    sentence = f"{sum(point.result == 'ok' for point in flown)} of {len(flown)} points flown, {len(lost)} lost."
+    reasons = [f"- lost at {point.speed:g} m/s and {point.altitude:g} m: {point.reason}" for point in lost]
+    heads = ["altitude (m), airspeed (m/s)", *(f"{speed:g}" for speed in speeds)]
+    title, command = f"Off the design point, {aircraft}", f"python -m benchmarks.guidance --grid --only {aircraft}"
+    return title, command, [*table(heads, rows), "", sentence, *reasons]
+
+
+def _long(_: str, figures: Any) -> tuple[str, str, list[str]]:
+    """The figures of benchmarks/long_flight.py."""
+    text = "; ".join(f"{name}: {_shown(value)}" for name, value in figures.items()) + "."
+    lines = textwrap.wrap(f"The c172p round a triangle in turbulence of 1.5 m/s, in lockstep over topics. {text}", 118)
+    return "A long flight", f"python -m benchmarks.long_flight --minutes {figures['minutes']:.0f}", lines
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_shown(one)}" for name, one in value.items())
+    return ", ".join(map(_shown, value)) if isinstance(value, list) else str(value)
