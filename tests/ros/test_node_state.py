@@ -114,3 +114,32 @@ def test_the_state_of_a_node_in_another_flight_does_not_start_this_one(
     with pytest.raises(ParameterError, match="timed out waiting for controller"):
         start_stage(osprey_gust, tmp_path / "run")
     assert other.popen.poll() is None
+
+
+CLOSES_SLOWLY = """
+import signal, time
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+try:
+    print("up", flush=True)
+    time.sleep(60)
+except KeyboardInterrupt:
+    time.sleep(1.0)
+    print("closed")
+"""
+
+
+@pytest.mark.parametrize("executable", ["recorder", "one_process"])
+def test_the_process_that_closes_the_log_has_time_for_it(
+    executable: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, peer_node: Peer
+) -> None:
+    only_stage.write_text(CLOSES_SLOWLY, encoding="utf-8")
+    node = NodeSpec("fake", executable)
+    monkeypatch.setattr(processes, executable.upper(), node)
+    monkeypatch.setattr(processes, "STOP_TIMEOUT", 0.1)  # of the other nodes
+    with FlightMonitor(osprey_gust.controller.outputs, lockstep=True) as monitor:
+        flight = FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=False, one_process=False)
+        process = processes.NodeProcess(node, osprey_gust.path, {}, tmp_path / "node.log")
+        flight.processes.append(process)
+        peer_node.until(lambda: "up" in process.lines)
+        flight.stop()
+    assert "closed" in process.lines

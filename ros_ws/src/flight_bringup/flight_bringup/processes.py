@@ -34,7 +34,8 @@ from flight_core.parameters import ParameterError
 if TYPE_CHECKING:
     from flight_bringup.clients import FlightMonitor
 
-STOP_TIMEOUT = 2.5  # s, for all processes together; a node needs 0.2 s
+STOP_TIMEOUT = 2.5  # s, for all processes but the recorder together; a node needs 0.2 s
+CLOSE_TIMEOUT = 30.0  # s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log
 READY_TIMEOUT = 20.0  # s
 FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
 POLL_PERIOD = 0.005  # s, while nodes start
@@ -180,11 +181,11 @@ class FlightProcesses:
         return None
 
     def stop(self) -> None:
-        """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT."""
-        with handle_signals(signal.SIG_IGN):  # a second Ctrl-C must not interrupt this: it lasts STOP_TIMEOUT at most
-            deadline = time.monotonic() + STOP_TIMEOUT
-            for recorder in (False, True):
-                group = [process for process in self.processes if (process.node is RECORDER) is recorder]
+        """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT, and for the recorder CLOSE_TIMEOUT."""
+        with handle_signals(signal.SIG_IGN):  # a second Ctrl-C must not interrupt this: it would truncate the log
+            for recorder, timeout in ((False, STOP_TIMEOUT), (True, CLOSE_TIMEOUT)):
+                deadline = time.monotonic() + timeout
+                group = [process for process in self.processes if (process.node in {RECORDER, ONE_PROCESS}) is recorder]
                 for process in group:
                     if process.popen.poll() is None:
                         process.popen.terminate()  # not SIGINT, which gives a traceback while Python still imports
