@@ -100,7 +100,7 @@ def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
     """Exp of matrices. Cached, since new gains in flight are checked with the same plant."""
     from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
 
-    exponential = np.asarray(expm(np.frombuffer(matrices).reshape(shape)), dtype=np.float64)
+    exponential = np.asarray(expm(np.frombuffer(matrices).reshape(shape).copy()), dtype=np.float64)
     exponential.flags.writeable = False  # the cache returns it again
     return exponential
 
