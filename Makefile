@@ -3,6 +3,7 @@
 #
 # make fly     set up what is needed, fly the default scenario     make fly SCENARIO=... ARGS="--duration 10"
 # make test    set up what is needed, run all checks and tests
+# make test-fast   the quick tests without ROS, for the inner loop
 # make test-sitl   fly a real autopilot in software: docs/autopilots.md
 # make docs   write the site of docs/ to site/; make docs ARGS=serve shows it while it is written
 # make evidence   measure what has not been measured yet, write docs/evidence.md     make evidence ARGS="--again speed"
@@ -26,15 +27,21 @@ ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group docs --gro
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
 
-.PHONY: fly test test-sitl check docs evidence foxglove messages setup setup-all lock clean
+# Files of tests/ros come first: they wait more than they compute.
+XDIST = $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+
+.PHONY: fly test test-fast test-sitl check docs evidence foxglove messages setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
 
 test: check
 	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; \
-	  $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile tests/pure tests/docs tests/fuzz || status=$$?; \
-	  $(BIN)/python -m pytest tests/ros || status=$$?; exit $$status) # flights in real time have the host for themselves
+	  $(XDIST) --no-loadscope-reorder -m "not alone" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
+	  $(BIN)/python -m pytest -m alone tests/ros || status=$$?; exit $$status)
+
+test-fast: .venv/.all .venv/.workspace
+	@$(XDIST) --quiet -m "not slow" tests/pure
 
 test-sitl: setup-all
 	$(BIN)/python -m pytest tests/sitl $(ARGS)

@@ -26,6 +26,30 @@ few = settings(
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
+SLOW = {
+    "actuators", "any_plant", "bridge_identification", "campaign", "check_signs", "cli", "compare", "engagement",
+    "evidence", "excitation", "feedforward", "fleet", "gains", "guidance_benchmark", "guided_flight", "guided_report",
+    "identification", "jsbsim", "live_commands", "lyapunov", "model_identification", "observer_selection",
+    "observer_theory", "paper_identities", "repair", "replay", "report", "report_command", "report_page", "rival_laws",
+    "saturation", "schedule", "sensors", "servo_world", "signs", "simulate", "turbulence", "uncertainty", "view",
+    "view_control", "view_page",
+}  # fmt: skip
+"""Modules of tests/pure with seconds of processor time, which `make test-fast` leaves out."""
+
+ALONE = {"faults", "flight", "live_commands", "recorder"}
+"""Modules of tests/ros that fly in real time and measure it: `make test` runs them one after another, after all others."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of the modules above."""
+    for item in items:
+        folder = item.path.relative_to(REPOSITORY / "tests").parts[0]
+        name = item.path.stem.removeprefix("test_")
+        if folder == "pure" and name in SLOW:
+            item.add_marker("slow")
+        if folder == "ros" and name in ALONE:
+            item.add_marker("alone")
+
 
 @pytest.fixture(scope="session")
 def osprey_gust() -> Scenario:

@@ -9,6 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from tests.conftest import ALONE, SLOW
 from tests.pure.test_import_rule import imported
 
 SOURCES = Path(__file__).resolve().parents[2] / "ros_ws" / "src"
@@ -88,6 +89,12 @@ def test_executable_is_where_ros2_run_looks(package: str, executable: str) -> No
     path = INSTALLED / package / "lib" / package / executable
     assert path.is_file()
     assert path.stat().st_mode & 0o111
+
+
+def test_the_modules_that_the_tests_mark_exist() -> None:
+    tests = SOURCES.parents[1] / "tests"
+    assert {tests / "pure" / f"test_{name}.py" for name in SLOW} <= {*tests.glob("pure/*.py")}
+    assert {path.stem.removeprefix("test_") for path in tests.glob("ros/**/test_*.py")} >= ALONE
 
 
 def test_every_source_file_states_its_licence() -> None:

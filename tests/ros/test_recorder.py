@@ -259,18 +259,18 @@ def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
 
 
 @pytest.mark.usefixtures("publisher")
-def test_20_killed_recorders_lose_at_most_three_tenths_of_a_second(recorder: Recorder, tmp_path: Path, peer_node: Peer) -> None:
+def test_8_killed_recorders_lose_at_most_three_tenths_of_a_second(recorder: Recorder, tmp_path: Path, peer_node: Peer) -> None:
     generator = np.random.default_rng(1)
     witness = PolledSubscription(peer_node.node, Y, NEWEST_SAMPLES, raw=True)
     missing = []
     following = recorder("run0")
-    for k in range(20):
+    for k in range(8):
         process, folder = following, tmp_path / f"run{k}"
-        process.wait_for_log(folder, 50_000, timeout=30.0)
+        process.wait_for_log(folder, 50_000)
         while missing_seconds(folder, witness) > 0.2:  # at first it receives the history of 2 s that the publishers keep
             assert process.popen.poll() is None, process.output
         begin = {topic: sequences[-1] for topic, (_, sequences) in stamps_and_sequences(folder).items()}
-        if k < 19:
+        if k < 7:
             following = recorder(f"run{k + 1}")  # starts in the meantime
         with pytest.raises(subprocess.TimeoutExpired):  # the random instant of the kill is the test case
             process.popen.wait(float(generator.uniform(0.0, 0.3)))
@@ -291,11 +291,11 @@ def test_20_killed_recorders_lose_at_most_three_tenths_of_a_second(recorder: Rec
 
 def test_the_log_of_a_killed_recorder_is_reported_and_repairable(start: Start, osprey_gust: Scenario, tmp_path: Path) -> None:
     flight = start("flight_cli.cli", "fly", str(osprey_gust.path), "--duration", "30")
-    flight.wait_for_log(tmp_path / "runs", 150_000, timeout=30.0)
+    flight.wait_for_log(tmp_path / "runs", 150_000)
     node = flight.child("flight_recorder.main")
     killed_ns = time.time_ns()
     node.kill()
-    assert flight.end(60.0) == 3, flight.output
+    assert flight.end() == 3, flight.output
     assert "outcome: recorder was killed by SIGKILL" in flight.output
     run = (tmp_path / "runs" / "latest").resolve()
     before = read_run(run)
@@ -304,10 +304,10 @@ def test_the_log_of_a_killed_recorder_is_reported_and_repairable(start: Start, o
     assert {stored.name for stored in before.attachments} == {"parameters.yaml", "airframe.yaml"}
     filled = {name for name in before.metadata if before.metadata[name]}
     assert filled >= {"rise_di_flight", "rise_di_host", "rise_di_versions"}
-    report = start("flight_cli.cli", "report", str(run)).succeed(60.0)
+    report = start("flight_cli.cli", "report", str(run)).succeed()
     assert "is truncated: read up to its last complete chunk, t = " in " ".join(report.output.split())
     assert (run / "report.html").stat().st_size > 10_000
-    repair = start("flight_cli.cli", "repair", str(run)).succeed(60.0)
+    repair = start("flight_cli.cli", "repair", str(run)).succeed()
     assert "of the 30 s of the scenario" in repair.output
     assert count_messages(run)["/y"] == len(before.tape["y"].stamp_ns)
     after = read_run(run)
