@@ -19,7 +19,7 @@ from typing import Self
 import psutil
 import pytest
 from mcap.records import Channel, Message
-from tests.ros.peer import Peer, peer
+from tests.ros.peer import HANG, Peer, peer
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_log.scan import Scan
@@ -52,7 +52,7 @@ class Process:
         """The output so far."""
         return "\n".join(self.lines)
 
-    def wait_for(self, text: str, timeout: float = 30.0) -> Self:
+    def wait_for(self, text: str, timeout: float = HANG) -> Self:
         """Wait until a line contains the text."""
         with self._changed:
             logged = self._changed.wait_for(lambda: any(text in line for line in self.lines), timeout)
@@ -67,7 +67,7 @@ class Process:
         """Its child process of this module."""
         return next(child for child in self.children() if module in child.cmdline())
 
-    def until(self, condition: Callable[[], bool], timeout: float = 30.0) -> None:
+    def until(self, condition: Callable[[], bool], timeout: float = HANG) -> None:
         """Poll until a condition holds. The process must not end before."""
         deadline = time.monotonic() + timeout
         while not condition():
@@ -75,7 +75,7 @@ class Process:
             assert self.popen.poll() is None, self.output
             time.sleep(0.005)
 
-    def wait_for_log(self, folder: Path, size: int, timeout: float = 60.0) -> None:
+    def wait_for_log(self, folder: Path, size: int, timeout: float = HANG) -> None:
         """Wait until the logs below a folder have this size in bytes."""
         self.until(lambda: sum(path.stat().st_size for path in folder.rglob("*.mcap")) >= size, timeout)
 
@@ -93,12 +93,12 @@ class Process:
         self.popen.send_signal(signal.SIGINT)
         return self
 
-    def succeed(self, timeout: float = 30.0) -> Self:
+    def succeed(self, timeout: float = HANG) -> Self:
         """Wait for the end with status 0."""
         assert self.end(timeout) == 0, self.output
         return self
 
-    def end(self, timeout: float = 30.0) -> int:
+    def end(self, timeout: float = HANG) -> int:
         """Wait for the end. Returns the exit status."""
         try:
             status = self.popen.wait(timeout)

@@ -22,6 +22,7 @@ from flight_ros import transport
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
 
+HANG = 150.0  # s, until a test ends that makes no progress: a guard and no limit, which a busy host must not reach
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
 
 
@@ -38,7 +39,7 @@ class Peer:
             self.node.create_subscription(kind, topic, messages.append, qos)
         self._publishers: dict[str, Any] = {}
 
-    def until(self, condition: Callable[[], object], timeout: float = 20.0, each: Callable[[], None] | None = None) -> None:
+    def until(self, condition: Callable[[], object], timeout: float = HANG, each: Callable[[], None] | None = None) -> None:
         """Spin until the condition holds; `each` is called every 5 ms."""
         deadline = time.monotonic() + timeout
         while not condition():

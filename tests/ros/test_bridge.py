@@ -101,7 +101,7 @@ class BridgeSetup:
     def engage_by_command(self) -> None:
         """Engage by `rise-di engage`."""
         command = self._start("flight_cli.cli", "engage")
-        self.peer.until(lambda: command.popen.poll() is not None, timeout=60.0)
+        self.peer.until(lambda: command.popen.poll() is not None)
         command.succeed()
         self.wait_for_joys()
 
@@ -240,7 +240,7 @@ def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_t
         setup.peer.command(commanded, 0.0, 0.0, 0.0)
 
     received = setup.peer.received
-    setup.peer.until(lambda: received["y"] and received["bridge/would_send"], timeout=60.0, each=command)
+    setup.peer.until(lambda: received["y"] and received["bridge/would_send"], each=command)
     assert setup.engage(each=command) == ""
     setup.peer.until(lambda: len(setup.joys) > 10, each=command)
     stale = last
@@ -284,7 +284,7 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
     setup.bridge()
     player = start("flight_cli.cli", "play", str(bag), "--topics", ",".join(topics))
     command = partial(setup.peer.command, 0.1, 0.0, 0.0, 0.0)
-    setup.peer.until(lambda: player.popen.poll() is not None, timeout=60.0, each=command)
+    setup.peer.until(lambda: player.popen.poll() is not None, each=command)
     player.succeed()
     received = setup.peer.received["y"]
     assert len(received) > 50  # those with both topics fresh at a tick of the bridge
@@ -298,9 +298,9 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
 def test_rise_di_fly_starts_the_bridge_and_logs_the_autopilot_topics(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:
     setup.autopilot()
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "12", "--json")
-    setup.peer.until(lambda: setup.peer.received["bridge/would_send"], timeout=60.0)
+    setup.peer.until(lambda: setup.peer.received["bridge/would_send"])
     refused = start("flight_cli.cli", "engage")
-    setup.peer.until(lambda: flight.popen.poll() is not None, timeout=90.0)
+    setup.peer.until(lambda: flight.popen.poll() is not None)
     assert refused.end() == 1
     assert "error: not engaged: dry_run is true: nothing is sent" in refused.output
     flight.succeed()
@@ -326,11 +326,11 @@ def test_the_controller_is_active_only_while_engaged_and_the_summary_says_when_a
     duration = "25"
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send", "--duration", duration, "--json")
     engaged = start("flight_cli.cli", "engage")  # before the nodes run: it waits for the first u
-    setup.peer.until(lambda: engaged.popen.poll() is not None, timeout=60.0)
+    setup.peer.until(lambda: engaged.popen.poll() is not None)
     engaged.succeed()
     setup.peer.until(lambda: any(any(u.position) for u in setup.peer.received["u"]))
     off = start("flight_cli.cli", "engage", "--off")
-    setup.peer.until(lambda: flight.popen.poll() is not None, timeout=90.0)
+    setup.peer.until(lambda: flight.popen.poll() is not None)
     off.succeed()
     flight.succeed()
     run = tmp_path / "runs" / "latest"
@@ -358,9 +358,9 @@ def test_identify_excites_the_autopilot_and_writes_what_flies_it(setup: BridgeSe
     Path(setup.map).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     setup.autopilot()
     identify = start("flight_cli.cli", "identify", "--bridge", setup.map, "--speed", "25", "--write", "found", "--json")
-    setup.peer.until(lambda: setup.peer.received["bridge/would_send"], timeout=60.0)
+    setup.peer.until(lambda: setup.peer.received["bridge/would_send"])
     setup.engage_by_command()
-    setup.peer.until(lambda: identify.popen.poll() is not None, timeout=120.0)
+    setup.peer.until(lambda: identify.popen.poll() is not None)
     identify.succeed()
     found = json.loads(identify.lines[-1])
     assert found["inputs"] == ["aileron"]
@@ -378,7 +378,7 @@ def test_a_flight_without_the_topics_of_its_autopilot_ends_with_the_sentence_of_
 ) -> None:
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "60")
     setup.peer.node.create_publisher(TwistStamped, "/ap/airspeed", 10)
-    setup.peer.until(lambda: flight.popen.poll() is not None, timeout=60.0)
+    setup.peer.until(lambda: flight.popen.poll() is not None)
     assert flight.end() == 3
     assert "bridge ended with status 3: no y after 20 s: " in flight.output
     assert (

@@ -48,7 +48,7 @@ class Page:
             found = self.post("state")[1]
             return found | expected == found
 
-        flight.until(as_expected, 60.0)
+        flight.until(as_expected)
         return found
 
 
@@ -81,7 +81,7 @@ def test_a_flight_is_commanded_from_its_page_recorded_and_replayed(start: Start,
     assert page.post("activate")[0] == 200
     time.sleep(1.5)  # the gust of 10 m at 25 m/s
     flight.interrupt()
-    assert flight.end(timeout=60.0) == 130, flight.output
+    assert flight.end() == 130, flight.output
     assert watch.interrupt().end() == 0, watch.output
 
     changes = parameter_changes(run, "aircraft", {"actuators": None, "sensors": None, "gusts": None})
@@ -92,5 +92,5 @@ def test_a_flight_is_commanded_from_its_page_recorded_and_replayed(start: Start,
     assert abs(tape["truth"]["gust.vertical"]).max() > 2.0
     assert abs(tape["truth"]["noise.q"][-1] - 0.01) < 1e-9
     replayed = start("flight_cli.cli", "replay", str(run), "--json")
-    assert replayed.end(60.0) == 0, replayed.output
+    assert replayed.end() == 0, replayed.output
     assert json.loads(replayed.output)["equal"]

@@ -4,7 +4,6 @@
 
 import json
 import signal
-import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -68,7 +67,7 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
     # more than a quarter of its period, or the aircraft by more than a sample.
     all_late = True
     for _ in range(4):
-        start("flight_cli.cli", "fly", str(short_scenario)).succeed(60.0)
+        start("flight_cli.cli", "fly", str(short_scenario)).succeed()
         run = (tmp_path / "runs" / "latest").resolve()
         tape = read_run(run).tape
         ticks = json.loads((run / "summary.json").read_text(encoding="utf-8"))["ticks"]
@@ -130,11 +129,11 @@ def test_a_second_interrupt_does_not_interrupt_the_shutdown(engaged: Engaged, tm
     assert read_run(next((tmp_path / "runs").glob("*-short"))).tape.notes == ()  # the recorder closed its file
 
 
-@pytest.mark.parametrize("seconds", [0.3, 1.0])  # an earlier interrupt stops the interpreter itself
+@pytest.mark.parametrize("seconds", [0.3, 0.6])  # of processor time; an earlier interrupt stops the interpreter itself
 def test_an_early_interrupt_causes_no_traceback(seconds: float, start: Start, short_scenario: Path) -> None:
     flight = start("flight_cli.cli", "fly", str(short_scenario))
-    with pytest.raises(subprocess.TimeoutExpired):  # the instant of the interrupt is the test case
-        flight.popen.wait(seconds + 0.05)
+    used = psutil.Process(flight.popen.pid).cpu_times
+    flight.until(lambda: used().user + used().system >= seconds)
     nodes = flight.children()
     flight.interrupt()
     assert flight.end() in {130, -signal.SIGINT}, flight.output
@@ -156,7 +155,7 @@ def test_a_flight_with_a_wrong_sign_ends_when_it_diverges(start: Start, short_sc
     text = short_scenario.read_text(encoding="utf-8")
     wrong.write_text(text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"), encoding="utf-8")
     flight = start("flight_cli.cli", "fly", str(wrong))
-    assert flight.end(60.0) == 3
+    assert flight.end() == 3
     assert "aircraft ended with status 3: diverged at t = " in flight.output
     in_process = start("flight_cli.cli", "fly", str(wrong), "--in-process")
     assert in_process.end() == 3

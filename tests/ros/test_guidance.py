@@ -205,11 +205,11 @@ def test_the_wings_are_levelled_when_guidance_is_stopped_or_killed_in_a_turn(cal
     def turn() -> None:
         peer_node.publish("target", to_message(time.time_ns(), ["phi"], np.array([0.5]), "/operator#1"))
 
-    peer_node.until(lambda: phi() > 0.25, timeout=60.0, each=turn)
+    peer_node.until(lambda: phi() > 0.25, each=turn)
     with guidance.stopped():
         nodes["reference_model"].wait_for("/u_m timed out: wings are levelled")
         peer_node.until(lambda: abs(phi()) < math.radians(5.0))
-    peer_node.until(lambda: phi() > 0.4, timeout=60.0)  # it goes on
+    peer_node.until(lambda: phi() > 0.4)  # it goes on
     guidance.popen.kill()
     peer_node.received["pose"].clear()
     peer_node.until(lambda: peer_node.received["pose"] and abs(phi()) < math.radians(5.0))

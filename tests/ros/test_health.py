@@ -7,12 +7,13 @@ import sys
 
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Start
+from tests.ros.peer import HANG
 
 HEALTH = REPOSITORY / "docker" / "health.py"
 
 
 def check(*names: str) -> tuple[int, str]:
-    result = subprocess.run([sys.executable, str(HEALTH), *names], capture_output=True, text=True, timeout=30, check=False)
+    result = subprocess.run([sys.executable, str(HEALTH), *names], capture_output=True, text=True, timeout=HANG, check=False)
     return result.returncode, result.stdout
 
 

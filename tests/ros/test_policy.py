@@ -78,7 +78,7 @@ def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
         return found == before and all(one.publish and one.reply for one in found.values())
 
     for _ in range(3):  # the endpoints of a node are discovered one by one
-        peer_node.until(settled, timeout=60.0)
+        peer_node.until(settled)
         peer_node.spin(0.5)
     return found
 
@@ -90,7 +90,7 @@ def test_the_policy_allows_exactly_the_topics_and_services_of_nodes(start_node: 
     policy, packages = allowed(), ("rise_di_controller", "reference_model", "aircraft_sim", "flight_recorder")
     processes = [start_node(package) for package in packages]
     for process in processes:
-        process.wait_for("ready", timeout=60.0)
+        process.wait_for("ready")
     real_time = discovered(peer_node, ROLES)
     for process in processes:
         process.interrupt()
@@ -108,7 +108,7 @@ def test_the_policy_allows_exactly_those_of_guidance(start: Start, tmp_path: Pat
     for lockstep in (False, True):
         overrides = parameter_overrides(GUIDANCE, scenario, tmp_path, 0.0, lockstep=lockstep)
         words = (word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}"))
-        node = start("guidance.main", "--ros-args", "--params-file", str(scenario.path), *words).wait_for("ready", timeout=60.0)
+        node = start("guidance.main", "--ros-args", "--params-file", str(scenario.path), *words).wait_for("ready")
         found = found.merged(discovered(peer_node, ("guidance",))["guidance"])
         node.interrupt()
         node.end()

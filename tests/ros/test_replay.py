@@ -37,7 +37,7 @@ def replayed(start: Start, run: Path, *settings: str, status: int = 0) -> dict[s
 def receive_more(peer_node: Peer, count: int) -> None:
     """Wait for further samples of `internals`."""
     enough = len(peer_node.received["internals"]) + count
-    peer_node.until(lambda: len(peer_node.received["internals"]) >= enough, timeout=60.0)
+    peer_node.until(lambda: len(peer_node.received["internals"]) >= enough)
 
 
 def with_limits(path: Path) -> Path:
@@ -53,7 +53,7 @@ def test_lockstep_with_feedforward_saturation_and_lost_samples_is_replayed(
     options: tuple[str, ...], start: Start, tmp_path: Path
 ) -> None:
     flight = start("flight_cli.cli", "fly", str(with_limits(scenario_file(tmp_path, 4.0, aircraft=ROUGH))), *options)
-    flight.succeed(120.0)
+    flight.succeed()
     run = tmp_path / "runs" / "latest"
     output = replayed(start, run)
     assert output["ticks"] == output["checked"] > 300
@@ -71,7 +71,7 @@ def test_a_flight_in_real_time_is_replayed_with_parameter_changes_outages_and_a_
     def modes() -> list[int]:
         return peer_node.modes()[-1:]
 
-    peer_node.until(lambda: modes() == [Mode.ENGAGED], timeout=60.0)
+    peer_node.until(lambda: modes() == [Mode.ENGAGED])
     assert set_parameters(peer_node, k_g=1.5, Lambda=[4.0, 4.0, 2.0, 0.4])[0]
     receive_more(peer_node, 50)
     assert set_parameters(peer_node, upper=[0.01] * 4)[0]
@@ -86,7 +86,7 @@ def test_a_flight_in_real_time_is_replayed_with_parameter_changes_outages_and_a_
     peer_node.until(lambda: modes() == [Mode.ENGAGED])
     receive_more(peer_node, 50)
     flight.interrupt()
-    assert flight.end(timeout=60) == 130, flight.output
+    assert flight.end() == 130, flight.output
     run = tmp_path / "runs" / "latest"
     output = replayed(start, run)
     assert output["ticks"] == output["checked"] > 150
@@ -100,7 +100,7 @@ def test_the_log_of_a_killed_recorder_is_replayed(start: Start, tmp_path: Path) 
     flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 30.0, "osprey_gust")), "--lockstep")
     flight.wait_for_log(tmp_path, 200_000)
     flight.child("flight_recorder.main").kill()
-    assert flight.end(timeout=60) == 3, flight.output
+    assert flight.end() == 3, flight.output
     output = replayed(start, tmp_path / "runs" / "latest")
     assert output["ticks"] == output["checked"] > 100
     assert any("is truncated" in note for note in output["notes"])
@@ -114,7 +114,7 @@ def test_a_late_recorder_leaves_its_first_tick_unchecked_and_notes_the_missing_s
     for package in ("rise_di_controller", "aircraft_sim", "reference_model"):
         start(f"{package}.main", *parameters)
     more_than_history = PUBLISH.depth + 200
-    peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_history, timeout=90.0)
+    peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_history)
     recorder = start("flight_recorder.main", *parameters, "-p", f"scenario_file:={scenario}", "-p", "directory:=run")
     recorder.wait_for("recording to")
     receive_more(peer_node, 201)
