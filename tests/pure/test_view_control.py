@@ -82,6 +82,16 @@ def test_gains_are_set_together_seen_in_the_log_and_undone(desk: Desk, osprey_gu
     with_desk(desk, steps)
 
 
+def test_gains_may_be_set_before_the_first_tick(desk: Desk) -> None:
+    async def steps(desk: Desk) -> None:
+        desk.flight.digest = 0
+        state = await desk.ask("state")
+        assert (state["digest"] != state["logged"], state["logged"]) == (True, "000000000000")
+        await desk.ask("gains", digest=state["digest"], values={"k_g": [1.1 * desk.nodes.values["controller"]["k_g"]]})
+
+    with_desk(desk, steps)
+
+
 def test_a_set_on_top_of_the_change_of_another_program_is_refused(desk: Desk) -> None:
     async def steps(desk: Desk) -> None:
         digest = (await desk.ask("state"))["digest"]

@@ -224,8 +224,9 @@ class Control:
         ]
 
     def _refresh(self, request: Mapping[str, Any]) -> str:
-        """Read the controller's parameters where the log shows others than those that are known."""
-        if self._flight.scenario is not None and self._flight.digest != self._digest and "controller" in self._link.nodes():
+        """Read the controller's parameters at first, and where the log shows others than those that are known."""
+        stale = not self._digest or self._flight.digest not in {0, self._digest}  # 0 before the first tick
+        if stale and self._flight.scenario is not None and "controller" in self._link.nodes():
             self._read()
         return ""
 
