@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A campaign on a cluster of dask that loses a worker, has a slow one, and whose scheduler starts anew: the same bytes.
+"""A campaign on a cluster of dask that loses a worker, has a slow one, and whose scheduler starts again: the same bytes.
 
 python -m benchmarks.cluster              # a scheduler and four workers, each a process with an address of its own; 5 min
 """
