@@ -80,7 +80,10 @@ def _grid(aircraft: str, points: Any) -> tuple[str, str, list[str]]:
 def _long(_: str, figures: Any) -> tuple[str, str, list[str]]:
     """The figures of benchmarks/long_flight.py."""
     text = "; ".join(f"{name}: {_shown(value)}" for name, value in figures.items()) + "."
-    lines = textwrap.wrap(f"The c172p round a triangle in turbulence of 1.5 m/s, in lockstep over topics. {text}", 118)
+    lines = textwrap.wrap(
+        f"The c172p round a triangle in turbulence of 1.5 m/s, in lockstep over topics. {text} At its end flight_cli writes the report.",
+        118,
+    )
     return "A long flight", f"python -m benchmarks.long_flight --minutes {figures['minutes']:.0f}", lines
 
 
