@@ -14,6 +14,7 @@ from benchmarks.guidance_grid import Point
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "build" / "guidance"
 PAGE = REPOSITORY / "docs" / "evidence_guidance.md"
+REPORT = "At its end flight_cli writes the report."
 INTRODUCTION = """\
 # Evidence: guidance
 
@@ -81,7 +82,7 @@ def _long(_: str, figures: Any) -> tuple[str, str, list[str]]:
     """The figures of benchmarks/long_flight.py."""
     text = "; ".join(f"{name}: {_shown(value)}" for name, value in figures.items()) + "."
     lines = textwrap.wrap(
-        f"The c172p round a triangle in turbulence of 1.5 m/s, in lockstep over topics. {text} At its end flight_cli writes the report.",
+        f"The c172p round a triangle in turbulence of 1.5 m/s, in lockstep over topics. {text} {REPORT}",
         118,
     )
     return "A long flight", f"python -m benchmarks.long_flight --minutes {figures['minutes']:.0f}", lines
