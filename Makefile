@@ -44,7 +44,7 @@ test-fast: .venv/.all .venv/.workspace
 	@$(XDIST) --quiet -m "not slow" tests/pure
 
 test-sitl: setup-all
-	$(BIN)/python -m pytest tests/sitl $(ARGS)
+	$(BIN)/python -m pytest tests/sitl -m "not long" $(ARGS)
 
 foxglove: setup
 	$(INSTALL) --group foxglove

@@ -10,27 +10,34 @@ The kit is that of `make test-sitl`: docs/autopilots.md. build/autopilots/ has t
 """
 
 import argparse
+import fcntl
 import json
 import os
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
+from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationParameters
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.design.bridge_identification import channel_pairs, experiment
+from flight_analysis.design.identification import NOISE_SHARE
+from flight_analysis.design.observer_selection import with_extended_state_observer
 from flight_analysis.design.response_identification import MIN_RATIO, identify_response
 from flight_analysis.design.sign_check import check
-from flight_analysis.metrics import errors_by_part
+from flight_analysis.metrics import errors_by_part, in_spans
+from flight_analysis.report.guided import control_errors
 from flight_analysis.report.summary import transients
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
@@ -45,11 +52,15 @@ FOLDER = REPOSITORY / "build" / "autopilots"
 PAGE = REPOSITORY / "docs" / "evidence_autopilots.md"
 EXAMPLE = REPOSITORY / "examples" / "arduplane" / "scenario.yaml"
 PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
+LOCK: Path | None = None  # --lock
 ENGAGEMENTS, LARGEST_STEP = 20, 0.02  # of the range of a setpoint
 WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
 PERIODS = {"elevator": 4.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}  # s, of the multisines of the experiments on signs
 STRONGER_ELEVATOR = 2.0  # `check-signs` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
 TURBULENCE = (0.0, 0.25, 0.5, 1.0)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
+GUIDED, EACH, SETTLED = 600.0, 60.0, 45.0  # s: engaged under guidance, each turn, and from its command until it counts as held
+HELD = {"heading": "rad", "altitude": "m", "V": "m/s"}
+OBSERVER_MARGIN = 0.015  # s beyond the identified delay, as of `rise-di identify` from step tests
 DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
 
 
@@ -57,11 +68,11 @@ DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
 
 
 @contextmanager
-def arduplane(servo: float) -> Iterator["ArduPlane"]:
+def arduplane(servo: float, place: Path = FOLDER / "arduplane") -> Iterator["ArduPlane"]:
     """An ArduPlane in flight, with servos of this speed."""
     from tests.sitl.kit import ArduPlane  # noqa: PLC0415 - after the kit's place is known
 
-    with _flying(ArduPlane(FOLDER / "arduplane"), SIM_SERVO_SPEED=servo) as plane:
+    with _flying(ArduPlane(place), SIM_SERVO_SPEED=servo) as plane:
         yield plane
 
 
@@ -76,34 +87,47 @@ def px4() -> Iterator["Px4"]:
 
 @contextmanager
 def _flying(autopilot: Any, **parameters: float) -> Iterator[Any]:
-    try:
-        autopilot.up(**parameters)
-        autopilot.take_off()
-        yield autopilot
-    finally:
-        autopilot.down()
+    """In flight, and while --lock is held: a host flies one autopilot at a time."""
+    with nullcontext() if LOCK is None else LOCK.open("w", encoding="utf-8") as lock:
+        if lock is not None:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            autopilot.up(**parameters)
+            autopilot.take_off()
+            yield autopilot
+        finally:
+            autopilot.down()
 
 
 # Measurements
 
 
-def gains_of_arduplane() -> dict[str, Any]:
+def gains_of_arduplane(log: Path | None = None) -> dict[str, Any]:
     """ArduPlane with fast servos, by its own identification."""
-    with arduplane(0.03) as plane:
-        return identified(plane, plane.patient_map("ardupilot"), 24.0)
+    return identified(lambda: arduplane(0.03), FOLDER / "arduplane", "ardupilot", 24.0, log)
 
 
-def gains_of_slow_servos() -> dict[str, Any]:
+def gains_of_slow_servos(log: Path | None = None) -> dict[str, Any]:
     """ArduPlane with its default servos, by its own identification."""
-    with arduplane(0.14) as plane:
-        return identified(plane, plane.patient_map("ardupilot"), 24.0)
+    place = FOLDER / "slow_servos"
+    return identified(lambda: arduplane(0.14, place), place, "ardupilot", 24.0, log)
 
 
-def gains_of_px4() -> dict[str, Any]:
+def gains_of_px4(log: Path | None = None) -> dict[str, Any]:
     """PX4's airplane, by its own identification."""
-    with px4() as airplane, airplane.watching_truth() as truth:
-        result = identified(airplane, airplane.patient_map(str(PX4_MAP)), 11.5)
-        return result if "refused" in result else result | {"true_rms": true_errors(airplane, truth())}
+    flown: list[tuple[Any, Callable[[], Signal]]] = []
+
+    @contextmanager
+    def watched() -> Iterator[Any]:
+        with px4() as airplane, airplane.watching_truth() as truth:
+            flown.append((airplane, truth))
+            yield airplane
+
+    result = identified(watched, FOLDER / "px4", str(PX4_MAP), 11.5, log)
+    if "refused" in result:
+        return result
+    airplane, truth = flown[-1]
+    return result | {"true_rms": true_errors(airplane, truth())}
 
 
 def true_errors(autopilot: "Autopilot", truth: Signal) -> dict[str, float]:
@@ -115,29 +139,50 @@ def true_errors(autopilot: "Autopilot", truth: Signal) -> dict[str, float]:
     return {name: parts["command"].rms for name, parts in errors_by_part(tape, events).items()}
 
 
-def identified(autopilot: "Autopilot", channel_map: str, speed: float) -> dict[str, Any]:
-    """Experiment, gains, flight, replay: the commands of docs/autopilots.md."""
-    found = autopilot.folder / "found"
-    autopilot.level()
-    command = ("identify", "--bridge", channel_map, "--speed", f"{speed:g}", "--write", str(found))
-    excited = autopilot.start(*command)
-    excited.wait_for("DISENGAGED")
-    autopilot.hand_over()
-    autopilot.start("engage").succeed()
-    if excited.end(240.0):
-        return {"refused": excited.output}
-    log = autopilot.start(*command, "--log", str((REPOSITORY / "runs" / "latest").resolve()), "--json").succeed(240.0)
-    result = json.loads(log.lines[-1])
-    with autopilot.engaged(found / "scenario.yaml", str(found / "map.yaml"), 75.0) as flight:
+
+def identified(
+    flying: Callable[[], AbstractContextManager["Autopilot"]],
+    place: Path,
+    map_name: str,
+    speed: float,
+    log: Path | None,
+) -> dict[str, Any]:
+    """Experiment, gains, flight, replay: the commands of docs/autopilots.md. The log is read on the ground.
+
+    With the log of an experiment that this command flew before, there is no new one.
+    """
+    found, channel_map = place / "found", place / f"{Path(map_name).stem}.yaml"
+    command = ("identify", "--bridge", str(channel_map), "--speed", f"{speed:g}", "--write", str(found))
+    if log is None:
+        with flying() as autopilot:
+            autopilot.patient_map(map_name)
+            autopilot.level()
+            excited = autopilot.start(*command)
+            excited.wait_for("DISENGAGED")
+            autopilot.hand_over()
+            autopilot.start("engage").succeed()
+            excited.wait_for("log: ", 120.0)
+            autopilot.level()
+    read = _on_the_ground(*command, "--log", str((log or REPOSITORY / "runs" / "latest").resolve()), "--json")
+    if read.returncode:
+        return {"refused": read.stderr}
+    result = json.loads(read.stdout)
+    with flying() as autopilot, autopilot.engaged(found / "scenario.yaml", str(found / "map.yaml"), 75.0) as flight:
         flight.end(150.0)
     kept = {key: result["controller"][key] for key in ("outputs", "k_g", "k_d", "Lambda", "delay", "lag")}
-    return {"controller": kept, "delay_margin": result["delay_margin"], "said": excited.output, **tracking(autopilot)}
+    return {"controller": kept, "channels": result["channels"], "delay_margin": result["delay_margin"], **tracking(autopilot)}
+
+
+def _on_the_ground(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """A command of rise-di without an autopilot."""
+    command = (sys.executable, "-m", "flight_cli.cli", *arguments)
+    return subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - its own arguments
 
 
 def tracking(autopilot: "Autopilot") -> dict[str, Any]:
     """Of the last flight: errors while commanded, y behind y_m, the part of the time with u at a limit, whether it replays."""
     summary, log = autopilot.summary(), read_run(autopilot.run)
-    replayed = autopilot.start("replay", str(autopilot.run)).end(120.0) == 0
+    replayed = _on_the_ground("replay", str(autopilot.run)).returncode == 0
     return {
         "engaged": summary["engagements"],
         "outcome": summary["outcome"],
@@ -155,6 +200,54 @@ def behind(tape: Tape, name: str, engaged: Engagement) -> float:
     measured = np.interp(t, y.stamp_ns, y[name])
     errors = [float(np.var(measured - np.interp(t - delay * NANOSECONDS, y_m.stamp_ns, y_m[name]))) for delay in DELAYS]
     return float(DELAYS[int(np.argmin(errors))])
+
+
+def observer() -> dict[str, Any]:
+    """A flight with an extended-state observer from the identified Omega, lags and delay, and what its delay margin costs."""
+    found = FOLDER / "arduplane" / "found"
+    content = yaml.safe_load((found / "scenario.yaml").read_text(encoding="utf-8"))
+    frame, loaded = load_airframe(str(found / "airframe.yaml")), load_scenario(found / "scenario.yaml").rise_di()
+    law = loaded.law_params()
+    rows = [frame.outputs.index(name) for name in loaded.outputs]
+    columns = [list(frame.inputs).index(name) for name in loaded.inputs]
+    Omega = (frame.matrix_c() @ frame.matrix_b())[np.ix_(rows, columns)]
+    K = law.K * law.input_scale * np.abs(np.diag(Omega))
+    # the integrals of the rule: those that cancel a damping would be unstable in the observer's model, which has none
+    controller = loaded.model_copy(update={"Lambda": tuple((K / 4.0).tolist())})
+    size = np.array([1.0 if name == "V" else 0.1 for name in loaded.outputs])  # m/s, rad/s
+    selected = with_extended_state_observer(controller, Omega, size / NOISE_SHARE, size, loaded.delay + OBSERVER_MARGIN)
+    content["/**/controller"]["ros__parameters"] = json.loads(selected.controller.model_dump_json(exclude_defaults=True))
+    scenario = FOLDER / "arduplane" / "observer.yaml"
+    scenario.write_text(yaml.safe_dump(content), encoding="utf-8")
+    with arduplane(0.03) as plane, plane.engaged(scenario, str(found / "map.yaml"), 75.0) as flight:
+        flight.end(150.0)
+    weaker = dict(zip(loaded.outputs, selected.relaxation.tolist(), strict=True))
+    return {"delay": loaded.delay, "weaker": weaker, "delay_margin": selected.delay_margin - loaded.delay, **tracking(plane)}
+
+
+def guided() -> dict[str, Any]:
+    """Ten minutes engaged under guidance by rule, with the gains of the last identification: turns, climbs, changes of V."""
+    from tests.sitl.kit import ALTITUDE, guided_scenario  # noqa: PLC0415 - after the kit's place is known
+
+    starts = np.arange(15.0, GUIDED, EACH).tolist()
+    with arduplane(0.03) as plane:
+        found, scenario = plane.folder / "found", plane.folder / "guided.yaml"
+        program = plane.turns(starts, ALTITUDE + 20.0, 24.0)
+        scenario.write_text(guided_scenario(found / "scenario.yaml", program, 24.0), encoding="utf-8")
+        with plane.engaged(scenario, str(found / "map.yaml"), GUIDED) as flight:
+            flight.end(GUIDED + 100.0)
+    (one,), tape = plane.summary()["engagements"], read_run(plane.run).tape
+    t, errors = tape.time("guidance"), control_errors(tape)
+    stop = one["stop"] or GUIDED
+    held = in_spans(t, [(start + SETTLED, min(start + EACH, stop)) for start in starts if start + SETTLED < stop])
+    return {
+        "seconds": stop - one["start"],
+        "reason": one["reason"],
+        "turns": len(starts),
+        "rms": {name: float(np.sqrt(np.mean(errors[name][held] ** 2))) for name in HELD},
+        "max": {name: float(np.max(np.abs(errors[name][held]))) for name in HELD},
+        "replayed": tracking(plane)["replayed"],
+    }
 
 
 def bumpless() -> dict[str, Any]:
@@ -206,8 +299,8 @@ def signs(experiments: int = 20) -> dict[str, Any]:
         plane.say("param", "SIM_WIND_SPD", "5")
         flown = plane.fly(scenario, channel_map, 1000.0, "--send")
         flown.wait_for("DISENGAGED")
-        earlier, used = stored("signs").get("experiments", []), []
-        for number in range(len(earlier), len(earlier) + experiments):
+        used, earlier = [], len(stored("signs").get("experiments", []))
+        for number in range(earlier, earlier + experiments):
             used.append(TURBULENCE[number % len(TURBULENCE)])
             plane.say("param", "SIM_WIND_TURB", f"{used[-1]:g}")
             plane.level()
@@ -221,9 +314,19 @@ def signs(experiments: int = 20) -> dict[str, Any]:
         plane.level()
         flown.interrupt()
         flown.end(60.0)
-    log = read_run(plane.run)
-    found = [judged(loaded, log.tape, one) for one in log.engagements or []]
-    return {"experiments": [*earlier, *({"turbulence": one} | rest for one, rest in zip(used, found, strict=True))]}
+    return signs_of_logs([plane.run], used)
+
+
+def signs_of_logs(runs: Sequence[Path], turbulence: Sequence[float]) -> dict[str, Any]:
+    """The stored experiments on signs, and those of logs, whose engagements were in this turbulence one after another."""
+    found, channel_map = stored("signs").get("experiments", []), load_map("ardupilot")
+    for run in runs:
+        log = read_run(run)
+        found += [
+            {"run": run.name, "turbulence": wind} | judged(channel_map, log.tape, one)
+            for wind, one in zip(cycle(turbulence), log.engagements or [], strict=False)
+        ]
+    return {"experiments": found}
 
 
 def judged(channel_map: ChannelMap, tape: Tape, engaged: Engagement) -> dict[str, Any]:
@@ -256,10 +359,15 @@ def pose() -> dict[str, Any]:
         return {name: one._asdict() for name, one in plane.compare().items()}
 
 
-MEASUREMENTS: dict[str, Callable[[], dict[str, Any]]] = {
+IDENTIFICATIONS: dict[str, Callable[..., dict[str, Any]]] = {
     "arduplane": gains_of_arduplane,
     "slow_servos": gains_of_slow_servos,
     "px4": gains_of_px4,
+}
+MEASUREMENTS: dict[str, Callable[..., dict[str, Any]]] = {
+    **IDENTIFICATIONS,
+    "observer": observer,
+    "guided": guided,
     "engagements": bumpless,
     "signs": signs,
     "pose": pose,
@@ -311,6 +419,29 @@ def table_of_flight(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def table_of_observer(result: dict[str, Any]) -> str:
+    """What the margin costs, and the flight."""
+    weaker = ", ".join(f"{name} {factor:.1f}" for name, factor in result["weaker"].items())
+    return (
+        f"The extended-state observer knows Omega, lags and the delay of {1e3 * result['delay']:.0f} ms, not the damping. For"
+        f" {1e3 * OBSERVER_MARGIN:g} ms of margin beyond\nthe delay, gains and feedback are weaker by factors: {weaker}.\n\n"
+        + table_of_flight(result)
+    )
+
+
+def table_of_guidance(result: dict[str, Any]) -> str:
+    """How well heading, altitude and airspeed are held."""
+    rows = ["| held | rms | max |", "| --- | ---: | ---: |"]
+    rows += [f"| {name} ({unit}) | {result['rms'][name]:.3f} | {result['max'][name]:.3f} |" for name, unit in HELD.items()]
+    ended = f": {result['reason']}" if result["reason"] else ""
+    replay = "every bit" if result["replayed"] else "different"
+    rows.append(
+        f"\nEngaged for {result['seconds']:.0f} s{ended}. {result['turns']} turns of 40 deg, each with a climb or sink of"
+    )
+    rows.append(f"of 15 m and a change of V by 1 m/s; errors from {SETTLED:g} s after each on. Replay: {replay}.\n")
+    return "\n".join(rows)
+
+
 def table_of_engagements(result: dict[str, Any]) -> str:
     """Counts and the largest step."""
     steps = np.array(result["steps"])
@@ -359,6 +490,8 @@ TABLES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "arduplane": ("ArduPlane, servos of 0.03 s, gains by `identify --bridge`", table_of_flight),
     "slow_servos": ("ArduPlane, its default servos of 0.14 s, gains by `identify --bridge`", table_of_flight),
     "px4": ("PX4's airplane, gains by `identify --bridge`", table_of_flight),
+    "observer": ("ArduPlane, servos of 0.03 s, with an observer from the identification", table_of_observer),
+    "guided": ("ArduPlane, ten minutes under guidance", table_of_guidance),
     "engagements": ("Engagements without a jump", table_of_engagements),
     "signs": ("Signs, in short experiments in wind of 5 m/s", table_of_signs),
     "pose": ("Rates and pose over the autopilot's own log", table_of_pose),
@@ -371,8 +504,12 @@ def main() -> None:
     parser.add_argument("--sitl", type=Path, help="folder of the kit")
     parser.add_argument("--only", action="append", choices=MEASUREMENTS, help="repeatable")
     parser.add_argument("--experiments", type=int, default=20, help="number of further ones on signs, 40 s each")
+    parser.add_argument("--log", type=Path, action="append", help="with --only: a flown experiment in place of a new one")
+    parser.add_argument("--lock", type=Path, help="file that is locked while an autopilot flies, for a shared host")
     parser.add_argument("--render", action="store_true", help="no flight")
     arguments = parser.parse_args()
+    global LOCK  # noqa: PLW0603 - of the whole command
+    LOCK = arguments.lock
     FOLDER.mkdir(parents=True, exist_ok=True)
     if not arguments.render:
         if arguments.sitl is not None:
@@ -383,7 +520,12 @@ def main() -> None:
         if reason := missing():
             sys.exit(f"error: {reason}")
         for name in arguments.only or MEASUREMENTS:
-            found = signs(arguments.experiments) if name == "signs" else MEASUREMENTS[name]()
+            if name == "signs":
+                found = signs_of_logs(arguments.log, TURBULENCE) if arguments.log else signs(arguments.experiments)
+            elif arguments.log:
+                found = IDENTIFICATIONS[name](arguments.log[0])
+            else:
+                found = MEASUREMENTS[name]()
             result = {"date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "result": found}
             (FOLDER / f"{name}.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
             print(name, json.dumps(result), flush=True)

@@ -9,13 +9,14 @@ default python3.
 
 import csv
 import json
+import math
 import os
 import re
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Event, Thread
@@ -23,6 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
+import yaml
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
 
@@ -37,6 +39,10 @@ PILOT_PYTHON = os.environ.get("PILOT_PYTHON", "python3")
 POLL = 0.1  # s, between two questions to the autopilot
 MAX_AGE = 1.0  # s, in place of the shipped maps' 0.2 s: a busy host stops autopilot and agent for half a second
 SAFE_STICKS = (1500, 1500, 1000, 1500, 1800, 1500, 1500)  # us, as the kit begins; the throttle is closed
+Program = Mapping[str, tuple[Sequence[float], Sequence[float]]]
+"""Commands of guidance by channel: times, s, and values."""
+
+TURN = 0.7  # rad, 40 deg
 ALTITUDE = 300.0  # m above the ground, of ArduPlane's flights: an open loop in turbulence loses some of it
 
 
@@ -193,6 +199,20 @@ class Autopilot:
         return found
 
 
+def guided_scenario(scenario: Path, program: Program, speed: float) -> str:
+    """The text of a scenario under guidance by rule in place of its commands; `program` has times, s, and values by channel.
+
+    The poses of a busy host may be MAX_AGE old.
+    """
+    content = yaml.safe_load(scenario.read_text(encoding="utf-8"))
+    reference = content["/**/reference_model"]["ros__parameters"]
+    kept = {key: value for key, value in reference.items() if key not in {"pulses", "coordinated_turn"}}
+    content["/**/reference_model"]["ros__parameters"] = kept | {"live": {"speed": speed}}
+    steps = {name: {"start": list(start), "value": list(value)} for name, (start, value) in program.items()}
+    content["/**/guidance"] = {"ros__parameters": {"max_age": MAX_AGE, "program": steps}}
+    return str(yaml.safe_dump(content))
+
+
 class Agreement(NamedTuple):
     """A signal of the stack over the autopilot's own, at the delay between both with the smallest residual."""
 
@@ -292,6 +312,19 @@ class ArduPlane(Autopilot):
         with (self.folder / "mavlink.csv").open(encoding="utf-8", newline="") as file:
             rows = [(float(row[0]), json.loads(row[2])) for row in csv.reader(file) if len(row) == 3 and row[1] == kind]
         return np.array([t for t, _ in rows]), np.array([[row[field] for field in fields] for _, row in rows])
+
+    def turns(
+        self, starts: Sequence[float], altitude: float, speed: float
+    ) -> dict[str, tuple[Sequence[float], Sequence[float]]]:
+        """A program of guidance: at each start, s, a turn by TURN, a climb or sink of 15 m, and 1 m/s more or less."""
+        self.state()  # writes the log
+        heading = float(self.log("ATTITUDE", "yaw")[1][-1, 0])
+        numbers = range(1, len(starts) + 1)
+        return {
+            "heading": (starts, [math.remainder(heading + TURN * k, 2.0 * math.pi) for k in numbers]),
+            "altitude": (starts, [altitude + 15.0 * (k % 2) for k in numbers]),
+            "V": (starts, [speed + k % 2 for k in numbers]),
+        }
 
     def wander(self, flight: Process) -> None:
         """Fly turns and climbs until a flight of the stack ends by itself."""

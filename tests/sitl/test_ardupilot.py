@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
-from tests.sitl.kit import MAX_AGE, ArduPlane, burn
+from tests.sitl.kit import ALTITUDE, MAX_AGE, ArduPlane, burn, guided_scenario
 
 from autopilot_bridge.params import load_map
+from flight_analysis.metrics import in_spans
+from flight_analysis.report.guided import BANDS, control_errors
 from flight_bringup.scenarios import find_scenario
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
@@ -113,16 +115,49 @@ def test_turbulence_moves_the_aircraft_as_much_as_under_the_autopilots_own_law(p
     assert one["stop"] is None or "outside the envelope" in one["reason"]
 
 
+@pytest.mark.parametrize("turns", [1, pytest.param(9, marks=[pytest.mark.long, pytest.mark.timeout(900)])])
+def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: int) -> None:
+    """A minute for each turn, climb and change of airspeed: engaged to the end, and all are held again after 45 s.
+
+    Altitude and airspeed within the bands in which a guided flight counts as settled, 5 m and 1 m/s. The gyro of the simulator
+    drifts by up to b = 4.4 mrad/s, SIM_DRIFT_SPEED 0.05 deg/s a minute for 5 minutes, and heading is off by
+    b g / (k_phi k_chi V): 2.6 deg for the bandwidth of p in the example. 2 deg are those of a settled heading.
+    """
+    first, each = 15.0, 60.0  # s
+    starts = (first + each * np.arange(turns)).tolist()
+    program = plane.turns(starts, max(plane.state()["alt"] - plane.home, ALTITUDE), 24.0)
+    scenario = plane.folder / "guided.yaml"
+    scenario.write_text(guided_scenario(SCENARIO.path, program, 24.0), encoding="utf-8")
+    duration = first + each * turns
+    with plane.engaged(scenario, map_of(plane), duration) as flight:
+        flight.succeed(duration + 60.0)
+    (one,) = plane.summary()["engagements"]
+    assert one["stop"] is None, one["reason"]
+    tape = read_run(plane.run).tape
+    t, errors = tape.time("guidance"), control_errors(tape)
+    held = in_spans(t, [(start + 45.0, start + each) for start in starts])
+    largest = {name: float(np.max(np.abs(errors[name][held]))) for name in ("heading", "altitude", "V")}
+    bands = {name: BANDS[name] for name in largest} | {"heading": BANDS["heading"] + np.radians(2.6)}
+    assert {name for name, error in largest.items() if error > bands[name]} == set(), largest
+    plane.start("replay", str(plane.run)).succeed(120.0)
+
+
 class Event(NamedTuple):
     """What ends an engagement, the reason in the summary, and when the sticks act again, s after the event."""
 
     act: Callable[[ArduPlane, Process], Callable[[], object] | None]
     reason: str
     sticks_act: tuple[float, float]
+    change: tuple[str, str] | None = None  # of the text of the map
 
 
 def override(plane: ArduPlane, _: Process) -> Callable[[], object]:
     plane.say("stick", "7", "1900")
+    return lambda: plane.say("stick", "7", "1500")
+
+
+def move_a_stick(plane: ArduPlane, _: Process) -> Callable[[], object]:
+    plane.say("stick", "7", "1650")  # short of the threshold of the map's switch
     return lambda: plane.say("stick", "7", "1500")
 
 
@@ -160,6 +195,7 @@ AFTER_OVERRIDE_TIME = (RC_OVERRIDE_TIME - 0.5, RC_OVERRIDE_TIME + RC_PERIOD + LA
 
 EVENTS = {
     "override by a switch": Event(override, "pilot override by switch", AT_ONCE),
+    "override by a moved stick": Event(move_a_stick, "pilot override by switch", AT_ONCE, ("above: 1700.0", "moved: 100.0")),
     "release": Event(release, "disengaged by request", AT_ONCE),
     "mode changed": Event(change_mode, "the mode is not MANUAL", AFTER_STATUS),
     "controller killed": Event(kill("rise_di_controller.main"), "controller was killed", AFTER_TIMEOUT),
@@ -169,11 +205,23 @@ EVENTS = {
 }
 
 
+def test_sticks_that_the_bridge_overrides_do_not_show_and_do_not_act_before_the_release(plane: ArduPlane) -> None:
+    """The autopilot shows Joy in channels 1 to 4, so that an override by a stick of these would act on the law's own u."""
+    with engaged(plane, 60.0) as flight:
+        plane.say("stick", "4", str(MARK))
+        time.sleep(2.0)
+        assert plane.log("RC_CHANNELS", "chan4_raw")[1][-1, 0] != MARK
+        assert "ENGAGED" in flight.output.splitlines()[-1]
+        flight.interrupt()
+        flight.end()
+
+
 @pytest.mark.parametrize("name", EVENTS)
 def test_the_pilot_has_the_aircraft_again(plane: ArduPlane, name: str) -> None:
     """Within the time of the event the sticks act, and the log says why the engagement ended."""
     event = EVENTS[name]
-    with ExitStack() as afterwards, engaged(plane, 60.0) as flight:
+    channel_map = map_of(plane) if event.change is None else plane.patient_map("ardupilot", event.change)
+    with ExitStack() as afterwards, plane.engaged(SCENARIO.path, channel_map, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
         if (undo := event.act(plane, flight)) is not None:
             afterwards.callback(undo)
