@@ -27,13 +27,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationParameters
-from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.design.bridge_identification import channel_pairs, experiment
-from flight_analysis.design.identification import NOISE_SHARE
-from flight_analysis.design.observer_selection import with_extended_state_observer
 from flight_analysis.design.response_identification import MIN_RATIO, identify_response
 from flight_analysis.design.sign_check import check
 from flight_analysis.metrics import errors_by_part, in_spans
@@ -58,9 +54,8 @@ WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints 
 PERIODS = {"elevator": 4.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}  # s, of the multisines of the experiments on signs
 STRONGER_ELEVATOR = 2.0  # `check-signs` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
 TURBULENCE = (0.0, 0.25, 0.5, 1.0)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
-GUIDED, EACH, SETTLED = 600.0, 60.0, 45.0  # s: engaged under guidance, each turn, and from its command until it counts as held
+GUIDED, EACH, SETTLED = 300.0, 60.0, 45.0  # s: engaged under guidance, each turn, and from its command until it counts as held
 HELD = {"heading": "rad", "altitude": "m", "V": "m/s"}
-OBSERVER_MARGIN = 0.015  # s beyond the identified delay, as of `rise-di identify` from step tests
 DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
 
 
@@ -202,31 +197,8 @@ def behind(tape: Tape, name: str, engaged: Engagement) -> float:
     return float(DELAYS[int(np.argmin(errors))])
 
 
-def observer() -> dict[str, Any]:
-    """A flight with an extended-state observer from the identified Omega, lags and delay, and what its delay margin costs."""
-    found = FOLDER / "arduplane" / "found"
-    content = yaml.safe_load((found / "scenario.yaml").read_text(encoding="utf-8"))
-    frame, loaded = load_airframe(str(found / "airframe.yaml")), load_scenario(found / "scenario.yaml").rise_di()
-    law = loaded.law_params()
-    rows = [frame.outputs.index(name) for name in loaded.outputs]
-    columns = [list(frame.inputs).index(name) for name in loaded.inputs]
-    Omega = (frame.matrix_c() @ frame.matrix_b())[np.ix_(rows, columns)]
-    K = law.K * law.input_scale * np.abs(np.diag(Omega))
-    # the integrals of the rule: those that cancel a damping would be unstable in the observer's model, which has none
-    controller = loaded.model_copy(update={"Lambda": tuple((K / 4.0).tolist())})
-    size = np.array([1.0 if name == "V" else 0.1 for name in loaded.outputs])  # m/s, rad/s
-    selected = with_extended_state_observer(controller, Omega, size / NOISE_SHARE, size, loaded.delay + OBSERVER_MARGIN)
-    content["/**/controller"]["ros__parameters"] = json.loads(selected.controller.model_dump_json(exclude_defaults=True))
-    scenario = FOLDER / "arduplane" / "observer.yaml"
-    scenario.write_text(yaml.safe_dump(content), encoding="utf-8")
-    with arduplane(0.03) as plane, plane.engaged(scenario, str(found / "map.yaml"), 75.0) as flight:
-        flight.end(150.0)
-    weaker = dict(zip(loaded.outputs, selected.relaxation.tolist(), strict=True))
-    return {"delay": loaded.delay, "weaker": weaker, "delay_margin": selected.delay_margin - loaded.delay, **tracking(plane)}
-
-
 def guided() -> dict[str, Any]:
-    """Ten minutes engaged under guidance by rule, with the gains of the last identification: turns, climbs, changes of V."""
+    """Minutes engaged under guidance by rule, with the gains of the last identification: turns, climbs, changes of V."""
     from tests.sitl.kit import ALTITUDE, guided_scenario  # noqa: PLC0415 - after the kit's place is known
 
     starts = np.arange(15.0, GUIDED, EACH).tolist()
@@ -366,7 +338,6 @@ IDENTIFICATIONS: dict[str, Callable[..., dict[str, Any]]] = {
 }
 MEASUREMENTS: dict[str, Callable[..., dict[str, Any]]] = {
     **IDENTIFICATIONS,
-    "observer": observer,
     "guided": guided,
     "engagements": bumpless,
     "signs": signs,
@@ -417,16 +388,6 @@ def table_of_flight(result: dict[str, Any]) -> str:
         f"u at a limit: {limited} of the time. Replay: {'every bit' if result['replayed'] else 'different'}.\n",
     ]
     return "\n".join(rows)
-
-
-def table_of_observer(result: dict[str, Any]) -> str:
-    """What the margin costs, and the flight."""
-    weaker = ", ".join(f"{name} {factor:.1f}" for name, factor in result["weaker"].items())
-    return (
-        f"The extended-state observer knows Omega, lags and the delay of {1e3 * result['delay']:.0f} ms, not the damping. For"
-        f" {1e3 * OBSERVER_MARGIN:g} ms of margin beyond\nthe delay, gains and feedback are weaker by factors: {weaker}.\n\n"
-        + table_of_flight(result)
-    )
 
 
 def table_of_guidance(result: dict[str, Any]) -> str:
@@ -490,8 +451,7 @@ TABLES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "arduplane": ("ArduPlane, servos of 0.03 s, gains by `identify --bridge`", table_of_flight),
     "slow_servos": ("ArduPlane, its default servos of 0.14 s, gains by `identify --bridge`", table_of_flight),
     "px4": ("PX4's airplane, gains by `identify --bridge`", table_of_flight),
-    "observer": ("ArduPlane, servos of 0.03 s, with an observer from the identification", table_of_observer),
-    "guided": ("ArduPlane, ten minutes under guidance", table_of_guidance),
+    "guided": ("ArduPlane under guidance", table_of_guidance),
     "engagements": ("Engagements without a jump", table_of_engagements),
     "signs": ("Signs, in short experiments in wind of 5 m/s", table_of_signs),
     "pose": ("Rates and pose over the autopilot's own log", table_of_pose),

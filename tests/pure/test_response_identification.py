@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
-from flight_analysis.design.response_identification import Response, identify_response
+from flight_analysis.design.response_identification import Response, begins_with_Omega, identify_response
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal
@@ -79,3 +79,11 @@ def test_a_short_log_is_refused_with_the_time_that_is_needed() -> None:
     y, u = flown(0.1, seconds=5.0)
     with pytest.raises(ParameterError, match=r"the log: found .* s in which u acts .* expected .* s or more"):
         identified(y, u)
+
+
+def test_a_response_whose_sign_is_not_that_of_its_omega_is_no_fit() -> None:
+    # 1120 / (s^2 + 23 s + 267), all of it in the slow part: an elevator of 110 rad/s^2 per rad had an Omega of -0.016
+    t = np.arange(0.02, 0.8, 0.02)
+    assert not begins_with_Omega(t, np.array([0.07, 0.003, -0.016, 23.0, 267.0, 1120.0]))
+    assert begins_with_Omega(t, np.array([0.07, 0.04, 110.0, 23.0, 0.0, 0.0]))
+    assert begins_with_Omega(t, np.array([0.07, 0.04, -48.0, 13.0, 104.0, -40.0]))

@@ -406,7 +406,7 @@ def _column(t: FloatArray, responses: FloatArray, j: int) -> _Column:
     best = _search(t, whiten, step[:, j] / size, size, ORDERS[0], None)
     for free in ORDERS[1:]:
         tried = _search(t, whiten, step[:, j] / size, size, free, best.theta)
-        if best.chi_squared - tried.chi_squared > MIN_GAIN * (sum(free) - sum(best.free)):
+        if best.chi_squared - tried.chi_squared > MIN_GAIN * (sum(free) - sum(best.free)) and begins_with_Omega(t, tried.theta):
             best = tried
     inside = (np.array(best.free) > 0) & (best.theta > LOWER + 1e-6) & (best.theta < UPPER - 1e-6)
     misfit = max(best.chi_squared / max(len(t) - sum(best.free), 1), 1.0)  # R. T. Birge, Phys. Rev. 40, 1932
@@ -426,6 +426,16 @@ def _column(t: FloatArray, responses: FloatArray, j: int) -> _Column:
     return _Column(Omega, error, lag, float(deviation[1]), delay, float(deviation[0]), sign)
 
 
+def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
+    """Whether a fitted response has the sign of its Omega up to EARLY after delay and lag.
+
+    Otherwise the slow part is the whole response, two poles are in the place of one and a lag, and Omega is about 0.
+    """
+    delay, lag, Omega, damping, stiffness, slow = theta
+    first, second = second_order(t[t <= delay + lag + EARLY], delay, lag, damping, stiffness)
+    return bool(np.sum(Omega * first + slow * second) * Omega > 0.0)
+
+
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
     """Chi squared of no response against the fitted one, up to EARLY after delay and lag, less its parameters."""
     early = t <= theta[0] + theta[1] + EARLY
@@ -433,8 +443,7 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
     fitted = size * (theta[2] * first + theta[5] * second)
     whiten = _whitener(responses[:, early])
     none, left = whiten @ responses[0, early], whiten @ (responses[0, early] - fitted)
-    same_sign = float(np.sum(fitted)) * theta[2] > 0.0
-    return max(float(none @ none - left @ left) - len(theta), 0.0) if same_sign else 0.0
+    return max(float(none @ none - left @ left) - len(theta), 0.0) if begins_with_Omega(t, theta) else 0.0
 
 
 def _whitener(responses: FloatArray) -> FloatArray:
