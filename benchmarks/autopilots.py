@@ -29,6 +29,7 @@ import yaml
 
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationParameters
+from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.design.bridge_identification import channel_pairs, experiment
 from flight_analysis.design.response_identification import MIN_RATIO, identify_response
 from flight_analysis.design.sign_check import check
@@ -134,7 +135,6 @@ def true_errors(autopilot: "Autopilot", truth: Signal) -> dict[str, float]:
     return {name: parts["command"].rms for name, parts in errors_by_part(tape, events).items()}
 
 
-
 def identified(
     flying: Callable[[], AbstractContextManager["Autopilot"]],
     place: Path,
@@ -208,7 +208,13 @@ def guided() -> dict[str, Any]:
         scenario.write_text(guided_scenario(found / "scenario.yaml", program, 24.0), encoding="utf-8")
         with plane.engaged(scenario, str(found / "map.yaml"), GUIDED) as flight:
             flight.end(GUIDED + 100.0)
-    (one,), tape = plane.summary()["engagements"], read_run(plane.run).tape
+    return held_figures(plane.run, starts)
+
+
+def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
+    """How well a guided flight of turns at these times holds what it is commanded, and whether it replays."""
+    (one,) = json.loads((run / "summary.json").read_text(encoding="utf-8"))["engagements"]
+    tape = read_run(run).tape
     t, errors = tape.time("guidance"), control_errors(tape)
     stop = one["stop"] or GUIDED
     held = in_spans(t, [(start + SETTLED, min(start + EACH, stop)) for start in starts if start + SETTLED < stop])
@@ -218,7 +224,7 @@ def guided() -> dict[str, Any]:
         "turns": len(starts),
         "rms": {name: float(np.sqrt(np.mean(errors[name][held] ** 2))) for name in HELD},
         "max": {name: float(np.max(np.abs(errors[name][held]))) for name in HELD},
-        "replayed": tracking(plane)["replayed"],
+        "replayed": _on_the_ground("replay", str(run)).returncode == 0,
     }
 
 
@@ -396,9 +402,7 @@ def table_of_guidance(result: dict[str, Any]) -> str:
     rows += [f"| {name} ({unit}) | {result['rms'][name]:.3f} | {result['max'][name]:.3f} |" for name, unit in HELD.items()]
     ended = f": {result['reason']}" if result["reason"] else ""
     replay = "every bit" if result["replayed"] else "different"
-    rows.append(
-        f"\nEngaged for {result['seconds']:.0f} s{ended}. {result['turns']} turns of 40 deg, each with a climb or sink of"
-    )
+    rows.append(f"\nEngaged for {result['seconds']:.0f} s{ended}. {result['turns']} turns of 40 deg, each with a climb or sink")
     rows.append(f"of 15 m and a change of V by 1 m/s; errors from {SETTLED:g} s after each on. Replay: {replay}.\n")
     return "\n".join(rows)
 
