@@ -69,7 +69,7 @@ MEASUREMENTS = (
     Measurement("campaign-fleet", (*FLEET, "10000"), (*FLEET, "1000"), "uncertain aircraft flown by the same law", "1 min"),
     Measurement("campaign-missions", (*MISSIONS, "5000"), (*MISSIONS, "200"), "uncertain aircraft on a route", "3 min"),
     Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), "other laws on the same aircraft and course", "5 min"),
-    Measurement("view", VIEW, QUICK_VIEW, "the page beside a flight, and a log of one hour on it", "8 min", timed=True),
+    Measurement("view", VIEW, QUICK_VIEW, "the page beside a flight, and a log of one hour on it", "11 min", timed=True),
     Measurement("replay", REPLAY, (*REPLAY, "--seconds", "5"), "every scenario flown and replayed", "2 min"),
 )
 

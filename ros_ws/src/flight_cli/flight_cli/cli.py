@@ -9,6 +9,7 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import os
 import sys
+from contextlib import suppress
 from importlib.metadata import version
 from pkgutil import resolve_name
 from types import MappingProxyType
@@ -17,6 +18,7 @@ from typing import Annotated
 import typer
 
 BAD_INPUT, INTERRUPTED = 2, 130
+NICE = 10  # of a command that may run beside a flight
 
 COMMANDS = MappingProxyType(
     {
@@ -69,6 +71,9 @@ def application(words: list[str]) -> typer.Typer:
 
 def main() -> None:
     """Entry point: bad input is one sentence and exit status 2, Ctrl-C is quiet."""
+    if sys.argv[1:2] == ["watch"]:  # already while it loads: a flight beside it goes first
+        with suppress(OSError):
+            os.nice(NICE)
     words = [*sys.argv[1:2], *os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", "")).split()]
     try:
         app = application(words)

@@ -20,7 +20,6 @@ from flight_view.flight import Flight
 from flight_view.server import ADDRESS, Server
 
 DEFAULT_PORT = 8077
-NICE = 10  # the flight goes first
 
 
 def newest_run(runs: Path) -> Path:
@@ -52,8 +51,6 @@ def serve(
 
     Raises ParameterError where all ports are taken, or a log cannot be read.
     """
-    with suppress(OSError):
-        os.nice(NICE)
     asyncio.run(_serve(runs, ports, announce, control))
 
 
