@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="pid_law",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="PID control, an example of a control law for rise_di_controller.",
     license="Apache-2.0",
     packages=["pid_law"],

@@ -4,15 +4,16 @@
 
 import configparser
 import re
+import subprocess
 import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from ros_ws.src.conftest import MODULES, SOURCES, TESTS, WHOLE_TREE, files
 from tests.conftest import ALONE, SLOW
 from tests.pure.test_import_rule import imported
 
-SOURCES = Path(__file__).resolve().parents[2] / "ros_ws" / "src"
 INSTALLED = SOURCES.parent / "install"
 PACKAGES = sorted(path.parent for path in SOURCES.glob("*/package.xml"))
 EXECUTABLES = {
@@ -40,9 +41,10 @@ def test_package_files_agree_with_each_other(package: Path) -> None:
     assert root.findtext("name") == name
     assert root.findtext("license") == "Apache-2.0"
     assert root.findtext("export/build_type") == "ament_python"
-    version = re.search(r'version="([^"]+)"', setup)
-    assert version is not None
-    assert root.findtext("version") == version.group(1)
+    assert 'version=ElementTree.parse("package.xml").findtext("version")' in setup
+    assert 'extras_require={"test": ["pytest"]}' in setup  # by which colcon test chooses pytest
+    tested_with = {node.text for node in root.findall("test_depend")}
+    assert tested_with == {"python3-hypothesis", "python3-pytest", "python3-pytest-timeout"}
     # colcon builds a package with an e-mail it cannot parse as plain Python, with a warning only
     maintainer = root.find("maintainer")
     assert maintainer is not None
@@ -60,6 +62,30 @@ def test_package_declares_all_that_it_imports(package: Path) -> None:
     sources = [path for path in package.rglob("*.py") if path.name != "setup.py"]
     external = set().union(*map(imported, sources)) - sys.stdlib_module_names - {package.name} - WITHOUT_KEY
     assert {KEYS.get(name, name) for name in external} <= declared
+
+
+def test_packages_citation_and_changelog_have_one_version() -> None:
+    root = SOURCES.parents[1]
+    files = [*PACKAGES, root / "examples" / "pid_law"]
+    versions = {ElementTree.parse(package / "package.xml").findtext("version") for package in files}
+    cited = re.search(r"^version: (.+)$", (root / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
+    newest = re.search(r"^## (\d\S*) - \d{4}-\d\d-\d\d$", (root / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert cited is not None
+    assert newest is not None
+    assert versions == {cited[1]} == {newest[1]}
+
+
+def test_every_test_is_of_one_package_or_of_the_whole_tree() -> None:
+    listed = [path for modules in (*MODULES.values(), WHOLE_TREE) for path in files(modules)]
+    assert set(MODULES) == {package.name for package in PACKAGES}
+    assert sorted(listed) == sorted(path for path in TESTS.rglob("test_*.py") if path.parts[len(TESTS.parts)] != "sitl")
+
+
+def test_pytest_in_the_folder_of_a_package_runs_its_tests_as_colcon_asks_for_them() -> None:
+    command = [sys.executable, "-m", "pytest", "-o", "cache_dir=cache", "--collect-only", "-qq"]
+    done = subprocess.run(command, cwd=SOURCES / "flight_core", capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert set(re.findall(r"test_\w+\.py", done.stdout)) == {path.name for path in files(MODULES["flight_core"])}
 
 
 def test_the_page_on_ros_names_what_rosdep_cannot_install() -> None:

@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="aircraft_sim",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="Simulated aircraft of the RISE-DI flight stack: x_dot = A x + f(x, t) + B u, y = C x, with gusts.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["aircraft_sim"],
     package_data={"aircraft_sim": ["airframes/*.yaml"]},
     data_files=[

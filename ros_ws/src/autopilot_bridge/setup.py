@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="autopilot_bridge",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="Bridge to an autopilot, in place of the simulated aircraft: y and u through a channel map.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["autopilot_bridge"],
     package_data={"autopilot_bridge": ["maps/*.yaml"]},
     data_files=[

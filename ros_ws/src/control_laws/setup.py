@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="control_laws",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="Control laws other than RISE-DI, each a module of equations; the controller flies those of y alone.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["control_laws"],
     entry_points={
         "rise_di_controller.laws": [

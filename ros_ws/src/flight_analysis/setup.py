@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="flight_analysis",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="Flights without ROS: the closed loop in one process, metrics, gain design, the report page.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["flight_analysis", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.report"],
     package_data={"flight_analysis": ["py.typed", "report/*.jinja", "report/*.js", "report/scene/*", "report/vendor/*"]},
     data_files=[

@@ -1,14 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 from glob import glob
+from xml.etree import ElementTree
 
 from setuptools import setup
 
 setup(
     name="flight_bringup",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="Scenarios, launch files, process runner and service clients of the RISE-DI flight stack.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["flight_bringup", "flight_bringup.launch"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_bringup"]),

@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="flight_campaign",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="Monte Carlo campaigns over thousands of uncertain aircraft, tuning and comparison of control laws.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["flight_campaign"],
     package_data={"flight_campaign": ["tuned/*.yaml"]},
     data_files=[

@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="flight_cli",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="The rise-di command of the RISE-DI flight stack, one file a command.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["flight_cli"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_cli"]),

@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="flight_log",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="Writes, reads, scans and repairs the log of a flight, a rosbag2 bag, without ROS.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["flight_log"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_log"]),

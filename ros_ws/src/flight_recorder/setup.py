@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="flight_recorder",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="Records the topics of a flight to a rosbag2-layout MCAP bag.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["flight_recorder"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_recorder"]),

@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="reference_model",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="Reference model of the RISE-DI flight stack: commands u_m(t) and x_m_dot = A_m x_m + B_m u_m, y_m = C x_m.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["reference_model"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/reference_model"]),

@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 setup(
     name="rise_di_controller",
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="RISE dynamic inversion: a control law that uses the measured output only, its guard, and a ROS 2 node with a fixed rate.",
     license="Apache-2.0",
+    extras_require={"test": ["pytest"]},
     packages=["rise_di_controller"],
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/rise_di_controller"]),
