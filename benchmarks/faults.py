@@ -3,6 +3,7 @@
 """The fault campaign of tests/ros/faults, several times in a row, as a table.
 
     .venv/bin/python -m benchmarks.faults [--times 10] [--scenario osprey_observer] [--json FILE] [--only "killed or stopped"]
+    .venv/bin/python -m benchmarks.faults --only roll-in --guided jsbsim_c172p_route    # another aircraft under guidance
 
 Reaction: from the fault to its first detection by a node. Recovery: from the end of the fault (of a killed node: from ready)
 until the law flies again. An instant is the reception time of the message that shows the event. Where the host delayed a
@@ -29,15 +30,18 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 CAMPAIGN = REPOSITORY / "tests" / "ros" / "faults"
 MAX_HOST_DELAY = 0.02  # s
 
+TIMES = ("reaction", "recovery", "ready_to_traffic", "exec_to_traffic", "ready_to_caught_up", "longest_pause", "page")
+BANKS = ("bank_deg", "last_bank_deg")  # the largest after the loss of u_m, and that when the wings have to be level
+
 Row = dict[str, Any]
 
 
-def fly(times: int, seed: int, only: str, scenario: str) -> list[Row]:
+def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> list[Row]:
     """Inject every case `times` times in a row; one row for each injection."""
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "rows.jsonl"
         options = [f"--faults-table={table}", f"--faults-times={times}", f"--faults-seed={seed}"]
-        options += [f"--faults-scenario={scenario}", f"--timeout={120 * times}"]
+        options += [f"--faults-scenario={scenario}", f"--faults-guided={guided}", f"--timeout={120 * times}"]
         command = [sys.executable, "-m", "pytest", "-q", str(CAMPAIGN), *options, *(["-k", only] if only else [])]
         subprocess.run(command, cwd=REPOSITORY, check=False, stdout=sys.stderr)  # noqa: S603 - our own interpreter
         if not table.exists():
@@ -60,7 +64,7 @@ def _summary(case: str, rows: Sequence[Row]) -> Row:
     summary: Row = {"case": case, "u": rows[0]["does"], "injected": len(rows), "passed": len(passed), "quiet": len(quiet)}
     summary["detected"] = sum(row["reaction"] is not None for row in passed) if rows[0]["expected"] else None
     summary["held_back"] = max((row["held_back"] for row in judged), default=None)
-    for key in ("reaction", "recovery", "ready_to_traffic", "exec_to_traffic", "ready_to_caught_up", "longest_pause"):
+    for key in (*TIMES, *BANKS):
         values = [row[key] for row in judged if row.get(key) is not None]
         summary[key] = {"median": statistics.median(values), "worst": max(values)} if values else None
     return summary
@@ -83,15 +87,19 @@ def to_table(summaries: Sequence[Row]) -> Table:
 def main(
     times: Annotated[int, typer.Option(min=1, help="Number of injections of each fault.")] = 10,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first injection; the others count up.")] = 1,
-    scenario: Annotated[str, typer.Option(help="Scenario of the flight.")] = "osprey_gust",
+    scenario: Annotated[str, typer.Option(help="Scenario of the flight without guidance.")] = "osprey_gust",
+    guided: Annotated[str, typer.Option(help="Scenario of the flight under guidance.")] = "osprey_route",
     only: Annotated[str, typer.Option(help="Cases by parts of their names, as pytest's -k takes them.")] = "",
     file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
 ) -> None:
     """Run the fault campaign and print its table; exit status 1 if a case did not pass each time."""
-    summaries = summarise(fly(times, seed, only, scenario))
+    summaries = summarise(fly(times, seed, only, scenario, guided))
     if file is not None:
         file.write_text(json.dumps(summaries, indent=2) + "\n", encoding="utf-8")
     Console(width=None if sys.stdout.isatty() else 160).print(to_table(summaries))
+    for bank in (one for one in summaries if one["bank_deg"]):
+        largest, last = (f"{bank[key]['median']:.1f} / {bank[key]['worst']:.1f} deg" for key in BANKS)
+        print(f"{bank['case']}: largest bank {largest}, after ten seconds {last} (median / worst)")
     if any(one["passed"] < times for one in summaries):
         raise typer.Exit(1)
 

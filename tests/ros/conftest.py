@@ -106,7 +106,9 @@ class Process:
             pytest.fail(f"still running after {timeout} s; output:\n{self.output}")
         self._reader.join()
         assert self.popen.stdout is not None
-        self.popen.stdout.close()
+        for stream in (self.popen.stdin, self.popen.stdout):
+            if stream is not None:
+                stream.close()
         return status
 
 

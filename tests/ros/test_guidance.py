@@ -14,7 +14,7 @@ import pytest
 from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Path as PathMessage
 from std_srvs.srv import SetBool, Trigger
-from tests.ros.conftest import Process, Start
+from tests.ros.conftest import Start
 from tests.ros.peer import OUTPUTS, Peer
 from tests.ros.test_lockstep import LOG_SIZE, ROUGH, fly, scenario_file
 
@@ -190,28 +190,3 @@ def test_a_second_publisher_of_pose_is_refused_and_a_stale_pose_levels_the_wings
 
     flight.peer.until(lambda: "pose is stale: wings are levelled" in flight.process.output, each=without_pose)
     flight.until(lambda: "DEAD_RECKONING -> ENGAGED" in flight.process.output)
-
-
-def test_the_wings_are_levelled_when_guidance_is_stopped_or_killed_in_a_turn(calm: Path, start: Start, peer_node: Peer) -> None:
-    shared = ("--ros-args", "--params-file", str(calm))
-    packages = ("rise_di_controller", "aircraft_sim", "reference_model")
-    nodes: dict[str, Process] = {package: start(f"{package}.main", *shared) for package in packages}
-    guidance = start("guidance.main", *shared)
-
-    def phi() -> float:
-        last = peer_node.received["pose"][-1:]
-        return float(last[0].position[last[0].name.index("phi")]) if last else 0.0
-
-    def turn() -> None:
-        peer_node.publish("target", to_message(time.time_ns(), ["phi"], np.array([0.5]), "/operator#1"))
-
-    peer_node.until(lambda: phi() > 0.25, each=turn)
-    with guidance.stopped():
-        nodes["reference_model"].wait_for("/u_m timed out: wings are levelled")
-        peer_node.until(lambda: abs(phi()) < math.radians(5.0))
-    peer_node.until(lambda: phi() > 0.4)  # it goes on
-    guidance.popen.kill()
-    peer_node.received["pose"].clear()
-    peer_node.until(lambda: peer_node.received["pose"] and abs(phi()) < math.radians(5.0))
-    banks = [message.position[message.name.index("phi")] for message in peer_node.received["pose"]]
-    assert np.degrees(np.abs(banks).max()) < 45.0

@@ -57,19 +57,6 @@ def osprey(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_wings_are_levelled_when_guidance_falls_silent_in_a_roll_in(osprey: Path, start: Start, peer_node: Peer) -> None:
-    packages = ("rise_di_controller", "aircraft_sim", "reference_model")
-    nodes = [start(f"{package}.main", "--ros-args", "--params-file", str(osprey)) for package in packages]
-    peer_node.until(lambda: bank(peer_node) > BANK / 2.0, each=lambda: commands(peer_node))
-    nodes[2].wait_for("commands from /u_m replace the profile")
-    peer_node.received["pose"].clear()
-    peer_node.spin(10.5)  # s: no u_m from here on; wings are level ten seconds later
-    assert "/u_m timed out: wings are levelled" in nodes[2].output
-    phi = np.array([message.position[message.name.index("phi")] for message in peer_node.received["pose"]])
-    assert np.degrees(np.abs(phi).max()) < 45.0
-    assert abs(math.degrees(phi[-1])) < 5.0
-
-
 def test_a_second_publisher_and_a_command_beyond_its_bound_are_refused(osprey: Path, start: Start, peer_node: Peer) -> None:
     process = start("reference_model.main", "--ros-args", "--params-file", str(osprey))
 

@@ -6,17 +6,20 @@ Among them: nodes killed and stopped (failsafe, re-engagement), message storms a
 malformed samples, incompatible QoS, overruns, a full disk and steps of the clock.
 """
 
+import json
 import math
 import os
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import Enum
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
@@ -31,7 +34,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, logged
-from tests.ros.faults.flight import INPUTS, MAX_AGE, OUTPUTS, OWN_SESSION, PUBLISHED, U_MAX_AGE, Flight
+from tests.ros.faults.flight import INPUTS, MAX_AGE, OUTPUTS, OWN_SESSION, PUBLISHED, U_MAX_AGE, Flight, Kind
 from tests.ros.peer import peer
 from tests.small_disk import fill, small_disk
 
@@ -60,6 +63,8 @@ class Response(Enum):
     CONTROLLER_FAILSAFE = "held, then ramped to trim by the controller"
     AIRCRAFT_FAILSAFE = "held, then ramped to trim by the aircraft"
     LATE = "the law flies, late"
+    WINGS_LEVELLED = "the law flies on: the reference model levels the wings"
+    WITHIN_LIMITS = "the law flies on: guidance corrects the error within its limits"
 
 
 Detection = Callable[[Flight], float | None]
@@ -75,7 +80,8 @@ class Case(NamedTuple):
     within: float = 0.0  # s, from the begin of the fault to its detection
     response: Response = Response.UNCHANGED
     recovery: float = 0.0  # s, from the end of the fault until the law is engaged
-    own_clock: bool = False  # in a flight with a clock that can be set
+    kind: Kind = Kind.PLAIN  # of the flight
+    in_suite: bool = True  # else the benchmark alone injects it
 
 
 # Detection
@@ -154,19 +160,137 @@ def kill(role: str) -> Injection:
         elif role == "controller":
             trim = [[0.0] * len(INPUTS)]
             flight.until(lambda: flight.actuator_positions(time.time() - 1.0)[1][-1:].tolist() == trim, 10.0, "inputs at trim")
-        started = flight.start(role)
-        flight.processes[role].wait_for("ready")
-        flight.end_fault()
-        ready = flight.until(lambda: ready_stamp(flight, role, started), 5.0, f"{role} ready, on /rosout")
-        traffic = flight.until(lambda: full_traffic(flight, role, ready), 5.0, f"full traffic of {role}")
-        traffic = max(traffic, ready)  # the first tick of a recorder writes what it received before it was ready
-        flight.end = ready
-        flight.measured |= {"ready_to_traffic": traffic - ready, "exec_to_traffic": traffic - started}
-        if role == "recorder":
-            caught_up = flight.until(lambda: recorded_since(flight.runs[-1], ready), 5.0, "new samples in the log")
-            flight.measured["ready_to_caught_up"] = caught_up - ready
+        restart(flight, role)
 
     return inject
+
+
+def restart(flight: Flight, role: str) -> None:
+    """Start a killed node again. The end of the fault is when it is ready."""
+    started = flight.start(role)
+    flight.processes[role].wait_for("ready")
+    flight.end_fault()
+    ready = flight.until(lambda: ready_stamp(flight, role, started), 5.0, f"{role} ready, on /rosout")
+    traffic = flight.until(lambda: full_traffic(flight, role, ready), 5.0, f"full traffic of {role}")
+    traffic = max(traffic, ready)  # the first tick of a recorder writes what it received before it was ready
+    flight.end = ready
+    flight.measured |= {"ready_to_traffic": traffic - ready, "exec_to_traffic": traffic - started}
+    if role == "recorder":
+        caught_up = flight.until(lambda: recorded_since(flight.runs[-1], ready), 5.0, "new samples in the log")
+        flight.measured["ready_to_caught_up"] = caught_up - ready
+
+
+def disturb(flight: Flight, *words: str) -> float:
+    """Run a process of `foreign.py`, which is the fault; how much it sent."""
+    process = Process("tests.ros.faults.foreign", *words, cwd=REPOSITORY, within=OWN_SESSION)
+    try:
+        process.wait_for("begins at")
+        flight.begin = float(process.lines[-1].split()[-1])
+        process.wait_for("sent")
+    finally:
+        process.popen.kill()
+        process.end()
+    flight.end_fault()
+    return float(process.lines[-1].split()[1])
+
+
+BANK = 0.5  # rad, commanded in a roll-in; guidance flies at most 0.52
+LEVEL = 10.0  # s after the loss of u_m, until the wings have to be level
+
+
+def kill_in_a_roll_in(flight: Flight, random: Generator) -> None:
+    """Guidance killed at any bank of a roll-in to either side, and started again when the wings have to be level."""
+    bank = float(random.choice((-BANK, BANK)))
+    fraction = random.uniform(0.0, 0.95)
+
+    def rolled_in() -> bool:
+        flight.probe.target(phi=bank)
+        return bool((flight.bank(time.time() - 0.1)[1] / bank >= fraction).any())
+
+    flight.until(rolled_in, 20.0, f"a bank of {bank * fraction:.2f} rad")
+    flight.begin_fault()
+    flight.kill("guidance")
+    flight.until(lambda: flight.bank(flight.begin + LEVEL)[0].size, LEVEL + 5.0, "the end of the levelling")
+    restart(flight, "guidance")
+    flight.until(flight.is_level, 20.0, "level flight under guidance")
+
+
+def pose_fault(word: str, *back: str) -> Injection:
+    """The pose with a fault for some time; then guidance logs that it is back."""
+
+    def inject(flight: Flight, random: Generator) -> None:
+        at_random(flight, random)
+        flight.begin_fault()
+        with flight.pose_fault(word):
+            pause(flight, STOP)
+        flight.end_fault()
+        for line in back:
+            flight.until(lambda line=line: flight.first_line("guidance", line, flight.end), 5.0, line)  # type: ignore[misc]
+        flight.until(flight.is_level, 20.0, "level flight under guidance")
+
+    return inject
+
+
+# The live page
+
+
+class Page(NamedTuple):
+    """A server of the live page."""
+
+    process: Process
+    address: str
+
+    def state(self) -> str:
+        """What the page says of the recording, by one request of a browser that knows nothing; empty without an answer."""
+        parts = urlsplit(self.address)
+        try:
+            with urllib.request.urlopen(f"http://{parts.netloc}/data/0?{parts.query}", timeout=10.0) as response:
+                content = response.read()
+        except OSError:
+            return ""
+        return str(json.loads(content[4 : 4 + int.from_bytes(content[:4], "little")])["state"])
+
+
+@contextmanager
+def live_page(flight: Flight) -> Iterator[Page]:
+    """`rise-di watch` of the present recording, which it shows."""
+    words = ("flight_cli.cli", "watch", str(flight.runs[-1]), "--wait", "--port", "0")
+    process = Process(*words, cwd=flight.folder, within=OWN_SESSION)
+    try:
+        process.wait_for("http://")
+        page = Page(process, next(line for line in process.lines if line.startswith("http://")))
+        flight.until(lambda: page.state() == "recording", 10.0, "a page that shows the recording")
+        yield page
+        process.popen.terminate()
+        assert process.end() == 0, process.output
+        assert "Traceback" not in process.output
+    finally:
+        process.popen.kill()
+        process.end()
+
+
+CONNECTIONS, PAGE_STORM = 200, 2.0  # s
+
+
+def storm_on_the_page(flight: Flight, random: Generator) -> None:
+    """Two hundred connections to the live page that ask for all samples at once and read nothing; it answers afterwards."""
+    with live_page(flight) as page:
+        disturb(flight, "clients", page.address, str(CONNECTIONS), str(PAGE_STORM))
+        flight.until(lambda: page.state() == "recording", 10.0, "a page that answers again")
+        flight.measured["page"] = time.time() - flight.end
+
+
+def recorder_killed_under_the_page(flight: Flight, random: Generator) -> None:
+    """The page says that its recording was interrupted; a page of the new recording shows that."""
+    with live_page(flight) as page:
+        at_random(flight, random)
+        flight.begin_fault()
+        flight.kill("recorder")
+        flight.until(lambda: page.state() == "interrupted", 10.0, "a page that says so")
+        flight.measured["page"] = time.time() - flight.begin
+        restart(flight, "recorder")
+        with live_page(flight):
+            assert page.state() == "interrupted"
 
 
 def ready_stamp(flight: Flight, role: str, begin: float) -> float | None:
@@ -212,23 +336,13 @@ def stop(role: str) -> Injection:
 STORM_RATE, STORM_DURATION = 10_000.0, 2.0  # Hz, s
 
 
-def storm(topic: str) -> Injection:
-    """Ten thousand valid vectors a second from an unexpected publisher."""
+def storm(topic: str, reason: str = "conflicting publisher") -> Injection:
+    """Ten thousand vectors a second from an unexpected publisher, refused for a reason."""
 
     def inject(flight: Flight, random: Generator) -> None:
         seed = int(random.integers(2**31))
-        words = ("tests.ros.faults.foreign", "storm", topic, str(STORM_RATE), str(STORM_DURATION), str(seed))
-        until_refusal_logged_again(flight, topic, "conflicting publisher")
-        process = Process(*words, cwd=REPOSITORY, within=OWN_SESSION)
-        try:
-            process.wait_for("begins at")
-            flight.begin = float(process.lines[-1].split()[-1])
-            process.wait_for("sent")
-        finally:
-            process.popen.kill()
-            process.end()
-        flight.end_fault()
-        sent = float(process.lines[-1].split()[1])
+        until_refusal_logged_again(flight, topic, reason)
+        sent = disturb(flight, "storm", topic, str(STORM_RATE), str(STORM_DURATION), str(seed))
         flight.measured["messages_per_second"] = sent / STORM_DURATION
         assert sent >= 0.5 * STORM_RATE * STORM_DURATION, "the host is too busy for a storm"
 
@@ -237,7 +351,7 @@ def storm(topic: str) -> Injection:
 
 NAMES = {"y": OUTPUTS, "y_m": OUTPUTS, "u": INPUTS}
 PUBLISHERS = {"y": "aircraft", "y_m": "reference_model", "u": "controller"}
-CONSUMERS = {"y": "controller", "y_m": "controller", "u": "aircraft"}
+CONSUMERS = {"y": "controller", "y_m": "controller", "u": "aircraft", "u_m": "reference_model", "target": "guidance"}
 
 Names = tuple[str, ...]
 BadSample = tuple[float, Names, FloatArray]  # the offset of its stamp from the present, s; names; values
@@ -476,6 +590,12 @@ def invalid_change(random: Generator) -> tuple[str, object]:
 U_STALE = U_MAX_AGE + 0.005  # s, and a tick, until the aircraft logs the timeout of u
 STALE = MAX_AGE + 0.01  # s, and a tick, until the controller holds u
 
+POSE_IS_BACK, UNKNOWN = "DEAD_RECKONING -> ENGAGED", "expected some of"
+UNKNOWN_TARGET = logs("guidance", refusal("target", UNKNOWN))
+LIVE_MAX_AGE = 0.2  # s, of u_m, and of the pose in guidance: the defaults
+STALE_U_M = (logs("reference_model", "u_m timed out"), LIVE_MAX_AGE + 0.005)  # and a tick
+STALE_POSE = (logs("guidance", "pose is stale"), LIVE_MAX_AGE + 0.02)  # and a tick
+
 STALE_INPUT = (enters(Mode.HOLD), STALE, Response.CONTROLLER_FAILSAFE)
 STALE_U = (logs("aircraft", "failsafe: u from"), U_STALE, Response.AIRCRAFT_FAILSAFE)
 
@@ -501,6 +621,17 @@ CASES = (
     Case("CPU starved", starve, counts("aircraft", "missed ticks"), REPORT + 3.0, Response.LATE, 0.5),
     Case("disk full", full_disk, logs("recorder", "recording ended"), 0.1),
     Case("storm of parameters", parameters, logs("controller", "parameters rejected")),
-    Case("clock set back", step_of_clock(-5.0), logs("controller", "clock was set by -5"), REPORT, own_clock=True),
-    Case("clock set forth", step_of_clock(5.0), logs("controller", r"clock was set by \+5"), REPORT, own_clock=True),
+    Case("clock set back", step_of_clock(-5.0), logs("controller", "clock was set by -5"), REPORT, kind=Kind.OWN_CLOCK),
+    Case("clock set forth", step_of_clock(5.0), logs("controller", r"clock was set by \+5"), REPORT, kind=Kind.OWN_CLOCK),
+    Case("storm on the live page", storm_on_the_page, None, in_suite=False),
+    Case("recorder killed under a live page", recorder_killed_under_the_page, None, in_suite=False),
+    Case("guidance killed in a roll-in", kill_in_a_roll_in, *STALE_U_M, Response.WINGS_LEVELLED, kind=Kind.GUIDED),
+    Case("guidance stopped", stop("guidance"), *STALE_U_M, kind=Kind.GUIDED),
+    Case("second guidance", second("guidance", "u_m"), conflicting("u_m", "guidance"), kind=Kind.GUIDED),
+    Case("storm on u_m", storm("u_m"), conflicting("u_m", "foreign"), kind=Kind.GUIDED, in_suite=False),
+    Case("storm on target", storm("target", UNKNOWN), UNKNOWN_TARGET, kind=Kind.GUIDED, in_suite=False),
+    Case("pose frozen", pose_fault("repeat", POSE_IS_BACK), *STALE_POSE, kind=Kind.GUIDED),
+    Case("pose frozen, new stamps", pose_fault("freeze", POSE_IS_BACK), *STALE_POSE, kind=Kind.GUIDED, in_suite=False),
+    Case("pose stale", pose_fault("hold", POSE_IS_BACK), *STALE_POSE, kind=Kind.GUIDED, in_suite=False),
+    Case("pose jumping", pose_fault("jump"), None, response=Response.WITHIN_LIMITS, kind=Kind.GUIDED, in_suite=False),
 )

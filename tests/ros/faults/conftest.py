@@ -5,13 +5,13 @@
 import json
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from tests.ros.conftest import reserved_domain
-from tests.ros.faults.flight import Flight
+from tests.ros.faults.flight import Flight, Kind
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
@@ -22,7 +22,8 @@ Row = dict[str, str | int | float | bool | None]
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--faults-table", type=Path, default=None, help="append a row for each fault to this file of JSON lines")
     parser.addoption("--faults-seed", type=int, default=1, help="seed of the faults")
-    parser.addoption("--faults-scenario", default="osprey_gust", help="scenario of the flight")
+    parser.addoption("--faults-scenario", default="osprey_gust", help="scenario of the flight without guidance")
+    parser.addoption("--faults-guided", default="osprey_route", help="scenario of the flight with guidance")
     parser.addoption("--faults-times", type=int, default=1, help="how often each fault is injected in a row; seeds count up")
 
 
@@ -47,6 +48,12 @@ def seeds(pytestconfig: pytest.Config) -> range:
 
 
 @pytest.fixture(scope="session")
+def benchmark(pytestconfig: pytest.Config) -> bool:
+    """Whether benchmarks/faults.py runs these tests: all cases, with a table."""
+    return pytestconfig.getoption("--faults-table", None) is not None
+
+
+@pytest.fixture(scope="session")
 def record(pytestconfig: pytest.Config) -> Callable[[Row], None]:
     """Append a row to the table of `--faults-table`."""
     path = pytestconfig.getoption("--faults-table", None)
@@ -60,21 +67,21 @@ def record(pytestconfig: pytest.Config) -> Callable[[Row], None]:
 
 
 class Flights:
-    """The flight under test, on the clock of the system or on one that can be set. One runs at a time."""
+    """The flight under test, of one kind or another. One runs at a time."""
 
-    def __init__(self, folder: Path, scenario: Scenario) -> None:
-        self._folder, self._scenario = folder, scenario
-        self._running: dict[bool, Flight] = {}
+    def __init__(self, folder: Path, scenarios: Mapping[Kind, Scenario]) -> None:
+        self._folder, self._scenarios = folder, scenarios
+        self._running: dict[Kind, Flight] = {}
         self.all: list[Flight] = []  # including those that have ended
 
-    def steady(self, *, own_clock: bool) -> Flight:
+    def steady(self, kind: Kind) -> Flight:
         """A flight that is steady and near trim: the running one, or a new one where a fault has upset that."""
-        if own_clock in self._running:
+        if kind in self._running:
             with suppress(AssertionError):
-                self._running[own_clock].until_steady(20.0)
-                assert self._running[own_clock].is_near_trim()
-                return self._running[own_clock]
-        flight = self._start(own_clock)
+                self._running[kind].until_steady(20.0)
+                assert self._running[kind].is_near_trim()
+                return self._running[kind]
+        flight = self._start(kind)
         try:
             flight.until_steady()
             with suppress(AssertionError):  # on a busy host it is never at rest
@@ -84,18 +91,20 @@ class Flights:
             raise
         return flight
 
-    def _start(self, own_clock: bool) -> Flight:
+    def _start(self, kind: Kind) -> Flight:
         self.close()
         folder = self._folder / f"flight{len(self.all) + 1}"
         folder.mkdir()
-        flight = self._running[own_clock] = Flight(folder, self._scenario.path, _clock(folder) if own_clock else None)
+        flight = self._running[kind] = Flight(
+            folder, self._scenarios[kind].path, _clock(folder) if kind is Kind.OWN_CLOCK else None
+        )
         self.all.append(flight)
         return flight
 
     def close(self) -> None:
         """End the running flight."""
-        for own_clock in list(self._running):
-            self._running.pop(own_clock).close()
+        for kind in list(self._running):
+            self._running.pop(kind).close()
 
 
 def _clock(folder: Path) -> Path:
@@ -110,7 +119,9 @@ def _clock(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -> Iterator[Flights]:
-    scenario = find_scenario(str(pytestconfig.getoption("--faults-scenario", "osprey_gust")))
-    made = Flights(tmp_path_factory.mktemp("faults"), scenario)
+    plain = find_scenario(str(pytestconfig.getoption("--faults-scenario", "osprey_gust")))
+    guided = find_scenario(str(pytestconfig.getoption("--faults-guided", "osprey_route")))
+    scenarios = {Kind.PLAIN: plain, Kind.OWN_CLOCK: plain, Kind.GUIDED: guided}
+    made = Flights(tmp_path_factory.mktemp("faults"), scenarios)
     yield made
     made.close()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight under test: four processes that can be killed and stopped, and a probe that receives and times their messages."""
+"""A flight under test: processes that can be killed and stopped, and a probe that receives and times their messages."""
 
 import os
 import re
@@ -11,8 +11,9 @@ import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from enum import Enum
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -24,16 +25,18 @@ from rcl_interfaces.msg import Log
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, logged
 
+from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_bringup.processes import end_with_parent
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.vectors import FloatArray, StampedVector
 from flight_ros import transport
-from flight_ros.messages import Decoder
+from flight_ros.messages import Decoder, to_message
 from flight_ros.rclpy_private import WaitSet
 from flight_ros.subscriptions import PolledSubscription
-from flight_ros.topics import DIAGNOSTICS, INTERNALS, TRUTH, Y_M, Topic, U, Y
+from flight_ros.topics import DIAGNOSTICS, INTERNALS, POSE, PUBLISH, TARGET, TRUTH, U_M, Y_M, Topic, U, Y
 from rise_di_controller.guard import Mode
 
 PACKAGES = {
@@ -41,19 +44,36 @@ PACKAGES = {
     "controller": "rise_di_controller",
     "aircraft": "aircraft_sim",
     "reference_model": "reference_model",
+    "guidance": "guidance",
 }
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
 ROSOUT = Topic("/rosout", Log)
-TOPICS = (Y, Y_M, U, INTERNALS, TRUTH, DIAGNOSTICS, ROSOUT)
+TRUE_POSE = Topic("true_pose", POSE.type)  # of the aircraft in a guided flight: a gate relays it as `pose`
+TOPICS = (Y, Y_M, U, U_M, TRUE_POSE, INTERNALS, TRUTH, DIAGNOSTICS, ROSOUT)
+
+
+class Kind(Enum):
+    """What flies."""
+
+    PLAIN = "four nodes and a profile of commands"
+    OWN_CLOCK = "the same, with a clock that can be set"
+    GUIDED = "guidance beside them"
+
 
 # Linux gives a process in its own session its own share of a busy processor (man 7 sched, autogroup).
 OWN_SESSION = (*(command for command in (shutil.which("setsid"),) if command), *end_with_parent())
 
-PUBLISHED = {"aircraft": ("truth", "y"), "reference_model": ("y_m",), "controller": ("internals", "u")}
+PUBLISHED = {
+    "aircraft": ("truth", "y"),
+    "reference_model": ("y_m",),
+    "controller": ("internals", "u"),
+    "guidance": ("u_m",),
+}
 
 TICK = 0.01  # s, the controller's, as in the default scenario
 MAX_AGE = 0.1  # s, of y and y_m, as in the default scenario
 U_MAX_AGE = 0.2  # s, of u, the aircraft's default
+LEVEL = 0.01  # rad, of wings
 HOLD, RAMP = 0.2, 0.3  # s, of both failsafes: shorter than the defaults, so that a case sees all of them
 
 TRACKING = 0.05
@@ -89,6 +109,7 @@ class Probe:
         self._context = Context()
         rclpy.init(context=self._context)
         self._node = Node("probe", context=self._context, start_parameter_services=False)
+        self._target = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
         qos = {DIAGNOSTICS: PROBE_LOG_QOS, ROSOUT: PROBE_LOG_QOS}
         self._subscriptions = {
             topic.name: PolledSubscription(self._node, topic, qos.get(topic, PROBE_QOS), raw=topic not in qos)
@@ -145,6 +166,10 @@ class Probe:
                 self._changed.wait(0.05)
         return value
 
+    def target(self, **values: float) -> None:
+        """Command guidance, by channel."""
+        self._target.publish(to_message(time.time_ns(), [*values], np.array([*values.values()]), "/probe"))
+
     def close(self) -> None:
         """End the thread and the node."""
         self._closed = True
@@ -182,27 +207,39 @@ def _ticks(t: FloatArray, values: FloatArray) -> Ticks:
     return Ticks(t, mode[:, 0], e, u, y, y_m)
 
 
-TICK_CHANNELS = ("mode", *(f"e.{name}" for name in OUTPUTS), *(f"u.{name}" for name in INPUTS))
-TICK_CHANNELS += tuple(f"{group}.{name}" for group in ("y", "y_m") for name in OUTPUTS)
-ACTUATORS = tuple(f"actuator.{name}" for name in INPUTS)
+def tick_channels(inputs: tuple[str, ...]) -> tuple[str, ...]:
+    """The channels of `internals` in the order of `Ticks`."""
+    groups = (("e", OUTPUTS), ("u", inputs), ("y", OUTPUTS), ("y_m", OUTPUTS))
+    return ("mode", *(f"{group}.{name}" for group, names in groups for name in names))
 
 
 def steady_scenario(source: Path, folder: Path) -> Path:
-    """A scenario in a steady flight 0.1 m/s above trim, without an end: u is not 0, so that a change of it shows."""
+    """A scenario in a steady flight 0.1 m/s above trim, without an end: u is not 0, so that a change of it shows.
+
+    Guidance, where the scenario has a section of it, commands this flight with level wings.
+    """
     tree = yaml.safe_load(source.read_text(encoding="utf-8"))
     sections = {key.removeprefix("/**/"): content["ros__parameters"] for key, content in tree.items()}
+    aircraft, reference = sections["aircraft"], sections["reference_model"]
     # Noise would hide a change of u, and a probe finds u in the positions of ideal actuators.
-    for disturbance in ("gusts", "turbulence", "sensors", "actuators"):
-        sections["aircraft"].pop(disturbance, None)
-    del sections["reference_model"]["coordinated_turn"]
-    sections["aircraft"] |= {"rate": 200.0, "step": 0.005}  # a lower load, for busy hosts
-    sections["reference_model"]["rate"] = 200.0
-    sections["reference_model"]["second_order"]["natural_frequency"] = [4.0, 4.0, 5.0, 4.0]  # V settles sooner
-    sections["reference_model"]["pulses"] = {"V": {"start": [0.0], "stop": [1e5], "value": [0.1]}}
+    for disturbance in ("gusts", "turbulence", "wind", "sensors", "actuators"):
+        aircraft.pop(disturbance, None)
+    reference.pop("coordinated_turn", None)
+    aircraft |= {"rate": 200.0, "step": 0.005}  # a lower load, for busy hosts
+    reference["rate"] = 200.0
+    if (guidance := sections.get("guidance")) is None:
+        reference["second_order"]["natural_frequency"] = [4.0, 4.0, 5.0, 4.0]  # V settles sooner
+        reference["pulses"] = {"V": {"start": [0.0], "stop": [1e5], "value": [0.1]}}
+    else:
+        guidance.pop("route", None)
+        level = {"phi": 0.0, "climb": 0.0, "V": reference["live"]["speed"] + 0.1}
+        guidance["program"] = {name: {"start": [0.0], "value": [value]} for name, value in level.items()}
     sections["controller"] |= {"max_age": MAX_AGE, "hold": HOLD, "ramp": RAMP}
     sections["aircraft"] |= {"max_age": U_MAX_AGE, "hold": HOLD, "ramp": RAMP}
     path = folder / "steady.yaml"
     path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    if guidance is not None:  # the section by itself, with what follows from the others
+        path.write_text(scenario_yaml(load_scenario(path)), encoding="utf-8")
     return path
 
 
@@ -224,7 +261,7 @@ class Killed(NamedTuple):
 
 
 class Flight:
-    """Four processes and a probe. Instants are seconds of the system clock."""
+    """Four processes, guidance where the scenario has it, and a probe. Instants are seconds of the system clock."""
 
     def __init__(self, folder: Path, source: Path, clock: Path | None = None) -> None:
         self.folder = folder
@@ -232,6 +269,9 @@ class Flight:
         self._step = folder / "clock"
         self._step.write_bytes(bytes(8))
         self.scenario = steady_scenario(source, folder)
+        content = load_scenario(self.scenario)
+        inputs = content.controller.inputs
+        self._tick_channels, self._actuators = tick_channels(inputs), tuple(f"actuator.{name}" for name in inputs)
         self.probe = Probe()
         self.until = self.probe.until
         self.processes: dict[str, Process] = {}
@@ -241,8 +281,12 @@ class Flight:
         self.expected_logs: dict[str, ExpectedLog] = {}  # by case
         self._all: list[Process] = []
         self._killed: list[Killed] = []
-        self._instances: set[str] = set()  # of the four roles, including restarts
-        for role in PACKAGES:  # the recorder first, and no aircraft without its controller
+        self._instances: set[str] = set()  # of the roles, including restarts
+        guided = content.guidance is not None
+        self.gate = self._foreign("gate", TRUE_POSE.name, POSE.name) if guided else None
+        for role in (
+            one for one in PACKAGES if guided or one != "guidance"
+        ):  # the recorder first, no aircraft without its controller
             self.start(role)
             if role == "controller":
                 self.processes["recorder"].wait_for("ready")
@@ -253,6 +297,8 @@ class Flight:
     def node(self, role: str, *parameters: str) -> Process:
         """Start a node as `python -m PACKAGE.main`."""
         words = [word for one in parameters for word in ("-p", one)]
+        if role == "aircraft" and self.gate is not None:
+            words += ["-r", f"{POSE.name}:={TRUE_POSE.name}"]
         preload = {} if self._clock is None else {"LD_PRELOAD": str(self._clock), "FAULTS_CLOCK": str(self._step)}
         with patch.dict(os.environ, preload):
             arguments = (f"{PACKAGES[role]}.main", "--ros-args", "--params-file", str(self.scenario), *words)
@@ -261,13 +307,29 @@ class Flight:
         self.probe.monitored.append(process)
         return process
 
+    def _foreign(self, *words: str) -> Process:
+        """Start a process of `foreign.py` that lasts as long as the flight."""
+        process = Process("tests.ros.faults.foreign", *words, cwd=REPOSITORY, within=OWN_SESSION, stdin=subprocess.PIPE)
+        self._all.append(process)
+        return process
+
+    @contextmanager
+    def pose_fault(self, word: str) -> Iterator[None]:
+        """A fault of the relayed pose during the block."""
+        assert self.gate is not None
+        stdin = self.gate.popen.stdin
+        assert stdin is not None
+        print(word, file=stdin, flush=True)
+        yield
+        print("pass", file=stdin, flush=True)
+
     def set_clock(self, by: float) -> None:
         """Set the system clock of the processes this far from the true one, s."""
         with self._step.open("r+b") as stream:
             stream.write(struct.pack("=q", nanoseconds(by)))
 
     def start(self, role: str, *parameters: str) -> float:
-        """Start one of the four roles; the instant of the start."""
+        """Start one of the roles; the instant of the start."""
         if role == "recorder" and not parameters:
             self.runs.append(self.folder / f"run{len(self.runs)}")
             parameters = (f"directory:={self.runs[-1]}", "min_free:=0.0")
@@ -315,11 +377,11 @@ class Flight:
 
     def ticks(self, begin: float, end: float = float("inf")) -> Ticks:
         """The controller's ticks."""
-        return _ticks(*self._values("internals", TICK_CHANNELS, begin, end))
+        return _ticks(*self._values("internals", self._tick_channels, begin, end))
 
     def engaged_ticks(self, begin: float, until: float) -> Ticks | None:
         """The engaged ticks with samples from `begin` on, from the log, which is complete; None before it reaches `until`."""
-        decoder, found = Decoder(TICK_CHANNELS), []
+        decoder, found = Decoder(self._tick_channels), []
         for topic, record in logged(self.runs[-1]):
             sample = self._decode(decoder, record.data) if topic == "/internals" else None
             if sample is not None and seconds(sample.stamp_ns) >= begin - MAX_AGE:
@@ -331,7 +393,12 @@ class Flight:
 
     def actuator_positions(self, begin: float, end: float = float("inf")) -> tuple[FloatArray, FloatArray]:
         """The applied inputs of the aircraft: when (N,), and their deviations from trim (N, m)."""
-        return self._values("truth", ACTUATORS, begin, end)
+        return self._values("truth", self._actuators, begin, end)
+
+    def bank(self, begin: float, end: float = float("inf")) -> tuple[FloatArray, FloatArray]:
+        """The true bank of the aircraft in a guided flight: when (N,), and rad (N,)."""
+        t, phi = self._values(TRUE_POSE.name, ("phi",), begin, end)
+        return t, phi[:, 0]
 
     def _values(self, topic: str, names: tuple[str, ...], begin: float, end: float) -> tuple[FloatArray, FloatArray]:
         decoder, found = Decoder(names), []
@@ -428,6 +495,11 @@ class Flight:
             and (np.abs(ticks.e) <= TRACKING).all()
             and (np.abs(ticks.u[-10:] - inputs[-1]).max(axis=1) == 0.0).any()
         )
+
+    def is_level(self) -> bool:
+        """Whether a guided flight has had level wings for half a second."""
+        t, phi = self.bank(time.time() - 0.5)
+        return bool(len(t) and np.abs(phi).max() <= LEVEL)
 
     def is_at_rest(self) -> bool:
         """Whether u has hardly moved in the last second."""
