@@ -19,10 +19,9 @@ import tempfile
 import threading
 import time
 import urllib.parse
-import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http.cookiejar import CookieJar
+from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from typing import Any
 
@@ -115,9 +114,10 @@ class Client(threading.Thread):
 
     def __init__(self, address: str) -> None:
         super().__init__(daemon=True)
-        self._opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
-        self._base = address.partition("?")[0]
-        self._opener.open(address).read()
+        parts = urllib.parse.urlsplit(address)
+        self._connection = HTTPConnection(parts.netloc)  # one for all requests, as a browser has it
+        self._cookie = ""
+        self._get(f"{parts.path}?{parts.query}")
         self._ended = threading.Event()
         self.delays: list[float] = []
         self.bytes = 0
@@ -131,8 +131,8 @@ class Client(threading.Thread):
             known = {name: head.get(name, "") for name in ("epoch", "state", "described")} | rows
             query = urllib.parse.urlencode(known)
             try:
-                content = self._opener.open(f"{self._base}data/0?{query}").read()
-            except OSError:
+                content = self.ask(query)
+            except (OSError, HTTPException):
                 break
             now = time.time()
             self.bytes += len(content)
@@ -146,6 +146,16 @@ class Client(threading.Thread):
                     self.delays.append(now - start - float(np.frombuffer(content, "<f8", count, place)[-1]))
                 rows[topic["name"]] = topic["first"] + count
                 place += 8 * count + -(-4 * count * len(topic["channels"]) // 8) * 8
+
+    def ask(self, query: str = "") -> bytes:
+        """What a client lacks that knows so much. Raises OSError or HTTPException where the server has ended."""
+        return self._get(f"/data/0?{query}")
+
+    def _get(self, target: str) -> bytes:
+        self._connection.request("GET", target, headers={"Cookie": self._cookie})
+        response = self._connection.getresponse()
+        self._cookie = response.headers.get("Set-Cookie", self._cookie).partition(";")[0]
+        return response.read()
 
     def stop(self) -> None:
         """Ask no more."""
@@ -255,7 +265,7 @@ def frozen(seconds: float = FREEZE) -> dict[str, Any]:
 
 def start_of(client: Client) -> float:
     """System time of t = 0, s, as the page has it."""
-    content = client._opener.open(f"{client._base}data/0").read()
+    content = client.ask()
     size = int.from_bytes(content[:4], "little")
     return int(json.loads(content[4 : 4 + size])["epoch"].partition(".")[0]) / NANOSECONDS
 

@@ -162,9 +162,9 @@ class Flight:
                     break
         except OSError as error:
             raise ParameterError(f"{self.run}: cannot be read ({error.strerror}), expected the log of a flight") from None
-        for topic in self._topics.values():
-            self._decode(topic)
         if found:
+            for topic in self._topics.values():
+                self._decode(topic)
             self._changed = self._now()
             self._update_bands()
         return found

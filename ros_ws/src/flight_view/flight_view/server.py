@@ -49,7 +49,7 @@ REQUEST_TIMEOUT = 10.0  # s, for a request to arrive in full, and for the next o
 MAX_REQUEST_BYTES = 8192
 MAX_WAIT = 2.0  # s that a request for samples waits for new ones
 MAX_ROWS = 10_000  # of a topic in one answer
-POLL_PERIOD = 0.04  # s; the recorder closes a chunk each 0.1 s
+REST, POLL_PERIOD = 0.09, 0.03  # s, after a chunk and until the next: the recorder closes one each 0.1 s
 STATE_PERIOD = 0.25  # s, between two looks at the state of the recording
 BUDGET = 0.05  # s of reading between two answers
 
@@ -99,16 +99,15 @@ class Server:
             if any(found):
                 self._news.set()
                 self._news.clear()
-            await asyncio.sleep(0.0 if any(found) else POLL_PERIOD)
+            behind = any(flight.state() == "reading" for flight in self.flights)
+            await asyncio.sleep(0.0 if behind else REST if any(found) else POLL_PERIOD)
 
     async def news(self, flight: Flight, known: Mapping[str, str]) -> bytes:
         """The answer to a browser that knows so many rows of each topic; waits up to MAX_WAIT s for something new."""
         deadline = time.monotonic() + MAX_WAIT
         while not has_news(flight, known) and (rest := deadline - time.monotonic()) > 0.0:
-            try:
+            with suppress(TimeoutError):
                 await asyncio.wait_for(self._news.wait(), min(rest, STATE_PERIOD))
-            except TimeoutError:
-                continue
         return answer(flight, known, ghost=len(self.flights) > 1, control=self.control is not None)
 
 
@@ -128,10 +127,10 @@ def has_news(flight: Flight, known: Mapping[str, str]) -> bool:
     """Whether a browser lacks a row, an event, or the state."""
     first = _first_rows(flight, known)
     return (
-        known.get("epoch") != _epoch(flight)
-        or known.get("state") != flight.state()
-        or any(samples.count > first[name] for name, samples in flight.samples.items())
+        any(samples.count > first[name] for name, samples in flight.samples.items())
         or len(flight.events) > first["events"]
+        or known.get("epoch") != _epoch(flight)
+        or known.get("state") != flight.state()
     )
 
 
@@ -218,6 +217,9 @@ class _Handler(RequestHandler):
     def write_error(self, status_code: int, **kwargs: Any) -> None:
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(f"{status_code}: {self._reason}\n")
+
+    def compute_etag(self) -> None:
+        """No hash of each answer: nothing is to be kept."""
 
     def log_exception(self, *args: Any) -> None:
         if not isinstance(args[1], HTTPError):
