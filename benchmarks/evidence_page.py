@@ -19,6 +19,7 @@ WIDTH = 120  # characters of a line of prose
 HARD_SPACE = "\u00a0"  # no line is broken here
 BUSY = 0.1  # share of the processors in use just before a measurement; the page marks results above it
 ECHOES = ("bare echo, single", "bare echo, multi", "bare echo, events")  # rows of the group "node"
+GOAL, NOT_MET, UNMET = "- Goal: ", "**not met**", "UNMET"
 WITHOUT_RATIO = ("missed", "missed excluding host delays", "lost", "ticks", "max (us)")  # counts and single outliers
 
 
@@ -53,9 +54,21 @@ def render(measurements: Sequence[Measurement], results: Mapping[str, Result]) -
         results=results,
         value=lambda name: results[name]["result"] if name in results else None,
     )
-    paragraphs = re.sub(r"(?<=[^\n|])\n *(?=[^\s|#-])", " ", page).splitlines()
+    paragraphs = _unmet_first(re.sub(r"(?<=[^\n|])\n *(?=[^\s|#-])", " ", page).splitlines())
     wrapped = "\n".join(line for paragraph in paragraphs for line in _wrapped(paragraph.rstrip()))
     return re.sub(r"\n{3,}", "\n\n", wrapped).strip() + "\n"
+
+
+def _unmet_first(paragraphs: Sequence[str]) -> list[str]:
+    """With the goals that are not met in the place of UNMET, each behind its section."""
+    section, unmet = "", []
+    for paragraph in paragraphs:
+        if paragraph.startswith("#"):
+            section = paragraph.strip("# ")
+        elif NOT_MET in paragraph:
+            unmet.append(f"- {section}: {paragraph.removeprefix(GOAL)}")
+    lines = ["Goals that are not met:", "", *unmet] if unmet else ["Every goal on this page is met."]
+    return [line for one in paragraphs for line in (lines if one == UNMET else [one])]
 
 
 def _wrapped(paragraph: str) -> list[str]:
@@ -99,7 +112,7 @@ def milliseconds(times: Mapping[str, float] | None) -> str:
 def goal(sentence: str, value: float, limit: float, unit: str, *, at_least: bool = False) -> str:
     """A list item that compares a figure with its goal."""
     met = value >= limit if at_least else value <= limit
-    return f"- Goal: {sentence}. Measured: {number(value)}{' ' + unit if unit else ''}, {'met' if met else '**not met**'}."
+    return f"{GOAL}{sentence}. Measured: {number(value)}{' ' + unit if unit else ''}, {'met' if met else NOT_MET}."
 
 
 def speed_goal(row: Mapping[str, Any], wanted: Mapping[str, Any], figures: Mapping[str, Mapping[str, float]]) -> str:
@@ -168,7 +181,7 @@ TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-TEMPLATES.globals |= {"BUSY": BUSY, "SPEED": SPEED, "goal": goal, "ratio": ratio, "speed_goal": speed_goal, "zip": zip}
+TEMPLATES.globals |= {"UNMET": UNMET, "BUSY": BUSY, "SPEED": SPEED, "goal": goal, "ratio": ratio, "speed_goal": speed_goal, "zip": zip}
 TEMPLATES.globals |= {"fastest_echo": fastest_echo, "marked_scores": marked_scores, "outcomes": outcomes}
 TEMPLATES.filters |= {"number": number, "milliseconds": milliseconds, "host": host, "counts": counts}
 TEMPLATES.tests["always_passed"] = lambda fault: fault["passed"] == fault["injected"]

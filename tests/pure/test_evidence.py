@@ -59,6 +59,7 @@ VIEW: dict[str, Any] = {"live": BESIDE, "live with a browser": {"to the screen":
 VIEW |= {"frozen": {"frozen": 10.0, "recovered after": 0.4}}
 VIEW |= {"open": {"flight": 3600.0, "first samples": 0.4, "whole log": 5.0, "processor": 4.6, "memory": 157.0, "log": 626.0}}
 VIEW |= {"flights": {"without": PAIRS, "with": PAIRS, "probability of missed": 0.5, "probability of late p99": 1.0}}
+VIEW["flights"]["median of late p99"] = [0.0007, 0.00075]
 FLEET = {"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}
 RESULTS = {
     "speed-node": result("speed-node", {"seconds": 10.0, "rows": NODE}),
@@ -118,6 +119,16 @@ def test_a_goal_is_met_up_to_its_limit(p50: float, verdict: str) -> None:
     text = page(**{"speed-node": result("speed-node", {"rows": rows})})
     (line,) = [line for line in text.splitlines() if line.startswith("- Goal: controller: p50 at most 2 times")]
     assert line.endswith(verdict)
+
+
+def test_the_page_begins_with_the_goals_that_are_not_met() -> None:
+    top = page().partition("## ")[0]
+    assert "Goals that are not met: - Faults: a killed node is back" in top.replace("\n\n-", " -").replace("\n", " ")
+    rows = [NODE[0], row("controller", {"p50 (us)": 80.1}, "bare echo, single", (TWICE,))]
+    top = page(**{"speed-node": result("speed-node", {"rows": rows})}).partition("## ")[0]
+    assert "\n- The controller's tick compared with an echo's callback: controller: p50 at most 2 times" in top
+    met = render(MEASUREMENTS, {"speed-node": RESULTS["speed-node"]})
+    assert "Every goal on this page is met." in met
 
 
 def test_the_controller_is_also_compared_with_the_fastest_echo() -> None:
