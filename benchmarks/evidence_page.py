@@ -181,7 +181,7 @@ TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-TEMPLATES.globals |= {"UNMET": UNMET, "BUSY": BUSY, "SPEED": SPEED, "goal": goal, "ratio": ratio, "speed_goal": speed_goal, "zip": zip}
-TEMPLATES.globals |= {"fastest_echo": fastest_echo, "marked_scores": marked_scores, "outcomes": outcomes}
+TEMPLATES.globals |= {"BUSY": BUSY, "SPEED": SPEED, "goal": goal, "ratio": ratio, "speed_goal": speed_goal, "zip": zip}
+TEMPLATES.globals |= {"UNMET": UNMET, "fastest_echo": fastest_echo, "marked_scores": marked_scores, "outcomes": outcomes}
 TEMPLATES.filters |= {"number": number, "milliseconds": milliseconds, "host": host, "counts": counts}
 TEMPLATES.tests["always_passed"] = lambda fault: fault["passed"] == fault["injected"]
