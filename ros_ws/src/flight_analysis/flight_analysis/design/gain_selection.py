@@ -234,22 +234,17 @@ def study_airframe(
 def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
     """y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta; airframe's order, each (2 T - 1, m)."""
     matrices, profile = manoeuvre.reference.model(), manoeuvre.reference.profile()
-    near = 1e-5
-
-    def commanded(t: Array) -> Array:
-        return command(t, profile)
-
-    x, step = np.zeros(len(matrices.A_m)), model.stepper(STEP / 2.0, matrices)
-    rows = []
-    for k in range(2 * round(manoeuvre.duration / STEP) + 1):
-        t = k * STEP / 2.0
-        x_dot = model.x_m_dot(t, x, commanded(t), matrices)
-        u_dot = (commanded(t + near) - commanded(t - near)) / (2.0 * near)
-        x_ddot = model.x_m_dot(t, x_dot, u_dot, matrices)  # (2) differentiated
-        rows.append([model.output(z, matrices) for z in (x, x_dot, x_ddot)])
-        x = model.step(x, np.concatenate([commanded(t + part * STEP / 2.0) for part in (0.0, 0.5, 1.0)]), step)
+    near, step = 1e-5, model.stepper(STEP / 2.0, matrices)
+    t = STEP / 2.0 * np.arange(2 * round(manoeuvre.duration / STEP) + 1)
+    u_m, half_later = command(t, profile), command(t + STEP / 4.0, profile)
+    u_m_dot = (command(t + near, profile) - command(t - near, profile)) / (2.0 * near)
+    x = np.zeros((len(t), len(matrices.A_m)))
+    for k, stages in enumerate(np.concatenate([u_m[:-1], half_later[:-1], u_m[1:]], axis=1)):
+        x[k + 1] = model.step(x[k], stages, step)
+    x_dot = model.x_m_dot(t, x.T, u_m.T, matrices)
+    x_ddot = model.x_m_dot(t, x_dot, u_m_dot.T, matrices)  # (2) differentiated
     places = [manoeuvre.reference.outputs.index(name) for name in airframe.outputs]
-    y_m, y_m_dot, y_m_ddot = np.moveaxis(np.array(rows), 1, 0)[..., places]
+    y_m, y_m_dot, y_m_ddot = (model.output(z, matrices)[places].T for z in (x.T, x_dot, x_ddot))
     return y_m, y_m_dot, y_m_ddot
 
 
