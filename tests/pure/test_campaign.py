@@ -297,8 +297,13 @@ def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") ->
     pytest.fail(f"no {count} chunks within two minutes")
 
 
-def test_a_killed_campaign_resumes_to_the_figures_of_an_uninterrupted_one(tmp_path: Path) -> None:
-    whole = figures(command(*new(400, "--runs", "whole"), cwd=tmp_path))
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> list[object]:
+    """The figures of an uninterrupted campaign of 20 chunks."""
+    return figures(command(*new(400), cwd=tmp_path_factory.mktemp("whole")))
+
+
+def test_a_killed_campaign_resumes_to_the_figures_of_an_uninterrupted_one(whole: list[object], tmp_path: Path) -> None:
     stopped = command(*new(400, "--runs", "part", "--workers", "1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 2, stopped)
     stopped.send_signal(signal.SIGKILL)
@@ -336,12 +341,13 @@ def test_a_campaign_goes_on_with_a_scheduler_that_is_back() -> None:
     assert sorted(results) == [((k,), k**2) for k in range(20)]
 
 
-def test_two_dask_workers_give_the_same_figures_and_a_killed_one_repeats_only_its_chunks(tmp_path: Path) -> None:
-    local = figures(command(*new(400, "--runs", "local"), cwd=tmp_path))
+def test_two_dask_workers_give_the_same_figures_and_a_killed_one_repeats_only_its_chunks(
+    whole: list[object], tmp_path: Path
+) -> None:
     spread = command(*new(400, "--runs", "spread", "--engine", "dask", "--workers", "2"), cwd=tmp_path)
     wait_for_chunks(tmp_path / "spread", 2, spread)
     workers = [one for one in psutil.Process(spread.pid).children(recursive=True) if one.cpu_times().user > 0.5]
     assert workers, "no worker of dask found"
     workers[0].kill()
-    assert figures(spread) == local
+    assert figures(spread) == whole
     assert len(list(tmp_path.glob(f"spread/*/{CHUNKS}/*.json"))) == 20

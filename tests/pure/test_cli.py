@@ -10,9 +10,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_cli.cli import COMMANDS
+from flight_cli.cli import COMMANDS, application
 
 
 def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -86,8 +87,8 @@ def test_bad_input_is_one_sentence_and_status_2(arguments: list[str], sentence: 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_help_names_every_option(tmp_path: Path) -> None:
-    shown = rise_di("fly", "--help", cwd=tmp_path)
+def test_help_names_every_option() -> None:
+    shown = CliRunner().invoke(application(["fly"]), ["fly", "--help"])
     for option in ("--duration", "--in-process", "--runs", "--json"):
         assert option in shown.stdout
 
@@ -111,12 +112,13 @@ def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
     assert rise_di("--version", cwd=tmp_path).stdout == f"rise-di {version('flight_cli')}\n"
 
 
-def test_every_command_of_the_help_runs_and_has_a_help_of_its_own(tmp_path: Path) -> None:
+def test_every_command_of_the_help_has_a_help_of_its_own(tmp_path: Path) -> None:
     for name in COMMANDS:
-        shown = rise_di(name, "--help", cwd=tmp_path)
-        assert shown.returncode == 0, name
+        shown = CliRunner().invoke(application([name]), [name, "--help"], prog_name="rise-di")
+        assert shown.exit_code == 0, name
         assert f"Usage: rise-di {name}" in shown.stdout
-    assert all(name in rise_di("--help", cwd=tmp_path).stdout for name in COMMANDS)
+    listed = rise_di("--help", cwd=tmp_path).stdout
+    assert all(name in listed for name in COMMANDS)
 
 
 def test_the_shell_completes_commands_and_the_options_of_a_command() -> None:
