@@ -35,6 +35,9 @@ XDIST = $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
 
+# Two workers fill two cores: threads of OpenBLAS would only wait for each other.
+test test-fast: export OPENBLAS_NUM_THREADS = 1
+
 test: check
 	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; \
 	  $(XDIST) --no-loadscope-reorder -m "not alone" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
@@ -94,6 +97,7 @@ setup-all: .venv/.all .venv/.workspace
 	@printf '%s\n' $(PACKAGES:%=$(CURDIR)/ros_ws/build/%) \
 	  > "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/rise_di_workspace.pth"
 	@ln -sf ../../ros_ws/install/flight_cli/lib/flight_cli/rise-di .venv/bin/rise-di
+	@$(BIN)/python -m compileall -q ros_ws/src # also where PYTHONDONTWRITEBYTECODE is set: each process starts 0.15 s earlier
 	@touch $@
 
 lock: | .venv/.uv
