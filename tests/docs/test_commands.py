@@ -1,10 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Every command of every page exists: `rise-di` parses it, `make` has the target, ROS 2 the executable, Python the module."""
+"""Every command of every page exists: `rise-di` parses it, `make` has the target, ROS 2 the executable, Python the module.
+
+The quick ones run as they stand. tests/docs/test_pages.py runs all of the tutorials.
+"""
 
 import re
 import runpy
 import shlex
+import shutil
 import sys
 from contextlib import suppress
 from importlib.util import find_spec
@@ -15,6 +19,7 @@ import pytest
 import typer
 from tests import launch_stand_in
 from tests.conftest import REPOSITORY
+from typer.testing import CliRunner
 
 from flight_cli.cli import COMMANDS, application
 
@@ -65,6 +70,7 @@ def python(words: list[str]) -> None:
         assert all(Path(word).exists() for word in words[2:] if word.startswith("tests/"))
 
 
+QUICK = {"airframes", "layouts", "replay", "report"}  # a second or two each on a short run, and without ROS
 CHECKS = {"rise-di": rise_di, "make": make, "ros2": ros2, "python": python, "python3": python}
 
 
@@ -108,6 +114,22 @@ def test_every_option_of_rise_di_that_a_page_names_exists(page: Path) -> None:
         command = RISE_DI.commands[name]  # type: ignore[attr-defined]
         known = {option for parameter in command.params for option in parameter.opts}
         assert set(re.findall(r"(?<!\S)--[a-z-]+", rest)) <= known, name
+
+
+def test_the_quick_commands_of_the_pages_run_as_they_stand(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for run in ("latest", "A", "B"):
+        shutil.copytree(recorded, tmp_path / "runs" / run)
+    monkeypatch.chdir(tmp_path)
+    indented = [line for page in PAGES for line in INDENTED.findall(page.read_text(encoding="utf-8"))]
+    found = {tuple(words[1:]) for line in indented if "rise-di " in line for words in commands(line) if words[1:]}
+    quick = sorted(words for words in found if words[0] in QUICK)
+    assert {words[0] for words in quick} == QUICK
+    for words in quick:
+        done = CliRunner().invoke(application([words[0]]), words)
+        differs = "--set" in words  # status 1: other gains give another u
+        assert done.exit_code == int(differs), f"{' '.join(words)}\n{done.output}"
 
 
 def test_an_unknown_command_option_target_or_module_is_found() -> None:
