@@ -1,0 +1,33 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The aircraft of docs/ros.md, a node of rclpy alone, flies as it stands under the reference model and the controller."""
+
+import re
+from pathlib import Path
+
+from sensor_msgs.msg import JointState
+from tests.conftest import REPOSITORY
+from tests.ros.conftest import Start
+from tests.ros.peer import Peer
+
+PEER_TOPICS = ("y", "y_m")
+
+
+def pitch_rate(message: JointState) -> float:
+    return float(message.position[message.name.index("q")])
+
+
+def test_the_aircraft_of_the_page_tracks_the_reference_model(
+    start: Start, start_node: Start, peer_node: Peer, tmp_path: Path
+) -> None:
+    (program,) = re.findall(
+        r"^```python\n(.*?)^```$", (REPOSITORY / "docs" / "ros.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    (tmp_path / "my_aircraft.py").write_text(program, encoding="utf-8")
+    start("my_aircraft")
+    start_node("rise_di_controller").wait_for("ready")
+    start_node("reference_model")
+    y, y_m = peer_node.received["y"], peer_node.received["y_m"]
+    # Half of the first command of the scenario, then most of that by the aircraft: without control its q would stay 0.
+    peer_node.until(lambda: y_m and pitch_rate(y_m[-1]) > 0.05)
+    peer_node.until(lambda: pitch_rate(y[-1]) > 0.04)
