@@ -166,10 +166,10 @@ class EngagementClient(_Client):
 
         `progress` is called with the phase and the reason while the bridge waits for the autopilot.
         """
+        self._spin_until(lambda: bool(self._received_phases()), "bridge/engagement: not received, expected a running bridge")
         self._spin_until(lambda: bool(self._received_u()), "u: not received, expected a controller with y and y_m", FIRST_U)
         self._spin_until(self._at_rest, f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim")
-        self._spin_until(lambda: bool(self._received_phases()), "bridge/engagement: not received, expected a running bridge")
-        self._phases.clear()
+        self._received_phases().clear()
         if refusal := self._set_engaged(engaged=True):
             return refusal
         self._spin_until(lambda: self._settled(progress), "bridge/engagement: no change, expected ENGAGED or a reason", FIRST_U)

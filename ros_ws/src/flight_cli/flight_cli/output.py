@@ -28,6 +28,7 @@ from flight_analysis.report.summary import (
 from flight_core.files import writing
 
 ENDED_EARLY, INTERRUPTED = 3, 130  # exit statuses; bad input is 2 (`flight_cli.cli`)
+LATEST = Path("runs/latest")  # the run of a command that is given none
 
 
 def show_flight(console: Console, flight: RecordedFlight) -> None:

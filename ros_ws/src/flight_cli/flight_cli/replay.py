@@ -17,7 +17,7 @@ from flight_analysis.closed_loop.replay import OPEN_LOOP, Difference, ReplayResu
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
 from flight_analysis.report.summary import finite_or_null
-from flight_cli.output import new_table
+from flight_cli.output import LATEST, new_table
 from flight_core.files import parse_yaml, writing
 from flight_core.parameters import ParameterError, require
 from flight_log.stored_messages import parameter_changes
@@ -27,7 +27,7 @@ DIFFERS = 1
 
 
 def replay(
-    run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")],
+    run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")] = LATEST,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", help="A parameter to change, as in controller.Lambda='[5, 5, 3, 1]'; may be repeated."),

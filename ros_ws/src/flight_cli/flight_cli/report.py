@@ -15,12 +15,14 @@ from flight_analysis.report.export import write_csv, write_parquet, write_png
 from flight_analysis.report.html import write_page
 from flight_analysis.report.run_folder import read_flight, write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
-from flight_cli.output import display_path, new_table, show_flight
+from flight_cli.output import LATEST, display_path, new_table, show_flight
 from flight_core.files import writing
 
 
 def report(
-    runs: Annotated[list[Path], typer.Argument(help="Folder of a run; several runs are compared with the first.")],
+    runs: Annotated[
+        list[Path] | None, typer.Argument(help="Folder of a run, by default runs/latest; several are compared with the first.")
+    ] = None,
     html: Annotated[Path | None, typer.Option(help="Page of a comparison; by default comparison.html beside run 1.")] = None,
     png: Annotated[Path | None, typer.Option(help="Write y over y_m, e and u as one PNG figure.")] = None,
     csv: Annotated[
@@ -33,6 +35,7 @@ def report(
 
     Exit status: 0, or 2 bad input.
     """
+    runs = runs or [LATEST]
     outputs = [("--png", png, write_png), ("--csv", csv, write_csv), ("--parquet", parquet, write_parquet)]
     if len(runs) == 1 and html is None:
         result = write_report(runs[0])
