@@ -73,12 +73,12 @@ def test_the_sign_term_loses_its_advantage_with_gyros_as_noisy_as_the_error() ->
     assert q["soft", 0.05] > 1.1 * q["PI", 0.05]
 
 
-@pytest.mark.parametrize(("name", "seeds"), [("20% lost, nominal dt", range(1, 5)), ("50% lost, nominal dt", range(1, 4))])
-def test_lost_ticks_with_nominal_dt_cost_as_much_as_in_the_prototype(name: str, seeds: range) -> None:
+def test_lost_ticks_with_nominal_dt_cost_as_much_as_in_the_prototype() -> None:
     # A single flight scatters with the samples that are lost in a gust. Over twelve seeds the rms has standard deviations of
-    # 0.6, 0.0015, 0.23, 0.5 at 20 % lost, of 2.2, 0.004, 0.9, 0.6 at 50 %. The means of twelve, 9.0, 0.092, 11.8,
-    # 7.9 and 12.7, 0.114, 17.3, 10.8, agree with the prototype to 5 %.
-    assert_agrees(measure(ROWS[name]._replace(seeds=seeds)), ROWS[name])
+    # 2.2, 0.004, 0.9, 0.6. The means of twelve, 12.7, 0.114, 17.3, 10.8, agree with the prototype to 5 %. The row of 20 % lost
+    # is in benchmarks/servo_world.py alone.
+    row = ROWS["50% lost, nominal dt"]
+    assert_agrees(measure(row._replace(seeds=range(1, 4))), row)
 
 
 @pytest.mark.parametrize(

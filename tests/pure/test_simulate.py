@@ -3,7 +3,7 @@
 """The closed loop in one process: its tracking error, and the order of the error in the sampling period."""
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -21,17 +21,26 @@ Rms = Callable[..., FloatArray]
 
 @pytest.fixture(scope="module")
 def rms(osprey_gust: Scenario) -> Rms:
-    """Root mean square error over the whole flight by channel q, V, p, r."""
+    """Root mean square error over the whole flight by channel q, V, p, r.
+
+    The aircraft is sampled at 200 Hz, twice the rate of the controller; at 1 kHz the orders in dt are measured.
+    """
 
     @cache
     def fly(
-        *, rate: float = 100.0, sign: str = "implicit", gusts: bool = True, below_slew: bool = False, duration: float = 60.0
+        *,
+        rate: float = 100.0,
+        sign: str = "implicit",
+        gusts: bool = True,
+        below_slew: bool = False,
+        duration: float = 60.0,
+        aircraft: float = 200.0,
     ) -> FloatArray:
         scenario = osprey_gust.vary(
             flight={"duration": duration},
             controller={"rate": rate, "sign": sign, "beta": BELOW_SLEW if below_slew else ABOVE_SLEW},
-            reference_model={"rate": 1000.0},
-            aircraft={"rate": 1000.0, "step": 0.001} | ({} if gusts else {"gusts": {}}),
+            reference_model={"rate": aircraft},
+            aircraft={"rate": aircraft, "step": 1.0 / aircraft} | ({} if gusts else {"gusts": {}}),
         )
         error = tracking_error(simulate(scenario))
         assert error.names == ("q", "V", "p", "r")
@@ -58,17 +67,19 @@ def test_error_in_calm_air(rms: Rms) -> None:
 
 def test_implicit_sign_halving_dt_divides_the_error_by_four(rms: Rms) -> None:
     # Second order. The first 30 s have all commands on q, V and p, and most of those on r.
-    ratio = rms(gusts=False, duration=30.0) / rms(gusts=False, rate=200.0, duration=30.0)
+    calm = partial(rms, gusts=False, duration=30.0, aircraft=1000.0)
+    ratio = calm() / calm(rate=200.0)
     assert ratio == pytest.approx(4.0, rel=0.1)
 
 
 def test_literal_sign_halving_dt_halves_the_error(rms: Rms) -> None:
     # First order. The limit cycles are chaotic: the ratio scatters by some 15 %.
-    coarse = rms(gusts=False, sign="literal", rate=200.0, duration=20.0)
-    fine = rms(gusts=False, sign="literal", rate=500.0, duration=20.0)
+    calm = partial(rms, gusts=False, aircraft=1000.0)
+    coarse = calm(sign="literal", rate=200.0, duration=20.0)
+    fine = calm(sign="literal", rate=500.0, duration=20.0)
     assert coarse / fine == pytest.approx(2.5, rel=0.3)
     # The error is far above that of the implicit sign, which only needs the size of Omega's diagonal.
-    assert (coarse[[0, 3]] > 20 * rms(gusts=False, rate=200.0, duration=30.0)[[0, 3]]).all()
+    assert (coarse[[0, 3]] > 20 * calm(rate=200.0, duration=30.0)[[0, 3]]).all()
 
 
 def test_two_flights_of_one_scenario_are_equal_to_the_last_bit(osprey_gust: Scenario) -> None:
