@@ -2,10 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each node alone: parameter errors, waiting for a publisher, clean shutdown."""
 
+import re
 import signal
 import subprocess
 
+import numpy as np
 import pytest
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer
@@ -85,6 +90,20 @@ def test_no_module_is_imported_by_a_ready_node(start_node: Start, monkeypatch: p
     assert any("ENGAGED" in node.output for node in nodes)
     for node in nodes:
         assert [line for line in node.output.partition("]: ready")[2].splitlines() if "import time:" in line] == []
+
+
+def test_requests_whose_replies_do_not_arrive_leave_the_controller_its_ticks(start_node: Start, peer_node: Peer) -> None:
+    """The middleware blocks for 0.1 s before a reply whose reader does not match: here one that requires another durability."""
+    node = start_node("rise_di_controller").wait_for("ready")
+    unmatched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    client = peer_node.node.create_client(SetParameters, "controller/set_parameters", qos_profile=unmatched)
+    request = SetParameters.Request(parameters=[Parameter("k_g", value=0.5).to_parameter_msg()])
+
+    def changes() -> list[float]:
+        return [float(stamp) for stamp in re.findall(r"\[([\d.]+)\] \[controller\]: k_g: ", node.output)]
+
+    peer_node.until(lambda: len(changes()) >= 3, each=lambda: client.call_async(request))
+    assert np.diff(changes()).min() > 0.9  # s; without a pause 0.11
 
 
 def test_a_burst_of_signals_ends_a_node_as_one_signal_does(start_node: Start) -> None:

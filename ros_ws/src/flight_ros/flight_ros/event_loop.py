@@ -33,6 +33,12 @@ PEER_TIMEOUT_NS = 30 * NANOSECONDS  # of a lockstep flight that never begins
 
 SERVICE_POLL_PERIOD = 0.1  # s, between two checks of liveliness and service calls in lockstep
 
+LATE_REQUEST_PAUSE = 10
+"""Time without requests after one that delayed a tick, over its duration. The middleware blocks for 0.1 s before a reply whose
+reader does not match (rmw_fastrtps, `wait_for_subscription`), so that a client could take all of the time."""
+
+LONGEST_PAUSE_NS = NANOSECONDS
+
 IDLE_POLL_PERIOD = 0.02  # s, the longest sleep, so that signals and service calls are handled soon
 
 
@@ -165,10 +171,12 @@ def _run_real_time(node: FlightNode[Any], stop: _Stop) -> None:
             node.run_tick(tick, start_ns + tick.number * ticker.period_ns)
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
-            serve_ns = now_ns + nanoseconds(IDLE_POLL_PERIOD)
             # Requests may take half of the time to the next tick.
             _serve(executor, node, now_ns + nanoseconds(max(ticker.remaining(), 0.0) / 2.0))
             node.require_peers()
+            duration_ns = time.monotonic_ns() - now_ns
+            pause_ns = LATE_REQUEST_PAUSE * duration_ns if ticker.remaining() <= 0.0 else 0
+            serve_ns = now_ns + max(nanoseconds(IDLE_POLL_PERIOD), min(pause_ns, LONGEST_PAUSE_NS))
         if now_ns >= report_ns:
             report_ns = now_ns + NANOSECONDS
             reports += (node.publish_diagnostics, node.check_graph, node.check_clock)
