@@ -106,6 +106,33 @@ def test_a_process_that_ends_is_named_with_its_fatal_line_not_its_last_one(
         start_stage(osprey_gust, tmp_path / "run")
 
 
+LOSES_CONTACT = "import sys\nprint('[FATAL] [1.0] [recorder]: lost contact with aircraft')\nsys.exit(3)\n"
+
+
+@pytest.mark.parametrize(
+    ("end", "cause"),
+    [
+        ("import os\nos.kill(os.getpid(), 9)\n", "aircraft was killed by SIGKILL"),
+        ("import sys\nprint('[FATAL] [1.0] [aircraft]: diverged')\nsys.exit(3)\n", "aircraft ended with status 3: diverged"),
+    ],
+    ids=("killed", "diverged"),
+)
+def test_the_cause_is_named_when_the_recorder_that_lost_contact_has_ended_too(
+    end: str, cause: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    only_stage.write_text(LOSES_CONTACT, encoding="utf-8")
+    (tmp_path / "cause").mkdir()
+    (tmp_path / "cause" / "main.py").write_text(end, encoding="utf-8")
+    with FlightMonitor(osprey_gust.controller.outputs, lockstep=True) as monitor:
+        flight = FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=True, one_process=False)
+        for node in (NodeSpec("fake", "recorder"), NodeSpec("cause", "aircraft")):
+            flight.processes.append(processes.NodeProcess(node, osprey_gust.path, {}, tmp_path / f"{node.executable}.log"))
+        for process in flight.processes:
+            process.popen.wait()
+        assert flight.ended_early() == cause
+        flight.stop()
+
+
 def test_the_state_of_a_node_in_another_flight_does_not_start_this_one(
     start_node: Start, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:

@@ -29,6 +29,7 @@ from flight_bringup.graph import (
     second_stage,
     start_lead,
 )
+from flight_core.outcome import LOST_CONTACT
 from flight_core.parameters import ParameterError
 
 if TYPE_CHECKING:
@@ -166,19 +167,12 @@ class FlightProcesses:
             time.sleep(POLL_PERIOD)
 
     def ended_early(self) -> str | None:
-        """The reason of the first process that has ended, None while all run."""
-        for process in self.processes:
-            if (status := process.popen.poll()) is not None:
-                process.finish()
-                if status < 0:
-                    return f"{process.node.executable} was killed by {signal.Signals(-status).name}"
-                if status == 0:
-                    return f"{process.node.executable} was shut down"
-                lines = [line for line in process.lines if line.strip()] or ["no output"]
-                cause = next((line for line in reversed(lines) if re.match(r"\[FATAL\]|error: ", line)), lines[-1])
-                message = re.sub(r"^(\[[^]]*\] ?)*(: )?|^error: ", "", cause)  # without the logger's brackets
-                return f"{process.node.executable} ended with status {status}: {message}"
-        return None
+        """The reason of the first process that has ended, None while all run.
+
+        On a busy host several may have ended since the last call. One that lost contact with another is then not the cause.
+        """
+        reasons = [reason for process in self.processes if (reason := _end(process)) is not None]
+        return min(reasons, key=lambda reason: LOST_CONTACT in reason, default=None)
 
     def stop(self) -> None:
         """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT, and for the recorder CLOSE_TIMEOUT."""
@@ -196,3 +190,19 @@ class FlightProcesses:
                         process.popen.kill()
                     process.finish()
             self.processes = []
+
+
+def _end(process: NodeProcess) -> str | None:
+    """How a process has ended; None while it runs."""
+    name, status = process.node.executable, process.popen.poll()
+    if status is None:
+        return None
+    process.finish()
+    if status < 0:
+        return f"{name} was killed by {signal.Signals(-status).name}"
+    if status == 0:
+        return f"{name} was shut down"
+    lines = [line for line in process.lines if line.strip()] or ["no output"]
+    cause = next((line for line in reversed(lines) if re.match(r"\[FATAL\]|error: ", line)), lines[-1])
+    message = re.sub(r"^(\[[^]]*\] ?)*(: )?|^error: ", "", cause)  # without the logger's brackets
+    return f"{name} ended with status {status}: {message}"

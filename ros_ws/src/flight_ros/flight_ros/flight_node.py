@@ -20,7 +20,7 @@ from rclpy.qos import QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from flight_core.authentication import MessageAuthenticator, read_key
-from flight_core.outcome import FlightEnded
+from flight_core.outcome import LOST_CONTACT, FlightEnded
 from flight_core.parameters import KeyedParameters, NodeParameters, ParameterError
 from flight_core.rates import NANOSECONDS, seconds
 from flight_ros.endpoints import mismatch, type_name
@@ -253,7 +253,7 @@ class FlightNode(Node, Generic[P]):
     def require_peers(self) -> None:
         """Raise FlightEnded after the loss of a peer of a lockstep flight."""
         if self.peers is not None and (role := self.peers.lost()):
-            raise FlightEnded(f"lost contact with {role}")
+            raise FlightEnded(f"{LOST_CONTACT} {role}")
 
     def finish(self) -> None:
         """End the node. In lockstep, wait until its last messages have arrived."""
