@@ -23,7 +23,7 @@ from std_msgs.msg import String
 from tests.conftest import REPOSITORY
 from tests.recordings import messages
 from tests.ros.conftest import Process, Start, logged
-from tests.ros.peer import Peer
+from tests.ros.peer import OUTPUTS, Peer
 from tests.small_disk import small_disk
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -129,6 +129,16 @@ def test_a_topic_without_a_publisher_is_named(recorder: Recorder, peer_node: Pee
     peer_node.until(lambda: diagnostics(peer_node)[2].get("missing /never") == "no publisher")
     process.interrupt().succeed()
     assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: it had no publisher" in line)
+
+
+def test_a_flight_of_which_a_part_is_recorded_is_no_silent_failure(recorder: Recorder, peer_node: Peer) -> None:
+    process = recorder("run").wait_for("ready")
+
+    def send() -> None:
+        peer_node.publish("y", to_message(time.time_ns(), OUTPUTS, np.zeros(4), "/aircraft#1"))
+
+    peer_node.until(lambda: all(f"waiting for /{topic}: no publisher" in process.output for topic in ("y_m", "u")), each=send)
+    assert "waiting for /y:" not in process.output
 
 
 def test_a_topic_whose_type_is_not_installed_is_named(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:

@@ -31,11 +31,13 @@ from flight_ros.messages import instant, stamp_of
 from flight_ros.qos import rosbag2_profiles, strongest_compatible
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.ticker import Tick
-from flight_ros.topics import FLIGHT, PUBLISH, RECORD, RECORD_FOREIGN, RECORDED, TRUTH, Topic
+from flight_ros.topics import FLIGHT, PUBLISH, RECORD, RECORD_FOREIGN, RECORDED, TRUTH, Y_M, Topic, U, Y
 
 FLUSH_PERIOD_NS = nanoseconds(0.1)  # the longest loss when the recorder is killed; also the period of the graph checks
 DISK_PERIOD_NS = NANOSECONDS
 MEGABYTE = 1e6
+
+LOOP = (Y, Y_M, U)  # each flight has all of them
 
 # Published by ROS 2 itself (rmw: rmw_qos_profile_rosout_default, rmw_qos_profile_parameter_events).
 ROSOUT = Topic("/rosout", Log, foreign=True)
@@ -150,6 +152,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
         if self._ended:
             return
         self._subscribe_missing(now_ns)
+        self._warn_of_a_part()
         self._check_publisher_counts()
         if now_ns - self._disk_checked_ns > DISK_PERIOD_NS:
             self._disk_checked_ns = now_ns
@@ -223,6 +226,14 @@ class RecorderNode(FlightNode[RecorderParameters]):
         if self._missing and now_ns > self._warn_missing_ns:
             self._warn_missing_ns = now_ns + 10 * NO_PUBLISHER_WARNING_NS
             self.get_logger().warning(f"no publisher of {', '.join(self._missing)}; recording starts with the first one")
+
+    def _warn_of_a_part(self) -> None:
+        """Warn of a log with some of y, y_m and u: a flight has all of them, but discovery may have failed on a busy domain."""
+        loop = [topic for topic in self._topics if topic.subscription.topic in LOOP]
+        if any(topic.channel.messages for topic in loop):
+            for topic in loop:
+                if not topic.channel.messages:
+                    self.warn_no_publisher(topic.subscription)
 
     def _subscribe(self, name: str, message_type: str) -> None:
         package, _, kind = message_type.partition("/msg/")
