@@ -38,15 +38,20 @@ Row = dict[str, Any]
 
 def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> list[Row]:
     """Inject every case `times` times in a row; one row for each injection."""
+    options = [f"--faults-times={times}", f"--faults-seed={seed}", f"--timeout={120 * times}"]
+    options += [f"--faults-scenario={scenario}", f"--faults-guided={guided}", "-k", f"not random and ({only or 'test'})"]
+    return run_campaign(options)[0]
+
+
+def run_campaign(options: Sequence[str]) -> tuple[list[Row], int]:
+    """Run the tests with options of pytest; their rows, and the exit status. Exits where no test matches."""
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "rows.jsonl"
-        options = [f"--faults-table={table}", f"--faults-times={times}", f"--faults-seed={seed}"]
-        options += [f"--faults-scenario={scenario}", f"--faults-guided={guided}", f"--timeout={120 * times}"]
-        command = [sys.executable, "-m", "pytest", "-q", str(CAMPAIGN), *options, *(["-k", only] if only else [])]
-        subprocess.run(command, cwd=REPOSITORY, check=False, stdout=sys.stderr)  # noqa: S603 - our own interpreter
+        command = [sys.executable, "-m", "pytest", "-q", str(CAMPAIGN), f"--faults-table={table}", *options]
+        status = subprocess.run(command, cwd=REPOSITORY, check=False, stdout=sys.stderr).returncode  # noqa: S603 - our own interpreter
         if not table.exists():
             sys.exit("error: no case matches")
-        return [json.loads(line) for line in table.read_text(encoding="utf-8").splitlines()]
+        return [json.loads(line) for line in table.read_text(encoding="utf-8").splitlines()], status
 
 
 def summarise(rows: Sequence[Row]) -> list[Row]:
@@ -65,7 +70,7 @@ def _summary(case: str, rows: Sequence[Row]) -> Row:
     summary["detected"] = sum(row["reaction"] is not None for row in passed) if rows[0]["expected"] else None
     summary["held_back"] = max((row["held_back"] for row in judged), default=None)
     for key in (*TIMES, *BANKS):
-        values = [row[key] for row in judged if row.get(key) is not None]
+        values = [row[key] for row in (passed if key in BANKS else judged) if row.get(key) is not None]
         summary[key] = {"median": statistics.median(values), "worst": max(values)} if values else None
     return summary
 

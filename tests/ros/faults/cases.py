@@ -64,6 +64,7 @@ class Response(Enum):
     AIRCRAFT_FAILSAFE = "held, then ramped to trim by the aircraft"
     LATE = "the law flies, late"
     WINGS_LEVELLED = "the law flies on: the reference model levels the wings"
+    RELEASED = "released to the autopilot, and trim; engaged again by request"
     WITHIN_LIMITS = "the law flies on: guidance corrects the error within its limits"
 
 
@@ -82,6 +83,9 @@ class Case(NamedTuple):
     recovery: float = 0.0  # s, from the end of the fault until the law is engaged
     kind: Kind = Kind.PLAIN  # of the flight
     in_suite: bool = True  # else the benchmark alone injects it
+    victim: str = ""  # the role that is killed or stopped
+    needs: tuple[str, ...] = ()  # the roles that detect the fault, or that the injection needs
+    alone: bool = False  # beside no other fault: it concerns every node, or the log of what it left
 
 
 # Detection
@@ -225,10 +229,23 @@ def pose_fault(word: str, *back: str) -> Injection:
             pause(flight, STOP)
         flight.end_fault()
         for line in back:
-            flight.until(lambda line=line: flight.first_line("guidance", line, flight.end), 5.0, line)  # type: ignore[misc]
+            flight.until(lambda line=line: flight.first_line("guidance", line, flight.begin), 5.0, line)  # type: ignore[misc]
         flight.until(flight.is_level, 20.0, "level flight under guidance")
 
     return inject
+
+
+def reboot(flight: Flight, random: Generator) -> None:
+    """The autopilot killed and started again. The bridge engages when it is requested to, not before."""
+    at_random(flight, random)
+    begin = flight.begin_fault()
+    flight.kill("autopilot")
+    flight.until(lambda: flight.first_line("bridge", "RELEASE -> DISENGAGED", begin), 5.0, "disengaged")
+    started = flight.start("autopilot")
+    back = flight.until(lambda: flight.first_message("y", started), 20.0, "y of the autopilot")
+    flight.until(lambda: time.time() - back >= 1.0, 2.0, "a second with y")
+    assert flight.first_line("bridge", "-> ENGAGED", begin) is None
+    flight.engage()
 
 
 # The live page
@@ -350,7 +367,7 @@ def storm(topic: str, reason: str = "conflicting publisher") -> Injection:
 
 
 NAMES = {"y": OUTPUTS, "y_m": OUTPUTS, "u": INPUTS}
-PUBLISHERS = {"y": "aircraft", "y_m": "reference_model", "u": "controller"}
+PUBLISHERS = {"y": "aircraft", "y_m": "reference_model", "u": "controller", "u_m": "guidance"}
 CONSUMERS = {"y": "controller", "y_m": "controller", "u": "aircraft", "u_m": "reference_model", "target": "guidance"}
 
 Names = tuple[str, ...]
@@ -590,6 +607,8 @@ def invalid_change(random: Generator) -> tuple[str, object]:
 U_STALE = U_MAX_AGE + 0.005  # s, and a tick, until the aircraft logs the timeout of u
 STALE = MAX_AGE + 0.01  # s, and a tick, until the controller holds u
 
+RELEASE = logs("bridge", "ENGAGED -> RELEASE")
+MAP_MAX_AGE = 0.2 + 0.005  # s, of y in the map of the autopilot, and a tick of the bridge
 POSE_IS_BACK, UNKNOWN = "DEAD_RECKONING -> ENGAGED", "expected some of"
 UNKNOWN_TARGET = logs("guidance", refusal("target", UNKNOWN))
 LIVE_MAX_AGE = 0.2  # s, of u_m, and of the pose in guidance: the defaults
@@ -599,39 +618,80 @@ STALE_POSE = (logs("guidance", "pose is stale"), LIVE_MAX_AGE + 0.02)  # and a t
 STALE_INPUT = (enters(Mode.HOLD), STALE, Response.CONTROLLER_FAILSAFE)
 STALE_U = (logs("aircraft", "failsafe: u from"), U_STALE, Response.AIRCRAFT_FAILSAFE)
 
+AIRCRAFT: dict[str, Any] = {"victim": "aircraft", "needs": ("controller",)}
+REFERENCE_MODEL: dict[str, Any] = {"victim": "reference_model", "needs": ("controller",)}
+CONTROLLER: dict[str, Any] = {"victim": "controller", "needs": ("aircraft",)}
+GUIDANCE: dict[str, Any] = {"victim": "guidance", "needs": ("reference_model", "aircraft")}
+RECORDER: dict[str, Any] = {"victim": "recorder"}
+GUIDED: dict[str, Any] = {"kind": Kind.GUIDED, "in_suite": False}
+POSE_GATE: dict[str, Any] = {"victim": "gate", "needs": ("guidance",)}
+
+
+def ends_of(topic: str) -> tuple[str, str]:
+    """Publisher and subscriber of a topic."""
+    return PUBLISHERS[topic], CONSUMERS[topic]
+
+
 CASES = (
-    Case("aircraft killed", kill("aircraft"), *STALE_INPUT, RESTART),
-    Case("reference model killed", kill("reference_model"), *STALE_INPUT, RESTART),
-    Case("controller killed", kill("controller"), *STALE_U, RESTART),
-    Case("recorder killed", kill("recorder"), None),
-    Case("aircraft stopped", stop("aircraft"), *STALE_INPUT),
-    Case("reference model stopped", stop("reference_model"), *STALE_INPUT),
-    Case("controller stopped", stop("controller"), *STALE_U),
-    Case("recorder stopped", stop("recorder"), None),
-    *(Case(f"storm on {topic}", storm(topic), conflicting(topic, "foreign")) for topic in NAMES),
+    Case("aircraft killed", kill("aircraft"), *STALE_INPUT, RESTART, **AIRCRAFT),
+    Case("reference model killed", kill("reference_model"), *STALE_INPUT, RESTART, **REFERENCE_MODEL),
+    Case("controller killed", kill("controller"), *STALE_U, RESTART, **CONTROLLER),
+    Case("recorder killed", kill("recorder"), None, **RECORDER),
+    Case("aircraft stopped", stop("aircraft"), *STALE_INPUT, **AIRCRAFT),
+    Case("reference model stopped", stop("reference_model"), *STALE_INPUT, **REFERENCE_MODEL),
+    Case("controller stopped", stop("controller"), *STALE_U, **CONTROLLER),
+    Case("recorder stopped", stop("recorder"), None, **RECORDER),
+    *(Case(f"storm on {topic}", storm(topic), conflicting(topic, "foreign"), needs=ends_of(topic)) for topic in NAMES),
     *(
-        Case(f"{kind} on {topic}", malformed(topic, kind), logs(CONSUMERS[topic], refusal(topic, BAD[kind][2])))
+        Case(
+            f"{kind} on {topic}",
+            malformed(topic, kind),
+            logs(CONSUMERS[topic], refusal(topic, BAD[kind][2])),
+            needs=ends_of(topic),
+        )
         for topic in NAMES
         for kind in BAD
     ),
-    Case("second controller", second("controller", "u"), conflicting("u", "controller")),
-    Case("second aircraft", second("aircraft", "y"), conflicting("y", "aircraft")),
-    Case("weaker quality of service", weaker_qos, UNRELIABLE, REPORT + DISCOVERY),
-    Case("stronger quality of service", stronger_qos, DEADLINE, REPORT + DISCOVERY),
-    Case("CPU starved", starve, counts("aircraft", "missed ticks"), REPORT + 3.0, Response.LATE, 0.5),
-    Case("disk full", full_disk, logs("recorder", "recording ended"), 0.1),
-    Case("storm of parameters", parameters, logs("controller", "parameters rejected")),
-    Case("clock set back", step_of_clock(-5.0), logs("controller", "clock was set by -5"), REPORT, kind=Kind.OWN_CLOCK),
-    Case("clock set forth", step_of_clock(5.0), logs("controller", r"clock was set by \+5"), REPORT, kind=Kind.OWN_CLOCK),
-    Case("storm on the live page", storm_on_the_page, None, in_suite=False),
-    Case("recorder killed under a live page", recorder_killed_under_the_page, None, in_suite=False),
-    Case("guidance killed in a roll-in", kill_in_a_roll_in, *STALE_U_M, Response.WINGS_LEVELLED, kind=Kind.GUIDED),
-    Case("guidance stopped", stop("guidance"), *STALE_U_M, kind=Kind.GUIDED),
-    Case("second guidance", second("guidance", "u_m"), conflicting("u_m", "guidance"), kind=Kind.GUIDED),
-    Case("storm on u_m", storm("u_m"), conflicting("u_m", "foreign"), kind=Kind.GUIDED, in_suite=False),
-    Case("storm on target", storm("target", UNKNOWN), UNKNOWN_TARGET, kind=Kind.GUIDED, in_suite=False),
-    Case("pose frozen", pose_fault("repeat", POSE_IS_BACK), *STALE_POSE, kind=Kind.GUIDED),
-    Case("pose frozen, new stamps", pose_fault("freeze", POSE_IS_BACK), *STALE_POSE, kind=Kind.GUIDED, in_suite=False),
-    Case("pose stale", pose_fault("hold", POSE_IS_BACK), *STALE_POSE, kind=Kind.GUIDED, in_suite=False),
-    Case("pose jumping", pose_fault("jump"), None, response=Response.WITHIN_LIMITS, kind=Kind.GUIDED, in_suite=False),
+    Case("second controller", second("controller", "u"), conflicting("u", "controller"), needs=ends_of("u")),
+    Case("second aircraft", second("aircraft", "y"), conflicting("y", "aircraft"), needs=ends_of("y")),
+    Case("weaker quality of service", weaker_qos, UNRELIABLE, REPORT + DISCOVERY, needs=("recorder",)),
+    Case("stronger quality of service", stronger_qos, DEADLINE, REPORT + DISCOVERY, needs=("controller",)),
+    Case("CPU starved", starve, counts("aircraft", "missed ticks"), REPORT + 3.0, Response.LATE, 0.5, alone=True),
+    Case("disk full", full_disk, logs("recorder", "recording ended"), 0.1, alone=True),
+    Case("storm of parameters", parameters, logs("controller", "parameters rejected"), needs=("controller",)),
+    Case(
+        "clock set back",
+        step_of_clock(-5.0),
+        logs("controller", "clock was set by -5"),
+        REPORT,
+        kind=Kind.OWN_CLOCK,
+        alone=True,
+    ),
+    Case(
+        "clock set forth",
+        step_of_clock(5.0),
+        logs("controller", r"clock was set by \+5"),
+        REPORT,
+        kind=Kind.OWN_CLOCK,
+        alone=True,
+    ),
+    Case("storm on the live page", storm_on_the_page, None, in_suite=False, needs=("recorder",)),
+    Case("recorder killed under a live page", recorder_killed_under_the_page, None, in_suite=False, victim="recorder"),
+    Case("guidance killed in a roll-in", kill_in_a_roll_in, *STALE_U_M, Response.WINGS_LEVELLED, kind=Kind.GUIDED, **GUIDANCE),
+    Case("guidance stopped", stop("guidance"), *STALE_U_M, kind=Kind.GUIDED, **GUIDANCE),
+    Case("second guidance", second("guidance", "u_m"), conflicting("u_m", "guidance"), kind=Kind.GUIDED, needs=ends_of("u_m")),
+    Case("storm on u_m", storm("u_m"), conflicting("u_m", "foreign"), **GUIDED, needs=ends_of("u_m")),
+    Case("storm on target", storm("target", UNKNOWN), UNKNOWN_TARGET, **GUIDED, needs=("guidance",)),
+    Case("pose frozen", pose_fault("repeat", POSE_IS_BACK), *STALE_POSE, kind=Kind.GUIDED, **POSE_GATE),
+    Case(
+        "pose frozen, new stamps",
+        pose_fault("freeze", POSE_IS_BACK),
+        *STALE_POSE,
+        kind=Kind.GUIDED,
+        in_suite=False,
+        **POSE_GATE,
+    ),
+    Case("pose stale", pose_fault("hold", POSE_IS_BACK), *STALE_POSE, **GUIDED, **POSE_GATE),
+    Case("pose jumping", pose_fault("jump"), None, response=Response.WITHIN_LIMITS, **GUIDED, **POSE_GATE),
+    Case("autopilot rebooted", reboot, RELEASE, MAP_MAX_AGE, Response.RELEASED, RESTART, Kind.BRIDGED, in_suite=False),
 )

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from tests.ros.conftest import reserved_domain
+from tests.ros.faults.draws import Draw, draw, found
 from tests.ros.faults.flight import Flight, Kind
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -24,6 +25,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--faults-seed", type=int, default=1, help="seed of the faults")
     parser.addoption("--faults-scenario", default="osprey_gust", help="scenario of the flight without guidance")
     parser.addoption("--faults-guided", default="osprey_route", help="scenario of the flight with guidance")
+    parser.addoption("--faults-random", type=int, default=0, help="how many random faults are injected; seeds count up")
+    parser.addoption("--faults-lockstep", type=int, default=0, help="how many of lockstep flights")
     parser.addoption("--faults-times", type=int, default=1, help="how often each fault is injected in a row; seeds count up")
 
 
@@ -45,6 +48,20 @@ def seeds(pytestconfig: pytest.Config) -> range:
     """One for each injection of a fault."""
     first = int(pytestconfig.getoption("--faults-seed", 1))
     return range(first, first + int(pytestconfig.getoption("--faults-times", 1)))
+
+
+@pytest.fixture(scope="session")
+def draws(pytestconfig: pytest.Config) -> list[Draw]:
+    """Failures of the past, then random faults, those of one kind of flight after one another."""
+    first, count = (int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "random"))
+    return [*found(), *sorted((draw(seed) for seed in range(first, first + count)), key=lambda one: one.cases[0].kind.name)]
+
+
+@pytest.fixture(scope="session")
+def lockstep_seeds(pytestconfig: pytest.Config) -> range:
+    """One for each lockstep flight with a random fault."""
+    first, count = (int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "lockstep"))
+    return range(first, first + count)
 
 
 @pytest.fixture(scope="session")
@@ -96,7 +113,7 @@ class Flights:
         folder = self._folder / f"flight{len(self.all) + 1}"
         folder.mkdir()
         flight = self._running[kind] = Flight(
-            folder, self._scenarios[kind].path, _clock(folder) if kind is Kind.OWN_CLOCK else None
+            folder, self._scenarios[kind].path, kind, _clock(folder) if kind is Kind.OWN_CLOCK else None
         )
         self.all.append(flight)
         return flight
@@ -121,7 +138,8 @@ def _clock(folder: Path) -> Path:
 def flights(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -> Iterator[Flights]:
     plain = find_scenario(str(pytestconfig.getoption("--faults-scenario", "osprey_gust")))
     guided = find_scenario(str(pytestconfig.getoption("--faults-guided", "osprey_route")))
-    scenarios = {Kind.PLAIN: plain, Kind.OWN_CLOCK: plain, Kind.GUIDED: guided}
+    bridged = find_scenario("osprey_observer")
+    scenarios = {Kind.PLAIN: plain, Kind.OWN_CLOCK: plain, Kind.GUIDED: guided, Kind.BRIDGED: bridged}
     made = Flights(tmp_path_factory.mktemp("faults"), scenarios)
     yield made
     made.close()

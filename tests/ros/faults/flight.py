@@ -12,6 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from enum import Enum
 from pathlib import Path
@@ -25,9 +26,12 @@ from rcl_interfaces.msg import Log
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_srvs.srv import SetBool
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, logged
+from tests.ros.peer import peer
 
+from autopilot_bridge.params import LIBRARY
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_bringup.processes import end_with_parent
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
@@ -39,18 +43,6 @@ from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import DIAGNOSTICS, INTERNALS, POSE, PUBLISH, TARGET, TRUTH, U_M, Y_M, Topic, U, Y
 from rise_di_controller.guard import Mode
 
-PACKAGES = {
-    "recorder": "flight_recorder",
-    "controller": "rise_di_controller",
-    "aircraft": "aircraft_sim",
-    "reference_model": "reference_model",
-    "guidance": "guidance",
-}
-OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
-ROSOUT = Topic("/rosout", Log)
-TRUE_POSE = Topic("true_pose", POSE.type)  # of the aircraft in a guided flight: a gate relays it as `pose`
-TOPICS = (Y, Y_M, U, U_M, TRUE_POSE, INTERNALS, TRUTH, DIAGNOSTICS, ROSOUT)
-
 
 class Kind(Enum):
     """What flies."""
@@ -58,6 +50,24 @@ class Kind(Enum):
     PLAIN = "four nodes and a profile of commands"
     OWN_CLOCK = "the same, with a clock that can be set"
     GUIDED = "guidance beside them"
+    BRIDGED = "the bridge and a simulated autopilot in place of the aircraft"
+
+
+PACKAGES = {
+    "recorder": "flight_recorder",
+    "controller": "rise_di_controller",
+    "aircraft": "aircraft_sim",
+    "reference_model": "reference_model",
+    "guidance": "guidance",
+    "bridge": "autopilot_bridge",
+}
+ROLES = dict.fromkeys((Kind.PLAIN, Kind.OWN_CLOCK), ("recorder", "controller", "aircraft", "reference_model"))
+ROLES |= {Kind.GUIDED: (*ROLES[Kind.PLAIN], "guidance")}
+ROLES |= {Kind.BRIDGED: ("recorder", "controller", "reference_model", "autopilot", "bridge")}
+OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
+ROSOUT = Topic("/rosout", Log)
+TRUE_POSE = Topic("true_pose", POSE.type)  # of the aircraft in a guided flight: a gate relays it as `pose`
+TOPICS = (Y, Y_M, U, U_M, TRUE_POSE, INTERNALS, TRUTH, DIAGNOSTICS, ROSOUT)
 
 
 # Linux gives a process in its own session its own share of a busy processor (man 7 sched, autogroup).
@@ -68,6 +78,7 @@ PUBLISHED = {
     "reference_model": ("y_m",),
     "controller": ("internals", "u"),
     "guidance": ("u_m",),
+    "bridge": ("y",),
 }
 
 TICK = 0.01  # s, the controller's, as in the default scenario
@@ -243,6 +254,18 @@ def steady_scenario(source: Path, folder: Path) -> Path:
     return path
 
 
+RELEASE_AFTER = 3.0  # s without a message: RC_OVERRIDE_TIME of ArduPilot
+
+
+def fast_map(folder: Path) -> Path:
+    """The map of the simulated autopilot with 200 messages a second, as an observer's loop with a small delay needs them."""
+    content = yaml.safe_load((LIBRARY / "ardupilot_2024.yaml").read_text(encoding="utf-8"))
+    content["messages"]["joy"]["rate"] = 200.0
+    path = folder / "map.yaml"
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return path
+
+
 class ExpectedLog(NamedTuple):
     """What the log must hold of the time of a fault."""
 
@@ -261,16 +284,15 @@ class Killed(NamedTuple):
 
 
 class Flight:
-    """Four processes, guidance where the scenario has it, and a probe. Instants are seconds of the system clock."""
+    """The processes of a kind of flight, and a probe. Instants are seconds of the system clock."""
 
-    def __init__(self, folder: Path, source: Path, clock: Path | None = None) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, source: Path, kind: Kind, clock: Path | None = None) -> None:
+        self.folder, self.kind = folder, kind
         self._clock = clock  # a library that gives the processes a system clock that can be set
         self._step = folder / "clock"
         self._step.write_bytes(bytes(8))
         self.scenario = steady_scenario(source, folder)
-        content = load_scenario(self.scenario)
-        inputs = content.controller.inputs
+        inputs = load_scenario(self.scenario).controller.inputs
         self._tick_channels, self._actuators = tick_channels(inputs), tuple(f"actuator.{name}" for name in inputs)
         self.probe = Probe()
         self.until = self.probe.until
@@ -279,37 +301,42 @@ class Flight:
         self.begin = self.end = time.time()  # of the last fault
         self.measured: dict[str, Any] = {}  # what a case adds to its row
         self.expected_logs: dict[str, ExpectedLog] = {}  # by case
+        # A process ends with the thread that started it (man 2 PR_SET_PDEATHSIG): one thread starts all.
+        self._starter = ThreadPoolExecutor(1)
         self._all: list[Process] = []
         self._killed: list[Killed] = []
         self._instances: set[str] = set()  # of the roles, including restarts
-        guided = content.guidance is not None
-        self.gate = self._foreign("gate", TRUE_POSE.name, POSE.name) if guided else None
-        for role in (
-            one for one in PACKAGES if guided or one != "guidance"
-        ):  # the recorder first, no aircraft without its controller
+        words = ("tests.ros.faults.foreign", "gate", TRUE_POSE.name, POSE.name)
+        self.gate = self._run(*words, cwd=REPOSITORY, stdin=subprocess.PIPE) if kind is Kind.GUIDED else None
+        for role in ROLES[kind]:  # the recorder first, and no aircraft without its controller
             self.start(role)
             if role == "controller":
                 self.processes["recorder"].wait_for("ready")
                 self.processes["controller"].wait_for("ready")
+        if kind is Kind.BRIDGED:
+            self.engage()
 
     # Processes
 
     def node(self, role: str, *parameters: str) -> Process:
         """Start a node as `python -m PACKAGE.main`."""
+        if role == "autopilot":
+            return self._run("tests.ros.autopilot", str(self.scenario), str(RELEASE_AFTER), cwd=REPOSITORY)
+        if role == "bridge":
+            parameters = (f"map:={fast_map(self.folder)}", "dry_run:=false")
         words = [word for one in parameters for word in ("-p", one)]
         if role == "aircraft" and self.gate is not None:
             words += ["-r", f"{POSE.name}:={TRUE_POSE.name}"]
         preload = {} if self._clock is None else {"LD_PRELOAD": str(self._clock), "FAULTS_CLOCK": str(self._step)}
         with patch.dict(os.environ, preload):
             arguments = (f"{PACKAGES[role]}.main", "--ros-args", "--params-file", str(self.scenario), *words)
-            process = Process(*arguments, cwd=self.folder, within=OWN_SESSION)
-        self._all.append(process)
+            process = self._run(*arguments, cwd=self.folder)
         self.probe.monitored.append(process)
         return process
 
-    def _foreign(self, *words: str) -> Process:
-        """Start a process of `foreign.py` that lasts as long as the flight."""
-        process = Process("tests.ros.faults.foreign", *words, cwd=REPOSITORY, within=OWN_SESSION, stdin=subprocess.PIPE)
+    def _run(self, *words: str, cwd: Path, stdin: int | None = None) -> Process:
+        """Start a process of the flight, which lasts until its end."""
+        process = self._starter.submit(Process, *words, cwd=cwd, within=OWN_SESSION, stdin=stdin).result()
         self._all.append(process)
         return process
 
@@ -360,7 +387,18 @@ class Flight:
                     process.popen.wait(20.0)
             process.popen.kill()
             process.end()
+        self._starter.shutdown()
         self.probe.close()
+
+    def engage(self) -> None:
+        """Engage through the bridge, as soon as it permits. The end of the fault is the last request."""
+
+        def requested() -> bool:
+            self.end_fault()
+            return bool(peer_node.call(SetBool, "bridge/engage", SetBool.Request(data=True)).success)
+
+        with peer(topics=()) as peer_node:
+            self.until(requested, 30.0, "engaged through the bridge")
 
     # The fault
 
@@ -488,13 +526,10 @@ class Flight:
         """Whether the law has been engaged and has tracked for 0.4 s, and the aircraft applies its u."""
         now = time.time()
         ticks, (_, inputs) = self.ticks(now - 0.4), self.actuator_positions(now - 0.1)
-        return bool(
-            len(ticks.t) >= 10
-            and len(inputs)
-            and (ticks.mode == Mode.ENGAGED).all()
-            and (np.abs(ticks.e) <= TRACKING).all()
-            and (np.abs(ticks.u[-10:] - inputs[-1]).max(axis=1) == 0.0).any()
-        )
+        tracks = len(ticks.t) >= 10 and (ticks.mode == Mode.ENGAGED).all() and (np.abs(ticks.e) <= TRACKING).all()
+        if self.kind is Kind.BRIDGED:  # its aircraft publishes no truth
+            return bool(tracks)
+        return bool(tracks and len(inputs) and (np.abs(ticks.u[-10:] - inputs[-1]).max(axis=1) == 0.0).any())
 
     def is_level(self) -> bool:
         """Whether a guided flight has had level wings for half a second."""
@@ -508,7 +543,8 @@ class Flight:
 
     def is_near_trim(self) -> bool:
         """Whether no input has been far from trim in the last half second."""
-        inputs = self.actuator_positions(time.time() - 0.5)[1]
+        begin = time.time() - 0.5
+        inputs = self.ticks(begin).u if self.kind is Kind.BRIDGED else self.actuator_positions(begin)[1]
         return bool(len(inputs) and np.abs(inputs).max() <= 0.2)
 
     def until_steady(self, timeout: float = 60.0) -> None:

@@ -3,7 +3,7 @@
 """Each fault is detected in time, has no other effect on u than the failsafe, and leaves no effect after recovery."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from zlib import crc32
@@ -15,6 +15,7 @@ from rclpy.serialization import deserialize_message
 from tests.ros.conftest import logged
 from tests.ros.faults.cases import CASES, LEVEL, RESTART, SLACK, Case, Response
 from tests.ros.faults.conftest import Flights, Row
+from tests.ros.faults.draws import Draw, inject
 from tests.ros.faults.flight import HOLD, MAX_AGE, RAMP, TICK, U_MAX_AGE, Flight
 from tests.ros.faults.foreign import JUMP
 
@@ -57,6 +58,42 @@ def test_fault_is_detected_contained_and_recovered_from(
         flight.expect_in_log(f"{case.name}, seed {seed}")
         row |= {"passed": True, "reaction": reaction, "recovery": recovery, "held_back": host_delay}
         record(row | flight.measured)
+
+
+def test_random_faults_are_detected_contained_and_recovered_from(
+    flights: Flights, draws: Sequence[Draw], record: Callable[[Row], None]
+) -> None:
+    """Of two at a time: each is detected by the node that should, no process ends, and the flight is steady again."""
+    failed = []
+    for draw in draws:
+        row: Row = {"case": draw.name, "seed": draw.seed}
+        try:
+            flight = flights.steady(draw.cases[0].kind)
+            views = inject(flight, draw)
+            if len(views) == 1:
+                row["reaction"], row["recovery"], row["held_back"] = check(draw.cases[0], views[0])
+            else:
+                check_two(draw, views)
+            for view in views:
+                view.expect_in_log(f"{draw.name}, seed {draw.seed}")
+        except (AssertionError, pytest.fail.Exception) as error:
+            failed.append(f"{draw.name}, seed {draw.seed}: {error}")
+            record(row | {"passed": False, "error": f"{type(error).__name__}: {str(error).splitlines()[:1]}"})
+            flights.close()
+        else:
+            record(row | {"passed": True})
+    assert not failed, "\n".join(failed)
+
+
+def check_two(draw: Draw, views: Sequence[Flight]) -> None:
+    """Check what holds of a fault whatever the other one does."""
+    for case, view in zip(draw.cases, views, strict=True):
+        if case.detection is not None:
+            view.until(lambda case=case, view=view: case.detection(view), case.within + 3.0, f"{case.name}: detected")  # type: ignore[misc]
+    flight = views[0]
+    flight.until(lambda: engaged_for(SETTLING, flight), 10.0, "engaged again")
+    check_processes(flight)
+    flight.until_steady()
 
 
 def test_log_holds_every_received_message_of_each_fault(flights: Flights) -> None:
@@ -116,11 +153,16 @@ def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
         duration = flight.measured.get(key, 0.0)
         assert duration <= RESTART + slack, f"{key} {duration:.3f} s, allowed {RESTART + slack:.3f} s"
     CHECKS[case.response](case, flight, Window(engaged, host_delay, slack))
+    check_processes(flight)
+    flight.until_steady()
+    return reaction, recovery, host_delay
+
+
+def check_processes(flight: Flight) -> None:
+    """No process has ended or raised an exception."""
     for role, process in flight.processes.items():
         assert process.popen.poll() is None, f"{role} has ended: {process.output}"
         assert "Traceback" not in process.output
-    flight.until_steady()
-    return reaction, recovery, host_delay
 
 
 def engaged_for(duration: float, flight: Flight) -> float | None:
@@ -221,6 +263,15 @@ def check_late(case: Case, flight: Flight, window: Window) -> None:
     assert np.abs(ticks.u).max() <= 10.0 * MOVES
 
 
+def check_released(case: Case, flight: Flight, window: Window) -> None:
+    """While disengaged the controller is at trim and computes nothing; it begins at trim. y_m continues."""
+    ticks = flight.ticks(flight.begin, window.engaged + SETTLING)
+    disengaged = (ticks.t > flight.begin + case.within + window.slack) & (ticks.t < flight.end)
+    assert not (ticks.mode[disengaged] == Mode.ENGAGED).any()
+    assert (ticks.u[ticks.t >= window.engaged][0] == 0.0).all()
+    check_pauses(flight, ("y_m",), window.engaged, window)
+
+
 MAX_BANK, MAX_LEVEL_BANK = np.radians(45.0), np.radians(5.0)  # of the ending of u_m, at any time and after LEVEL
 
 
@@ -256,6 +307,7 @@ CHECKS = {
     Response.CONTROLLER_FAILSAFE: check_controller_failsafe,
     Response.AIRCRAFT_FAILSAFE: check_aircraft_failsafe,
     Response.LATE: check_late,
+    Response.RELEASED: check_released,
     Response.WINGS_LEVELLED: check_wings_levelled,
     Response.WITHIN_LIMITS: check_within_limits,
 }
