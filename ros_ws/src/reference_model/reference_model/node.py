@@ -7,7 +7,7 @@ from collections import deque
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from flight_core.rates import nanoseconds, period_ns, seconds
-from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_not_future
+from flight_core.vectors import ChannelError, FloatArray, require_not_future
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, stamp_of
 from flight_ros.publisher_lock import PublisherLock
@@ -32,7 +32,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
         self._encoder = self.encoder(Y_M, self.parameters.outputs)
         self._publisher_lock = PublisherLock()
         self._decoder = self.decoder(U_M, self.parameters.outputs)
-        self._attitude_decoder = Decoder((*self.parameters.outputs, *ATTITUDE))
+        self._attitude_decoder = Decoder(ATTITUDE)
         rate = self.parameters.u_m_rate
         self._u_m_ns = period_ns(rate, "u_m_rate") if rate else 0
         if self.parameters.lockstep:
@@ -62,32 +62,27 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
         live = self.parameters.live
         max_age_ns, takeover_ns = nanoseconds(live.max_age), nanoseconds(live.max_age + live.levelling)
         try:
-            sample = self._decode(message)
+            sample = self._decoder.decode(message)
             if sample is None:
                 return
             require_not_future(sample.stamp_ns, now_ns, max_age_ns)
             if now_ns - sample.stamp_ns > max_age_ns:
                 raise ChannelError("old", f"stamp {seconds(now_ns - sample.stamp_ns):g} s old")
             self._publisher_lock.check(sample.sender, now_ns, max_age_ns, takeover_ns)
-            m = len(self.parameters.outputs)
-            attitude = sample.value[m:] if len(sample.value) > m else None
-            self._reference.take(sample.stamp_ns - start_ns, sample.value[:m], attitude)
+            self._reference.take(sample.stamp_ns - start_ns, sample.value, self._attitude(message))
             self._publisher_lock.refresh(sample.sender, now_ns)
         except ChannelError as error:
             self.reject(self._u_m_subscription, error.reason, str(error))
 
-    def _decode(self, message: bytes) -> StampedVector | None:
-        """The commands, and the attitude where the message has it."""
-        sample = self._decoder.decode(message)
-        if sample is None:
-            return None
+    def _attitude(self, message: bytes) -> FloatArray | None:
+        """The attitude where the message has it. Read of accepted messages alone: a storm of others would delay y_m."""
         try:
-            with_attitude = self._attitude_decoder.decode(message)
+            sample = self._attitude_decoder.decode(message)
         except ChannelError as error:
             if error.reason != "name":
                 raise
-            return sample
-        return sample if with_attitude is None else sample._replace(value=with_attitude.value)
+            return None
+        return None if sample is None else sample.value
 
     def _log_source(self, source: str) -> None:
         if source == "ending":
