@@ -48,6 +48,7 @@ def _speed(group: str) -> Measurement:
 
 
 FAULTS = (PYTHON, "-m", "benchmarks.faults", "--json", FILE, "--times")
+RANDOM_FAULTS = (PYTHON, "-m", "benchmarks.random_faults", "--json", FILE, "--count")
 CAMPAIGN = (PYTHON, "-m", "benchmarks.campaign", "--json", FILE)
 FUZZ, REPLAY = ((PYTHON, "-m", "benchmarks.evidence", "--do", task, "--json", FILE) for task in ("fuzz", "replay"))
 QUICK_CAMPAIGN = (*CAMPAIGN, "--aircraft", "2000", "--chunk", "200", "--exact", "1")
@@ -61,7 +62,15 @@ COMPARE = ("rise-di", "compare", "osprey_servo", "--tuning", "gust,gust_turbulen
 
 MEASUREMENTS = (
     *(_speed(group) for group in SPEED),
-    Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), "faults injected into a flight over DDS", "20 min", timed=True),
+    Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), "faults injected into a flight over DDS", "30 min", timed=True),
+    Measurement(
+        "random-faults",
+        (*RANDOM_FAULTS, "100", "--lockstep", "10"),
+        (*RANDOM_FAULTS, "5", "--lockstep", "1"),
+        "random faults, also two at a time and in lockstep",
+        "9 min",
+        timed=True,
+    ),
     Measurement("security", (*SECURITY, "tests/ros/test_policy.py"), SECURITY, "who can receive y and command u", "2 min"),
     Measurement("fuzz", (*PYTEST, "tests/fuzz"), (*PYTEST, "tests/fuzz"), "external input, fuzzed by hypothesis", "2 min"),
     Measurement("fuzz-coverage", (*FUZZ, "--seconds", "60"), (*FUZZ, "--seconds", "5"), READERS, "11 min"),

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from benchmarks.faults import run_campaign
+from benchmarks.faults import Row, run_campaign
 
 
 def main(
@@ -39,14 +39,15 @@ def main(
     rows, status = run_campaign(options)
     failed = [row for row in rows if not row["passed"]]
     two = sum("," in row["case"] for row in rows)
-    result = {
+    cases = Counter(name for row in rows for name in row["case"].split(", "))
+    result: Row = {
         "seed": seed,
         "draws": len(rows),
         "two": two,
+        "lockstep": lockstep,
         "passed": len(rows) - len(failed),
-        "log": status == 0 or bool(failed),
     }
-    result |= {"cases": Counter(name for row in rows for name in row["case"].split(", ")), "failed": failed}
+    result |= {"status": status, "cases": cases, "failed": failed}
     if file is not None:
         file.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     for row in failed:

@@ -64,6 +64,7 @@ FLEET = {"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lo
 RESULTS = {
     "speed-node": result("speed-node", {"seconds": 10.0, "rows": NODE}),
     "faults": result("faults", [FAULT]),
+    "random-faults": result("random-faults", {"draws": 110, "two": 9, "lockstep": 10, "failed": []}),
     "security": result("security", [{"name": "test_an_attacker_receives_nothing", "outcome": "passed", "seconds": 1.0}]),
     "fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE}),
     "campaign": result("campaign", CAMPAIGN),
@@ -180,6 +181,13 @@ def test_a_killed_node_is_timed_from_its_start_and_from_its_being_ready() -> Non
 
 def test_a_busy_host_is_marked_only_for_timed_measurements() -> None:
     assert "host was busy" not in page(replay=RESULTS["replay"] | {"busy": 1.0})
+
+
+def test_a_random_fault_that_failed_is_named_with_its_seed() -> None:
+    failed = {"seed": 417, "case": "storm on y, recorder killed", "error": "not within 3 s: detected"}
+    text = page(**{"random-faults": result("random-faults", {"draws": 9, "two": 1, "lockstep": 0, "failed": [failed]})})
+    assert "- Seed 417, storm on y, recorder killed: not within 3 s: detected" in text
+    assert "failed. Measured: 1 of 9, **not met**" in text
 
 
 def test_a_fault_that_did_not_pass_each_time_is_bold() -> None:

@@ -625,6 +625,7 @@ GUIDANCE: dict[str, Any] = {"victim": "guidance", "needs": ("reference_model", "
 RECORDER: dict[str, Any] = {"victim": "recorder"}
 GUIDED: dict[str, Any] = {"kind": Kind.GUIDED, "in_suite": False}
 POSE_GATE: dict[str, Any] = {"victim": "gate", "needs": ("guidance",)}
+POSE_BENCHMARK = GUIDED | POSE_GATE
 
 
 def ends_of(topic: str) -> tuple[str, str]:
@@ -683,15 +684,8 @@ CASES = (
     Case("storm on u_m", storm("u_m"), conflicting("u_m", "foreign"), **GUIDED, needs=ends_of("u_m")),
     Case("storm on target", storm("target", UNKNOWN), UNKNOWN_TARGET, **GUIDED, needs=("guidance",)),
     Case("pose frozen", pose_fault("repeat", POSE_IS_BACK), *STALE_POSE, kind=Kind.GUIDED, **POSE_GATE),
-    Case(
-        "pose frozen, new stamps",
-        pose_fault("freeze", POSE_IS_BACK),
-        *STALE_POSE,
-        kind=Kind.GUIDED,
-        in_suite=False,
-        **POSE_GATE,
-    ),
-    Case("pose stale", pose_fault("hold", POSE_IS_BACK), *STALE_POSE, **GUIDED, **POSE_GATE),
-    Case("pose jumping", pose_fault("jump"), None, response=Response.WITHIN_LIMITS, **GUIDED, **POSE_GATE),
+    Case("pose frozen, new stamps", pose_fault("freeze", POSE_IS_BACK), *STALE_POSE, **POSE_BENCHMARK),
+    Case("pose stale", pose_fault("hold", POSE_IS_BACK), *STALE_POSE, **POSE_BENCHMARK),
+    Case("pose jumping", pose_fault("jump"), None, response=Response.WITHIN_LIMITS, **POSE_BENCHMARK),
     Case("autopilot rebooted", reboot, RELEASE, MAP_MAX_AGE, Response.RELEASED, RESTART, Kind.BRIDGED, in_suite=False),
 )

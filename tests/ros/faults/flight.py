@@ -61,9 +61,13 @@ PACKAGES = {
     "guidance": "guidance",
     "bridge": "autopilot_bridge",
 }
-ROLES = dict.fromkeys((Kind.PLAIN, Kind.OWN_CLOCK), ("recorder", "controller", "aircraft", "reference_model"))
-ROLES |= {Kind.GUIDED: (*ROLES[Kind.PLAIN], "guidance")}
-ROLES |= {Kind.BRIDGED: ("recorder", "controller", "reference_model", "autopilot", "bridge")}
+FOUR: tuple[str, ...] = ("recorder", "controller", "aircraft", "reference_model")
+ROLES = {
+    Kind.PLAIN: FOUR,
+    Kind.OWN_CLOCK: FOUR,
+    Kind.GUIDED: (*FOUR, "guidance"),
+    Kind.BRIDGED: ("recorder", "controller", "reference_model", "autopilot", "bridge"),
+}
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
 ROSOUT = Topic("/rosout", Log)
 TRUE_POSE = Topic("true_pose", POSE.type)  # of the aircraft in a guided flight: a gate relays it as `pose`
