@@ -293,7 +293,8 @@ def storm_on_the_page(flight: Flight, random: Generator) -> None:
     """Two hundred connections to the live page that ask for all samples at once and read nothing; it answers afterwards."""
     with live_page(flight) as page:
         disturb(flight, "clients", page.address, str(CONNECTIONS), str(PAGE_STORM))
-        flight.until(lambda: page.state() == "recording", 10.0, "a page that answers again")
+        # The goal is 2 s. A busy host takes longer: each connection has one answer of some megabytes ahead of this one.
+        flight.until(lambda: page.state() == "recording", 60.0, "a page that answers again")
         flight.measured["page"] = time.time() - flight.end
 
 
