@@ -26,7 +26,8 @@ MODULES = {
     " metrics model_identification observer_selection observer_theory replay report report_page response_identification"
     " servo_world simulate; ros: replay",
     "flight_campaign": "pure: campaign compare fleet",
-    "flight_bringup": "pure: launch_files; ros: flight lockstep node_state nodes own_aircraft policy faults/faults",
+    "flight_bringup": "pure: launch_files; ros: flight lockstep node_state nodes own_aircraft policy faults/faults"
+    " faults/lockstep_faults",
     "flight_view": "pure: view view_control view_foxglove view_page; ros: control",
     "flight_cli": "pure: cli report_command; ros: play; fuzz: fuzz_command_line",
 }
