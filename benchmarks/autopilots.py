@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flies real autopilots in software and writes docs/evidence_autopilots.md: identified gains, engagements, signs, pose.
 
-    python -m benchmarks.autopilots --sitl ../shared/sitl                       # everything, about 40 minutes
-    python -m benchmarks.autopilots --sitl ../shared/sitl --only signs          # one measurement; the others keep their results
-    python -m benchmarks.autopilots --render                                    # the page alone, from the stored results
+    python -m benchmarks.autopilots --sitl KIT                       # everything, about 40 minutes
+    python -m benchmarks.autopilots --sitl KIT --only signs          # one measurement; the others keep their results
+    python -m benchmarks.autopilots --render                         # the page alone, from the stored results
 
 The kit is that of `make test-sitl`: docs/autopilots.md. build/autopilots/ has the results and the runs.
 """

@@ -36,6 +36,7 @@ from flight_log.tape_reader import read_run
 KIT = Path(os.environ.get("RISE_DI_SITL", REPOSITORY.parent / "shared" / "sitl"))
 PROFILE = REPOSITORY / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopback.xml"
 PILOT_PYTHON = os.environ.get("PILOT_PYTHON", "python3")
+OWN_MAP, OWN_SCENARIO = os.environ.get("RISE_DI_MAP"), os.environ.get("RISE_DI_SCENARIO")  # of a rehearsal
 POLL = 0.1  # s, between two questions to the autopilot
 MAX_AGE = 1.0  # s, in place of the shipped maps' 0.2 s: a busy host stops autopilot and agent for half a second
 SAFE_STICKS = (1500, 1500, 1000, 1500, 1800, 1500, 1500)  # us, as the kit begins; the throttle is closed

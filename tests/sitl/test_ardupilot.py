@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map `ardupilot` against ArduPlane's own DDS interface and its own log over MAVLink."""
 
-import os
 import struct
 import time
 from collections.abc import Callable
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
-from tests.sitl.kit import ALTITUDE, MAX_AGE, ArduPlane, burn, guided_scenario
+from tests.sitl.kit import ALTITUDE, MAX_AGE, OWN_MAP, OWN_SCENARIO, ArduPlane, burn, guided_scenario
 
 from autopilot_bridge.params import load_map
 from flight_analysis.metrics import in_spans
@@ -22,8 +21,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
 
-SCENARIO = find_scenario(os.environ.get("RISE_DI_SCENARIO", str(REPOSITORY / "examples" / "arduplane" / "scenario.yaml")))
-OWN_MAP = os.environ.get("RISE_DI_MAP")  # of a rehearsal
+SCENARIO = find_scenario(OWN_SCENARIO or str(REPOSITORY / "examples" / "arduplane" / "scenario.yaml"))
 MARK = 1550  # us, where the stick of the rudder is during an engagement, so that its return to the pilot shows
 RC_PERIOD = 0.1  # s, of RC_CHANNELS in the autopilot's log
 LATE = 0.4  # s, for a busy host: commands of the pilot and of the log pass through several processes
