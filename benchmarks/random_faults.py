@@ -29,13 +29,8 @@ def main(
     file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
 ) -> None:
     """Inject random faults and print what failed; exit status 1 if any did."""
-    options = [
-        f"--faults-random={count}",
-        f"--faults-seed={seed}",
-        f"--timeout={30 * count + 300}",
-        "-k",
-        "random or log_holds",
-    ]
+    options = [f"--faults-random={count}", f"--faults-lockstep={lockstep}", f"--faults-seed={seed}"]
+    options += [f"--timeout={30 * (count + lockstep) + 300}", "-k", "random or log_holds"]
     rows, status = run_campaign(options)
     failed = [row for row in rows if not row["passed"]]
     two = sum("," in row["case"] for row in rows)

@@ -533,6 +533,8 @@ class Flight:
         tracks = len(ticks.t) >= 10 and (ticks.mode == Mode.ENGAGED).all() and (np.abs(ticks.e) <= TRACKING).all()
         if self.kind is Kind.BRIDGED:  # its aircraft publishes no truth
             return bool(tracks)
+        if self.kind is Kind.GUIDED and not self.probe.since("u_m", now - 0.2):
+            return False
         return bool(tracks and len(inputs) and (np.abs(ticks.u[-10:] - inputs[-1]).max(axis=1) == 0.0).any())
 
     def is_level(self) -> bool:

@@ -65,7 +65,7 @@ def fly_with_a_fault(
     """A lockstep flight with a fault at a random instant."""
     command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", runs)
     folder = scenario.parent / runs
-    command.wait_for_log(folder, 20_000)  # bytes: the flight has begun
+    command.wait_for_log(folder, 200_000)  # bytes: the flight has begun, and a chunk of the log is complete
     time.sleep(random.uniform(0.0, FASTEST))  # the instant of the fault is anywhere in the flight
     victim = command.child(MODULES[role])
     if kills:
