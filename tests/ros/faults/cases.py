@@ -304,9 +304,9 @@ def recorder_killed_under_the_page(flight: Flight, random: Generator) -> None:
         at_random(flight, random)
         flight.begin_fault()
         flight.kill("recorder")
+        restart(flight, "recorder")  # at once: publishers keep two seconds
         flight.until(lambda: page.state() == "interrupted", 10.0, "a page that says so")
         flight.measured["page"] = time.time() - flight.begin
-        restart(flight, "recorder")
         with live_page(flight):
             assert page.state() == "interrupted"
 

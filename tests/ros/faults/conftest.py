@@ -52,9 +52,10 @@ def seeds(pytestconfig: pytest.Config) -> range:
 
 @pytest.fixture(scope="session")
 def draws(pytestconfig: pytest.Config) -> list[Draw]:
-    """Failures of the past, then random faults, those of one kind of flight after one another."""
+    """Failures of the past and random faults, those of one kind of flight after one another; none outside the campaign."""
     first, count = (int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "random"))
-    return [*found(), *sorted((draw(seed) for seed in range(first, first + count)), key=lambda one: one.cases[0].kind.name)]
+    drawn = [*found(), *map(draw, range(first, first + count))] if count else []
+    return sorted(drawn, key=lambda one: one.cases[0].kind.name)
 
 
 @pytest.fixture(scope="session")
