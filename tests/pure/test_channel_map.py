@@ -8,6 +8,7 @@ test_published_messages.py.
 """
 
 import math
+from functools import cache
 from types import SimpleNamespace as Message
 from typing import Any
 
@@ -149,6 +150,7 @@ def test_the_map_of_older_sources_of_ardupilot_needs_only_message_types_of_commo
     assert types == {*stamped, "sensor_msgs/msg/Joy"}
 
 
+shipped = cache(load_map)  # parsed once, not for each example
 ANGLE = st.floats(-math.pi, math.pi)
 TURN_NED_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # x east, y north, z up
 TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
@@ -158,13 +160,12 @@ TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 @given(phi=ANGLE, theta=st.floats(-1.5, 1.5), psi=ANGLE)
 def test_the_attitude_of_a_map_is_that_of_body_frd_in_ned(name: str, phi: float, theta: float, psi: float) -> None:
     """Checked by SciPy's rotations. ArduPilot and MAVROS publish body FLU in ENU (REP 103), PX4 body FRD in NED."""
-    frd_in_ned = Rotation.from_euler("ZYX", [psi, theta, phi])
-    rows = load_map(name).pose
+    frd_in_ned, channel_map = Rotation.from_euler("ZYX", [psi, theta, phi]), shipped(name)
     x, y, z, w = (frd_in_ned if name == "px4" else TURN_NED_ENU * frd_in_ned * TURN_FLU_FRD).as_quat().tolist()
     quaternion = [w, x, y, z] if name == "px4" else Message(w=w, x=x, y=y, z=z)
-    bridge = Bridge(load_map(name), dry_run=True)
+    bridge = Bridge(channel_map, dry_run=True)
     for channel in ("phi", "theta", "psi"):
-        bridge.take_output(channel, read_raw(Message(q=quaternion), "q", rows[channel].function), 1, 1)
+        bridge.take_output(channel, read_raw(Message(q=quaternion), "q", channel_map.pose[channel].function), 1, 1)
     names, pose = bridge.pose(1) or ((), None)
     assert names == ("phi", "theta", "psi")
     assert pose is not None
