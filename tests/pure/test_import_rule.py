@@ -168,4 +168,4 @@ def test_a_node_loads_nothing_heavy_that_it_does_not_need(node: str) -> None:
 
 @pytest.mark.parametrize("module", ["flight_analysis.report.run_folder", "flight_analysis.closed_loop.simulate"])
 def test_a_flight_loads_no_library_of_the_report(module: str) -> None:
-    assert not modules_loaded_by(f"import {module}") & {"scipy", "plotly", "jinja2", "polars", "matplotlib"}
+    assert not modules_loaded_by(f"import {module}") & {"scipy", "plotly", "jinja2", "polars", "matplotlib", "ruamel"}

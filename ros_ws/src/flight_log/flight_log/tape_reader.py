@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
 from numpy.typing import NDArray
-from rosbags.rosbag2 import Reader
 
 from flight_core.files import is_file, is_folder
 from flight_core.parameters import ParameterError, printable, require
@@ -259,6 +258,8 @@ def _read_mcap(file: Path, log: _Log) -> None:
 
 def _read_other(run: Path, log: _Log) -> None:
     """A bag of another rosbag2 storage, or a compressed one."""
+    from rosbags.rosbag2 import Reader  # noqa: PLC0415 - takes 70 ms, which no bag of ours needs
+
     try:
         with Reader(run) as reader:
             for connection, _, message in reader.messages():
