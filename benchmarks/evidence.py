@@ -65,10 +65,10 @@ MEASUREMENTS = (
     Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), "faults injected into a flight over DDS", "30 min", timed=True),
     Measurement(
         "random-faults",
-        (*RANDOM_FAULTS, "100", "--lockstep", "10"),
+        (*RANDOM_FAULTS, "40", "--lockstep", "4"),
         (*RANDOM_FAULTS, "5", "--lockstep", "1"),
         "random faults, also two at a time and in lockstep",
-        "9 min",
+        "5 min",
         timed=True,
     ),
     Measurement("security", (*SECURITY, "tests/ros/test_policy.py"), SECURITY, "who can receive y and command u", "2 min"),
