@@ -33,6 +33,7 @@ FOUND: tuple[tuple[int, tuple[str, ...]], ...] = (
     (10, ("storm on the live page",)),
     (35, ("reference model stopped",)),
     (106, ("future stamps on u", "recorder killed under a live page")),
+    (141, ("wrong length on y_m",)),
 )
 """Seeds and cases of failures that were mended. The campaign replays them too."""
 

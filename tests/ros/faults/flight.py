@@ -463,10 +463,13 @@ class Flight:
     def host_delay(self, begin: float, end: float) -> float:
         """The longest host scheduling delay of a process between two instants, s: it was ready, and waited for a processor.
 
-        As Linux counts it (proc_pid_schedstat), for all threads of a process together.
+        As Linux counts it (proc_pid_schedstat), for all threads of a process together. It is at least the time without a
+        sample of it, in which the probe itself waited.
         """
         end += 2.0 * DELAY_PERIOD
-        return max((delay for at, delay in list(self.probe.delays) if begin <= at <= end), default=0.0)
+        samples = [(at, delay) for at, delay in list(self.probe.delays) if begin - 2.0 * DELAY_PERIOD <= at <= end]
+        gaps = np.diff([at for at, _ in samples]) - 2.0 * DELAY_PERIOD
+        return float(max([0.0, *gaps, *(delay for at, delay in samples if at >= begin)]))
 
     def first_line(self, role: str, pattern: str, begin: float) -> float | None:
         """When a node first logged a line that matches the pattern."""
