@@ -16,11 +16,11 @@ import os
 import subprocess
 import sys
 import time
+from bisect import bisect
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
-from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -277,10 +277,11 @@ def signs(experiments: int = 20) -> dict[str, Any]:
         plane.say("param", "SIM_WIND_SPD", "5")
         flown = plane.fly(scenario, channel_map, 1000.0, "--send")
         flown.wait_for("DISENGAGED")
-        used, earlier = [], len(stored("signs").get("experiments", []))
-        for number in range(earlier, earlier + experiments):
-            used.append(TURBULENCE[number % len(TURBULENCE)])
-            plane.say("param", "SIM_WIND_TURB", f"{used[-1]:g}")
+        begun, earlier = [], len(stored("signs").get("experiments", []))
+        winds = [TURBULENCE[number % len(TURBULENCE)] for number in range(earlier, earlier + experiments)]
+        for wind in winds:
+            plane.say("param", "SIM_WIND_TURB", f"{wind:g}")
+            begun.append(time.time_ns())
             plane.level()
             plane.hand_over()
             while plane.start("engage").end() != 0:  # outside of the envelope, by a gust
@@ -292,19 +293,25 @@ def signs(experiments: int = 20) -> dict[str, Any]:
         plane.level()
         flown.interrupt()
         flown.end(60.0)
-    return signs_of_logs([plane.run], used)
+    return signs_of_logs([plane.run], lambda number, one: winds[bisect(begun, one.start_ns) - 1], duration)
 
 
-def signs_of_logs(runs: Sequence[Path], turbulence: Sequence[float]) -> dict[str, Any]:
-    """The stored experiments on signs, and those of logs, whose engagements were in this turbulence one after another."""
-    found, channel_map = stored("signs").get("experiments", []), load_map("ardupilot")
+def signs_of_logs(runs: Sequence[Path], wind_of: Callable[[int, Engagement], float], duration: float = 0.0) -> dict[str, Any]:
+    """The stored experiments on signs, and those of logs; `wind_of` is the turbulence of an engagement.
+
+    An engagement shorter than `duration`, s, was ended by the bridge: it is counted, not judged.
+    """
+    earlier, channel_map = stored("signs"), load_map("ardupilot")
+    found, ended = earlier.get("experiments", []), earlier.get("ended", [])
     for run in runs:
         log = read_run(run)
-        found += [
-            {"run": run.name, "turbulence": wind} | judged(channel_map, log.tape, one)
-            for wind, one in zip(cycle(turbulence), log.engagements or [], strict=False)
-        ]
-    return {"experiments": found}
+        for number, one in enumerate(log.engagements or []):
+            about = {"run": run.name, "turbulence": wind_of(number, one), "reason": one.reason}
+            if one.stop_ns is not None and seconds(one.stop_ns - one.start_ns) < duration:
+                ended.append(about)
+            else:
+                found.append(about | judged(channel_map, log.tape, one))
+    return {"experiments": found, "ended": ended}
 
 
 def judged(channel_map: ChannelMap, tape: Tape, engaged: Engagement) -> dict[str, Any]:
@@ -324,8 +331,11 @@ def judged(channel_map: ChannelMap, tape: Tape, engaged: Engagement) -> dict[str
         shown = ((one.input, one.ratio or 0.0, (one.measured or 0.0) * one.effect) for one in checked.channels)
         return {name: "unsure" if ratio < MIN_RATIO else "right" if agrees > 0.0 else "wrong" for name, ratio, agrees in shown}
 
-    ended = {"reason": engaged.reason, "seconds": seconds(span[1] - span[0])}
-    return ended | {"as flown": verdicts(""), "flipped": {name: verdicts(name) for name in pairing.inputs}}
+    return {
+        "seconds": seconds(span[1] - span[0]),
+        "as flown": verdicts(""),
+        "flipped": {name: verdicts(name) for name in pairing.inputs},
+    }
 
 
 def pose() -> dict[str, Any]:
@@ -433,7 +443,10 @@ def table_of_signs(result: dict[str, Any]) -> str:
     clean = sum(set(one["as flown"].values()) == {"right"} for one in experiments)
     caught = sum(all(given[name] == "wrong" for name, given in one["flipped"].items()) for one in experiments)
     count = len(experiments)
-    rows.append(f"\n{clean} of {count} show every sign, right; {caught} find each single sign that is flipped.\n")
+    rows.append(
+        f"\n{clean} of {count} show every sign, right; {caught} find each single sign that is flipped."
+        f" The envelope or the pilot ended {len(result.get('ended', []))} further ones early.\n"
+    )
     return "\n".join(rows)
 
 
@@ -485,7 +498,11 @@ def main() -> None:
             sys.exit(f"error: {reason}")
         for name in arguments.only or MEASUREMENTS:
             if name == "signs":
-                found = signs_of_logs(arguments.log, TURBULENCE) if arguments.log else signs(arguments.experiments)
+                found = (
+                    signs_of_logs(arguments.log, lambda number, one: TURBULENCE[number % len(TURBULENCE)])
+                    if arguments.log
+                    else signs(arguments.experiments)
+                )
             elif arguments.log:
                 found = IDENTIFICATIONS[name](arguments.log[0])
             else:
