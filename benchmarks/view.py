@@ -215,7 +215,7 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
             with Browser(Path(folder) / "profile") as page:
                 page.open(address)
                 page.wait_for("document.getElementById('state')?.textContent === 'LIVE'")
-                page.run(f"{MEASURE}({start_of(client)})")
+                page.run(f"{MEASURE}({start_of(address)})")
                 time.sleep(seconds - 8.0)
                 drawn = page.run("delays")
         else:
@@ -237,10 +237,9 @@ def frozen(seconds: float = FREEZE) -> dict[str, Any]:
         watching(run) as (_, address),
         Browser(Path(folder) / "profile") as page,
     ):
-        client = Client(address)
         page.open(address)
         page.wait_for("document.getElementById('state')?.textContent === 'LIVE'")
-        page.run(f"{MEASURE}({start_of(client)})")
+        page.run(f"{MEASURE}({start_of(address)})")
         time.sleep(3.0)
         renderers = [one for one in psutil.Process(page.pid).children(recursive=True) if "--type=renderer" in one.cmdline()]
         for one in renderers:
@@ -263,9 +262,9 @@ def frozen(seconds: float = FREEZE) -> dict[str, Any]:
     }
 
 
-def start_of(client: Client) -> float:
+def start_of(address: str) -> float:
     """System time of t = 0, s, as the page has it."""
-    content = client.ask()
+    content = Client(address).ask()
     size = int.from_bytes(content[:4], "little")
     return int(json.loads(content[4 : 4 + size])["epoch"].partition(".")[0]) / NANOSECONDS
 
