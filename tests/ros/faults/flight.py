@@ -195,9 +195,10 @@ class Probe:
 
 def _waited_ns(process: int) -> int:
     waited = 0
-    for path in Path(f"/proc/{process}/task").glob("*/schedstat"):
-        with suppress(OSError):
-            waited += int(path.read_text(encoding="ascii").split()[1])
+    with suppress(OSError):  # a process that has just been killed
+        for path in Path(f"/proc/{process}/task").glob("*/schedstat"):
+            with suppress(OSError):  # a thread that has just ended
+                waited += int(path.read_text(encoding="ascii").split()[1])
     return waited
 
 
