@@ -95,12 +95,12 @@ class Server:
     async def follow(self) -> None:
         """Read the logs until cancelled. Raises as `Flight.update` does."""
         while True:
-            found = [flight.update(BUDGET) for flight in self.flights]
+            found, rest = [flight.update(BUDGET) for flight in self.flights], POLL_PERIOD
             if any(found):
                 self._news.set()
                 self._news.clear()
-            behind = any(flight.state() == "reading" for flight in self.flights)
-            await asyncio.sleep(0.0 if behind else REST if any(found) else POLL_PERIOD)
+                rest = 0.0 if any(flight.state() == "reading" for flight in self.flights) else REST
+            await asyncio.sleep(rest)
 
     async def news(self, flight: Flight, known: Mapping[str, str]) -> bytes:
         """The answer to a browser that knows so many rows of each topic; waits up to MAX_WAIT s for something new."""
