@@ -2,14 +2,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge without ROS: engagement, failsafe, pilot override, saturation, stamps; the tests give the time."""
 
+import time
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
+
 import numpy as np
 import pytest
 
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import to_raw
 from autopilot_bridge.params import ChannelMap, load_map
+from flight_bringup.fly import _follow_real_time
+from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError
+
+if TYPE_CHECKING:
+    from flight_bringup.clients import FlightMonitor
+    from flight_bringup.processes import FlightProcesses
 
 CHANNEL_MAP = load_map("ardupilot_2024")
 OUTPUTS = tuple(CHANNEL_MAP.outputs)
@@ -82,6 +92,14 @@ def test_a_dry_run_computes_but_never_sends_or_engages() -> None:
     assert bridge.engage(at(0.0)).startswith("dry_run")
     assert not bridge.sends("joy", at(0.0))
     assert bridge.raw_u()[0] == pytest.approx(0.1 / 0.523599)
+
+
+def test_a_dry_run_says_what_else_would_refuse_an_engagement() -> None:
+    bridge = new_bridge(dry_run=True)
+    receive_outputs(bridge, 0.0)
+    assert bridge.refusal(at(0.0)) == "dry_run is true: nothing is sent; u not received yet"
+    receive_u(bridge, 0.0)
+    assert bridge.refusal(at(0.0)) == "dry_run is true: nothing is sent"
 
 
 def test_engagement_with_u_away_from_trim_is_refused() -> None:
@@ -420,3 +438,13 @@ def test_a_pose_has_the_fresh_channels_and_the_stamp_of_its_first_row() -> None:
     receive_outputs(bridge, 0.3, ("phi",))
     names, _ = bridge.pose(at(0.3)) or ((), None)
     assert names == ("phi",)  # the others are 0.3 s old
+
+
+def test_a_flight_announces_each_reason_once_without_those_in_which_a_number_alone_changes() -> None:
+    reasons = ["would refuse: u not received yet", "u is 0.30 s old", "u is 0.41 s old", "not engaged yet", "not engaged yet"]
+    waiting, announced = [("DISENGAGED", reason) for reason in reasons] + [("ENGAGED", "")], list[str]()
+    processes = SimpleNamespace(start_time=time.time(), ended_early=lambda: None if waiting else "the end")
+    monitor = SimpleNamespace(engagement=lambda: [waiting.pop(0)], newest=lambda: None)
+    nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
+    assert _follow_real_time(find_scenario("osprey_gust"), *nodes, lambda t, text: None, announced.append, np.inf) == "the end"
+    assert announced == [*(f"DISENGAGED: {reasons[i]}" for i in (0, 1, 3)), "ENGAGED"]

@@ -155,9 +155,11 @@ class Bridge:
         return f"u is {seconds(now_ns - self._u_ns):.2f} s old" if self.u_timed_out(now_ns) else ""
 
     def refusal(self, now_ns: int) -> str:
-        """The reason why `engage` would be refused now; empty where it would not. Awaited conditions do not count."""
+        """Why `engage` would be refused now; empty where it would not. Awaited conditions do not count.
+
+        A dry run states the reason that there would be with `dry_run: false` too.
+        """
         checks: tuple[Callable[[int], str], ...] = (
-            lambda _: "dry_run is true: nothing is sent" if self.dry_run else "",
             self._active_overrides,
             lambda now_ns: self._unmet(now_ns, awaited=False),
             self._missing,
@@ -165,7 +167,8 @@ class Bridge:
             lambda _: self._away_from_trim(),
             lambda _: "; ".join(filter(None, map(self._beyond_range, self.channel_map.trims))),
         )
-        return next(filter(None, (check(now_ns) for check in checks)), "")
+        dry_run = "dry_run is true: nothing is sent" if self.dry_run else ""
+        return "; ".join(filter(None, (dry_run, next(filter(None, (check(now_ns) for check in checks)), ""))))
 
     def _active_overrides(self, now_ns: int) -> str:
         active = [name for name in self.channel_map.overrides if self._is_active(name, now_ns)]

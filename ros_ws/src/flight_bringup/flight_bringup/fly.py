@@ -3,6 +3,7 @@
 """Fly a scenario: over topics in real time or in lockstep, or in one process."""
 
 import math
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from flight_bringup.clients import FlightMonitor
 
 POLL_PERIOD = 0.05  # s, of the progress bar
+NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # in a reason: "q is 0.30 s old"
 
 STALL_TIMEOUT = 40.0
 """s. A lockstep flight without progress for so long ends; lost contact with a node ends it within two seconds."""
@@ -47,8 +49,9 @@ def fly_over_topics(
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
     Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one process, in lockstep only.
-    `autopilot` flies in the aircraft's place, in real time only; `announce` gets a line for each change of its engagement. With
-    `engaged_for`, s, the flight ends so long after its first engagement, or with it.
+    `autopilot` flies in the aircraft's place, in real time only. `announce` gets a line for each change of engagement and of
+    reason, but not for a changed number. With `engaged_for`, s, the flight ends so long after its first engagement, or with
+    it.
     Outcomes: "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence that names the process that ended early.
     """
     from flight_bringup.clients import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -77,16 +80,16 @@ def _follow_real_time(
     engaged_for: float,
 ) -> str:
     units, outputs = display_units(scenario), scenario.controller.outputs
-    text, phase, why = "starting", "", ""
+    text, phase, why, announced = "starting", "", "", ""
     engaged_at = math.inf
     while (t := time.time() - processes.start_time) < scenario.flight.duration:
         if (reason := processes.ended_early()) is not None:
             return reason
-        before = phase
         for phase, why in monitor.engagement():
-            if phase != before:
-                announce(f"{phase}{f': {why}' if why else ''}")
-            before = phase
+            line = f"{phase}{f': {why}' if why else ''}"
+            if (kind := NUMBER.sub("", line)) != announced:
+                announce(line)
+            announced = kind
             if phase == "ENGAGED":
                 engaged_at = min(engaged_at, t)
         if t > engaged_at + engaged_for or (engaged_for < math.inf and engaged_at < math.inf and phase != "ENGAGED"):

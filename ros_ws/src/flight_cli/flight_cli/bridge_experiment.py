@@ -116,7 +116,7 @@ def _announce(console: Console, planned: Experiment, duration: float) -> None:
         )
     console.print(table)
     console.print(
-        f"Trim the aircraft in level flight, in the mode in which sticks move surfaces, then: rise-di engage (within"
+        f"Fly straight and level, in the mode in which the map engages, then in another terminal: rise-di engage (within"
         f" {duration - controller.duration:.0f} s). The pilot's override, rise-di engage --off and Ctrl-C end it at any time.",
         highlight=False,
         soft_wrap=True,
