@@ -229,7 +229,7 @@ def pose_fault(word: str, *back: str) -> Injection:
             pause(flight, STOP)
         flight.end_fault()
         for line in back:
-            flight.until(lambda line=line: flight.first_line("guidance", line, flight.begin), 5.0, line)  # type: ignore[misc]
+            flight.until(lambda line=line: flight.first_line("guidance", line, flight.begin), 20.0, line)  # type: ignore[misc]
         flight.until(flight.is_level, 20.0, "level flight under guidance")
 
     return inject
