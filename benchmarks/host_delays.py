@@ -1,27 +1,38 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Missed ticks without those that host scheduling delays (steal time) explain; pure."""
+"""Lateness and missed ticks without what host scheduling delays (steal time) explain; pure."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
-Intervals = Sequence[tuple[int, int]]  # begin and end of each, monotonic ns
+import numpy as np
+from numpy.typing import NDArray
+
+Intervals = Sequence[tuple[int, int]] | NDArray[np.int64]
+"""Begin and end of each, ns."""
 
 
-def missed_excluding_delays(skipped: Intervals, delays: Iterable[tuple[int, int]], period_ns: int) -> int:
+def missed_excluding_delays(skipped: Intervals, delays: Intervals, period_ns: int) -> int:
     """Missed deadlines, excluding host delays.
 
-    `skipped`: from the first missed deadline to the next tick. `delays`: when a core ran none of our processes. All cores
-    count, since the scheduler may run the process on any. The rest of each skip counts in whole periods.
+    `skipped`: from the first missed deadline to the next tick. The rest of each skip counts in whole periods.
     """
-    ordered = sorted(delays)
-    return sum((until - since - _overlap(since, until, ordered)) // period_ns for since, until in skipped)
+    return int(np.sum(excluding_delays(skipped, delays) // period_ns))
 
 
-def _overlap(since: int, until: int, ordered: Intervals) -> int:
-    """Time in [since, until] that lies in any of the intervals; they may overlap."""
-    overlap = 0
-    for begin, end in ordered:
-        length = min(end, until) - max(begin, since)
-        if length > 0:
-            overlap, since = overlap + length, min(end, until)
-    return overlap
+def excluding_delays(intervals: Intervals, delays: Intervals) -> NDArray[np.int64]:
+    """Length of each interval outside of the host delays, ns, shape (N,).
+
+    `delays`: when a core ran none of our processes; they may overlap. All cores count, since the scheduler may run the process
+    on any.
+    """
+    begin, end = np.asarray(intervals, dtype=np.int64).reshape(-1, 2).T
+    origin = int(begin.min(initial=np.iinfo(np.int64).max))
+    edges, total = [0], [0]  # of the disjoint delays: begins and ends after the origin, and the time in delays until each
+    for since, until in sorted((int(one) - origin, int(other) - origin) for one, other in delays):
+        first = max(since, edges[-1])
+        if until > first:
+            edges += [first, until]
+            total += [total[-1], total[-1] + until - first]
+    delayed = [np.interp(instants - origin, edges, total) for instants in (begin, end)]
+    result: NDArray[np.int64] = end - begin - np.rint(delayed[1] - delayed[0]).astype(np.int64)
+    return result

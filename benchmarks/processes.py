@@ -1,18 +1,22 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Child processes of the benchmarks, their output and their processor time."""
+"""Child processes of the benchmarks, their output, their processor time and their host delays."""
 
 import contextlib
 import json
+import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import psutil
+from benchmarks.host_delays import Intervals
 
 ENDS_WITHIN = 30.0  # s
+PRIORITY = 50  # SCHED_FIFO, as that of ros2_control
 
 
 class Child:
@@ -61,3 +65,22 @@ def threads_ns(pid: int) -> int:
         with contextlib.suppress(FileNotFoundError):
             total += int((task / "schedstat").read_text(encoding="ascii").split()[0])
     return total
+
+
+def real_time() -> tuple[str, ...]:
+    """What runs a command at real-time priority; empty where that is not permitted."""
+    within = (shutil.which("chrt") or "", "-f", str(PRIORITY))
+    permitted = within[0] and not subprocess.run([*within, "true"], check=False).returncode  # noqa: S603
+    return within if permitted else ()
+
+
+@contextlib.contextmanager
+def delay_monitors(allowed: bool) -> Iterator[Callable[[], Intervals] | None]:
+    """Host delays, measured by a process of the highest priority on each core, monotonic ns; None if not allowed."""
+    if not allowed:
+        yield None
+        return
+    with contextlib.ExitStack() as stack:
+        cores = sorted(os.sched_getaffinity(0))
+        monitors = [stack.enter_context(Child("delay_monitor", "--core", str(core))) for core in cores]
+        yield lambda: [tuple(one) for child in monitors for one in child.stop()["delays"]]

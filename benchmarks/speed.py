@@ -13,7 +13,6 @@ import argparse
 import contextlib
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -29,7 +28,7 @@ import psutil
 from benchmarks import campaign, law, lockstep, recorder
 from benchmarks.host_delays import Intervals, missed_excluding_delays
 from benchmarks.nodes import open_node, ticks
-from benchmarks.processes import Child, threads_ns
+from benchmarks.processes import PRIORITY, Child, delay_monitors, real_time, threads_ns
 from benchmarks.sampling import new_table
 from rclpy.node import Node
 from rich.console import Console
@@ -49,7 +48,6 @@ from flight_ros.topics import INTERNALS, PUBLISH, RECORD, Y_M, U, Y
 SCENARIO = "osprey_gust"
 RATES = (100, 500, 1000)  # Hz
 EXECUTORS = ("single", "multi", "events")
-PRIORITY = 50  # SCHED_FIFO, as that of ros2_control
 FLOOR_SECONDS = 15.0  # longest measurement of a baseline
 NODE_RATE = 500.0  # Hz, at which callbacks are timed
 OBSERVER_RATE = 100.0  # Hz, of the matrices of the shipped observer
@@ -231,9 +229,7 @@ def _latency(driven: Driven, values: Sequence[float]) -> dict[str, float]:
 def tick_rows(seconds: float) -> Iterator[Row]:
     """Lateness of the ticks of an empty node of the stack, compared with rclpy's own timers."""
     short = min(seconds, FLOOR_SECONDS)
-    chrt = shutil.which("chrt")
-    if chrt is not None and subprocess.run([chrt, "-f", str(PRIORITY), "true"], check=False).returncode:  # noqa: S603
-        chrt = None  # no right to real-time priority here
+    within = real_time()
     for hz in RATES:
         options = ("--hz", str(hz), "--seconds")
         floor = f"empty timer, single, {hz} Hz"
@@ -242,13 +238,12 @@ def tick_rows(seconds: float) -> Iterator[Row]:
                 yield Row(f"empty timer, {executor}, {hz} Hz", _ticks(child, short), floor)
         with Child("bare_loop", *options, str(short)) as child:
             yield Row(f"loop that only sleeps, {hz} Hz", _ticks(child, short), floor)
-        goals = {500: [Goal(OWN_MISSES if chrt else "missed", 0)], 1000: [Goal("p99 (us)", 100.0)]}.get(hz, [])
-        with delay_monitors(chrt is not None) as delays, Child("ticker", *options, str(seconds)) as child:
+        goals = {500: [Goal(OWN_MISSES if within else "missed", 0)], 1000: [Goal("p99 (us)", 100.0)]}.get(hz, [])
+        with delay_monitors(bool(within)) as delays, Child("ticker", *options, str(seconds)) as child:
             figures = _ticks(child, seconds, delays)
         yield Row(f"the stack's loop, {hz} Hz", figures, floor, goals)
-    if chrt is None:
+    if not within:
         return
-    within = (chrt, "-f", str(PRIORITY))
     with full_load():
         for name, role in (("empty timer, single", "timer"), ("the stack's loop", "ticker")):
             length = short if role == "timer" else seconds
@@ -256,18 +251,6 @@ def tick_rows(seconds: float) -> Iterator[Row]:
                 goals = [Goal("p99 (us)", 50.0)] if role == "ticker" else []
                 what, floor = (f"{one}, 100 Hz, FIFO {PRIORITY}, full load" for one in (name, "empty timer, single"))
                 yield Row(what, _ticks(child, length), floor, goals)
-
-
-@contextlib.contextmanager
-def delay_monitors(allowed: bool) -> Iterator[Callable[[], Intervals] | None]:
-    """Host delays, measured by a process of the highest priority on each core; None if not allowed."""
-    if not allowed:
-        yield None
-        return
-    with contextlib.ExitStack() as stack:
-        cores = sorted(os.sched_getaffinity(0))
-        monitors = [stack.enter_context(Child("delay_monitor", "--core", str(core))) for core in cores]
-        yield lambda: [tuple(one) for child in monitors for one in child.stop()["delays"]]
 
 
 def _ticks(child: Child, seconds: float, delays: Callable[[], Intervals] | None = None) -> dict[str, float]:

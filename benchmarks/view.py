@@ -6,7 +6,7 @@
 .venv/bin/python -m benchmarks.view open --hours 1       # a log of that length, read by the server
 .venv/bin/python -m benchmarks.view live --seconds 30    # a flight in real time, a client, and a browser where there is one
 .venv/bin/python -m benchmarks.view frozen               # a page whose process stops for 10 s, and how it comes back
-.venv/bin/python -m benchmarks.view flights --count 10   # that many flights with a client and as many without, in turns
+.venv/bin/python -m benchmarks.view flights --count 10   # that many flights, with a client for half of the time
 """
 
 import argparse
@@ -27,17 +27,20 @@ from typing import Any
 
 import numpy as np
 import psutil
-from benchmarks.processes import threads_ns
+from benchmarks.host_delays import Intervals, excluding_delays, missed_excluding_delays
+from benchmarks.processes import delay_monitors, real_time, threads_ns
 from tests.browser import CHROMIUM, Browser
 
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from flight_log.bag import BagWriter
 from flight_log.named_vectors import JOINT_STATE, STAMP
 from flight_log.stored_messages import StoredMessage, stored_messages
+from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 
 SCENARIO = "osprey_servo"  # y, y_m and truth at 500 Hz, ticks at 100 Hz, noise
@@ -46,7 +49,8 @@ FLUSH_PERIOD_NS = nanoseconds(0.1)  # as the recorder
 START_S = 1_795_000_000  # s, stamps of today
 POLLS = 60.0  # Hz: the page asks again once an answer is drawn, a frame later
 FREEZE, RECOVERED = 10.0, 0.3  # s: a page stops for so long, and is back when it is less behind than that
-FLIGHT_SECONDS = 20.0  # of each of the flights whose ticks are compared
+BEGUN = 3.0  # s, until a flight has begun
+FLIGHT_SECONDS = 60.0  # of each of the flights whose ticks are compared
 RISE_DI = str(Path(sys.executable).parent / "rise-di")
 
 
@@ -209,7 +213,7 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
     ):
         client, drawn = Client(address), []
         client.start()
-        time.sleep(3.0)  # the flight has begun
+        time.sleep(BEGUN)
         before, begin = threads_ns(server.pid), time.monotonic()
         if browser:
             with Browser(Path(folder) / "profile") as page:
@@ -275,30 +279,54 @@ def percentiles(delays: list[float]) -> dict[str, float]:
 
 
 def flights(count: int, seconds: float) -> dict[str, Any]:
-    """Missed ticks and late p99 of flights without and with a watching client, in turns."""
-    found: dict[str, list[tuple[int, float]]] = {"without": [], "with": []}
+    """Ticks of flights, for half of the time without and with a watching client: missed, and late p99 in s.
+
+    The client is there in the middle of each flight. So the phases of the nodes' timers, which differ from flight to flight,
+    are the same for both, and a drift of the host cancels. The start and the end of the server count as its own.
+    """
+    period_ns = nanoseconds(1.0 / find_scenario(SCENARIO).controller.rate)
+    found: dict[str, list[dict[str, float]]] = {"without": [], "with": []}
     for _ in range(count):
-        for kind, results in found.items():
-            with tempfile.TemporaryDirectory() as folder, flying(Path(folder), seconds) as (flight, run):
-                if kind == "with":
-                    with watching(run) as (_, address):
-                        client = Client(address)
-                        client.start()
-                        output, _ = flight.communicate()
-                        client.stop()
-                else:
-                    output, _ = flight.communicate()
-            ticks = json.loads(output)["ticks"]
-            results.append((ticks["without_new_y"], ticks["late_p99"]))
-    shown: dict[str, Any] = {
-        kind: {"missed": [missed for missed, _ in results], "late p99": [late for _, late in results]}
-        for kind, results in found.items()
-    }
-    for name in ("missed", "late p99"):
-        without, beside = (shown[kind][name] for kind in ("without", "with"))
-        shown |= {f"median of {name}": [float(np.median(without)), float(np.median(beside))]}
-        shown |= {f"probability of {name}": probability(np.subtract(beside, without))}
-    return shown
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            delay_monitors(bool(real_time())) as delays,
+            flying(Path(folder), BEGUN + seconds) as (flight, run),
+        ):
+            time.sleep(BEGUN)
+            begin = time.time_ns()
+            joins, leaves, end = (begin + nanoseconds(seconds) * k // 4 for k in (1, 3, 4))
+            time.sleep(seconds / 4.0)
+            with watching(run) as (_, address):
+                client = Client(address)
+                client.start()
+                time.sleep((leaves - time.time_ns()) / NANOSECONDS)
+                client.stop()
+            flight.communicate()
+            clock = time.time_ns() - time.monotonic_ns()
+            host_delays = [(since + clock, until + clock) for since, until in delays()] if delays else None
+            internals = read_run(run).tape["internals"]
+        for kind, windows in {"without": [(begin, joins), (leaves, end)], "with": [(joins, leaves)]}.items():
+            found[kind].append(figures_of_ticks(internals.within(windows), host_delays, period_ns))
+    names = found["with"][0]
+    shown: dict[str, Any] = {kind: {name: [one[name] for one in figures] for name in names} for kind, figures in found.items()}
+    more = {name: np.subtract(shown["with"][name], shown["without"][name]) for name in names}
+    shown |= {"more": {name: float(np.median(values)) for name, values in more.items()}}
+    return shown | {"probability": {name: probability(values) for name, values in more.items()}}
+
+
+def figures_of_ticks(internals: Signal, delays: Intervals | None, period_ns: int) -> dict[str, float]:
+    """Missed ticks and late p99, also excluding host delays where they are known. A pause of a second is no miss."""
+    at = internals.stamp_ns + np.rint(internals["age"] * NANOSECONDS).astype(np.int64)
+    due = at - np.rint(internals["late"] * NANOSECONDS).astype(np.int64)
+    gaps = np.diff(due)
+    skipped = np.column_stack((due[:-1] + period_ns, at[1:]))[(gaps > 1.5 * period_ns) & (gaps < NANOSECONDS)]
+    figures: dict[str, float] = {}
+    for words, known in (("", ()), (", excluding host delays", delays)):
+        if known is not None:
+            figures["missed ticks" + words] = missed_excluding_delays(skipped, known, period_ns)
+            late = excluding_delays(np.column_stack((due, at)), known)
+            figures["late p99 (ms)" + words] = float(np.percentile(late, 99)) / 1e6
+    return figures
 
 
 def probability(differences: FloatArray) -> float:
@@ -316,7 +344,7 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", choices=["open", "live", "frozen", "flights", []], help="all by default")
     parser.add_argument("--hours", type=float, default=1.0, help="length of the log")
     parser.add_argument("--seconds", type=float, default=30.0, help="length of the live flight")
-    parser.add_argument("--count", type=int, default=10, help="flights with a client, and as many without")
+    parser.add_argument("--count", type=int, default=10, help="flights whose ticks are compared")
     parser.add_argument("--no-browser", action="store_true", help="measure without a browser on this machine")
     parser.add_argument("--json", type=Path, help="file for the figures")
     arguments = parser.parse_args()

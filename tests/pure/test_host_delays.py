@@ -24,4 +24,4 @@ def test_the_rest_of_a_skip_counts_in_whole_periods() -> None:
 
 def test_a_delay_of_two_cores_at_once_is_subtracted_once() -> None:
     delays = [(0, 2 * PERIOD_NS), (PERIOD_NS, 3 * PERIOD_NS), (PERIOD_NS, 2 * PERIOD_NS)]
-    assert missed_excluding_delays([(0, 5 * PERIOD_NS)], reversed(delays), PERIOD_NS) == 2
+    assert missed_excluding_delays([(0, 5 * PERIOD_NS)], delays[::-1], PERIOD_NS) == 2

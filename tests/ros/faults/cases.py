@@ -558,11 +558,11 @@ def full_disk(flight: Flight, random: Generator) -> None:
     flight.processes["recorder"].wait_for("ready")
 
 
-CHANGES, IN_FLIGHT = 2000, 8  # requests; a service queues ten
+CHANGES, IN_FLIGHT = 1000, 8  # requests; a service queues ten
 
 
 def parameters(flight: Flight, random: Generator) -> None:
-    """Two thousand changes of the controller's gains, half of them invalid, also the first one; eight requests at once."""
+    """A thousand changes of the controller's gains, half of them invalid, also the first one; eight requests at once."""
     valid = random.random(CHANGES) < 0.5
     valid[0] = False
     with peer(topics=()) as peer_node:
