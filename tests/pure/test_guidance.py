@@ -16,8 +16,9 @@ from flight_core.vectors import FloatArray
 from guidance import path, protection
 from guidance.attitude import AttitudeParams, body_rates
 from guidance.lateral import PathError, PathParams, bank_for, course_acceleration, least_period, least_radius, path_acceleration
+from guidance.params import GuidanceParameters
 from guidance.path import Arc, Line
-from guidance.vertical import VerticalParams, alpha_estimate, climb_for, pitch_for, slewed
+from guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_lag, pitch_for, slewed
 
 SPEED = 40.0  # m/s
 HOLD = AttitudeParams(k_phi=1.25, k_theta=1.0, roll_rate=0.3, load=0.5, n_alpha=1e9, k_beta=0.0)
@@ -78,6 +79,25 @@ def test_the_climb_rate_is_continuous_in_value_and_slope_and_brakes_at_half_the_
     assert climb_for(far, free) * (climb_for(far + step, free) - climb_for(far, free)) / step == pytest.approx(0.5, abs=1e-4)
     assert climb_for(-far, free) == -climb_for(far, free)
     assert (climb_for(far, CLIMB), climb_for(-far, CLIMB)) == (5.0, -4.0)
+
+
+@pytest.mark.parametrize("stall_speed", [20.0, 60.0, 121.9, 133.0])
+def test_the_altitude_loop_keeps_its_margin_where_the_flight_path_lags_the_pitch(stall_speed: float) -> None:
+    # theta = gamma_c + low-pass of (theta - gamma), T_L gamma_dot = theta - gamma, h_dot = V gamma. JSBSim's f16 at 154 m/s and
+    # 12 km, V_s = 121.9 m/s, fell into a limit cycle of 22 s with k_h = 0.2 and T = 2 s.
+    frequencies = (4.0, 1.2, 5.0, 4.0)
+    loop = GuidanceParameters(natural_frequency=frequencies, speed=154.0, stall_speed=stall_speed).params().vertical
+    lag, time = path_lag(stall_speed, 154.0), loop.alpha_time
+    poles = Polynomial([1.0, time, lag * time]).roots()
+    assert np.min(-np.real(poles) / np.abs(poles)) >= 0.5 - 1e-9  # the damping of the flight path
+    assert np.max(np.real(Polynomial([2.49 * loop.k_h, 1.0, time, lag * time]).roots())) < 0.0  # a gain margin of 2.5
+
+
+def test_without_a_stall_speed_the_altitude_loop_is_that_of_a_path_which_follows_within_two_seconds() -> None:
+    loop = GuidanceParameters(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=154.0).params().vertical
+    assert (loop.k_h, loop.alpha_time) == (0.2, 2.0)
+    given = GuidanceParameters(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=154.0, altitude_gain=0.3, alpha_time=1.0)
+    assert given.params().vertical[::4] == (0.3, 1.0)
 
 
 def test_pitch_settles_where_the_angle_of_attack_is_estimated() -> None:

@@ -30,7 +30,7 @@ from guidance.lateral import PathParams, least_period, least_radius
 from guidance.modes import TARGETS, GuidanceParams, Limits, read_target
 from guidance.path import Route, leads
 from guidance.route_file import Waypoint
-from guidance.vertical import VerticalParams
+from guidance.vertical import VerticalParams, path_lag
 
 OUTPUTS = ("q", "V", "p", "r")
 BY_RULE = ("outputs", "natural_frequency", "speed", "throttle_authority", "roll_authority")
@@ -39,6 +39,9 @@ FLOOR_FRACTION = 0.8
 
 FASTEST_ROLL = 0.35
 """rad/s, 20 deg/s."""
+
+ALTITUDE_GAIN, ALPHA_TIME = 0.2, 2.0
+"""1/s and s, for a flight path that follows the pitch within two seconds."""
 
 STEEPEST = 0.1
 """Largest climb and sink rate over the trim speed."""
@@ -111,8 +114,12 @@ class GuidanceParameters(KeyedParameters):
     climb: Positive | None = Field(default=None, description="largest climb rate, m/s; none: by the throttle's authority")
     sink: Positive | None = Field(default=None, description="largest sink rate, m/s; none: by the throttle's authority")
     acceleration: Positive = Field(default=1.0, description="permitted vertical acceleration, m/s^2")
-    altitude_gain: Positive = Field(default=0.2, description="k_h, climb rate per altitude error, 1/s")
-    alpha_time: Positive = Field(default=2.0, description="time constant of the estimated angle of attack, s")
+    altitude_gain: Positive | None = Field(
+        default=None, description="k_h, climb rate per altitude error, 1/s; none: by rule, at most 0.2"
+    )
+    alpha_time: Positive | None = Field(
+        default=None, description="time constant of the estimated angle of attack, s; none: by rule, at least 2"
+    )
     sideslip_gain: NonNegative | None = Field(
         default=None, description="k_beta, 1/s, used where `pose` has beta; none: by rule, at most 0.5"
     )
@@ -207,13 +214,23 @@ class GuidanceParameters(KeyedParameters):
             speed=self.speed,
             k_chi=roll / 3.5,
             attitude=AttitudeParams(roll, pitch, roll_rate, self.load, 20.0, self.k_beta()),
-            vertical=VerticalParams(self.altitude_gain, self.acceleration, climb, sink, self.alpha_time),
+            vertical=self._vertical(climb, sink),
             path=PathParams(self.period or self.least_period(), self.damping, self.capture),
             limits=Limits(self.bank, self.pitch[0], self.pitch[1], floor, floor / protection.FLOOR, self.least_radius()),
             slew=tuple(slew[name] for name in self.outputs),
             max_age_ns=nanoseconds(self.max_age),
             hold_ns=nanoseconds(self.hold),
         )
+
+    def _vertical(self, climb: float, sink: float) -> VerticalParams:
+        """The altitude loop. Where the lag T_L of the flight path is known, T >= T_L and k_h <= 0.4 / T_L.
+
+        The flight path then has a damping of 0.5 or more, and the altitude a gain margin of 2.5 by Routh's criterion.
+        """
+        lag = path_lag(self.stall_speed, self.speed) if self.stall_speed else 0.0
+        gain = min(ALTITUDE_GAIN, 0.4 / lag) if lag else ALTITUDE_GAIN
+        time = self.alpha_time or max(ALPHA_TIME, lag)
+        return VerticalParams(self.altitude_gain or gain, self.acceleration, climb, sink, time)
 
     def waypoints(self) -> tuple[Waypoint, ...]:
         """The waypoints of the section's route; none without one."""

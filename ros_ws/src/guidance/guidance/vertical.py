@@ -6,7 +6,11 @@ import math
 from typing import NamedTuple
 
 from flight_core.kinematics import clip
+from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
+
+STALL_ANGLE = 0.3
+"""rad from zero lift, C_Lmax / C_Lalpha: 1.45 and 4.9 1/rad, of a clean wing of aspect ratio 7 by lifting-line theory."""
 
 
 class VerticalParams(NamedTuple):
@@ -51,6 +55,16 @@ def alpha_estimate(alpha: Scalar, theta: Scalar, climb: Scalar, speed: Scalar, d
 def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
     """Pitch for a climb rate, rad: theta_c = asin(climb / V) + alpha."""
     return path_angle(climb, speed) + alpha
+
+
+def path_lag(stall_speed: float, speed: float) -> float:
+    """Time constant with which the flight path follows the pitch, s.
+
+        T_L = V alpha_1 / g,  alpha_1 = 0.3 rad (V_s / V)^2
+
+    V gamma_dot = g (alpha - alpha_1) / alpha_1 near level flight; alpha_1 is the angle of attack there, from zero lift.
+    """
+    return STALL_ANGLE * stall_speed**2 / (GRAVITY * speed)
 
 
 def path_angle(climb: Scalar, speed: Scalar) -> Scalar:
