@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flies real autopilots in software and writes docs/evidence_autopilots.md: identified gains, engagements, signs, pose.
 
-    python -m benchmarks.autopilots --sitl KIT                       # everything, about 40 minutes
+    python -m benchmarks.autopilots --sitl KIT                       # everything, about 50 minutes
     python -m benchmarks.autopilots --sitl KIT --only signs          # one measurement; the others keep their results
     python -m benchmarks.autopilots --render                         # the page alone, from the stored results
 
@@ -29,8 +29,11 @@ import yaml
 
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationParameters
-from flight_analysis.closed_loop.scenario import load_scenario
+from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.design.bridge_identification import channel_pairs, experiment
+from flight_analysis.design.identification import NOISE_SHARE
+from flight_analysis.design.nominal import sizes
+from flight_analysis.design.observer_selection import with_extended_state_observer
 from flight_analysis.design.response_identification import MIN_RATIO, identify_response
 from flight_analysis.design.sign_check import check
 from flight_analysis.metrics import errors_by_part, in_spans
@@ -56,6 +59,7 @@ PERIODS = {"elevator": 4.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}  # s, 
 STRONGER_ELEVATOR = 2.0  # `check-signs` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
 TURBULENCE = (0.0, 0.25, 0.5, 1.0)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
 GUIDED, EACH, SETTLED = 300.0, 60.0, 45.0  # s: engaged under guidance, each turn, and from its command until it counts as held
+OBSERVER_MARGIN, OBSERVED_TURBULENCE, OBSERVED_PAIRS = 0.025, 0.5, 2  # s beyond the identified delay; SIM_WIND_TURB; flights
 HELD = {"heading": "rad", "altitude": "m", "V": "m/s"}
 DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
 
@@ -228,6 +232,31 @@ def held_figures(run: Path, starts: Sequence[float]) -> dict[str, Any]:
     }
 
 
+def observed() -> dict[str, Any]:
+    """The last identified gains without and with an extended-state observer of the identified Omega and lags, in turbulence."""
+    found, results = FOLDER / "arduplane" / "found", []
+    alone = load_scenario(found / "scenario.yaml")
+    controller = alone.rise_di()
+    model = controller.feedforward
+    if model is None:
+        sys.exit(f"error: {found}: found no feedforward, expected a scenario of identify --bridge")
+    rows = [model.states.index(name) for name in controller.outputs]
+    Omega = np.reshape(model.B, (len(model.states), -1))[rows]
+    size = sizes("m/s" if name == "V" else "rad/s" for name in controller.outputs)
+    observer = with_extended_state_observer(controller, Omega, size / NOISE_SHARE, size, controller.delay + OBSERVER_MARGIN)
+    scenarios = {"without": alone, "with": replace(alone, controller=observer.controller)}
+    with arduplane(0.03) as plane:
+        plane.say("param", "SIM_WIND_SPD", "5")
+        plane.say("param", "SIM_WIND_TURB", f"{OBSERVED_TURBULENCE:g}")
+        for name in [*scenarios] * OBSERVED_PAIRS:
+            scenario = plane.folder / f"{name}_observer.yaml"
+            scenario.write_text(scenario_yaml(scenarios[name]), encoding="utf-8")
+            with plane.engaged(scenario, str(found / "map.yaml"), 75.0) as flight:
+                flight.end(150.0)
+            results.append({"observer": name, **tracking(plane)})
+    return {"flights": results, "relaxation": dict(zip(controller.outputs, observer.relaxation.tolist(), strict=True))}
+
+
 def bumpless() -> dict[str, Any]:
     """Engagements and releases in one flight: the largest step of a setpoint around each, of its range."""
     with arduplane(0.03) as plane:
@@ -355,6 +384,7 @@ IDENTIFICATIONS: dict[str, Callable[..., dict[str, Any]]] = {
 MEASUREMENTS: dict[str, Callable[..., dict[str, Any]]] = {
     **IDENTIFICATIONS,
     "guided": guided,
+    "observer": observed,
     "engagements": bumpless,
     "signs": signs,
     "pose": pose,
@@ -417,6 +447,23 @@ def table_of_guidance(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def table_of_observer(result: dict[str, Any]) -> str:
+    """Errors of each flight, without and with the observer."""
+    titles = [f"{name} ({'m/s' if name == 'V' else 'mrad/s'})" for name in result["flights"][0]["rms"]]
+    rows = [f"| observer | {' | '.join(titles)} | engaged until |", "| --- |" + " ---: |" * len(titles) + " --- |"]
+    for one in result["flights"]:
+        rms = [value and f"{value * (1.0 if name == 'V' else 1e3):.3g}" for name, value in one["rms"].items()]
+        (span,) = one["engaged"]
+        ended = f"{span['stop'] - span['start']:.0f} s: {span['reason']}" if span["stop"] else "the end of the flight"
+        rows.append(f"| {one['observer']} | {' | '.join(value or '-' for value in rms)} | {ended} |")
+    weaker = ", ".join(f"{name} {factor:.3g}" for name, factor in result["relaxation"].items())
+    rows.append(
+        f"\nrms while commanded; SIM_WIND_SPD 5, SIM_WIND_TURB {OBSERVED_TURBULENCE:g}. For a margin of"
+        f" {1e3 * OBSERVER_MARGIN:.0f} ms beyond the identified delay the design raised the cost of u by {weaker}.\n"
+    )
+    return "\n".join(rows)
+
+
 def table_of_engagements(result: dict[str, Any]) -> str:
     """Counts and the largest step."""
     steps = np.array(result["steps"])
@@ -469,6 +516,7 @@ TABLES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "slow_servos": ("ArduPlane, its default servos of 0.14 s, gains by `identify --bridge`", table_of_flight),
     "px4": ("PX4's airplane, gains by `identify --bridge`", table_of_flight),
     "guided": ("ArduPlane under guidance", table_of_guidance),
+    "observer": ("ArduPlane with an observer of its identified Omega and lags, in turbulence", table_of_observer),
     "engagements": ("Engagements without a jump", table_of_engagements),
     "signs": ("Signs, in short experiments in wind of 5 m/s", table_of_signs),
     "pose": ("Rates and pose over the autopilot's own log", table_of_pose),
