@@ -26,8 +26,8 @@ WINDOW = 100
 class AircraftNode(FlightNode[AircraftParameters]):
     """At tick k it integrates from t(k-1) to t(k) with the last u held, publishes y and truth, then takes the newest u.
 
-    In lockstep it sets the time: it publishes /clock, y, truth and pose at its instants. At the controller's instants it
-    waits for u before it goes on. Each instant has exactly one y, without channels where no sample arrives.
+    In lockstep it sets the time: it publishes y, truth and pose at its instants. At the controller's instants it waits for u,
+    then publishes /clock with the next of them. Each instant has exactly one y, without channels where no sample arrives.
     """
 
     def __init__(self) -> None:
@@ -64,18 +64,21 @@ class AircraftNode(FlightNode[AircraftParameters]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         scale = self.parameters.failsafe_scale(self._publisher_lock.age_ns(now_ns))
-        self._publish(tick.number, now_ns - tick.number * self.period_ns(), self._u if scale == 1.0 else scale * self._u)
+        start_ns = now_ns - tick.number * self.period_ns()
+        for message in self._fly_to(tick.number, start_ns, self._u if scale == 1.0 else scale * self._u):
+            self._publish_y(message)
+        self._publish_motion(tick.number, start_ns)
         self._take_u(now_ns)
 
-    def _publish(self, number: int, start_ns: int, u: FloatArray) -> bool:
-        arrived = self._simulator.sample(number, u)
-        for sample in arrived:
-            self._publish_y(self._y_encoder.encode(start_ns + sample.stamp_ns, sample.value))
+    def _fly_to(self, number: int, start_ns: int, u: FloatArray) -> list[bytes]:
+        """Fly to a sample; the messages of y that arrive."""
+        return [self._y_encoder.encode(start_ns + one.stamp_ns, one.value) for one in self._simulator.sample(number, u)]
+
+    def _publish_motion(self, number: int, start_ns: int) -> None:
         stamp_ns = start_ns + number * self.period_ns()
         if number % self._simulator.pose_every == 0:
             self._publish_pose(self._pose_encoder.encode(stamp_ns, self._simulator.pose()))
         self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
-        return bool(arrived)
 
     def advance(self) -> bool:
         if not self._u_received and not self._take_u(self._number * self.period_ns()):
@@ -83,15 +86,20 @@ class AircraftNode(FlightNode[AircraftParameters]):
         self._u_received = True
         if self._finished() or self._ahead_of_log():
             return False
-        t_ns = self._number * self.period_ns()
-        self._publish_clock(instant(t_ns))  # first: the reference model computes y_m while the aircraft integrates
-        if not self._publish(self._number, 0, self._u):
-            self._publish_y(self._empty_encoder.encode(t_ns, NO_CHANNELS))
-        self._u_received = t_ns % self._control_ns != 0
-        self._number += 1
+        waits_ns = -(-self._number * self.period_ns() // self._control_ns) * self._control_ns  # the next instant that needs a u
+        until_ns = min(waits_ns, self._end_ns or waits_ns)
+        self._publish_clock(instant(until_ns))  # first: the reference model computes y_m while the aircraft integrates
+        messages: list[bytes] = []
+        while (t_ns := self._number * self.period_ns()) <= until_ns:
+            messages += self._fly_to(self._number, 0, self._u) or [self._empty_encoder.encode(t_ns, NO_CHANNELS)]
+            self._publish_motion(self._number, 0)
+            self._number += 1
+        for message in messages:  # together: each y by itself would wake up the controller
+            self._publish_y(message)
+        self._u_received = until_ns % self._control_ns != 0
         if self._finished():
             self.publish_state(NodeState.COMPLETED)
-            self.get_logger().info(f"flight completed at t = {seconds(t_ns):g} s")
+            self.get_logger().info(f"flight completed at t = {seconds((self._number - 1) * self.period_ns()):g} s")
         return True
 
     def _finished(self) -> bool:

@@ -18,6 +18,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError, StampedVector, require_not_future, select
 from flight_ros.flight_node import FlightNode
+from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS
 from flight_ros.publisher_lock import PublisherLock
 from flight_ros.rclpy_private import DeserializationError
@@ -81,10 +82,8 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         self._y_lock, self._pose_lock = PublisherLock(), PublisherLock()
         self._allowed, self._mode = True, Mode.OFF
         if self.parameters.lockstep:
-            self._number = 0  # of the next y
-            self._y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
-            self._y_due: deque[StampedVector | None] = deque()
-            self._pose_due: deque[StampedVector] = deque()
+            y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
+            self._inputs = LockstepInputs(y_period_ns, self.period_ns(), self._received_y, self._received_poses)
             self._empty_encoder = self.encoder(U_M, ())
         else:
             self._controller_mode = ControllerMode.WAITING
@@ -118,20 +117,11 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
             self._publish(output, now_ns)
 
     def advance(self) -> bool:
-        if not self._y_due:
-            self._y_due.extend(self._received_y())
-        self._pose_due.extend(self._received_poses())
         advanced = False
-        while self._y_due:
-            now_ns = self._number * self._y_period_ns
-            due = now_ns % self.period_ns() == 0
-            if due and not (self._pose_due and self._pose_due[-1].stamp_ns >= now_ns):
-                break
-            self._number += 1
-            if (y := self._y_due.popleft()) is not None:
+        for now_ns, due, y, poses in self._inputs.complete():
+            if y is not None:
                 self._accept(self._y_subscription, self._y_lock, self._guidance.take_y, y, now_ns)
-            while self._pose_due and self._pose_due[0].stamp_ns <= now_ns:
-                pose = self._pose_due.popleft()
+            for pose in poses:
                 self._accept(self._pose_subscription, self._pose_lock, self._guidance.take_pose, pose, now_ns)
             if due and (output := self._step(now_ns, now_ns)) is not None:
                 self._publish(output, now_ns)
@@ -141,7 +131,7 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         return advanced
 
     def awaited_topic(self) -> str:
-        return (self._pose_subscription if self._y_due else self._y_subscription).name
+        return (self._pose_subscription if self._inputs.has_y else self._y_subscription).name
 
     def _step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
         self._take_targets(now_ns)

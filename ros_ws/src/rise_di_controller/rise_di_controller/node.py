@@ -5,7 +5,6 @@
 It subscribes to y and y_m and publishes u and internals. It handles overruns, conflicting publishers and stale inputs.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterator
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -14,6 +13,7 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.flight_node import FlightNode
+from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS, Decoder
 from flight_ros.publisher_lock import PublisherLock
 from flight_ros.subscriptions import PolledSubscription
@@ -44,10 +44,12 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         self._internals_encoder = self.encoder(INTERNALS, self._controller.names)
         if self.parameters.lockstep:
             self._empty_encoder = self.encoder(U, ())
-            self._number = 0  # of the next y
-            self._y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
-            self._y_due: deque[StampedVector | None] = deque()
-            self._y_m_due: deque[StampedVector] = deque()
+            self._inputs = LockstepInputs(
+                period_ns(self.parameters.y_rate, "y_rate"),
+                self.period_ns(),
+                lambda: self._received(self._y_subscription, self._y_decoder),
+                lambda: self._received(self._y_m_subscription, self._y_m_decoder),
+            )
         self._y_publisher_lock, self._y_m_publisher_lock = PublisherLock(), PublisherLock()
         self._last_ns = 0  # of the last tick
         if self.parameters.autostart:
@@ -159,28 +161,19 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         return True
 
     def advance(self) -> bool:
-        if not self._y_due:
-            self._y_due.extend(self._received(self._y_subscription, self._y_decoder))
-        received = self._received(self._y_m_subscription, self._y_m_decoder)
-        self._y_m_due.extend(sample for sample in received if sample is not None)
         advanced = False
-        while self._y_due:
-            now_ns = self._number * self._y_period_ns
-            due = now_ns % self.period_ns() == 0
-            if due and not (self._y_m_due and self._y_m_due[-1].stamp_ns >= now_ns):
-                break
-            self._number += 1
-            if (y := self._y_due.popleft()) is not None:
+        for now_ns, due, y, y_m in self._inputs.complete():
+            if y is not None:
                 self._accept(self._y_subscription, self._controller.take_y, y, now_ns)
-            while self._y_m_due and self._y_m_due[0].stamp_ns <= now_ns:
-                self._accept(self._y_m_subscription, self._controller.take_y_m, self._y_m_due.popleft(), now_ns)
+            for sample in y_m:
+                self._accept(self._y_m_subscription, self._controller.take_y_m, sample, now_ns)
             if due and not self._step(now_ns, late_ns=0):
                 self._publish_u(self._empty_encoder.encode(now_ns, NO_CHANNELS))
             advanced = True
         return advanced
 
     def awaited_topic(self) -> str:
-        return (self._y_m_subscription if self._y_due else self._y_subscription).name
+        return (self._y_m_subscription if self._inputs.has_y else self._y_subscription).name
 
     def _warn_stale_inputs(self, now_ns: int) -> None:
         stale = self._controller.stale(now_ns)

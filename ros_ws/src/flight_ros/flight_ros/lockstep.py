@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The inputs of a node in a lockstep flight, where the number of samples of y gives the time."""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+from flight_core.vectors import StampedVector
+
+
+class Instant(NamedTuple):
+    """An instant of y. `others`: the samples of the second signal up to it that were not in an earlier one."""
+
+    now_ns: int
+    due: bool  # whether the node steps at this instant
+    y: StampedVector | None  # None: a sample did not arrive, or is invalid
+    others: list[StampedVector]
+
+
+class LockstepInputs:
+    """y and a second signal, brought together. A step waits for the y of its instant and the second signal up to it."""
+
+    def __init__(
+        self,
+        y_period_ns: int,
+        period_ns: int,
+        receive_y: Callable[[], Iterable[StampedVector | None]],
+        receive_other: Callable[[], Iterable[StampedVector | None]],
+    ) -> None:
+        self._y_period_ns, self._period_ns = y_period_ns, period_ns
+        self._receive_y, self._receive_other = receive_y, receive_other
+        self._number = 0  # of the next y
+        self._y_due: deque[StampedVector | None] = deque()
+        self._others_due: deque[StampedVector] = deque()
+
+    def complete(self) -> Iterator[Instant]:
+        """The instants whose inputs have arrived, in their order, each once."""
+        if not self._y_due:
+            self._y_due.extend(self._receive_y())
+        self._others_due.extend(sample for sample in self._receive_other() if sample is not None)
+        while self._y_due:
+            now_ns = self._number * self._y_period_ns
+            due = now_ns % self._period_ns == 0
+            if due and not (self._others_due and self._others_due[-1].stamp_ns >= now_ns):
+                return
+            self._number += 1
+            others = []
+            while self._others_due and self._others_due[0].stamp_ns <= now_ns:
+                others.append(self._others_due.popleft())
+            yield Instant(now_ns, due, self._y_due.popleft(), others)
+
+    @property
+    def has_y(self) -> bool:
+        """Whether a y waits for the second signal."""
+        return bool(self._y_due)
