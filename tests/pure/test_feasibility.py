@@ -111,3 +111,20 @@ def test_a_leg_too_short_for_its_fillets_and_a_route_of_one_waypoint_are_refused
     assert refusal(short) == "route[3]: found 500 m from the waypoint before, expected more than 580 m, for fillets of 580 m"
     assert refusal(CORNER[:1]) == "route: found 1 waypoints, expected two or more"
     assert refusal(()) == "route: found 0 waypoints, expected two or more"
+
+
+@pytest.mark.parametrize(
+    ("waypoints", "sentence"),
+    [
+        ((), "route: found 0 waypoints, expected two or more"),
+        ((Waypoint(math.inf, 0, 0), Waypoint(900, 0, 0)), "route[0]: found north inf, east 0, altitude 0 m, expected finite"),
+        ((Waypoint(0, 0, 0), Waypoint(0, math.nan, 0)), "route[1]: found north 0, east nan, altitude 0 m, expected finite"),
+        ((Waypoint(-1e308, 0, 0), Waypoint(1e308, 0, 0)), "route[0]: found north -1e+308, east 0, altitude 0 m, expected"),
+    ],
+)
+def test_what_any_message_may_hold_is_refused_as_a_route(waypoints: tuple[Waypoint, ...], sentence: str) -> None:
+    guidance = find_scenario("osprey_route").guidance
+    assert guidance is not None
+    with pytest.raises(ParameterError) as refused:
+        guidance.plan(waypoints)
+    assert str(refused.value).startswith(sentence)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from flight_core.parameters import require
 from guidance import path, protection
 from guidance.lateral import least_period, least_radius
+from guidance.modes import LARGEST
 from guidance.path import Leg, Line
 from guidance.route_file import Waypoint
 
@@ -37,10 +38,15 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 def flyable_legs(waypoints: Sequence[Waypoint], radius: float, period: float, can: Performance) -> tuple[Leg, ...]:
     """The legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
-    Raises ParameterError for a speed below the floor, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)),
-    a leg too short for its fillets, and an altitude that the climb or sink along the straight part of its leg, with the wind
-    from behind, does not reach. phi_max is the bank that the stall speed permits at V.
+    Raises ParameterError for a waypoint that is not finite or beyond LARGEST, a speed below the floor, a period below the rule,
+    a radius below (V + W)^2 / (g tan(0.8 phi_max)), a leg too short for its fillets, and an altitude that the climb or sink
+    along the straight part of its leg, with the wind from behind, does not reach. phi_max is the bank that the stall speed
+    permits at V.
     """
+    for k, (north, east, altitude, _) in enumerate(waypoints):
+        known = all(abs(value) <= LARGEST for value in (north, east, altitude))
+        found = f"north {north:g}, east {east:g}, altitude {altitude:g} m"
+        require(known, f"route[{k}]", found, f"finite values, at most {LARGEST:g} m either way")
     floor, flown = protection.speed_floor(can.stall_speed), speeds(waypoints, can.speed)
     for k, speed in enumerate(flown):
         require(speed >= floor, f"route[{k}].V", f"{speed:g} m/s", f"at least {_up(floor, 0.1):g} m/s, the speed floor")

@@ -245,7 +245,8 @@ class GuidanceParameters(KeyedParameters):
         stall, flown = floor / protection.FLOOR, speeds(waypoints, self.speed)
         can = Performance(self.speed, stall, self.bank, self.largest_roll_rate(), climb, sink, self.wind)
         banks = [protection.bank_limit(self.bank, stall, max(speed, floor)) for speed in flown]
-        radius = max(least_radius(speed, self.wind, bank) for speed, bank in zip(flown, banks, strict=True))
+        # an empty route is refused below
+        radius = max((least_radius(speed, self.wind, bank) for speed, bank in zip(flown, banks, strict=True)), default=0.0)
         legs = flyable_legs(waypoints, self.radius or math.ceil(radius), self.period or self.least_period(), can)
         numbers = leads(legs)
         return Route(legs, tuple(waypoints[k].altitude for k in numbers), tuple(flown[k] for k in numbers))
