@@ -141,6 +141,21 @@ def test_a_stale_pose_levels_the_wings_by_dead_reckoning_then_stops_all_rates() 
     assert (state.vertical, state.target.altitude) == (Vertical.ALTITUDE, 100.0)
 
 
+@pytest.mark.parametrize("command", [{}, {"heading": 0.5}])
+def test_a_shorter_route_replaces_one_on_a_later_leg(command: dict[str, float]) -> None:
+    section = GuidanceParameters.validate_mapping(SECTION, "guidance")
+    made, points = flying(), [Waypoint(900.0 * k, 0.0, 100.0) for k in range(5)]
+    made.take_route(section.plan(points))
+    made.take_target({"leg": 3.0})
+    assert run(made, 1, 2)["leg"][0] == 3.0
+    made.take_route(section.plan(points[:2]))  # a line and the orbit
+    if command:
+        made.take_target(command)
+    signal = run(made, 2, 3)
+    assert signal["mode.lateral"][0] == (modes.Lateral.HEADING if command else modes.Lateral.ROUTE)
+    assert signal["to_go"][0] == (0.0 if command else pytest.approx(900.0, abs=2.0))  # of the first leg
+
+
 def test_without_fresh_y_there_is_no_command_and_a_frozen_pose_is_refused() -> None:
     made = flying()
     assert made.step(400 * MS, 400 * MS) is None

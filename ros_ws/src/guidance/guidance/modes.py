@@ -332,9 +332,12 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
 
 
 def _with_commands(state: GuidanceState, inputs: Inputs, route: Route | None) -> GuidanceState:
-    """The modes and commands in force: those of the next leg once a leg is passed, then those given."""
+    """The modes and commands in force: those of the next leg once a leg is passed, then those given.
+
+    A lateral command ends the leg: it may come with another route, which has other legs.
+    """
     position = (inputs.pose[POSE.index("north")], inputs.pose[POSE.index("east")])
-    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE
+    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & inputs.given.keys()
     if on_route and route is not None and path.passed(route.legs[state.leg], position):
         state = _on_leg(state, state.leg + 1, route)
     if not inputs.given:
