@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
+from tests.joint_states import JOINT_STATE, vector
 from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
@@ -22,6 +23,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_log.bag import BagWriter
 from flight_log.named_vectors import PATH, typestore
 from flight_log.tape_reader import read_run
 from guidance import guidance, modes
@@ -362,6 +364,14 @@ def test_a_route_that_arrives_in_flight_is_read_from_the_log_replayed_and_drawn(
     assert (result.steps, result.checked, result.differing) == (151, 151, 0)
     assert flown_routes(scenario, tape) == [section.plan([Waypoint(*point) for point in WAYPOINTS])]
     assert replay_guidance(flown, section).checked == 50  # without the route: those before it
+
+
+def test_a_log_with_an_empty_route_alone_is_read(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "run") as bag:
+        y, route = bag.add_topic("/y", JOINT_STATE, ""), bag.add_topic("/route", PATH, "")
+        bag.write(y, 1, 1, 0, vector(1, ["q"], [0.1]))
+        bag.write(route, 2, 2, 0, path_message())
+    assert [*read_run(tmp_path / "run").tape.signals] == ["y"]
 
 
 def test_a_route_file_is_flown_and_stays_with_the_flight(tmp_path: Path) -> None:

@@ -110,8 +110,9 @@ def decode_routes(messages: Sequence[bytes]) -> Decoded:
             unreadable += 1
             continue
         points = [stamped.pose.position for stamped in route.poses]
-        rows = np.array([(k, point.y, point.x, point.z) for k, point in enumerate(points)]).reshape(-1, len(WAYPOINT))
-        samples.append(Samples(WAYPOINT, np.full(len(rows), stamp_of(message)), rows))
+        if points:
+            rows = np.array([(k, point.y, point.x, point.z) for k, point in enumerate(points)])
+            samples.append(Samples(WAYPOINT, np.full(len(rows), stamp_of(message)), rows))
     return Decoded(samples, unreadable)
 
 
