@@ -240,6 +240,22 @@ def test_a_bridge_engages_by_the_name_of_its_map_and_disengages_while_it_waits(r
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
 
 
+def test_an_engagement_that_waits_for_its_turn_is_cancelled_too(recorded: Path, osprey_gust: Scenario) -> None:
+    async def steps(desk: Desk) -> None:
+        await desk.ask("state")
+        first = asyncio.ensure_future(desk.refused("engage", map="plane"))
+        await asyncio.get_running_loop().run_in_executor(None, desk.nodes.blocked.wait, 20.0)
+        desk.nodes.blocked.clear()
+        second = asyncio.ensure_future(desk.refused("engage", map="plane"))
+        await asyncio.sleep(0)  # the request is made
+        await desk.ask("disengage")
+        assert await first == await second == (422, "cancelled by a later request")
+        assert not desk.nodes.blocked.is_set()  # the second one did not begin
+        assert desk.nodes.done == [("disengage", None)]
+
+    with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
+
+
 # Over HTTP
 
 

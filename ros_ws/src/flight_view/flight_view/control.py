@@ -12,6 +12,7 @@ import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Protocol
@@ -108,6 +109,7 @@ class Control:
         self._worker = ThreadPoolExecutor(max_workers=1)
         self._lease, self._lease_end = "", -math.inf
         self._wrong_key, self._requests, self._refilled = -math.inf, BURST, now()
+        self._cancellations = 0
         self._undo: list[dict[str, Any]] = []  # earlier values, the last change at the end
         self._digest = 0  # of the controller's parameters, as far as known
         self._values: dict[str, Any] = {}  # the controller's tunable parameters that are set
@@ -137,9 +139,11 @@ class Control:
                 HTTPStatus.BAD_REQUEST, f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}"
             )
         self._take_lease(lease)
-        if action in {"disengage", "deactivate"}:  # at once, also while an engagement waits
+        if action in {"disengage", "deactivate"}:  # at once, also while an engagement waits, or waits for its turn
+            self._cancellations += 1
             self._link.cancel()
-        return await asyncio.get_running_loop().run_in_executor(self._worker, self._carry_out, action, request)
+        carry_out = partial(self._carry_out, action, request, self._cancellations)
+        return await asyncio.get_running_loop().run_in_executor(self._worker, carry_out)
 
     def close(self) -> None:
         """End the request that runs, and take no further one."""
@@ -175,9 +179,12 @@ class Control:
 
     # What may be commanded
 
-    def _carry_out(self, action: str, request: Mapping[str, Any]) -> dict[str, Any]:
+    def _carry_out(self, action: str, request: Mapping[str, Any], cancellations: int) -> dict[str, Any]:
+        """Carry out a request that came after so many cancellations; a later one refuses it."""
         self._link.resume()
         try:
+            if cancellations != self._cancellations:
+                raise ParameterError("cancelled by a later request")
             if action == "check":
                 return self._check(request)
             before, refusal = dict(self._values), self._actions[action](request)
