@@ -252,6 +252,11 @@ def test_noise_far_above_the_response_leaves_no_model() -> None:
     assert model is None or not model.usable
 
 
+def test_an_output_that_never_moves_has_no_model() -> None:
+    y, u = Known().measured(noise=0.0)
+    assert fit_channel(Signal(y.stamp_ns, y.names, 0.0 * y.values), u, "q", "elevator", 1.0) is None
+
+
 def thrust_with_phugoid(amplitude: float) -> Tape:
     """V by thrust in Lanchester's phugoid, behind a servo of 0.1 s, and the climb of the pose; noise as of an airspeed sensor.
 

@@ -75,6 +75,15 @@ def test_an_input_that_never_moves_is_refused_by_name() -> None:
     assert not found.refusal[0]
 
 
+def test_an_output_that_never_moves_is_refused_by_name() -> None:
+    y, u = flown(0.1)
+    found = identified(Signal(y.stamp_ns, y.names, np.where([True, False], y.values, 0.3)), u)
+    assert found.refusal[1].startswith("r by rudder: found r constant, expected it to move")
+    assert not found.refusal[0]
+    assert found.Omega[0, 0] == pytest.approx(OMEGA[0, 0], rel=0.2)
+    assert found.Omega[1, 0] == 0.0
+
+
 def test_a_short_log_is_refused_with_the_time_that_is_needed() -> None:
     y, u = flown(0.1, seconds=5.0)
     with pytest.raises(ParameterError, match=r"the log: found .* s in which u acts .* expected .* s or more"):

@@ -94,10 +94,11 @@ class ChannelModel(NamedTuple):
 def fit_channel(
     y: Signal, u: Signal, output: str, name: str, sign: float, gravity: Signal | None = None
 ) -> ChannelModel | None:
-    """The model from the time in which an input is excited, of the lowest order that explains it; None where it never is.
+    """The model from the time in which an input is excited, of the lowest order that explains it.
 
-    The search begins with an Omega of this sign, and may end with the other one. `gravity` is a measured part of y_dot that is
-    not of u itself, one channel: then the model is of first order.
+    None where the input never is, or the output is constant then. The search begins with an Omega of this sign, and may end
+    with the other one. `gravity` is a measured part of y_dot that is not of u itself, one channel: then the model is of first
+    order.
     """
     excited = np.flatnonzero(u[name] != 0.0)
     if not len(excited):
@@ -105,6 +106,8 @@ def fit_channel(
     first = int(u.stamp_ns[excited[0]] - BEFORE * NANOSECONDS)
     last = int(u.stamp_ns[excited[-1]] + AFTER * NANOSECONDS)
     measured = y.within([(first, last)])
+    if not len(measured.stamp_ns) or not np.ptp(measured[output]):
+        return None
     t = (measured.stamp_ns - first) / NANOSECONDS
     t_u = (u.stamp_ns - first) / NANOSECONDS
     impulse = np.concatenate([[0.0], np.cumsum(u[name][:-1] * np.diff(t_u))])

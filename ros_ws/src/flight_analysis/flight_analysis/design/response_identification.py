@@ -325,10 +325,11 @@ def _responses(
     t, responses = layout.period * np.arange(every, responses.shape[1] + 1, every), responses[:, every - 1 :: every]
     columns, refusal = [], []
     for j in range(len(inputs)):
-        moved = max(float(np.ptp(one.u[:, j])) if len(one.u) else 0.0 for one in rows)
-        usable = moved > 0.0 and bool(np.isfinite(responses[..., j]).all())
+        recorded = {inputs[j]: [one.u[:, j] for one in rows], outputs[j]: [one.y[:, j] for one in rows]}
+        still = next((name for name, parts in recorded.items() if not any(len(one) and np.ptp(one) > 0.0 for one in parts)), "")
+        usable = not still and bool(np.isfinite(responses[..., j]).all())
         columns.append(_column(t, responses[..., j], j) if usable else _no_column(len(outputs)))
-        refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, moved, float(share[j])))
+        refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, still, float(share[j])))
     counts = (share >= MIN_SHARE) & ~((share < 1.0) & (np.array([one.delay for one in columns]) < LEAST_DELAY))
     counted = np.where(share < 1.0, counts / CLOSED_LOOP_ERRORS, counts)
     return Response(
@@ -351,9 +352,9 @@ def _no_column(m: int) -> _Column:
     return _Column(np.full(m, np.nan), np.full(m, np.nan), math.nan, math.nan, math.nan, math.nan, 0.0)
 
 
-def _refusal(output: str, name: str, column: _Column, j: int, moved: float, share: float) -> str:
-    if moved == 0.0:
-        return f"{output} by {name}: found {name} constant, expected it to move"
+def _refusal(output: str, name: str, column: _Column, j: int, still: str, share: float) -> str:
+    if still:
+        return f"{output} by {name}: found {still} constant, expected it to move"
     if not np.isfinite(column.Omega[j]):
         return f"{output} by {name}: found a response that grows beyond all bounds, expected a flight that does not diverge"
     if share < MIN_SHARE:
@@ -447,10 +448,14 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
 
 
 def _whitener(responses: FloatArray) -> FloatArray:
-    """W with W (s - true s) of covariance I, (N, N), of responses (1 + DRAWS, N), to FLOOR of the largest value."""
+    """W with W (s - true s) of covariance I, (N, N), of responses (1 + DRAWS, N), to FLOOR of the largest value.
+
+    0 for the responses of an output that is constant.
+    """
     values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(responses[1:].T)))
     floor = (FLOOR * np.max(np.abs(responses[0]))) ** 2 + RANK * values[-1]
-    return np.asarray(vectors.T / np.sqrt(np.maximum(values, 0.0) + floor)[:, None])
+    deviations = np.sqrt(np.maximum(values, 0.0) + floor)
+    return np.asarray(vectors.T / np.where(deviations > 0.0, deviations, np.inf)[:, None])
 
 
 class _Curve(NamedTuple):
