@@ -324,6 +324,25 @@ def test_a_guided_flight_shows_its_route_and_its_modes(browser: Browser, tmp_pat
 # Control
 
 
+def test_the_desk_has_the_parts_of_the_nodes_that_run(browser: Browser, recorded: Path, osprey_gust: Scenario) -> None:
+    nodes, controls = NodesInMemory(osprey_gust, "controller"), list[Control]()
+
+    def control(flight: Flight) -> Control:
+        controls.append(Control(flight, nodes, "ABCD-EFGH"))
+        return controls[0]
+
+    with shown(browser, recorded, control=control):
+        browser.wait_for("!document.getElementById('control').hidden")
+        browser.run("document.getElementById('control-typed').value = 'abcd-efgh'")
+        browser.run("void document.getElementById('control-take').click()")
+        browser.wait_for("document.getElementById('control-gains') !== null")
+        assert browser.run("document.getElementById('control-map') === null")
+        nodes.names[:] = ["bridge"]
+        browser.wait_for("document.getElementById('control-map') !== null && document.getElementById('control-gains') === null")
+        assert browser.console == []
+    controls[0].close()
+
+
 def test_gains_are_pending_until_they_are_applied_and_can_be_undone(
     browser: Browser, recorded: Path, osprey_gust: Scenario
 ) -> None:

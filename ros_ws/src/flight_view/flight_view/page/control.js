@@ -33,13 +33,16 @@ async function act(request, done) {
   return true;
 }
 
+// What the desk is built from: nodes start and end, and the log has the axes of the wind from its first sample of truth on.
+const offered = found => found && JSON.stringify([found.nodes, Boolean(found.gains), found.aircraft, found.bridge]);
+
 function take(found) {
-  const first = !state;
+  const changed = offered(state) !== offered(found);
   lease = found.lease;
   state = found;
   $("control-key").hidden = true;
   $("control-desk").hidden = false;
-  if (first) build();
+  if (changed) build();
   show();
 }
 
