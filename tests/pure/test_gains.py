@@ -449,6 +449,14 @@ def test_the_command_names_the_conditions_that_a_scenario_fails() -> None:
     assert "beta in units of y / s^2" in " ".join(result.stdout.split())
 
 
+def test_the_command_shows_the_sign_of_each_channel() -> None:
+    signs = {"navion_longitudinal": {"q by elevator": "-1"}, "osprey": {"q by elevator": "+1", "r by rudder": "+1"}}
+    for airframe, expected in signs.items():  # the elevator is positive nose down, and nose up
+        shown = rise_di("gains", airframe, "--samples", "2").stdout
+        for channel, sign in expected.items():
+            assert f"{channel} {sign} " in " ".join(shown.split())
+
+
 def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
     path = tmp_path / "gain_conditions.yaml"
     loop = ("--lag", "0.02,0.1,0.02,0.02", "--delay", "0")

@@ -207,9 +207,9 @@ def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) ->
     samples = len(found.A) - 1
     title = f"Gains for {found.airframe.name}, A and B +-{100 * found.uncertainty:g} % ({samples} samples); K, Lambda in 1/s,"
     headings = [heading for name in answers for heading in (f"{name}\nK", "\nLambda", "\nbeta")]
-    table = new_table(f"{title} beta in units of y / s^2", ["channel", *headings], left=("channel",))
+    table = new_table(f"{title} beta in units of y / s^2", ["channel", "D", *headings], left=("channel",))
     for i, (output, name) in enumerate(zip(outputs, first.controller.inputs, strict=True)):
-        row = [f"{output} by {name}"]
+        row = [f"{output} by {name}", f"{first.controller.D[i]:+d}"]
         for answer in answers.values():
             params = answer.controller.law_params()
             row += [f"{params.K[i]:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i]:.4g}"]
