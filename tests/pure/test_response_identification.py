@@ -58,6 +58,17 @@ def test_doublets_in_open_loop_give_omega_lag_and_delay_back_within_their_errors
     assert (np.abs(np.diag(found.Omega) / np.diag(OMEGA) - 1.0) < 0.2).all()  # known well enough for gains
     # u is held for 0.02 s and y_dot is known every 0.02 s: delay and lag apart are finer than that, their sum is known better
     assert found.delay + found.lag == pytest.approx(DELAY + LAG, abs=0.015)
+
+
+def test_only_the_time_in_which_u_acts_on_the_aircraft_counts() -> None:
+    # From 20 s on the log holds a u that does not act, as that of a controller beside an autopilot which flies by itself.
+    y, u = flown(0.1)
+    engaged_ns = nanoseconds(20.0)
+    other = Signal(u.stamp_ns, u.names, np.where((u.stamp_ns > engaged_ns)[:, None], -u.values, u.values))
+    found = identify_response(y, other, OUTPUTS, INPUTS, engaged=[(0, engaged_ns)])
+    assert not any(found.refusal)
+    assert (np.abs(np.diag(found.Omega) / np.diag(OMEGA) - 1.0) < 0.3).all()  # half of the time: 0.2 times sqrt(2)
+    assert (np.diag(identified(y, other).Omega) / np.diag(OMEGA) < 0.5).all()  # the two halves contradict each other
     assert (found.sign_ratio > 10.0).all()
 
 
