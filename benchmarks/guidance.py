@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +32,7 @@ from rich.console import Console
 
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.metrics import tracking_error
 from flight_bringup.scenarios import find_scenario
 from flight_core.outcome import COMPLETED
 from flight_core.rates import nanoseconds, seconds
@@ -44,6 +46,7 @@ from guidance.params import GuidanceParameters
 from guidance.protection import FLOOR
 
 SIGMA = 1.5  # m/s, of the turbulence
+RATES = ("q", "p", "r")
 START = 5.0  # s, of the command
 BANK, TURN, CLIMB, FASTER = math.radians(20.0), math.pi / 2.0, 100.0, 0.1  # rad, rad, m, of V0
 WIND = 0.2  # of V0
@@ -339,17 +342,23 @@ def prepared(scenario: Scenario) -> Scenario:
 @cache
 def aircraft_of(name: str) -> Scenario:
     """The scenario of an aircraft, with guidance."""
+    return prepared(original_of(name))
+
+
+@cache
+def original_of(name: str) -> Scenario:
+    """The scenario of an aircraft, with the commands and the gusts of its own."""
     if name == "osprey_servo":
         slower = {"rate": 100.0, "step": 0.005}  # as the law: four times faster than with 500 Hz
-        return prepared(find_scenario(name).vary(aircraft=slower, reference_model={"rate": 100.0}))
+        return find_scenario(name).vary(aircraft=slower, reference_model={"rate": 100.0})
     if name in {"c172p", "f16"}:
-        return prepared(find_scenario(f"jsbsim_{name}"))
+        return find_scenario(f"jsbsim_{name}")
     from flight_analysis.design.identification import identify  # noqa: PLC0415 - for this aircraft alone
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"jsbsim_{name}.yaml"
         path.write_text(identify(name, *CONDITIONS[name]).text, encoding="utf-8")
-        return prepared(load_scenario(path))
+        return load_scenario(path)
 
 
 CONDITIONS: Mapping[str, tuple[float, float]] = {"737": (154.0, 6096.0)}
@@ -375,8 +384,7 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
     if manoeuvre.figures is of_switch:
         aircraft["sensors"] = {}  # noise moves u by itself
     if air.seed is not None:
-        low = {"altitude": LOW, "wind": LOW_WIND} if altitude == 0.0 else {"altitude": altitude, "sigma": SIGMA}
-        aircraft["turbulence"] = low | {"seed": air.seed}
+        aircraft["turbulence"] = turbulence(scenario, air.seed)
     varied = scenario.vary(flight={"duration": duration}, aircraft=aircraft, guidance=section)
     controller = scenario.controller
     RANGES.clear()
@@ -397,6 +405,34 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
     yield from of_limits(tape, guidance, calm, manoeuvre.pose)
 
 
+def turbulence(scenario: Scenario, seed: int) -> dict[str, Any]:
+    """The section `aircraft.turbulence`, with SIGMA."""
+    altitude = scenario.aircraft.altitude or 0.0
+    low = {"altitude": LOW, "wind": LOW_WIND} if altitude == 0.0 else {"altitude": altitude, "sigma": SIGMA}
+    return low | {"seed": seed}
+
+
+def rate_ratios(name: str, seed: int | None) -> dict[str, float]:
+    """The rms of e of q, p and r under guidance over that of the same scenario without guidance.
+
+    In calm air in a turn of 90 deg, over the commands of the scenario's own; in turbulence in straight flight, over straight
+    flight without commands.
+    """
+    guided = aircraft_of(name)
+    if guided.guidance is None:
+        raise ValueError(f"{guided.name} has no guidance")
+    section, duration = MANOEUVRES["heading"].plan(guided.guidance)
+    aircraft: dict[str, Any] = {"gusts": {}, "turbulence": None if seed is None else turbulence(guided, seed)}
+    flight = {"duration": duration}
+    if seed is None:
+        pair = guided.vary(flight=flight, guidance=section), original_of(name).vary(aircraft=aircraft)
+    else:
+        straight = guided.vary(flight=flight, aircraft=aircraft)
+        pair = straight, replace(straight, guidance=None)
+    errors = [tracking_error(simulate(one)) for one in pair]
+    return {rate: rms(errors[0][rate]) / rms(errors[1][rate]) for rate in RATES}
+
+
 def trim_pitch(scenario: Scenario) -> float:
     """Pitch in trim, rad."""
     return float(simulate(scenario.vary(flight={"duration": 0.1}))["guidance"]["pose.theta"][0])
@@ -404,6 +440,8 @@ def trim_pitch(scenario: Scenario) -> float:
 
 EXEMPT = {("f16", "heading", "altitude (m)"): 40.0, ("f16", "orbit", "rms (s)"): 0.05}
 """Limits of an aircraft whose rudder is at its stop in turns: its own yaw damper feeds r back without a washout."""
+AT_STOP = ("f16", "r")
+"""Its rudder is at the stop in turns, so that r is not compared."""
 LATE = 8.0
 """Limit of the bank beyond its limit with a poor pose, deg: 0.2 s at p_max = 0.35 rad/s are 4 deg, and so are 5 Hz."""
 
@@ -445,7 +483,10 @@ def main() -> None:
     parser.add_argument("--manoeuvres", nargs="*", choices=[*MANOEUVRES], default=[*MANOEUVRES], help="manoeuvres; not stored")
     parser.add_argument("--seeds", type=int, default=5, help="of the turbulence")
     parser.add_argument("--grid", action="store_true", help="the flights off the design point, in place of the manoeuvres")
+    parser.add_argument("--rates", action="store_true", help="errors of the rates with and without guidance, instead")
     options = parser.parse_args()
+    if options.rates:
+        sys.exit(compare_rates(options.only, options.seeds) > 0)
     missed = 0
     for name in options.only:
         if options.grid:
@@ -472,6 +513,18 @@ def fly_manoeuvres(name: str, manoeuvres: Sequence[str], seeds: int) -> int:
         guidance_page.store(f"flights {name}", kept)
     Console().print(table)
     return missed
+
+
+def compare_rates(names: Sequence[str], seeds: int) -> int:
+    """The ratios of `rate_ratios`, the worst over the seeds, stored. Returns how many are beyond their limit."""
+    rows: list[tuple[str, str, dict[str, float], float]] = []
+    for name in names:
+        for air, numbers, limit in (("calm", [None], 1.5), (f"turbulence, {seeds} seeds", range(1, seeds + 1), 1.2)):
+            ratios = [rate_ratios(name, seed) for seed in numbers]
+            rows.append((name, air, {rate: max(one[rate] for one in ratios) for rate in RATES}, limit))
+            print(*rows[-1], sep="\t", file=sys.stderr, flush=True)
+    guidance_page.store("rates", rows)
+    return sum(ratio > limit for name, _, ratios, limit in rows for rate, ratio in ratios.items() if (name, rate) != AT_STOP)
 
 
 def fly_grid(name: str) -> int:

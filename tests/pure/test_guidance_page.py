@@ -14,6 +14,7 @@ def test_the_page_marks_what_misses_its_limit_and_names_what_was_lost() -> None:
         for name, result in {
             "flights c172p": flights,
             "grid c172p": grid,
+            "rates": [("c172p", "calm", {"q": 0.9, "p": 1.6}, 1.5)],
             "long flight": {"minutes": 60.0, "legs": [1, 2]},
         }.items()
     }
@@ -21,6 +22,7 @@ def test_the_page_marks_what_misses_its_limit_and_names_what_was_lost() -> None:
     assert "| heading: V (m/s) | calm | 1.25 | 2 |" in lines
     assert "| heading: V (m/s) | turbulence, 5 seeds | *7.6* | 5 |" in lines
     assert "| 300 | ok | lost |" in lines
+    assert "| c172p, calm | 0.90 | *1.60* | 1.5 |" in lines
     assert "1 of 2 points flown, 1 lost." in lines
     assert "- lost at 36 m/s and 300 m: diverged at t = 3.00 s" in lines
     assert any("minutes: 60.0; legs: 1, 2." in line for line in lines)
