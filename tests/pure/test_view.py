@@ -524,3 +524,13 @@ def test_the_terminal_shows_the_newest_values_in_the_units_of_the_report(recorde
     assert rows["q"][0] == f"{1e3 * tape['internals']['y.q'][-1]:.3f}"
     assert rows["elevator"][0] == f"{np.degrees(tape['internals']['u.elevator'][-1]):.3f}"
     assert "0.00 s  mode: ENGAGED" in text
+
+
+def test_the_terminal_shows_a_pose_without_a_heading(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "run") as bag:
+        pose = bag.add_topic("/pose", JOINT_STATE, "")
+        bag.write(pose, 1, 1, 0, vector(1, ["phi", "theta"], [0.1, 0.2]))
+    flight, console = Flight(tmp_path / "run"), Console(width=120, record=True, file=io.StringIO())
+    flight.update()
+    console.print(picture(flight))
+    assert "roll +5.7 deg, pitch +11.5 deg, heading - deg" in console.export_text()

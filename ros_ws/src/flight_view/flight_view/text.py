@@ -75,7 +75,8 @@ def _inputs(flight: Flight) -> Table:
 def _attitude(flight: Flight) -> str:
     roll, pitch, heading = (math.degrees(_newest(flight, "pose", name)) for name in ("phi", "theta", "psi"))
     altitude, climb = (_newest(flight, "pose", name) for name in ("altitude", "climb"))
-    angles = f"roll {roll:+.1f} deg, pitch {pitch:+.1f} deg, heading {round(heading) % 360:03d} deg"
+    turned = f"{round(heading) % 360:03d}" if math.isfinite(heading) else "-"  # a pose may have no psi
+    angles = f"roll {roll:+.1f} deg, pitch {pitch:+.1f} deg, heading {turned} deg"
     return f"{angles}, altitude {altitude:.1f} m, climb {climb:+.1f} m/s"
 
 
