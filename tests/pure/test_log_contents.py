@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import yaml
 from tests.conftest import REPOSITORY
+from tests.joint_states import vector
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import SCHEMAS, ParameterOverrides, Scenario, load_scenario
@@ -23,7 +24,8 @@ from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.graph import AIRCRAFT, ONE_PROCESS, RECORDER, parameter_overrides
 from flight_bringup.scenarios import find_scenario, scenarios
 from flight_core.parameters import ParameterError
-from flight_log.bag import LogAttachments, read_metadata_records
+from flight_log.bag import BagWriter, LogAttachments, read_metadata_records
+from flight_log.named_vectors import JOINT_STATE
 from flight_log.provenance import STACK, provenance, revision
 from flight_log.tape_reader import RecordedRun, read_run
 from flight_log.tape_writer import write_run
@@ -158,3 +160,17 @@ def test_a_host_without_git_has_no_revision(monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_folder_that_cannot_be_written_is_one_sentence(osprey_gust: Scenario, tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"nowhere/parameters.yaml cannot be written \(No such file or directory\)"):
         attachments_for(osprey_gust, tmp_path / "nowhere")
+
+
+def test_a_pose_whose_first_samples_lack_a_channel_is_read_with_it(tmp_path: Path) -> None:
+    # The topics of an autopilot begin at different times: its first poses may be without climb.
+    with BagWriter(tmp_path / "run") as bag:
+        topic = bag.add_topic("/pose", JOINT_STATE, "")
+        for k in range(1, 7):
+            message = vector(k, ["phi"], [0.1]) if k < 3 else vector(k, ["phi", "climb"], [0.1, float(k)])
+            bag.write(topic, k, k, k, message)
+        for k in range(7, 17):  # of another publisher
+            bag.write(topic, k, k, k, vector(k, ["z"], [0.1]))
+    tape = read_run(tmp_path / "run").tape
+    assert tape["pose"]["climb"].tolist() == [3.0, 4.0, 5.0, 6.0]
+    assert "pose: 12 samples with other names refused" in tape.notes

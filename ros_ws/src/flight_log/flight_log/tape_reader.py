@@ -97,14 +97,12 @@ def _names_of_one_aircraft(topics: Collection[str], namespace: str | None, where
 
 
 class _TopicSamples:
-    """Samples of one topic, decoded in batches."""
+    """Samples of one topic, decoded in batches. Those with the same names are its signal."""
 
     def __init__(self, decode: Decoder) -> None:
         self._decode = decode
         self._batch: list[bytes] = []
-        self._names: tuple[str, ...] | None = None
-        self._stamps: list[NDArray[np.int64]] = []
-        self._values: list[FloatArray] = []
+        self._samples: dict[tuple[str, ...], list[tuple[NDArray[np.int64], FloatArray]]] = {}  # by names: stamps, values
         self._refused = 0
 
     def add(self, message: bytes) -> None:
@@ -117,25 +115,34 @@ class _TopicSamples:
         self._batch = []
         self._refused += decoded.unreadable
         for names, stamp_ns, values in decoded.samples:
-            self._names = self._names or names
-            if names == self._names and values.shape[1] == len(names):
-                self._stamps.append(stamp_ns)
-                self._values.append(values)
+            if values.shape[1] == len(names):
+                self._samples.setdefault(names, []).append((stamp_ns, values))
             else:
                 self._refused += len(stamp_ns)
 
     def signal(self) -> Signal | None:
         """All samples in the order of their stamps; None without samples."""
         self._decode_batch()
-        if self._names is None or not self._stamps:
+        if not self._samples:
             return None
-        stamp_ns = np.concatenate(self._stamps)
+        names = self._names()
+        stamps, values = zip(*self._samples[names], strict=True)
+        stamp_ns = np.concatenate(stamps)
         order = np.argsort(stamp_ns, kind="stable")
-        return Signal(stamp_ns[order], self._names, np.concatenate(self._values)[order])
+        return Signal(stamp_ns[order], names, np.concatenate(values)[order])
+
+    def _names(self) -> tuple[str, ...]:
+        """The names of the first sample, or of more samples that have further names beside these."""
+        first = next(iter(self._samples))
+        return max((names for names in self._samples if set(first) <= set(names)), key=self._count)
+
+    def _count(self, names: tuple[str, ...]) -> int:
+        return sum(len(stamp_ns) for stamp_ns, _ in self._samples[names])
 
     def note(self, name: str) -> str:
         """The note on refused samples; empty without any."""
-        return f"{name}: {self._refused} samples with other names refused" if self._refused else ""
+        refused = self._refused + sum(map(self._count, self._samples)) - (self._count(self._names()) if self._samples else 0)
+        return f"{name}: {refused} samples with other names refused" if refused else ""
 
 
 class _Log:
