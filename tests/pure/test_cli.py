@@ -129,3 +129,23 @@ def test_the_shell_completes_commands_and_the_options_of_a_command() -> None:
 
     assert complete("rise-di re", 1) == ["report", "replay", "repair"]
     assert "--parquet" in complete("rise-di report --", 2)
+
+
+def test_an_interrupt_inside_a_destructor_ends_a_command_without_a_traceback() -> None:
+    code = """
+import signal, time
+from flight_cli import cli
+
+class Interrupting:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+def command(prog_name):
+    Interrupting()
+    time.sleep(60.0)
+
+cli.application = lambda words: command
+cli.main()
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=50.0, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")

@@ -19,6 +19,7 @@ import typer
 
 BAD_INPUT, INTERRUPTED = 2, 130
 NICE = 10  # of a command that may run beside a flight
+REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores
 
 COMMANDS = MappingProxyType(
     {
@@ -69,6 +70,15 @@ def application(words: list[str]) -> typer.Typer:
     return app
 
 
+def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
+    """Repeat a Ctrl-C that came inside a destructor or a callback of a weak reference: Python prints and ignores it there."""
+    if issubclass(ignored.exc_type, KeyboardInterrupt):
+        signal.signal(signal.SIGALRM, signal.default_int_handler)
+        signal.setitimer(signal.ITIMER_REAL, REPEATED_AFTER)
+    else:
+        sys.__unraisablehook__(ignored)
+
+
 def main() -> None:
     """Entry point: bad input is one sentence and exit status 2, Ctrl-C is quiet."""
     if sys.argv[1:2] == ["watch"]:  # already while it loads: a flight beside it goes first
@@ -78,6 +88,7 @@ def main() -> None:
     try:
         app = application(words)
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.unraisablehook = _repeat_interrupt
         from flight_core.parameters import ParameterError  # noqa: PLC0415 - loads pydantic, which --help does without
 
         try:
