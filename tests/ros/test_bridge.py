@@ -364,10 +364,15 @@ def test_identify_excites_the_autopilot_and_writes_what_flies_it(setup: BridgeSe
     identify.succeed()
     found = json.loads(identify.lines[-1])
     assert found["inputs"] == ["aileron"]
+    channels = {name: np.squeeze(values) for name, values in found["channels"].items()}
     airframe = load_airframe("osprey")
-    roll = airframe.matrix_b()[list(airframe.states).index("p"), list(airframe.inputs).index("aileron")]
-    # 40 %: messages of 20 ms show little above 8 Hz; a loop with a phase margin of 54 degrees bears a factor of 2
-    assert found["channels"]["Omega"][0][0] == pytest.approx(roll, rel=0.4)
+    p, aileron = list(airframe.states).index("p"), list(airframe.inputs).index("aileron")
+    s = 0.5j / (channels["lag"] + channels["delay"])  # where a loop by the rules crosses 1
+    true = airframe.matrix_b()[p, aileron] / (s - airframe.matrix_a()[p, p]) / (0.02 * s + 1.0)  # lag of slow_autopilot.yaml
+    gain = channels["Omega"] / (s + channels["damping"]) / (channels["lag"] * s + 1.0)
+    # The gain of the loop, since Omega and damping alone take each other's place where messages of 20 ms are late. 40 %: a loop
+    # with a phase margin of 54 degrees bears a factor of 2.
+    assert abs(gain) == pytest.approx(abs(true), rel=0.4)
     (folder,) = tmp_path.rglob("found")
     check = CliRunner().invoke(app, ["check-signs", str(folder / "map.yaml"), "--scenario", str(folder / "scenario.yaml")])
     assert check.exit_code == 0, check.output
