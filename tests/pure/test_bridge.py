@@ -448,3 +448,13 @@ def test_a_flight_announces_each_reason_once_without_those_in_which_a_number_alo
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     assert _follow_real_time(find_scenario("osprey_gust"), *nodes, lambda t, text: None, announced.append, np.inf) == "the end"
     assert announced == [*(f"DISENGAGED: {reasons[i]}" for i in (0, 1, 3)), "ENGAGED"]
+
+
+def test_an_experiment_without_an_engagement_ends_when_too_little_time_is_left() -> None:
+    # osprey_gust has 60 s, of which the experiment needs 59.8; it began 0.3 s ago
+    processes = SimpleNamespace(start_time=time.time() - 0.3, ended_early=lambda: None)
+    monitor = SimpleNamespace(engagement=list, newest=lambda: None)
+    nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
+    scenario = find_scenario("osprey_gust")
+    outcome = _follow_real_time(scenario, *nodes, lambda t, text: None, lambda line: None, scenario.flight.duration - 0.2)
+    assert outcome == "not engaged within 0.2 s"

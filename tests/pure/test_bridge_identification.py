@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy.signal import cont2discrete, dlsim
+from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.params import AircraftParameters
@@ -33,6 +34,7 @@ from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
 from flight_analysis.design.response_identification import Response, identify_response
 from flight_analysis.metrics import best_error, error_metrics
 from flight_bringup.scenarios import find_scenario
+from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
@@ -307,6 +309,20 @@ def test_a_map_without_an_envelope_is_refused() -> None:
     with pytest.raises(ParameterError, match=sentence):
         require_envelope(MAP.model_copy(update={"envelope": {}}))
     require_envelope(MAP.model_copy(update={"envelope": dict.fromkeys(("phi", "theta", "V"), (-1.0, 1.0))}))
+
+
+def test_a_refused_experiment_leaves_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    new, below_file = tmp_path / "found", tmp_path / "file" / "found"
+    for name, folder, sentence in (
+        ("rosflight", new, "map rosflight: envelope: found none of"),
+        ("ardupilot", below_file, f"--write: {below_file} cannot be written (Not a directory)"),
+    ):
+        arguments = ["identify", "--bridge", name, "--speed", "25", "--write", str(folder)]
+        result = CliRunner().invoke(application([*COMMANDS]), arguments)
+        assert isinstance(result.exception, ParameterError)
+        assert str(result.exception).startswith(sentence)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_written_map_has_the_trims_that_were_sent() -> None:

@@ -51,7 +51,7 @@ def fly_over_topics(
     Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one process, in lockstep only.
     `autopilot` flies in the aircraft's place, in real time only. `announce` gets a line for each change of engagement and of
     reason, but not for a changed number. With `engaged_for`, s, the flight ends so long after its first engagement, or with
-    it.
+    it, or without one when too little time is left.
     Outcomes: "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence that names the process that ended early.
     """
     from flight_bringup.clients import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
@@ -94,6 +94,8 @@ def _follow_real_time(
                 engaged_at = min(engaged_at, t)
         if t > engaged_at + engaged_for or (engaged_for < math.inf and engaged_at < math.inf and phase != "ENGAGED"):
             return COMPLETED
+        if engaged_at == math.inf and t > (latest := scenario.flight.duration - engaged_for) > 0.0:
+            return f"not engaged within {latest:.3g} s"
         if phase not in {"", "ENGAGED"}:
             text = f"{phase}: {why}"
         elif (status := monitor.newest()) is not None:

@@ -3,6 +3,7 @@
 """The part of `rise-di identify` that excites the aircraft behind a channel map, and writes a scenario that flies it."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,8 @@ from flight_analysis.report.run_folder import link_latest, new_run
 from flight_analysis.report.summary import finite_or_null
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
-from flight_cli.output import CLOCK_COLUMNS, display_path, new_table, progress_bar, write_text
+from flight_cli.output import CLOCK_COLUMNS, display_path, new_table, progress_bar
+from flight_core.files import writing
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Tape
 from flight_log.tape_reader import read_run
@@ -43,7 +45,6 @@ def identify_behind_bridge(
     channel_map = load_map(map_name)
     require(0.0 < amplitude <= 1.0, "--amplitude", amplitude, "above 0 and at most 1, a part of the limits of the map")
     require(folder.is_dir() or not folder.exists(), "--write", folder, "a folder, or the name of a new one")
-    folder.mkdir(parents=True, exist_ok=True)
     console = Console(quiet=as_json)
     if log is None:
         require_envelope(channel_map)
@@ -58,10 +59,9 @@ def identify_behind_bridge(
     found = join(channel_map, response, models)
     airframe = folder / "airframe.yaml"
     flyable = flying_scenario(channel_map, found, speed, str(airframe.resolve()))
-    written_map = map_text(channel_map, trims, run.name)
+    written_map = map_text(channel_map, trims, run.resolve().name)  # that of the run, not `latest`
     files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
-    for name, content in files.items():
-        write_text("--write", folder / f"{name}.yaml", content)
+    _write(folder, files)
     load_scenario(folder / "scenario.yaml")
     if as_json:
         print(json.dumps(_as_json(response, found, flyable, trims, folder)))
@@ -77,8 +77,7 @@ def _excite(
     """Fly the experiment; the folder of its run."""
     airframe, scenario = folder / "experiment_airframe.yaml", folder / "experiment.yaml"
     planned = experiment(channel_map, speed, amplitude, str(airframe.resolve()))
-    write_text("--write", airframe, planned.airframe)
-    write_text("--write", scenario, planned.scenario)
+    _write(folder, {airframe.stem: planned.airframe, scenario.stem: planned.scenario})
     chosen = load_scenario(scenario)
     _announce(console, planned, chosen.flight.duration)
     run = new_run(chosen, runs)
@@ -99,6 +98,14 @@ def _excite(
     link_latest(run)
     console.print(f"outcome: {outcome}\nlog:     {display_path(run)}", highlight=False)
     return run
+
+
+def _write(folder: Path, files: Mapping[str, str]) -> None:
+    """Write YAML files by their names into a folder, which is created where it does not exist."""
+    with writing("--write", folder, "a folder that can"):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in files.items():
+            (folder / f"{name}.yaml").write_text(content, encoding="utf-8")
 
 
 def _announce(console: Console, planned: Experiment, duration: float) -> None:
