@@ -60,24 +60,34 @@ def test_a_notebook_runs_and_is_stored_without_its_output(notebook: Path, tmp_pa
     run([sys.executable, "-c", "\n".join(code)], tmp_path)
 
 
-def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
-    run(
-        [
-            sys.executable,
-            "-m",
-            "mkdocs",
-            "build",
-            "--strict",
-            "--quiet",
-            "-f",
-            str(REPOSITORY / "mkdocs.yml"),
-            "-d",
-            str(tmp_path / "site"),
-        ],
-        tmp_path,
-    )
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built without a warning."""
+    folder = tmp_path_factory.mktemp("site")
+    options = ["--strict", "--quiet", "-f", str(REPOSITORY / "mkdocs.yml"), "-d", str(folder)]
+    run([sys.executable, "-m", "mkdocs", "build", *options], folder)
+    return folder
+
+
+def test_the_site_has_every_page(site: Path) -> None:
     pages = {path.relative_to(REPOSITORY / "docs").with_suffix(".html") for path in (REPOSITORY / "docs").rglob("*.md")}
-    assert all((tmp_path / "site" / page).is_file() for page in pages)
+    assert all((site / page).is_file() for page in pages)
+
+
+def test_a_formula_is_mathml_on_the_site(site: Path) -> None:
+    code = re.compile(r"<(pre|code|script|style)\b.*?</\1>", re.DOTALL)
+    pages = {path.name: code.sub("", path.read_text(encoding="utf-8")) for path in site.rglob("*.html")}
+    theory = (REPOSITORY / "docs" / "theory.md").read_text(encoding="utf-8")
+    assert pages["theory.html"].count("<math") == theory.replace("$$", "$").count("$") / 2
+    assert [name for name, page in pages.items() if re.search(r"\\[(\[]|\$", page)] == []
+
+
+def test_the_site_loads_nothing_from_another_host(site: Path) -> None:
+    pages = {path.name: path.read_text(encoding="utf-8") for path in site.rglob("*.html")}
+    loads = re.compile(r"""<link [^>]*\bhref="?(?:https?:)?//|\bsrc(?:set)?="?(?:https?:)?//""")
+    assert [name for name, page in pages.items() if loads.search(page)] == []
+    # The theme would load the library of such a diagram from a host; without the library the diagram is code.
+    assert [page.name for page in (REPOSITORY / "docs").rglob("*.md") if "```mermaid" in page.read_text(encoding="utf-8")] == []
 
 
 def test_the_reference_of_parameters_is_that_of_the_classes() -> None:
