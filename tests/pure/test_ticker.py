@@ -1,14 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The ticker: deadlines on the monotonic clock, overruns and the busy-wait before a deadline."""
+"""Ticks: deadlines on the monotonic clock, overruns, the busy-wait before a deadline, requests to Linux's scheduler."""
 
+import platform
+import re
 import subprocess
 import sys
 import time
 
 import pytest
 
-from flight_ros.ticker import MAX_SPIN_FRACTION, SPIN_TIME, TIMER_SLACK, Ticker
+from flight_ros.scheduling import SLICE_NS, THREADS, TIMER_SLACK
+from flight_ros.ticker import MAX_SPIN_FRACTION, SPIN_TIME, Ticker
 
 PERIOD_NS = 10_000_000
 
@@ -66,6 +69,25 @@ def test_the_busy_wait_before_a_deadline_is_limited_to_a_fraction_of_the_period(
 @pytest.mark.skipif(not TIMER_SLACK.exists(), reason="no Linux, or no /proc")
 def test_the_timer_slack_of_the_thread_is_set_to_its_minimum() -> None:
     # in a process of its own, as the setting lasts; the default of Linux is 50 us (prctl(2), PR_SET_TIMERSLACK)
-    code = "from flight_ros.ticker import *; disable_timer_slack(); print(TIMER_SLACK.read_text())"
+    code = "from flight_ros.scheduling import *; disable_timer_slack(); print(TIMER_SLACK.read_text())"
     ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert int(ran.stdout) == 1
+
+
+def kernel() -> tuple[int, ...]:
+    return tuple(map(int, re.findall(r"\d+", platform.release())[:2]))
+
+
+@pytest.mark.skipif(
+    kernel() < (6, 12) or not (THREADS.parent / "sched").exists(), reason="needs Linux 6.12, CONFIG_SCHED_DEBUG"
+)
+def test_every_thread_of_a_node_has_short_time_slices() -> None:
+    code = """
+import threading, time
+from flight_ros.scheduling import *
+threading.Thread(target=time.sleep, args=(0.1,)).start()
+request_short_slices()
+print([(one / "sched").read_text() for one in THREADS.iterdir()])
+"""
+    ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert [int(slice_ns) for slice_ns in re.findall(r"se\.slice\s*:\s*(\d+)", ran.stdout)] == [SLICE_NS, SLICE_NS]

@@ -22,7 +22,8 @@ from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_ros import transport
 from flight_ros.flight_node import FlightNode
 from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, destroy_participant, ready_callback
-from flight_ros.ticker import Ticker, disable_timer_slack
+from flight_ros.scheduling import disable_timer_slack, request_short_slices
+from flight_ros.ticker import Ticker
 from flight_ros.topics import NodeState
 
 BAD_PARAMETERS, ENDED_EARLY = 2, 3  # exit statuses
@@ -165,6 +166,7 @@ def _run_real_time(node: FlightNode[Any], stop: _Stop) -> None:
     serve_ns = report_ns = time.monotonic_ns()
     reports: deque[Callable[[], None]] = deque()
     disable_timer_slack()
+    request_short_slices()
     while not stop.requested:
         ticker.wait(IDLE_POLL_PERIOD)
         if (tick := ticker.due()) is not None:

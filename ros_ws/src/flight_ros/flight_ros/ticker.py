@@ -3,22 +3,10 @@
 """Ticker: a fixed rate on the monotonic clock with absolute deadlines, without drift and independent of the system clock."""
 
 import time
-from contextlib import suppress
-from pathlib import Path
 from typing import NamedTuple
 
-TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
 SPIN_TIME = 2.5e-4  # s of busy-wait before a deadline: the wake-up of a sleeping thread takes 20 to 250 us
 MAX_SPIN_FRACTION = 0.2  # maximum of the busy-wait, as a fraction of the period and so of a core
-
-
-def disable_timer_slack() -> None:
-    """Set the timer slack of the main thread to its minimum. By default Linux delays a wake-up by up to 50 us to save power.
-
-    Source: prctl(2), PR_SET_TIMERSLACK. No privilege is needed. Threads of real-time priority have no timer slack.
-    """
-    with suppress(OSError):  # /proc is missing or read-only: ticks keep the slack
-        TIMER_SLACK.write_text("1", encoding="utf-8")
 
 
 class Tick(NamedTuple):
