@@ -128,7 +128,7 @@ class Client(threading.Thread):
 
     def run(self) -> None:
         """Ask until stopped, or until the server ends."""
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)  # in use the browser is on another host
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # of this thread: in use the browser is on another host
         head: dict[str, Any] = {}
         rows: dict[str, int] = {}
         while not self._ended.wait(1.0 / POLLS):

@@ -84,6 +84,7 @@ def main() -> None:
     if sys.argv[1:2] == ["watch"]:  # already while it loads: a flight beside it goes first
         with suppress(OSError):
             os.nice(NICE)
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # it interrupts no node when it wakes up
     words = [*sys.argv[1:2], *os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", "")).split()]
     try:
         app = application(words)
