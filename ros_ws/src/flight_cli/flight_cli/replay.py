@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from flight_analysis.closed_loop.guidance_replay import GuidanceReplay, replay_guidance
-from flight_analysis.closed_loop.replay import OPEN_LOOP, Difference, ReplayResult, recorded_parameters, recorded_scenario, vary
+from flight_analysis.closed_loop.replay import Difference, ReplayResult, recorded_parameters, recorded_scenario, vary
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
 from flight_analysis.report.summary import finite_or_null
@@ -120,7 +120,7 @@ def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...],
         console.print(f"{of}, {len(rows)} differ, the last at t = {result.t[rows[-1]]:.6g} s; {by_group}")
     if open_loop:
         headings = ("input", "rms", "max", "at t (s)", "rms recorded")
-        table = new_table(f"u computed minus u recorded, {OPEN_LOOP}", headings, left=("input",))
+        table = new_table("u computed minus u recorded", headings, left=("input",))
         for name, figures in _u_figures(result, inputs).items():
             table.add_row(name, *(f"{value:.4g}" for value in figures.values()))
         console.print(table)
