@@ -232,6 +232,10 @@ def test_a_command_that_cannot_be_flown_is_refused_and_changes_nothing(values: d
         ({"route": {"north": [0.0], "east": [0.0, 1.0], "altitude": [0.0]}}, "guidance.route.east: found 2 values, expected 1"),
         ({"pitch": [0.2, 0.1]}, "guidance.pitch: found .* expected the least before the largest"),
         ({"lockstep": True}, "guidance.y_rate: found 0 Hz, expected the rate of y in lockstep"),
+        (
+            {"route": {"north": [0.0, 1e3], "east": [0.0, 0.0], "altitude": [0.0, 0.0], "V": [25.0, 1e200]}},
+            "guidance: found numbers too large or too small .*, expected those of a flight",
+        ),
     ],
 )
 def test_parameters_that_cannot_be_flown_are_refused(section: dict[str, Any], sentence: str) -> None:

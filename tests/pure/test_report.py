@@ -116,6 +116,11 @@ def test_a_log_of_only_y_and_its_reference_has_a_report(tmp_path: Path, servo: S
     assert "Events" not in page
 
 
+def test_a_pose_without_an_attitude_has_no_replay(tmp_path: Path, servo: Scenario) -> None:
+    page = page_of(tmp_path, servo, flight(pose=held(101, climb=1.0)))
+    assert headings(page) == ["Output y over the reference y_m", "Tracking error e = y - y_m"]
+
+
 def test_a_flight_of_one_sample_has_a_report(tmp_path: Path, servo: Scenario) -> None:
     one = flight(1, u=held(1, **dict.fromkeys(INPUTS, 0.0)), internals=ticks(1), truth=held(1, x__q=0.0))
     assert len(headings(page_of(tmp_path, servo, one))) == 5  # y, e, u, states, integrals: no wind, no late tick

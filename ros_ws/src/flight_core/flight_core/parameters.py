@@ -69,6 +69,9 @@ class Parameters(BaseModel):
             first, *others = sorted(error.errors(), key=lambda one: one["type"] not in {"extra_forbidden", "invalid_key"})
             more = f" (and {len(others)} more)" if others else ""
             raise ParameterError(_sentence(cls, where, first) + more) from None
+        except ArithmeticError as error:  # of a check that computes with several keys
+            found = f"numbers too large or too small ({error.args[-1]})"
+            raise ParameterError(f"{where}: found {found}, expected those of a flight") from None
 
 
 class NodeParameters(Parameters):

@@ -36,9 +36,9 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
     """The replay of a flight whose attitude is in its log, else None. Adds the poses to the samples of the page."""
     tape, topics = flight.tape, {}
     truth = tape.signals.get("truth")
-    if (pose := tape.signals.get("pose")) is not None:
+    if (pose := tape.signals.get("pose")) is not None and "phi" in pose.names:
         topics["pose"] = _topic(context, _thinned(pose), {name: name for name in POSE})
-    attitude = () if pose is not None else ("x.phi", "x.theta")
+    attitude = () if "pose" in topics else ("x.phi", "x.theta")
     if truth is not None:
         groups = [name for name in truth.names if name.startswith(("actuator.", "gust.")) or name in attitude]
         topics["truth"] = _topic(context, truth, {name: name.partition(".")[2] for name in groups})
