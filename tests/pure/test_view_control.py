@@ -130,6 +130,7 @@ def test_the_margins_of_pending_gains_are_those_of_the_gain_check(desk: Desk, os
 
     async def steps(desk: Desk) -> None:
         await desk.ask("state")
+        assert await desk.refused("check", values={"k_g": []}) == (400, "k_g: found 0 values, expected 1")
         same = await desk.ask("check", values={"k_g": [desk.nodes.values["controller"]["k_g"]]})
         assert same["delay_margin"] == found.delay_margin
         assert tuple(same["channels"].values()) == found.channel_margins
@@ -182,7 +183,7 @@ def test_targets_routes_and_services_reach_guidance_and_refusals_come_back(desk:
         ]  # fmt: skip
         assert await desk.refused("skip") == (422, "no route is flown")
         assert (await desk.refused("target", values={"bank": 1.0}))[0] == 400
-        for points in ([[0, 0, 0]], [[0, 0], [1, 1]], "north", [["a", 0, 0], [0, 0, 0]]):
+        for points in ([[0, 0, 0]], [[0, 0], [1, 1]], "north", [["a", 0, 0], [0, 0, 0]], [[0, 0, None], [0, 0, 0]]):
             assert (await desk.refused("route", points=points))[0] == 400
         assert (await desk.refused("fly"))[0] == 400
 

@@ -249,12 +249,13 @@ class Control:
         return type(base).validate_mapping(nest(content), "controller")
 
     def _set_gains(self, request: Mapping[str, Any]) -> str:
-        values, gains = _mapping(request, "values"), gains_of(self._controller())
+        values, gains, chosen = _mapping(request, "values"), gains_of(self._controller()), {}
         for name, value in values.items():
             if name not in gains:
                 raise RefusedError(HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no gain, expected one of {', '.join(gains)}")
-            _require_range(name, value, gains[name])
-        return self._apply(request, {name: _like(gains[name], value) for name, value in values.items()}, undo=True)
+            chosen[name] = _like(name, gains[name], value)
+            _require_range(name, chosen[name], gains[name])
+        return self._apply(request, chosen, undo=True)
 
     def _undo_gains(self, request: Mapping[str, Any]) -> str:
         if not self._undo:
@@ -286,7 +287,7 @@ class Control:
         if self._assess is None or self._flight.scenario is None:
             return {}
         values, gains = _mapping(request, "values"), gains_of(self._controller())
-        chosen = {name: _like(gains[name], _numbers(name, value)) for name, value in values.items() if name in gains}
+        chosen = {name: _like(name, gains[name], value) for name, value in values.items() if name in gains}
         return self._assess(self._flight.scenario, self._with(self._values | chosen))
 
     def _map(self) -> str:
@@ -337,10 +338,9 @@ class Control:
         points = request.get("points")
         if not isinstance(points, list) or not 2 <= len(points) <= MAX_WAYPOINTS:
             raise RefusedError(HTTPStatus.BAD_REQUEST, f"points: expected 2 to {MAX_WAYPOINTS} of north, east, altitude")
-        waypoints = [_numbers("points", point) for point in points]
-        if any(not isinstance(point, list) or len(point) != len(("north", "east", "altitude")) for point in waypoints):
+        if any(not isinstance(point, list) or len(point) != len(("north", "east", "altitude")) for point in points):
             raise RefusedError(HTTPStatus.BAD_REQUEST, "points: expected north, east and altitude of each")
-        return self._link.send_route(waypoints)
+        return self._link.send_route([[_number("points", one) for one in point] for point in points])
 
     def _engage(self, request: Mapping[str, Any]) -> str:
         if request.get("map") != (name := self._map()):
@@ -370,10 +370,7 @@ def _range(value: float) -> list[float]:
 
 
 def _require_range(name: str, value: Any, base: Any) -> None:
-    values, bases = _as_list(_numbers(name, value)), _as_list(base)
-    if len(values) != len(bases):
-        raise RefusedError(HTTPStatus.BAD_REQUEST, f"{name}: found {len(values)} values, expected {len(bases)}")
-    for one, middle in zip(values, bases, strict=True):
+    for one, middle in zip(_as_list(value), _as_list(base), strict=True):
         low, high = _range(middle)
         if not low <= one <= high:
             raise RefusedError(
@@ -382,9 +379,11 @@ def _require_range(name: str, value: Any, base: Any) -> None:
             )
 
 
-def _like(base: Any, value: Any) -> Any:
+def _like(name: str, base: Any, value: Any) -> Any:
     """A value as a float or a list, as its parameter has it."""
-    values = [float(one) for one in _as_list(value)]
+    values, expected = _as_list(_numbers(name, value)), len(_as_list(base))
+    if len(values) != expected:
+        raise RefusedError(HTTPStatus.BAD_REQUEST, f"{name}: found {len(values)} values, expected {expected}")
     return values if isinstance(base, tuple) else values[0]
 
 

@@ -49,6 +49,7 @@ REQUEST_TIMEOUT = 10.0  # s, for a request to arrive in full, and for the next o
 MAX_REQUEST_BYTES = 8192
 MAX_WAIT = 2.0  # s that a request for samples waits for new ones
 MAX_ROWS = 10_000  # of a topic in one answer
+MAX_DIGITS = 18  # of a number of rows: below 2^63
 REST, POLL_PERIOD = 0.09, 0.03  # s, after a chunk and until the next: the recorder closes one each 0.1 s
 STATE_PERIOD = 0.25  # s, between two looks at the state of the recording
 BUDGET = 0.05  # s of reading between two answers
@@ -117,9 +118,11 @@ def _epoch(flight: Flight) -> str:
 
 
 def _first_rows(flight: Flight, known: Mapping[str, str]) -> dict[str, int]:
-    """The first row of each topic that a browser does not know."""
+    """The first row of each topic that a browser does not know. Raises HTTPError for a number that is too long."""
     same = known.get("epoch") == _epoch(flight)
     rows = {name: known.get(name, "") if same else "" for name in (*flight.samples, "events")}
+    if any(len(text) > MAX_DIGITS for text in rows.values()):
+        raise HTTPError(HTTPStatus.BAD_REQUEST, reason=f"A number of rows has more than {MAX_DIGITS} digits")
     return {name: int(text) if text.isascii() and text.isdigit() else 0 for name, text in rows.items()}
 
 
