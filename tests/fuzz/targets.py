@@ -153,7 +153,7 @@ def message(data: bytes, folder: Path) -> None:
     run = write_run(folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)]))
     rejected(lambda: read_run(run))
     rejected(lambda: read_playback(run))
-    rejected(lambda: parameter_changes(run, "controller", RiseDiParameters.model_fields))
+    rejected(lambda: parameter_changes(run, "/controller", RiseDiParameters.model_fields))
 
 
 def route(data: bytes, folder: Path) -> None:
@@ -282,7 +282,7 @@ def _replay(file: Path) -> None:
     if recorded.scenario is not None:
         parameters = recorded_parameters(recorded.scenario)
         with np.errstate(all="ignore"):
-            replay(recorded.tape, parameters, None, parameter_changes(file, "controller", type(parameters).model_fields))
+            replay(recorded.tape, parameters, None, parameter_changes(file, "/controller", type(parameters).model_fields))
 
 
 def log(

@@ -254,7 +254,7 @@ def test_a_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
 
 
 def test_two_aircraft_in_one_bag_are_selected_by_their_namespace(tmp_path: Path) -> None:
-    topics = {"/one/y": SAMPLES, "/fleet/two/y": SAMPLES[:7], "/fleet/two/gps/speed": SAMPLES[:3], "/one/u": SAMPLES[:5]}
+    topics = {"/one/y": SAMPLES, "/fleet/two/y": SAMPLES[:7], "/fleet/two/gps/speed": SAMPLES[:3], "/one/u": SAMPLES[1:6]}
     record(tmp_path / "bag", topics, StoragePlugin.MCAP)
     found = "bag: found aircraft in the namespaces /fleet/two, /one, expected"
     with pytest.raises(ParameterError, match=f"{found} that one of them"):
@@ -262,8 +262,10 @@ def test_two_aircraft_in_one_bag_are_selected_by_their_namespace(tmp_path: Path)
     with pytest.raises(ParameterError, match=r"namespaces /fleet/two, /one, expected one in '/three'"):
         read_run(tmp_path / "bag", "/three")
     for namespace, counts in (("/one", {"y": 50, "u": 5}), ("fleet/two/", {"y": 7, "gps/speed": 3})):
-        signals = read_run(tmp_path / "bag", namespace).tape.signals
-        assert {name: len(signal.stamp_ns) for name, signal in signals.items()} == counts
+        back = read_run(tmp_path / "bag", namespace)
+        assert {name: len(signal.stamp_ns) for name, signal in back.tape.signals.items()} == counts
+        assert back.namespace == f"/{namespace.strip('/')}"
+        assert (back.latency is not None) == ("u" in counts)
 
 
 def test_an_aircraft_at_the_root_excludes_those_in_namespaces(tmp_path: Path) -> None:
@@ -334,12 +336,13 @@ def test_the_engagements_of_a_log_begin_with_the_phase_engaged_and_end_with_thei
     bag.write(other, 1, 1, 1, SAMPLES[0])
     bag.flush()
     assert read_run(tmp_path / "run").engagements is None
-    channel = bag.add_topic("/plane/bridge/engagement", kind, "")
+    channel, of_another = (bag.add_topic(f"{name}/bridge/engagement", kind, "") for name in ("", "/plane"))
     reports = ["DISENGAGED", "ENGAGED", "ENGAGED", "RELEASE lost", "DISENGAGED lost", "ENGAGING mode", "ENGAGED", "ENGAGED"]
     for number, report in enumerate(reports):
         key, _, value = report.partition(" ")
         data = bytes(STORE.serialize_cdr(STORE.types[kind](key=key, value=value), kind))
         bag.write(channel, number, 10 * number, number, data)
+        bag.write(of_another, number, 10 * number + 5, number, data)
     bag.close()
     assert read_run(tmp_path / "run").engagements == [
         Engagement(10, 30, "lost"),

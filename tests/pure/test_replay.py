@@ -512,8 +512,9 @@ def test_changes_of_parameters_are_read_from_the_log(tmp_path: Path) -> None:
     gains, clock = one("Lambda", 8, double_array_value=np.array([1.0, 2.0])), one("use_sim_time", 1, bool_value=True)
     limits = one("upper", 0)
     events = [
-        event(time(2, 0), "/one/controller", [], [gains, clock], []),  # not in the order of their stamps
-        event(time(1, 5), "/controller", [k_g], [sign], [limits]),
+        event(time(2, 0), "/one/controller", [], [gains, clock], []),
+        event(time(1, 5), "/controller", [k_g], [sign], [limits]),  # not in the order of their stamps
+        event(time(1, 0), "/controller", [], [one("upper", 8, double_array_value=np.array([1.0, 2.0]))], []),
         event(time(0, 1), "/aircraft", [], [one("k_g", 3, double_value=9.0)], []),
         event(time(0, 2), "/controller", [clock], [], []),
     ]
@@ -521,5 +522,8 @@ def test_changes_of_parameters_are_read_from_the_log(tmp_path: Path) -> None:
         channel = bag.add_topic("/parameter_events", PARAMETER_EVENT, "")
         for number, message in enumerate(events):
             bag.write(channel, number, number, number, bytes(STORE.serialize_cdr(message, PARAMETER_EVENT)))
-    changes = parameter_changes(tmp_path / "run", "controller", RiseDiParameters.model_fields)
-    assert changes == [{"k_g": 2.5, "sign": "soft", "upper": None}, {"Lambda": [1.0, 2.0]}]
+    nodes, known = ("/controller", "/one/controller"), RiseDiParameters.model_fields
+    assert {node: parameter_changes(tmp_path / "run", node, known) for node in nodes} == {
+        "/controller": [{"upper": [1.0, 2.0]}, {"k_g": 2.5, "sign": "soft", "upper": None}],
+        "/one/controller": [{"Lambda": [1.0, 2.0]}],
+    }

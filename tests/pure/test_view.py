@@ -30,7 +30,9 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.disk import try_lock
+from flight_log.engagements import KEY_VALUE
 from flight_log.named_vectors import typestore
+from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS
 from flight_view import flight as followed_flight
 from flight_view import server as http
 from flight_view.flight import MAX_TEXT, ROUTE_TYPE, Flight
@@ -215,6 +217,27 @@ def test_names_and_texts_of_a_log_are_bounded_and_printable(tmp_path: Path) -> N
     assert max(map(len, head["topics"][0]["channels"])) <= MAX_TEXT
 
 
+def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:
+    store: Any = typestore()
+    arrays = {f"{kind}_array_value": np.zeros(0) for kind in ("byte", "bool", "integer", "double")}
+    types, time = store.types, store.types["builtin_interfaces/msg/Time"](0, 0)
+    value = types["rcl_interfaces/msg/ParameterValue"](3, False, 0, 2.5, "", string_array_value=[], **arrays)
+    changed = [types["rcl_interfaces/msg/Parameter"]("k_g", value)]
+    reports = {node: types[PARAMETER_EVENT](time, node, [], changed, []) for node in ("/one/controller", "/two/controller")}
+    with BagWriter(tmp_path / "run") as bag:
+        for number, name in enumerate(("one", "two")):
+            bag.write(bag.add_topic(f"/{name}/y", JOINT_STATE, ""), number, number, 0, vector(number, ["q"], [0.0]))
+            report = types[KEY_VALUE](key="ENGAGED", value=name)
+            engagement = bag.add_topic(f"/{name}/bridge/engagement", KEY_VALUE, "")
+            bag.write(engagement, number, number, 0, bytes(store.serialize_cdr(report, KEY_VALUE)))
+        events = bag.add_topic(PARAMETER_EVENTS, PARAMETER_EVENT, "")
+        for number, message in enumerate(reports.values()):
+            bag.write(events, number, number, number, bytes(store.serialize_cdr(message, PARAMETER_EVENT)))
+    flight = Flight(tmp_path / "run")
+    flight.update()
+    assert sorted(one[1:] for one in flight.events) == [("bridge", "ENGAGED one"), ("parameter", "controller: k_g = 2.5")]
+
+
 def test_a_route_that_is_given_in_flight_replaces_that_of_the_scenario(tmp_path: Path) -> None:
     scenario = find_scenario("osprey_route")
     store, given = typestore(), [(0.0, 0.0, 50.0), (0.0, 600.0, 55.0), (400.0, 600.0, 55.0)]  # east, north, altitude
@@ -229,6 +252,9 @@ def test_a_route_that_is_given_in_flight_replaces_that_of_the_scenario(tmp_path:
         route = bag.add_topic("/route", ROUTE_TYPE, "")
         bag.write(route, 1, 1, 0, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses), ROUTE_TYPE)))
         bag.write(route, 2, 2, 1, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses[:1]), ROUTE_TYPE)))  # cannot be flown
+        bag.write(bag.add_topic("/y", JOINT_STATE, ""), 3, 3, 0, vector(3, ["q"], [0.0]))
+        other = bag.add_topic("/other/route", ROUTE_TYPE, "")
+        bag.write(other, 4, 4, 0, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses[:2]), ROUTE_TYPE)))
     flight = Flight(tmp_path / "run")
     flight.update()
     head_of, _ = decoded(answer(flight, {"described": "1"}))
@@ -299,6 +325,8 @@ def test_the_page_is_served_with_a_token_alone_and_asks_no_other_host(recorded: 
         head, _ = decoded((await get(server, "/data/0")).body)
         assert (head["flight"]["name"], head["ghost"]) == ("run", False)
         assert (await get(server, "/data/1")).code == 404
+        long = await get(server, f"/data/0?epoch={head['epoch']}&y={'9' * 4301}")  # more digits than Python converts
+        assert (long.code, long.body) == (400, b"400: A number of rows has more than 18 digits\n")
 
     against(recorded)(client)
     for path in FILES.values():

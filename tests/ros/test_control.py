@@ -84,7 +84,7 @@ def test_a_flight_is_commanded_from_its_page_recorded_and_replayed(start: Start,
     assert flight.end() == 130, flight.output
     assert watch.interrupt().end() == 0, watch.output
 
-    changes = parameter_changes(run, "aircraft", {"actuators": None, "sensors": None, "gusts": None})
+    changes = parameter_changes(run, "/aircraft", {"actuators": None, "sensors": None, "gusts": None})
     assert [sorted(one) for one in changes[-3:]] == [
         ["sensors.bias"], ["actuators.stuck_at"], ["gusts.vertical.length", "gusts.vertical.speed", "gusts.vertical.start"],
     ]  # fmt: skip

@@ -47,7 +47,8 @@ def replay(
             raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
         parameters = recorded_parameters(recorded.scenario)
         others = vary(parameters, dict(map(_parse_setting, settings))) if settings else None
-        changes = parameter_changes(run, "controller", type(parameters).model_fields) if others is None else []
+        controller = f"{recorded.namespace}/controller"
+        changes = parameter_changes(run, controller, type(parameters).model_fields) if others is None else []
         result = recompute(recorded.tape, parameters, others, changes)
         guided = None
         if others is None and "guidance" in recorded.tape:

@@ -56,8 +56,8 @@ def stored_messages(run: Path) -> Iterator[StoredMessage]:
 def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list[dict[str, Any]]:
     """The changes of a node's parameters on `/parameter_events`, in the order of the stamps.
 
-    `node` is the node's name in any namespace. Each change maps dotted names to values, for `known` parameters or groups of
-    them. None stands for a deleted parameter. SI units.
+    `node` is the node's full name, as in "/one/controller". Each change maps dotted names to values, for `known` parameters
+    or groups of them. None stands for a deleted parameter. SI units.
     """
     store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []
@@ -68,7 +68,7 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
             event: Any = store.deserialize_cdr(stored.data, PARAMETER_EVENT)
         except SerdeError:
             continue
-        if event.node.rpartition("/")[2] != node:
+        if event.node != node:
             continue
         changes = {one.name: parameter_value(one.value) for one in (*event.new_parameters, *event.changed_parameters)}
         changes |= {one.name: None for one in event.deleted_parameters}

@@ -46,7 +46,7 @@ class RecordedRun(NamedTuple):
     """The content of a log. `metadata` holds its named sets of strings, `attachments` all files except the scenario.
 
     `latency` is that of the loop from y to u, `engagements` are those of a bridge; None for a log without them, or one that
-    is no bag of MCAP files.
+    is no bag of MCAP files. All are of the aircraft in `namespace`, "" for the root.
     """
 
     tape: Tape
@@ -55,6 +55,7 @@ class RecordedRun(NamedTuple):
     attachments: tuple[StoredFile, ...] = ()
     latency: Signal | None = None
     engagements: list[Engagement] | None = None
+    namespace: str = ""
 
 
 def read_run(run: Path, namespace: str | None = None) -> RecordedRun:
@@ -67,28 +68,39 @@ def read_run(run: Path, namespace: str | None = None) -> RecordedRun:
     log = _read(run)
     filled = {topic: signal for topic, samples in log.topics.items() if (signal := samples.signal()) is not None}
     require(bool(filled), str(run), "; ".join(["no sample on any topic", *log.notes_at(None)]), "a recorded flight")
-    names = _names_of_one_aircraft(filled, namespace, str(run))
+    aircraft = _namespace_of_one_aircraft(filled, namespace, str(run))
+    names = _names_within(aircraft, filled)
     require(bool(names), str(run), f"topics that begin with no slash: {', '.join(filled)}", "a recorded flight")
     signals = {name: filled[topic] for topic, name in names.items()}
     start_ns = _start_ns(signals)
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
     notes = [*log.notes_at(end), *(note for topic, name in names.items() if (note := log.topics[topic].note(name)))]
     tape = Tape(signals, start_ns, tuple(map(printable, notes)))
-    engaged = engagements(log.reports)
-    return RecordedRun(tape, log.scenario, log.metadata, tuple(log.attachments), latency(log.sent), engaged)
+    engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
+    delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
+    return RecordedRun(tape, log.scenario, log.metadata, tuple(log.attachments), delays, engaged, aircraft)
 
 
-def _names_of_one_aircraft(topics: Collection[str], namespace: str | None, where: str) -> dict[str, str]:
-    """Names within the namespace of one aircraft, by full topic name. Without an aircraft: names without the leading slash."""
-    aircraft = sorted({topic.rpartition("/")[0] for topic in topics if topic.rpartition("/")[2] in AIRCRAFT_TOPICS})
+def _aircraft(topics: Collection[str]) -> list[str]:
+    """The namespaces of aircraft."""
+    return sorted({topic.rpartition("/")[0] for topic in topics if topic.rpartition("/")[2] in AIRCRAFT_TOPICS})
+
+
+def _namespace_of_one_aircraft(topics: Collection[str], namespace: str | None, where: str) -> str:
+    """The namespace of one aircraft, "" for the root and without an aircraft; `namespace` is what the caller asks for."""
+    aircraft = _aircraft(topics)
     known = ", ".join(one or "/" for one in aircraft) or "none"
     if namespace is None:
         require(len(aircraft) < 2, where, f"aircraft in the namespaces {known}", "that one of them is asked for")
-        chosen = aircraft[0] if aircraft else ""
-    else:
-        chosen = f"/{namespace.strip('/')}".rstrip("/")
-        require(chosen in aircraft, where, f"aircraft in the namespaces {known}", f"one in {namespace!r}")
-    nested = [f"{other}/" for other in aircraft if other.startswith(f"{chosen}/")]
+        return aircraft[0] if aircraft else ""
+    chosen = f"/{namespace.strip('/')}".rstrip("/")
+    require(chosen in aircraft, where, f"aircraft in the namespaces {known}", f"one in {namespace!r}")
+    return chosen
+
+
+def _names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
+    """Names within the namespace of one aircraft, by full topic name, without those of aircraft nested in it."""
+    nested = [f"{other}/" for other in _aircraft(topics) if other.startswith(f"{chosen}/")]
     return {
         topic: topic.removeprefix(f"{chosen}/")
         for topic in topics
@@ -158,7 +170,7 @@ class _Log:
         self.last_ns = 0  # log time of the last message
         self.known_end_ns = 0  # the latest log time in any index or metadata
         self.sent: dict[str, dict[int, int]] = {}  # of y and u by full topic name: times of sending by stamp, ns
-        self.reports: list[tuple[int, bytes]] = []  # of a bridge: time of sending, ns, and message
+        self.reports: dict[str, list[tuple[int, bytes]]] = {}  # of bridges by full topic name: time of sending, ns, and message
 
     def reader_of(self, topic: str, type_name: str) -> Callable[[Message], None] | None:
         """What takes the messages of a topic; None for a topic that plays no part."""
@@ -174,7 +186,8 @@ class _Log:
         if samples is not None:
             return lambda message: samples.add(message.data)
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
-            return lambda message: self.reports.append((message.publish_time, message.data))
+            reports = self.reports.setdefault(topic, [])
+            return lambda message: reports.append((message.publish_time, message.data))
         return None
 
     def samples_of(self, topic: str, type_name: str) -> _TopicSamples | None:

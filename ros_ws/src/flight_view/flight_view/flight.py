@@ -49,6 +49,7 @@ GROUPS = {
 
 LOG, LOG_TYPE, WARN = "/rosout", "rcl_interfaces/msg/Log", 30  # rcl_interfaces/msg/Log: WARN=30
 CONTROL = "control"  # name of the node that carries out the requests of a page
+SHARED = (LOG, PARAMETER_EVENTS)  # topics of all aircraft
 ROUTE, ROUTE_TYPE = "route", "nav_msgs/msg/Path"
 LIVE_BACKLOG = 200_000  # bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading"
 MAX_EVENTS, MAX_NOTES, MAX_CHANNELS = 5000, 50, 200
@@ -186,6 +187,10 @@ class Flight:
             return 0.0
         return RATES[name]
 
+    def _shows(self, namespace: str) -> bool:
+        """Whether a namespace is that of the aircraft that is shown, which may not be known yet."""
+        return self._namespace in {None, namespace}
+
     def _note(self, sentence: str) -> None:
         if (line := _text(sentence)) not in self.notes and len(self.notes) < MAX_NOTES:
             self.notes.append(line)
@@ -265,6 +270,9 @@ class Flight:
         self._mode = modes[-1]
 
     def _take_events(self, messages: Messages) -> None:
+        namespace = messages.topic.removesuffix(ENGAGEMENT).removesuffix(f"/{ROUTE}")
+        if messages.topic not in SHARED and not self._shows(namespace):
+            return
         store = typestore()
         for sent_ns, data in zip(messages.sent_ns, messages.data, strict=True):
             try:
@@ -283,8 +291,9 @@ class Flight:
                 new = message.new_parameters if self._first_ns is not None else []
                 changed = {one.name: parameter_value(one.value) for one in (*new, *message.changed_parameters)}
                 text = ", ".join(f"{name} = {value}" for name, value in changed.items())
-                if text:
-                    self._add_event(Event(sent_ns, "parameter", f"{message.node.rpartition('/')[2]}: {text}"))
+                namespace, _, node = message.node.rpartition("/")
+                if text and self._shows(namespace):
+                    self._add_event(Event(sent_ns, "parameter", f"{node}: {text}"))
             elif messages.type_name == ROUTE_TYPE:
                 places = [one.pose.position for one in message.poses]
                 self._take_route(sent_ns, [Waypoint(one.y, one.x, one.z) for one in places])
