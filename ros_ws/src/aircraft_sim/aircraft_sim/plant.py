@@ -92,7 +92,7 @@ def advance(
 
 def diverged(state: AircraftState) -> bool:
     """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
-    return not bool(abs(state.x).max() < DIVERGENCE_LIMIT)  # False for NaN too
+    return not all(abs(x) < DIVERGENCE_LIMIT for x in state.x.tolist())  # the comparison is false for NaN too
 
 
 def output(state: AircraftState, plant: PlantParams) -> Array:

@@ -78,7 +78,7 @@ def quantised(measured: Array, quantum: Array) -> Array:
 
 def noise(number: int, params: Sensors) -> FloatArray:
     """Error of sample `number` >= 0: noise_i n_i with n_i standard normal, white over channels and samples; shape (m,)."""
-    if not params.noise.any():
+    if not any(params.noise.tolist()):  # a seventh of the time of .any() for a few channels
         return params.noise
     return params.noise * random_streams.generator(number, random_streams.NOISE, params.seed).standard_normal(len(params.noise))
 

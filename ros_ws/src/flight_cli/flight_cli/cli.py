@@ -7,6 +7,7 @@ import signal
 # Until the command runs, Ctrl-C ends it without a word: its imports may take a second.
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 
+import gc
 import os
 import sys
 from contextlib import suppress
@@ -19,6 +20,7 @@ import typer
 
 BAD_INPUT, INTERRUPTED = 2, 130
 NICE = 10  # of a command that may run beside a flight
+GARBAGE_THRESHOLD = 100_000  # new objects before a collection, 700 by default: a flight keeps what it makes
 REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores
 
 COMMANDS = MappingProxyType(
@@ -81,6 +83,7 @@ def _repeat_interrupt(ignored: "sys.UnraisableHookArgs") -> None:
 
 def main() -> None:
     """Entry point: bad input is one sentence and exit status 2, Ctrl-C is quiet."""
+    gc.set_threshold(GARBAGE_THRESHOLD)
     if sys.argv[1:2] == ["watch"]:  # already while it loads: a flight beside it goes first
         with suppress(OSError):
             os.nice(NICE)
