@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flies real autopilots in software and writes docs/evidence_autopilots.md: identified gains, engagements, signs, pose.
+"""Flies real autopilots in software and writes docs/evidence_autopilots.md: gains, engagements, signs, pose, releases.
 
-    python -m benchmarks.autopilots --sitl KIT                       # everything, about 50 minutes
+    python -m benchmarks.autopilots --sitl KIT                       # everything, about 80 minutes
     python -m benchmarks.autopilots --sitl KIT --only signs          # one measurement; the others keep their results
     python -m benchmarks.autopilots --render                         # the page alone, from the stored results
 
@@ -23,9 +23,11 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
 import numpy as np
 import yaml
+from benchmarks.evidence_page import UNMET, finished, goal
 
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationParameters
@@ -376,6 +378,20 @@ def pose() -> dict[str, Any]:
         return {name: one._asdict() for name, one in plane.compare().items()}
 
 
+def releases() -> dict[str, Any]:
+    """`make test-sitl`: what failed, and the times until the pilot or PX4's own law flies again, s."""
+    report, python = FOLDER / "releases.xml", sys.executable
+    with nullcontext() if LOCK is None else LOCK.open("w", encoding="utf-8") as lock:
+        if lock is not None:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        command = [python, "-m", "pytest", "tests/sitl", "-m", "not long", f"--junitxml={report}"]
+        subprocess.run(command, cwd=REPOSITORY, check=False)  # noqa: S603 - our own arguments; a failure is in the report
+    suite = next(ElementTree.parse(report).getroot().iter("testsuite"))  # noqa: S314 - written by pytest just now
+    times = {one.attrib["name"]: float(one.attrib["value"]) for one in suite.iter("property")}
+    counts = {name: int(suite.attrib[name]) for name in ("tests", "failures", "errors", "skipped")}
+    return counts | {"failed": [one.attrib["name"] for one in suite.iter("testcase") if len(one)], "times": times}
+
+
 IDENTIFICATIONS: dict[str, Callable[..., dict[str, Any]]] = {
     "arduplane": gains_of_arduplane,
     "slow_servos": gains_of_slow_servos,
@@ -388,10 +404,23 @@ MEASUREMENTS: dict[str, Callable[..., dict[str, Any]]] = {
     "engagements": bumpless,
     "signs": signs,
     "pose": pose,
+    "releases": releases,
 }
 
 
 # The page
+
+AT_ONCE = ("override by a switch", "override by a moved stick", "release")  # what the bridge knows within one sample
+RC_SAMPLE = 0.1  # s, RC_CHANNELS in ArduPlane's log
+OWN_LAW = 0.6  # s, from the event to a mode of PX4's own, where the bridge asks for it
+BY_TIMEOUT = "killed"  # PX4's own COM_OF_LOSS_T, or an age limit first
+# Of the rms of e: rad/s, and m/s for V. PX4: half of what the first flight had.
+ERROR_GOALS = {
+    "arduplane": {"q": 0.010, "p": 0.020, "r": 0.015, "V": 0.05},
+    "px4": {"q": 0.0265, "p": 0.0505, "r": 0.015, "V": 0.215},
+}
+BEHIND_GOAL = 0.1  # s beyond the loop's delay
+MODERATE = 0.5  # SIM_WIND_TURB
 
 
 def stored(name: str) -> dict[str, Any]:
@@ -408,11 +437,64 @@ def page() -> str:
     for name, (title, table) in TABLES.items():
         parts.append(f"## {title}\n")
         if name in results:
+            result = results[name]["result"]
             parts.append(f"    python -m benchmarks.autopilots --only {name}    # {results[name]['date']}\n")
-            parts.append(table(results[name]["result"]))
+            parts.append(table(result))
+            parts.append("\n".join(goals(name, result)) + "\n")
         else:
             parts.append("Not measured yet.\n")
-    return "\n".join(parts)
+    return finished("\n".join(parts))
+
+
+def goals(name: str, result: dict[str, Any]) -> list[str]:
+    """The goals of a measurement, each beside its figure."""
+    if name in ERROR_GOALS:
+        scale = {one: (1.0, "m/s") if one == "V" else (1e3, "mrad/s") for one in result["rms"]}
+        rms = [
+            goal(f"rms of {one} at most {factor * limit:g} {unit}", factor * result["rms"][one], factor * limit, unit)
+            for one, limit in ERROR_GOALS[name].items()
+            for factor, unit in (scale[one],)
+        ]
+        behind = max(result["behind"].values())
+        return [*rms, goal(f"y behind y_m by less than the loop's delay and {BEHIND_GOAL:g} s", behind, BEHIND_GOAL, "s")]
+    if name == "engagements":
+        largest = 100.0 * LARGEST_STEP
+        return [goal(f"no step beyond {largest:g} % of the range", 100.0 * max(result["steps"]), largest, "%")]
+    if name == "signs":
+        wrong = sum("wrong" in one["as flown"].values() for one in result["experiments"])
+        moderate = [one for one in result["experiments"] if one["turbulence"] <= MODERATE]
+        unsure = sum(set(one["as flown"].values()) != {"right"} for one in moderate)
+        count = f"of {len(moderate)}"
+        return [
+            goal("experiments that call a right sign wrong", wrong, 0, f"of {len(result['experiments'])}"),
+            goal(f"experiments at SIM_WIND_TURB up to {MODERATE:g} that do not show every sign", unsure, 0, count),
+        ]
+    if name == "pose":
+        largest = max(abs(result[one]["slope"] - 1.0) for one in "pqr")
+        return [goal("slopes of the rates 1 within 1 %", 100.0 * largest, 1.0, "%")]
+    if name == "releases":
+        times = result["times"]
+        sticks = max(times[f"ArduPlane, {one}"] for one in AT_ONCE)
+        own = max(value for one, value in times.items() if one.startswith("PX4") and BY_TIMEOUT not in one)
+        return [
+            goal("no test fails", len(result["failed"]), 0, f"of {result['tests']}"),
+            goal("ArduPlane: a release or an override acts within one RC sample", sticks, RC_SAMPLE, "s"),
+            goal(f"PX4 flies by its own law within {OWN_LAW:g} s where the bridge asks for it", own, OWN_LAW, "s"),
+        ]
+    return []
+
+
+def table_of_releases(result: dict[str, Any]) -> str:
+    """Times by event."""
+    rows = ["| autopilot, event | until the sticks or PX4's own law act (s) |", "| --- | ---: |"]
+    rows += [f"| {name} | {value:.2f} |" for name, value in result["times"].items()]
+    failed = f" Failed: {', '.join(result['failed'])}." if result["failed"] else ""
+    passed = result["tests"] - result["failures"] - result["errors"] - result["skipped"]
+    rows.append(
+        f"\n`make test-sitl`: {passed} of {result['tests']} tests passed.{failed} Times by the autopilot's own log: RC_CHANNELS"
+        f" each {RC_SAMPLE:g} s, nav_state. Without the bridge RC_OVERRIDE_TIME (3 s) and COM_OF_LOSS_T (1 s, 0.3 s) act.\n"
+    )
+    return "\n".join(rows)
 
 
 def table_of_flight(result: dict[str, Any]) -> str:
@@ -504,12 +586,14 @@ def table_of_pose(result: dict[str, Any]) -> str:
     return "\n".join(rows) + "\n"
 
 
-HEAD = """# Evidence: real autopilots in software
+HEAD = f"""# Evidence: real autopilots in software
 
 Flights of ArduPlane 4.8.0-dev and PX4 1.16.0 in software, on two cores beside other work.
 `python -m benchmarks.autopilots --sitl FOLDER` measures everything and writes this page; docs/autopilots.md
 says what the kit is. Age limits of y and u: 1 s, for the host. The identified gains fly the scenario that `identify` writes:
 pulses of 50 mrad/s in q and 150 mrad/s in p in coordinated turns, a step of at most 2 m/s in V.
+
+{UNMET}
 """
 TABLES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "arduplane": ("ArduPlane, servos of 0.03 s, gains by `identify --bridge`", table_of_flight),
@@ -520,6 +604,7 @@ TABLES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "engagements": ("Engagements without a jump", table_of_engagements),
     "signs": ("Signs, in short experiments in wind of 5 m/s", table_of_signs),
     "pose": ("Rates and pose over the autopilot's own log", table_of_pose),
+    "releases": ("Tests, and the times of a release", table_of_releases),
 }
 
 

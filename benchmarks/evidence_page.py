@@ -54,6 +54,11 @@ def render(measurements: Sequence[Measurement], results: Mapping[str, Result]) -
         results=results,
         value=lambda name: results[name]["result"] if name in results else None,
     )
+    return finished(page)
+
+
+def finished(page: str) -> str:
+    """A page whose goals that are not met are said in the place of UNMET, in lines of at most WIDTH."""
     paragraphs = _unmet_first(re.sub(r"(?<=[^\n|])\n *(?=[^\s|#-])", " ", page).splitlines())
     wrapped = "\n".join(line for paragraph in paragraphs for line in _wrapped(paragraph.rstrip()))
     return re.sub(r"\n{3,}", "\n\n", wrapped).strip() + "\n"

@@ -215,7 +215,9 @@ def test_sticks_that_the_bridge_overrides_do_not_show_and_do_not_act_before_the_
 
 
 @pytest.mark.parametrize("name", EVENTS)
-def test_the_pilot_has_the_aircraft_again(plane: ArduPlane, name: str) -> None:
+def test_the_pilot_has_the_aircraft_again(
+    plane: ArduPlane, name: str, record_testsuite_property: Callable[[str, object], None]
+) -> None:
     """Within the time of the event the sticks act, and the log says why the engagement ended."""
     event = EVENTS[name]
     channel_map = map_of(plane) if event.change is None else plane.patient_map("ardupilot", event.change)
@@ -228,6 +230,7 @@ def test_the_pilot_has_the_aircraft_again(plane: ArduPlane, name: str) -> None:
             flight.interrupt()
         flight.end()
         afterwards.close()
+    record_testsuite_property(f"ArduPlane, {name}", f"{until_sticks:.3f}")
     assert event.sticks_act[0] <= until_sticks <= event.sticks_act[1]
     flown = plane.summary()
     (one,) = flown["engagements"]
