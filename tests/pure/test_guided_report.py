@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 import pytest
 from numpy.typing import ArrayLike
+from tests.plots import drawn
 from tests.recordings import EPOCH, signal
 
 from flight_analysis.closed_loop.simulate import simulate
@@ -19,6 +19,7 @@ from flight_analysis.report import guided_figures
 from flight_analysis.report.figures import plot_context
 from flight_analysis.report.guided import guidance_summary, segments
 from flight_analysis.report.html import write_page
+from flight_analysis.report.plotting import Figure
 from flight_analysis.report.summary import RecordedFlight, summarise, transients
 from flight_analysis.report.tables import flight_tables
 from flight_bringup.scenarios import find_scenario
@@ -126,20 +127,20 @@ def context_of(tape: Tape) -> Any:
     return guided_figures.guided_context(plot_context(tape, {}, {}))
 
 
-def curve(figure: go.Figure, name: str, row: int) -> FloatArray:
+def curve(figure: Figure, name: str, row: int) -> FloatArray:
     axis = "y" if row == 1 else f"y{row}"
-    (trace,) = (one for one in figure.data if one.name == name and one.yaxis == axis)
+    (trace,) = (one for one in drawn(figure).data if one.name == name and one.yaxis == axis)
     return np.asarray(trace.y, dtype=float)
 
 
 def test_the_ground_track_has_equal_axes_and_arrows_of_the_wind() -> None:
-    figure = guided_figures.track_figure(log(pose__v_east=5.0), [], SPEED)
+    figure = drawn(guided_figures.track_figure(log(pose__v_east=5.0), [], SPEED))
     assert (figure.layout.yaxis.scaleanchor, figure.layout.yaxis.scaleratio) == ("x", 1.0)
     assert [trace.name for trace in figure.data] == ["flown", "wind, the longest arrow 5 m/s"]
     arrows = figure.layout.annotations
     assert len(arrows) == guided_figures.WIND_ARROWS
     assert (arrows[0].ax, arrows[0].ay) == pytest.approx((-guided_figures.ARROW_PIXELS, 0.0), abs=1e-9)  # points to the east
-    assert not guided_figures.track_figure(log(), [], SPEED).layout.annotations
+    assert not drawn(guided_figures.track_figure(log(), [], SPEED)).layout.annotations
 
 
 def test_commands_and_limits_are_drawn_in_display_units() -> None:
@@ -147,21 +148,20 @@ def test_commands_and_limits_are_drawn_in_display_units() -> None:
     context, bounds = context_of(tape), {"V": (30.0, math.inf), "phi": (-0.5, 0.5)}
     attitude = guided_figures.attitude_figure(context, bounds)
     assert np.max(curve(attitude, "command", 1)) == pytest.approx(20.0)
-    assert sorted((shape.y0, shape.yref) for shape in attitude.layout.shapes) == [
+    assert sorted((shape.y0, shape.yref) for shape in drawn(attitude).layout.shapes) == [
         (pytest.approx(-math.degrees(0.5)), "y"),
         (pytest.approx(math.degrees(0.5)), "y"),
     ]
     vertical = guided_figures.vertical_figure(context, SPEED, bounds)
     assert np.isnan(curve(vertical, "command", 1)[-1])  # no altitude is commanded
-    assert [(shape.y0, shape.y1 < 30.0, shape.yref) for shape in vertical.layout.shapes] == [(30.0, True, "y2")]
+    assert [(shape.y0, shape.y1 < 30.0, shape.yref) for shape in drawn(vertical).layout.shapes] == [(30.0, True, "y2")]
     assert curve(vertical, "flown", 2)[0] == SPEED
 
 
 def test_the_cross_track_error_is_drawn_by_leg_where_a_path_is_followed() -> None:
     assert guided_figures.cross_track_figure(context_of(log())) is None
     lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
-    figure = guided_figures.cross_track_figure(context_of(log(mode__lateral=lateral, leg=after(20.0, 1.0), xtrack=7.0)))
-    assert figure is not None
+    figure = drawn(guided_figures.cross_track_figure(context_of(log(mode__lateral=lateral, leg=after(20.0, 1.0), xtrack=7.0))))
     assert [note.text for note in figure.layout.annotations] == ["leg 0", "leg 1"]
     assert np.isnan(figure.data[0].y[0])
     assert figure.data[0].y[-1] == 7.0
@@ -201,7 +201,7 @@ def test_a_comparison_draws_all_ground_tracks_over_the_route(flight: RecordedFli
     assert page.count("<h2>Ground track</h2>") == 1
     routes = guided_figures.flown_routes(flight.scenario, flight.tape)
     tracks = {"one": (flight.tape, "#000000"), "two": (flight.tape, "#111111")}
-    figure = guided_figures.tracks_figure(tracks, routes)
+    figure = drawn(guided_figures.tracks_figure(tracks, routes))
     assert [trace.name for trace in figure.data] == ["route", "one", "two"]
 
 

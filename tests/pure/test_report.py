@@ -4,15 +4,16 @@
 
 import base64
 import hashlib
+import json
 import re
 import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 import pytest
 from plotly.offline import get_plotlyjs
+from tests.plots import drawn
 from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -21,7 +22,7 @@ from flight_analysis.metrics import mask_spans
 from flight_analysis.report import comparison, figures, html, plotting, summary
 from flight_analysis.report.figures import input_limits
 from flight_analysis.report.html import Page, TableGroup, page_html, write_page
-from flight_analysis.report.plotting import Interval, PlotContext, SampleStore
+from flight_analysis.report.plotting import Figure, Interval, PlotContext, SampleStore
 from flight_analysis.report.summary import DisplayUnit, RecordedFlight, summarise
 from flight_analysis.report.tables import events
 from flight_bringup.scenarios import find_scenario
@@ -70,15 +71,13 @@ def context(tape: Tape, units: dict[str, DisplayUnit] | None = None) -> PlotCont
     return figures.plot_context(tape, units or {}, {})
 
 
-def traces(figure: go.Figure | None, name: str) -> list[Any]:
-    assert figure is not None
-    return [trace for trace in figure.data if trace.name == name]
+def traces(figure: Figure | None, name: str) -> list[Any]:
+    return [trace for trace in drawn(figure).data if trace.name == name]
 
 
-def titles(figure: go.Figure | None) -> list[str]:
+def titles(figure: Figure | None) -> list[str]:
     """Titles of the rows from top to bottom."""
-    assert figure is not None
-    return [axis.title.text for axis in figure.select_yaxes()]
+    return [axis.title.text for axis in drawn(figure).select_yaxes()]
 
 
 def page_of(tmp_path: Path, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> str:
@@ -203,11 +202,12 @@ def test_every_mode_but_engaged_is_an_interval_with_its_name() -> None:
 
 def test_intervals_are_shaded_over_the_whole_height_of_a_figure() -> None:
     intervals = [Interval("hold", 0.2, 0.3, "#f2c230", False), Interval("a gust", 0.5, 0.6, "#7f7f7f", True)]
-    drawn = figures.tracking_figure(context(flight())._replace(intervals=intervals))
-    shapes = [(shape.x0, shape.x1, shape.y0, shape.y1, shape.yref) for shape in drawn.layout.shapes]
+    figure = figures.tracking_figure(context(flight())._replace(intervals=intervals))
+    layout = drawn(figure).layout
+    shapes = [(shape.x0, shape.x1, shape.y0, shape.y1, shape.yref) for shape in layout.shapes]
     assert shapes == [(0.2, 0.3, 0, 1, "paper"), (0.5, 0.6, 0, 1, "paper")]
-    assert [note.text for note in drawn.layout.annotations] == ["a gust"]
-    assert len(traces(drawn, "hold")) == 1  # in the legend
+    assert [note.text for note in layout.annotations] == ["a gust"]
+    assert len(traces(figure, "hold")) == 1  # in the legend
 
 
 def input_flight(**limited: list[Saturation]) -> Tape:
@@ -221,10 +221,9 @@ def test_limits_near_the_input_are_in_view_and_far_ones_are_not(servo: Scenario)
     for scenario, limit, inside in ((near, 3.0, True), (servo, 30.0, False)):
         tape = input_flight()
         figure = figures.input_figure(context(tape, units), input_limits(scenario, tape))
-        assert figure is not None
         lines = traces(figure, "limits of the controller")
         assert [line.y[0] for line in lines[:2]] == pytest.approx([-limit, limit])  # deg
-        low, high = next(figure.select_yaxes()).range
+        low, high = drawn(figure).layout.yaxis.range
         assert (low <= 2.0 <= high, low <= limit <= high) == (True, inside)
 
 
@@ -277,10 +276,16 @@ def test_ideal_sensors_and_still_air_have_no_figure() -> None:
     assert titles(figures.wind_figure(real)) == ["longitudinal (m/s)"]
 
 
+def test_a_range_that_is_no_number_is_left_to_the_page() -> None:
+    figure = figures.input_figure(context(flight(u=held(**dict.fromkeys(INPUTS, np.nan)))), {})
+    assert figure is not None
+    assert json.loads(html.script_json(figure))["layout"]["yaxis"]["range"] == [None, None]
+
+
 def test_the_true_error_is_drawn_over_the_measured_one_where_they_differ() -> None:
     states = {f"x__{name}": 0.5 for name in OUTPUTS}
     ideal = figures.error_figure(context(flight(truth=held(**states, noise__q=0.0))))
-    assert {trace.name for trace in ideal.data} == {"e"}
+    assert {trace.name for trace in drawn(ideal).data} == {"e"}
     noisy = figures.error_figure(context(flight(truth=held(**states, noise__q=0.1))))
     assert [traces(noisy, name)[0].y[0] for name in ("measured", "true")] == [0.0, 0.5]
 
@@ -301,26 +306,24 @@ def test_a_visible_noise_floor_is_drawn_on_both_sides_of_zero() -> None:
 def test_both_integrals_of_an_output_stand_side_by_side() -> None:
     tape = flight(internals=ticks(Pi__p=[0.0] * 100 + [3.0], integral_e__p=[0.0] * 100 + [2.0]))
     figure = figures.integral_figure(context(tape))
-    assert figure is not None
     assert titles(figure)[4:6] == ["∫e p", "Pi p"]
-    assert [trace.y[-1] for trace in figure.data[4:6]] == [2.0, 3.0]
+    assert [trace.y[-1] for trace in drawn(figure).data[4:6]] == [2.0, 3.0]
 
 
 def test_the_spectrum_of_a_commanded_sine_has_its_peak_there() -> None:
     u = held(1001, elevator=np.sin(2.0 * np.pi * 5.0 * np.arange(1001) / 100.0), thrust=0.0)
     units = {"elevator": DisplayUnit("deg", 1 / DEG)}
     figure = figures.spectrum_figure({"u": (flight(u=u), 10 * MS)}, {"u": figures.PLANT}, units)
-    assert figure is not None
     assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
-    assert figure.data[0].x[np.argmax(figure.data[0].y)] == pytest.approx(5.0, abs=0.2)
+    elevator = drawn(figure).data[0]
+    assert elevator.x[np.argmax(elevator.y)] == pytest.approx(5.0, abs=0.2)
     assert figures.spectrum_figure({"u": (flight(u=u.until(EPOCH + 100 * MS)), 10 * MS)}, {}, {}) is None  # eleven samples
 
 
 def test_timing_has_a_histogram_if_it_is_not_zero() -> None:
     assert figures.timing_figure({"": (flight(internals=ticks()), 10 * MS)}, {"": figures.PLANT}) is None
     delayed = flight(internals=ticks(), latency=signal([0, 10, 20], y_to_u=[1e-3, 1e-3, 3e-3]))
-    figure = figures.timing_figure({"": (delayed, 10 * MS)}, {"": figures.PLANT})
-    assert figure is not None
+    figure = drawn(figures.timing_figure({"": (delayed, 10 * MS)}, {"": figures.PLANT}))
     assert [axis.title.text for axis in figure.select_xaxes()] == ["y sent to u sent (ms)"]
     assert [count for count in figure.data[0].y if count] == [2.0, 1.0]
 
@@ -357,19 +360,19 @@ def test_less_error_is_better_and_less_input_is_neither() -> None:
 
 
 def test_curves_of_several_flights_are_drawn_over_one_reference(pair: list[RecordedFlight]) -> None:
-    drawn = comparison.tracking_figure(comparison.plot_context(pair), pair)
-    q = [trace for trace in drawn.data if trace.yaxis == "y"]
+    figure = drawn(comparison.tracking_figure(comparison.plot_context(pair), pair))
+    q = [trace for trace in figure.data if trace.yaxis == "y"]
     assert [trace.name for trace in q] == ["y_m", "a", "b"]
     assert [trace.y[0] for trace in q] == pytest.approx([1000.0, 1200.0, 1100.0])
-    assert [trace.name for trace in drawn.data if trace.yaxis == "y3"] == ["y_m", "a"]  # p
-    errors = comparison.error_figure(comparison.plot_context(pair), pair)
+    assert [trace.name for trace in figure.data if trace.yaxis == "y3"] == ["y_m", "a"]  # p
+    errors = drawn(comparison.error_figure(comparison.plot_context(pair), pair))
     assert [trace.y[0] for trace in errors.data if trace.yaxis == "y"] == pytest.approx([200.0, 100.0])
 
 
 def test_each_distinct_reference_is_drawn(pair: list[RecordedFlight], servo: Scenario) -> None:
     three = [*pair, recorded("c", servo, flight(y_m=signal([0, 1000], **dict.fromkeys(OUTPUTS, (0.0, 2.0)))))]
-    drawn = comparison.tracking_figure(comparison.plot_context(three), three)
-    assert [trace.name for trace in drawn.data if trace.yaxis == "y"] == ["y_m a", "y_m c", "a", "b", "c"]
+    figure = drawn(comparison.tracking_figure(comparison.plot_context(three), three))
+    assert [trace.name for trace in figure.data if trace.yaxis == "y"] == ["y_m a", "y_m c", "a", "b", "c"]
 
 
 def test_each_flight_is_in_the_legend_once_whatever_its_channels(servo: Scenario) -> None:
@@ -381,9 +384,8 @@ def test_each_flight_is_in_the_legend_once_whatever_its_channels(servo: Scenario
     shared = comparison.plot_context(two)
     runs, colours = {flight.name: (flight.tape, flight.period_ns) for flight in two}, comparison.colours(two)
     spectrum = figures.spectrum_figure(runs, colours, shared.units)
-    for drawn in (comparison.error_figure(shared, two), spectrum, figures.timing_figure(runs, colours)):
-        assert drawn is not None
-        assert [trace.name for trace in drawn.data if trace.showlegend] == ["a", "b"]
+    for figure in (comparison.error_figure(shared, two), spectrum, figures.timing_figure(runs, colours)):
+        assert [trace.name for trace in drawn(figure).data if trace.showlegend] == ["a", "b"]
 
 
 def test_flights_of_equal_names_are_numbered(pair: list[RecordedFlight]) -> None:
@@ -446,8 +448,8 @@ def test_all_samples_of_long_curves_are_stored_once() -> None:
     stamps = EPOCH + np.arange(count, dtype=np.int64) * 2 * MS
     y = Signal(stamps, OUTPUTS, np.random.default_rng(1).standard_normal((count, 4)))
     shared = context(Tape({"y": y, "y_m": Signal(stamps, OUTPUTS, np.zeros((count, 4)))}, EPOCH - 7))
-    drawn = [*figures.tracking_figure(shared).data, *figures.error_figure(shared).data]
-    q = [trace for trace in drawn if trace.yaxis == "y"]
+    found = [*drawn(figures.tracking_figure(shared)).data, *drawn(figures.error_figure(shared)).data]
+    q = [trace for trace in found if trace.yaxis == "y"]
     assert [trace.y for trace in q] == [None] * 3
     instants = np.cumsum(unpacked(shared.samples.packed[q[1].meta["t"]], "<f8"))
     assert instants.tolist() == (stamps - EPOCH + 7).tolist()  # to the nanosecond
@@ -465,13 +467,13 @@ def test_a_curve_of_few_samples_is_drawn_whole_and_not_stored() -> None:
 
 def test_overlapping_labels_of_intervals_are_merged() -> None:
     intervals = [Interval(name, start, start + 1.0, "#7f7f7f", True) for name, start in (("c", 50.0), ("a", 10.0), ("b", 12.0))]
-    drawn = figures.tracking_figure(context(flight(10_001))._replace(intervals=intervals))
-    assert [(note.x, note.text) for note in drawn.layout.annotations] == [(10.0, "a, b"), (50.0, "c")]
+    figure = figures.tracking_figure(context(flight(10_001))._replace(intervals=intervals))
+    assert [(note.x, note.text) for note in drawn(figure).layout.annotations] == [(10.0, "a, b"), (50.0, "c")]
 
 
 def test_the_time_axis_is_flight_time_whatever_the_stamps() -> None:
-    drawn = traces(figures.tracking_figure(context(flight())), "y")[0]
-    assert (drawn.x[0], drawn.x[-1]) == (0.0, 1.0)
+    y = traces(figures.tracking_figure(context(flight())), "y")[0]
+    assert (y.x[0], y.x[-1]) == (0.0, 1.0)
 
 
 def test_the_vendored_plotly_is_that_of_its_hash_and_of_the_release_of_the_python_package() -> None:

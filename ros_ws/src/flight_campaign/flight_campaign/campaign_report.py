@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 
 from aircraft_sim.uncertainty import WindEffect
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import CAPTURE_TIME
+from flight_analysis.report import plotting
 from flight_analysis.report.comparison import COLOURS
 from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
-from flight_analysis.report.plotting import SampleStore, set_layout, subplot, subplot_grid
+from flight_analysis.report.plotting import SampleStore, set_layout
 from flight_analysis.report.summary import NO_UNIT, QUANTITY_UNITS, Column, DisplayUnit, display_units
 from flight_analysis.report.tables import Table
 from flight_campaign.campaign import Definition
@@ -111,19 +111,28 @@ def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
 
 def _spread(
     labels: Sequence[str], tallies: Sequence[Tally], names: Sequence[str], units: Mapping[str, DisplayUnit]
-) -> go.Figure:
-    columns = min(len(names), 2)
-    figure = subplot_grid(len(names), columns, 190, vertical_spacing=0.2)
+) -> plotting.Figure:
+    figure = plotting.Figure(len(names), min(len(names), 2), 190, spacing=0.2)
     for place, name in enumerate(names):
         label_, factor = _label(name, units)
         for label, tally, colour in zip(labels, tallies, COLOURS * len(labels), strict=False):
             x, y = _density(tally.figures.get(name, Figure()))
-            line = go.Scatter(x=x * factor, y=100.0 * y, mode="lines", name=label, legendgroup=label, fill="tozeroy")
-            line.update(line={"color": colour, "width": 1.4, "shape": "hvh"}, showlegend=place == 0 and len(labels) > 1)
-            figure.add_trace(line.update(hovertemplate="%{y:.3g} % around %{x:.3g}"), **subplot(place, columns))
-        figure.update_xaxes(title_text=label_, type="log", **subplot(place, columns))
-    figure.update_yaxes(title_text="%", rangemode="tozero")
-    return set_layout(figure, 190, below=44)
+            line = {
+                "type": "scatter",
+                "x": x * factor,
+                "y": 100.0 * y,
+                "mode": "lines",
+                "name": label,
+                "legendgroup": label,
+                "fill": "tozeroy",
+                "line": {"color": colour, "width": 1.4, "shape": "hvh"},
+                "showlegend": place == 0 and len(labels) > 1,
+                "hovertemplate": "%{y:.3g} % around %{x:.3g}",
+            }
+            figure.add(line, place)
+        figure.x[place] |= {"title": {"text": label_}, "type": "log"}
+        figure.y[place] |= {"title": {"text": "%"}, "rangemode": "tozero"}
+    return set_layout(figure, below=44)
 
 
 def _density(figure: Figure) -> tuple[FloatArray, FloatArray]:
@@ -138,17 +147,17 @@ def _density(figure: Figure) -> tuple[FloatArray, FloatArray]:
     return EDGES[0] * 10.0 ** (exponents / PER_DECADE), counts / figure.count
 
 
-def _sweep(definition: Definition, tallies: Sequence[Tally]) -> go.Figure | None:
+def _sweep(definition: Definition, tallies: Sequence[Tally]) -> plotting.Figure | None:
     if definition.sweep is None:
         return None
-    figure = subplot_grid(1, 1, 260)
+    figure = plotting.Figure(1, 1, 260)
     scores = [tally.figures["score"] for tally in tallies]
     curves = {"mean": [one.mean for one in scores]}
     curves |= {label: [one.quantile(share) for one in scores] for label, share in SPREAD.items()}
     curves["worst"] = [one.largest for one in scores]
     for (label, values), colour in zip(curves.items(), COLOURS, strict=True):
-        look = {"mode": "lines+markers", "name": label, "line": {"color": colour}}
-        figure.add_trace(go.Scatter(x=definition.sweep.factors, y=values, **look))
-    figure.update_xaxes(title_text=f"{definition.sweep.parameter} times", type="log")
-    figure.update_yaxes(title_text="score", rangemode="tozero")
-    return set_layout(figure, 260, below=44)
+        look = {"type": "scatter", "mode": "lines+markers", "name": label, "line": {"color": colour}}
+        figure.add(look | {"x": np.array(definition.sweep.factors), "y": np.array(values)})
+    figure.x[0] |= {"title": {"text": f"{definition.sweep.parameter} times"}, "type": "log"}
+    figure.y[0] |= {"title": {"text": "score"}, "rangemode": "tozero"}
+    return set_layout(figure, below=44)

@@ -6,11 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import plotly.graph_objects as go
 
 from flight_analysis.metrics import best_error
 from flight_analysis.report import figures, summary
-from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, time_series_figure
+from flight_analysis.report.plotting import Curve, Figure, Interval, PlotContext, SampleStore, time_series_figure
 from flight_analysis.report.summary import Column, DisplayUnit, RecordedFlight
 from flight_core.tape import Signal, Tape
 
@@ -135,7 +134,7 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
     return PlotContext(Tape({}), units(flights), list(intervals), end, SampleStore())
 
 
-def tracking_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> go.Figure:
+def tracking_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> Figure:
     """Y of every flight over each distinct reference."""
     references: dict[str, Signal] = {}
     for label, flight in zip(labels(flights), flights, strict=True):
@@ -153,12 +152,12 @@ def tracking_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> 
     return time_series_figure(context, curves | _curves(flights, "y", lambda tape: tape["y"]))
 
 
-def error_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> go.Figure:
+def error_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> Figure:
     """The best error of every flight."""
     return time_series_figure(context, _curves(flights, "y", lambda tape: best_error(tape)[1]), height=120)
 
 
-def input_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> go.Figure | None:
+def input_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> Figure | None:
     """U of every flight."""
     curves = _curves(flights, "u", lambda tape: tape["u"], steps=True)
     return time_series_figure(context, curves) if curves else None

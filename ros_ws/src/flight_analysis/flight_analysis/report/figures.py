@@ -8,21 +8,19 @@ The figures do not depend on the aircraft: channels are drawn under their own na
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import Windows, mask_spans, spectra, tick_periods, tracking_error, true_error
 from flight_analysis.report.plotting import (
     Curve,
+    Figure,
     Interval,
     PlotContext,
     SampleStore,
     add_line,
     first_in_legend,
     set_layout,
-    subplot,
-    subplot_grid,
     time_series_figure,
 )
 from flight_analysis.report.summary import NO_UNIT, DisplayUnit
@@ -95,13 +93,13 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
     ]
 
 
-def tracking_figure(context: PlotContext) -> go.Figure:
+def tracking_figure(context: PlotContext) -> Figure:
     """Y over y_m of every output."""
     tape = context.tape
     return time_series_figure(context, {"y_m": Curve(tape["y_m"], REFERENCE, 6.0), "y": Curve(tape["y"], PLANT)})
 
 
-def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> go.Figure:
+def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> Figure:
     """E = y - y_m of every output. Where the tape holds errors of the sensors, the true error over the measured one.
 
     Noise floors, by channel in SI, are lines on both sides of 0 where they are wide enough to see.
@@ -111,16 +109,16 @@ def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None
     if true is not None and _nonzero_group(context.tape, "noise").names:
         curves = {"measured": measured._replace(colour=MEASURED), "true": Curve(true, ERROR)}
     figure = time_series_figure(context, curves, height=110)
-    for row, name in enumerate(measured.signal.names, start=1):
+    for index, name in enumerate(measured.signal.names):
         floor, largest = (floors or {}).get(name, 0.0), np.max(np.abs(measured.signal[name]), initial=0.0)
         if floor > MIN_VISIBLE_FRACTION * largest > 0.0:
             level = floor * context.units.get(name, NO_UNIT).factor
             x, y = [0.0, context.end, None, 0.0, context.end], [level] * 3 + [-level] * 2
-            add_line(figure, row, "noise floor", x, y, NOISE_FLOOR_LINE)
-    return set_layout(figure, 110, labels=16)
+            add_line(figure, index, "noise floor", x, y, NOISE_FLOOR_LINE)
+    return set_layout(figure, labels=16)
 
 
-def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> go.Figure | None:
+def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> Figure | None:
     """Actuator positions over the command u, at most two kinds of limits as lines, and marks where an input was saturated."""
     tape = context.tape
     if "u" not in tape:
@@ -129,21 +127,21 @@ def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> go.Figur
     if (position := _truth_group(tape, "actuator")).names:
         curves = {"command u": Curve(tape["u"], REFERENCE, 4.0, steps=True), "actuator": Curve(position, PLANT)}
     figure = time_series_figure(context, curves)
-    for row, name in enumerate(tape["u"].names, start=1):
+    for index, name in enumerate(tape["u"].names):
         factor = context.units.get(name, NO_UNIT).factor
         values = [curve.signal[name] * factor for curve in curves.values() if name in curve.signal.names]
         bounds = {kind: np.array(by_input[name]) * factor for kind, by_input in limits.items() if name in by_input}
         low, high = _axis_range(np.concatenate(values), np.concatenate([[], *bounds.values()]))
         for (kind, pair), style in zip(bounds.items(), LIMIT_LINES, strict=False):
             for bound in pair[np.isfinite(pair)]:
-                add_line(figure, row, kind, [0.0, context.end], [bound, bound], style)
+                add_line(figure, index, kind, [0.0, context.end], [bound, bound], style)
         mark, top = high + 0.07 * (high - low), high + 0.14 * (high - low)
         for saturation, colour in SATURATION_COLOURS.items():
             spans = mask_spans(*_saturated(tape, name, saturation), context.end * MIN_VISIBLE_FRACTION)
             x = [instant for start, stop in spans for instant in (start, stop, None)]
-            add_line(figure, row, f"saturated: {saturation.name.lower()}", x, [mark] * len(x), {"color": colour, "width": 9})
-        figure.update_yaxes(range=[low, top], row=row, col=1)
-    return set_layout(figure, 150, labels=16)
+            add_line(figure, index, f"saturated: {saturation.name.lower()}", x, [mark] * len(x), {"color": colour, "width": 9})
+        figure.y[index]["range"] = [low, top]
+    return set_layout(figure, labels=16)
 
 
 def input_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
@@ -160,7 +158,7 @@ def _limit_pairs(names: Sequence[str], lower: Sequence[float], upper: Sequence[f
     return dict(zip(names, zip(lower or [-bound for bound in none], upper or none, strict=True), strict=True))
 
 
-def integral_figure(context: PlotContext) -> go.Figure | None:
+def integral_figure(context: PlotContext) -> Figure | None:
     """Both integrals of the law, by output: that of e beside that of the sign."""
     if "internals" not in context.tape:
         return None
@@ -174,7 +172,7 @@ def integral_figure(context: PlotContext) -> go.Figure | None:
     return time_series_figure(context, {"": curve}, columns=2, height=120)
 
 
-def spectrum_figure(runs: Runs, colours: Mapping[str, str], units: Mapping[str, DisplayUnit]) -> go.Figure | None:
+def spectrum_figure(runs: Runs, colours: Mapping[str, str], units: Mapping[str, DisplayUnit]) -> Figure | None:
     """Amplitude spectral density of u, both axes logarithmic: one subplot per channel with all runs that have it.
 
     A run with fewer than MIN_SPECTRUM_SAMPLES is left out; None without a run.
@@ -188,26 +186,28 @@ def spectrum_figure(runs: Runs, colours: Mapping[str, str], units: Mapping[str, 
         return None
     channels = list(dict.fromkeys(name for tape, _ in runs.values() for name in tape["u"].names))
     columns = min(len(channels), 2)
-    figure = subplot_grid(len(channels), columns, 190, vertical_spacing=0.2)
+    figure = Figure(len(channels), columns, 190, spacing=0.2)
     for label, (tape, period_ns) in runs.items():
         frequency, densities = spectra(tape["u"], period_ns)
         for name, density in densities.items():
             unit, factor = units.get(name, NO_UNIT)
-            line = go.Scatter(
-                x=frequency, y=density * factor, mode="lines", name=label, line={"color": colours[label], "width": 1.4}
-            )
-            line.update(
-                legendgroup=label,
-                showlegend=len(runs) > 1 and first_in_legend(figure, label),
-                hovertemplate=f"%{{y:.3g}} {unit}/√Hz at %{{x:.3g}} Hz",
-            )
-            figure.add_trace(line, **subplot(channels.index(name), columns))
-    for index, name in enumerate(channels):
-        unit = units.get(name, NO_UNIT).unit
-        position = subplot(index, columns)
-        figure.update_yaxes(type="log", dtick=1, exponentformat="power", title_text=f"{name} ({unit}/√Hz)", **position)
-        figure.update_xaxes(type="log", tickvals=FREQUENCIES, title_text="Hz", **position)
-    return set_layout(figure, 190, below=44)
+            line = {
+                "type": "scatter",
+                "x": frequency,
+                "y": density * factor,
+                "mode": "lines",
+                "name": label,
+                "line": {"color": colours[label], "width": 1.4},
+                "legendgroup": label,
+                "showlegend": len(runs) > 1 and first_in_legend(figure, label),
+                "hovertemplate": f"%{{y:.3g}} {unit}/√Hz at %{{x:.3g}} Hz",
+            }
+            figure.add(line, channels.index(name))
+    for name, x, y in zip(channels, figure.x, figure.y, strict=True):
+        title = {"text": f"{name} ({units.get(name, NO_UNIT).unit}/√Hz)"}
+        y |= {"type": "log", "dtick": 1, "exponentformat": "power", "title": title}
+        x |= {"type": "log", "tickvals": FREQUENCIES, "title": {"text": "Hz"}}
+    return set_layout(figure, below=44)
 
 
 def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
@@ -223,7 +223,7 @@ def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
     return {quantity: values for quantity, values in samples.items() if len(values) and np.any(np.abs(values) > 1e-6)}
 
 
-def timing_figure(runs: Runs, colours: Mapping[str, str]) -> go.Figure | None:
+def timing_figure(runs: Runs, colours: Mapping[str, str]) -> Figure | None:
     """Histograms of the controller's timing in ms, on common bins and a logarithmic axis; None where all of it is 0.
 
     There is one subplot per quantity with all runs that have it.
@@ -233,23 +233,32 @@ def timing_figure(runs: Runs, colours: Mapping[str, str]) -> go.Figure | None:
     if not quantities:
         return None
     columns = min(len(quantities), 2)
-    figure = subplot_grid(len(quantities), columns, 150, vertical_spacing=0.24)
+    figure = Figure(len(quantities), columns, 150, spacing=0.24)
     for index, quantity in enumerate(quantities):
         samples = {label: run[quantity] for label, run in timing.items() if quantity in run}
         edges = np.histogram_bin_edges(np.concatenate(list(samples.values())), bins=HISTOGRAM_BINS)
         for label, values in samples.items():
             counts, width = np.histogram(values, edges)[0].astype(float), edges[1] - edges[0]
-            bars = go.Bar(x=edges[:-1] + width / 2.0, y=counts, width=width, name=label, marker={"color": colours[label]})
-            bars.update(legendgroup=label, showlegend=len(runs) > 1 and first_in_legend(figure, label))
-            bars.update(opacity=1.0 if len(runs) == 1 else 0.6)
-            figure.add_trace(bars.update(hovertemplate="%{y} ticks around %{x:.4g} ms"), **subplot(index, columns))
-        figure.update_xaxes(title_text=f"{quantity} (ms)", **subplot(index, columns))
-    figure.update_yaxes(type="log", title_text="ticks")
-    figure.update_layout(barmode="overlay")
-    return set_layout(figure, 150, below=44)
+            bars = {
+                "type": "bar",
+                "x": edges[:-1] + width / 2.0,
+                "y": counts,
+                "width": float(width),
+                "name": label,
+                "marker": {"color": colours[label]},
+                "legendgroup": label,
+                "showlegend": len(runs) > 1 and first_in_legend(figure, label),
+                "opacity": 1.0 if len(runs) == 1 else 0.6,
+                "hovertemplate": "%{y} ticks around %{x:.4g} ms",
+            }
+            figure.add(bars, index)
+        figure.x[index]["title"] = {"text": f"{quantity} (ms)"}
+        figure.y[index] |= {"type": "log", "title": {"text": "ticks"}}
+    figure.layout["barmode"] = "overlay"
+    return set_layout(figure, below=44)
 
 
-def wind_figure(context: PlotContext) -> go.Figure | None:
+def wind_figure(context: PlotContext) -> Figure | None:
     """Every component of the wind that is not zero throughout."""
     wind = _nonzero_group(context.tape, "gust")
     if not wind.names:
@@ -258,19 +267,19 @@ def wind_figure(context: PlotContext) -> go.Figure | None:
     return time_series_figure(context._replace(units=units), {"wind": Curve(wind, WIND)}, height=110)
 
 
-def state_figure(context: PlotContext) -> go.Figure | None:
+def state_figure(context: PlotContext) -> Figure | None:
     """All states of a simulated aircraft."""
     x = _truth_group(context.tape, "x")
     return time_series_figure(context, {"x": Curve(x, PLANT)}, columns=2, height=130) if x.names else None
 
 
-def sensor_figure(context: PlotContext) -> go.Figure | None:
+def sensor_figure(context: PlotContext) -> Figure | None:
     """Y less the true output, of every sensor that has an error."""
     noise = _nonzero_group(context.tape, "noise")
     return time_series_figure(context, {"error": Curve(noise, ERROR, 0.8)}, columns=2, height=120) if noise.names else None
 
 
-def tick_figure(context: PlotContext) -> go.Figure | None:
+def tick_figure(context: PlotContext) -> Figure | None:
     """Lateness, age of y and dt of the controller's ticks; None where all ticks were on time with a fresh y."""
     tape, channels = context.tape, ("late", "age", "dt")
     if "internals" not in tape:

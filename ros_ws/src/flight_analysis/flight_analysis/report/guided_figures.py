@@ -6,13 +6,21 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import plotly.graph_objects as go
 
 from flight_analysis.closed_loop.guidance_replay import known_routes
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report.figures import END_STOP, ERROR, MODE_COLOURS, PLANT, REFERENCE, WIND
-from flight_analysis.report.plotting import INTERVAL_OPACITY, Curve, Interval, PlotContext, set_layout, time_series_figure
+from flight_analysis.report.plotting import (
+    INTERVAL_OPACITY,
+    Curve,
+    Figure,
+    Interval,
+    PlotContext,
+    axis,
+    set_layout,
+    time_series_figure,
+)
 from flight_analysis.report.summary import QUANTITY_UNITS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
@@ -61,31 +69,31 @@ def flown_routes(scenario: Scenario, tape: Tape) -> list[Route]:
     return [route for digest, route in known_routes(tape, scenario.guidance).items() if digest in flown]
 
 
-def track_figure(tape: Tape, routes: Sequence[Route], speed: float) -> go.Figure:
+def track_figure(tape: Tape, routes: Sequence[Route], speed: float) -> Figure:
     """Ground track over the routes with their fillets, equal axes, and arrows of the wind. `speed`: trim speed V0, m/s."""
     figure = tracks_figure({"flown": (tape, PLANT)}, routes)
     _add_wind(figure, tape, speed)
-    return set_layout(figure, TRACK_HEIGHT, labels=16)
+    return set_layout(figure, labels=16)
 
 
-def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> go.Figure:
+def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:
     """Ground tracks over routes, equal axes: the tape of a guided flight and its colour by label."""
-    figure = go.Figure()
+    figure = Figure(1, 1, TRACK_HEIGHT)
     for route in routes:
         line = {"color": REFERENCE, "width": 6.0}
         north, east, _ = (np.array(values, dtype=np.float32) for values in zip(*route_outline(route), strict=True))
-        figure.add_trace(go.Scatter(x=east, y=north, mode="lines", name="route", line=line, hoverinfo="skip"))
+        outline = {"type": "scatter", "x": east, "y": north, "mode": "lines", "name": "route", "line": line}
+        figure.add(outline | {"hoverinfo": "skip"})
     for label, (tape, colour) in tracks.items():
         t, pose = tape.time("guidance"), tape["guidance"].group("pose")
         keep = np.unique(np.linspace(0, len(t) - 1, TRACK_POINTS).astype(int))
         north, east = (pose[name][keep].astype(np.float32) for name in ("north", "east"))
-        track = go.Scatter(
-            x=east, y=north, mode="lines", name=label, line={"color": colour, "width": 1.4}, hoverinfo="x+y+text"
-        )
-        figure.add_trace(track.update(text=[f"t = {instant:.1f} s" for instant in t[keep]]))
-    figure.update_xaxes(title_text="east (m)")
-    figure.update_yaxes(title_text="north (m)", scaleanchor="x", scaleratio=1.0)
-    return set_layout(figure, TRACK_HEIGHT, labels=16)
+        line = {"color": colour, "width": 1.4}
+        track = {"type": "scatter", "x": east, "y": north, "mode": "lines", "name": label, "line": line}
+        figure.add(track | {"text": [f"t = {instant:.1f} s" for instant in t[keep]], "hoverinfo": "x+y+text"})
+    figure.x[0]["title"] = {"text": "east (m)"}
+    figure.y[0] |= {"title": {"text": "north (m)"}, "scaleanchor": "x", "scaleratio": 1.0}
+    return set_layout(figure, labels=16)
 
 
 def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
@@ -101,7 +109,7 @@ def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
     return np.array([part.mean(axis=0) for part in np.array_split(wind, min(parts, len(wind)))])
 
 
-def _add_wind(figure: go.Figure, tape: Tape, speed: float) -> None:
+def _add_wind(figure: Figure, tape: Tape, speed: float) -> None:
     wind = mean_wind(tape, speed)
     strength = np.hypot(wind[:, 0], wind[:, 1])
     if (strongest := float(strength.max())) < LEAST_WIND:
@@ -110,12 +118,13 @@ def _add_wind(figure: go.Figure, tape: Tape, speed: float) -> None:
     middles = [int(part[len(part) // 2]) for part in np.array_split(np.arange(len(pose.stamp_ns)), len(wind))]
     for k, (to_north, to_east) in zip(middles, wind * (ARROW_PIXELS / strongest), strict=True):
         arrow = {"x": pose["east"][k], "y": pose["north"][k], "ax": -to_east, "ay": to_north, "text": ""}  # ay points down
-        figure.add_annotation(**arrow, showarrow=True, arrowhead=2, arrowwidth=1.6, arrowcolor=WIND)
+        arrow |= {"showarrow": True, "arrowhead": 2, "arrowwidth": 1.6, "arrowcolor": WIND}
+        figure.layout["annotations"].append(arrow)
     label = f"wind, the longest arrow {strongest:.2g} m/s"
-    figure.add_trace(go.Scatter(x=[None], y=[None], mode="lines", name=label, line={"color": WIND}))
+    figure.add({"type": "scatter", "x": [None], "y": [None], "mode": "lines", "name": label, "line": {"color": WIND}})
 
 
-def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> go.Figure:
+def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figure:
     """Altitude and airspeed over their commands, with the limits of the commands. `speed`: trim speed V0, m/s."""
     log = context.tape["guidance"]
     commanded = np.where(log["mode.vertical"] == Vertical.ALTITUDE, log["target.altitude"], np.nan)
@@ -123,7 +132,7 @@ def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> go.Fi
     return _over_commands(context, commands, {"altitude": log["pose.altitude"], "V": speed + log["y.V"]}, bounds)
 
 
-def attitude_figure(context: PlotContext, bounds: Bounds) -> go.Figure:
+def attitude_figure(context: PlotContext, bounds: Bounds) -> Figure:
     """Bank and pitch over their commands, with the limits of the commands."""
     log = context.tape["guidance"]
     names = ("phi", "theta")
@@ -132,7 +141,7 @@ def attitude_figure(context: PlotContext, bounds: Bounds) -> go.Figure:
     )
 
 
-def cross_track_figure(context: PlotContext) -> go.Figure | None:
+def cross_track_figure(context: PlotContext) -> Figure | None:
     """Cross-track error while a path is followed, by leg of the route; None for a flight without a path."""
     log = context.tape["guidance"]
     lateral = log["mode.lateral"]
@@ -155,13 +164,13 @@ def _signal(context: PlotContext, channels: Mapping[str, FloatArray]) -> Signal:
 
 def _over_commands(
     context: PlotContext, commands: Mapping[str, FloatArray], flown: Mapping[str, FloatArray], bounds: Bounds
-) -> go.Figure:
+) -> Figure:
     curves = {
         "command": Curve(_signal(context, commands), REFERENCE, 5.0),
         "flown": Curve(_signal(context, flown), PLANT),
     }
     figure = time_series_figure(context, curves)
-    for row, name in enumerate(flown, start=1):
+    for index, name in enumerate(flown):
         factor = context.units[name].factor
         values = np.concatenate([flown[name], commands[name]]) * factor
         low, high = float(np.nanmin(values)), float(np.nanmax(values))
@@ -172,6 +181,7 @@ def _over_commands(
         for bound, edge in zip((lower, upper), view, strict=True):
             if math.isfinite(bound):
                 shape = {"type": "rect", "x0": 0.0, "x1": context.end, "y0": bound, "y1": edge, "layer": "below"}
-                figure.add_shape(**shape, fillcolor=END_STOP, opacity=INTERVAL_OPACITY, line_width=0, row=row, col=1)
-        figure.update_yaxes(range=view, row=row, col=1)
-    return set_layout(figure, 150, labels=16)
+                shape |= {"xref": axis("x", index), "yref": axis("y", index), "line": {"width": 0}}
+                figure.layout["shapes"].append(shape | {"fillcolor": END_STOP, "opacity": INTERVAL_OPACITY})
+        figure.y[index]["range"] = view
+    return set_layout(figure, labels=16)

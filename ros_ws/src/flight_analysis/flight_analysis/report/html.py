@@ -2,20 +2,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report as one HTML page without network access: the tables of a flight and its figures, or a comparison of several."""
 
+import base64
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import plotly.graph_objects as go
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from flight_analysis.report import comparison, figures, guided_figures, plotting, tables
-from flight_analysis.report.plotting import SampleStore, pack
+from flight_analysis.report.plotting import Figure, SampleStore, pack
 from flight_analysis.report.replay import Replay, replay
-from flight_analysis.report.summary import INPUT_COLUMNS, RecordedFlight, display_units, format_value, parts_legend
+from flight_analysis.report.summary import (
+    INPUT_COLUMNS,
+    RecordedFlight,
+    display_units,
+    finite_or_null,
+    format_value,
+    parts_legend,
+)
 from flight_core.outcome import COMPLETED
+from flight_core.vectors import FloatArray
 
 HERE = Path(__file__).parent
 
@@ -43,7 +53,7 @@ class Section(NamedTuple):
 
     title: str
     hint: str
-    figure: go.Figure | None
+    figure: Figure | None
     over_time: bool = True  # all figures over time are zoomed together
 
 
@@ -190,8 +200,14 @@ def page_html(page: Page) -> str:
 
 def script_json(value: Any) -> Markup:
     """JSON that cannot end the script element around it: "<" occurs only in strings, where it is escaped."""
-    text = value.to_json() if isinstance(value, go.Figure) else json.dumps(value)
-    return Markup(str(text).replace("<", "\\u003c"))  # noqa: S704
+    content = finite_or_null({"data": value.data, "layout": value.layout} if isinstance(value, Figure) else value)
+    text = json.dumps(content, default=_typed_array, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("<", "\\u003c"))  # noqa: S704
+
+
+def _typed_array(array: FloatArray | NDArray[np.float32]) -> dict[str, str]:
+    """An array as plotly.js takes it: its type, "f8" or "f4", and its bytes, little endian."""
+    return {"dtype": array.dtype.str[1:], "bdata": base64.b64encode(array.tobytes()).decode()}
 
 
 def format_ratio(ratio: float | None) -> Markup:

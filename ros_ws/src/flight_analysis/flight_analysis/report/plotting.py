@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Time-series figures in plotly: one subplot per channel, shaded intervals over all subplots.
+"""Time-series figures for plotly.js: one subplot per channel, shaded intervals over all subplots.
 
 All figures of a page share the time axis and the margins, so their subplots line up. A figure holds curves of few samples
 itself. `SampleStore` holds all samples of a longer one: the page decimates them to what the view can show.
@@ -13,9 +13,7 @@ from hashlib import blake2b
 from typing import Any, NamedTuple
 
 import numpy as np
-import plotly.graph_objects as go
 from numpy.typing import NDArray
-from plotly.subplots import make_subplots
 
 from flight_analysis.report.summary import NO_UNIT, DisplayUnit, channel_label
 from flight_core.rates import NANOSECONDS
@@ -96,89 +94,108 @@ class Curve(NamedTuple):
     faint: bool = False
 
 
-def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, columns: int = 1, height: int = 150) -> go.Figure:
+class Figure:
+    """Subplots as plotly.js takes them: the traces `data` and the `layout`, of which `x` and `y` are the axes by subplot.
+
+    `count` subplots are filled row by row, `height` pixels each, with `spacing` between the rows as a fraction of the figure.
+    Source of the names: https://plotly.com/javascript/reference.
+    """
+
+    def __init__(self, count: int, columns: int, height: int, spacing: float | None = None) -> None:
+        self.rows, self.height = -(-count // columns), height
+        across = 0.24 / columns
+        between = min(0.14, 24.0 / (self.rows * height)) if spacing is None else spacing
+        wide, high = (1.0 - across * (columns - 1)) / columns, (1.0 - between * (self.rows - 1)) / self.rows
+        self.data: list[dict[str, Any]] = []
+        self.x: list[dict[str, Any]] = []
+        self.y: list[dict[str, Any]] = []
+        for index in range(count):
+            row, column = divmod(index, columns)
+            left, bottom = column * (wide + across), (self.rows - 1 - row) * (high + between)
+            self.x.append({"anchor": axis("y", index), "domain": [left, left + wide]})
+            self.y.append({"anchor": axis("x", index), "domain": [bottom, bottom + high]})
+        self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
+        for letter, axes in (("x", self.x), ("y", self.y)):
+            self.layout |= {axis(f"{letter}axis", index): one for index, one in enumerate(axes)}
+
+    def add(self, trace: dict[str, Any], index: int = 0) -> None:
+        """Add a trace to a subplot."""
+        self.data.append(trace | {"xaxis": axis("x", index), "yaxis": axis("y", index)})
+
+
+def axis(name: str, index: int) -> str:
+    """The name of an axis of a subplot counted from 0: x, x2, x3."""
+    return name if index == 0 else f"{name}{index + 1}"
+
+
+def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, columns: int = 1, height: int = 150) -> Figure:
     """One subplot of `height` pixels per channel, with every curve that has the channel; two columns are filled row by row."""
     channels = list(dict.fromkeys(name for curve in curves.values() for name in curve.signal.names))
     columns = min(columns, len(channels))
-    figure = subplot_grid(len(channels), columns, height, shared_xaxes="all")
+    figure = Figure(len(channels), columns, height)
+    followed = (figure.rows - 1) * columns
     for index, channel in enumerate(channels):
-        position = subplot(index, columns)
         unit, factor = context.units.get(channel, NO_UNIT)
         for label, curve in curves.items():
             if channel in curve.signal.names:
                 trace = _trace(context, curve, channel, factor, MAX_POINTS // columns)
-                trace.update(name=label, legendgroup=label, showlegend=len(curves) > 1 and first_in_legend(figure, label))
-                figure.add_trace(trace.update(hovertemplate=f"%{{y:.4g}} {unit}"), **position)
-        figure.update_yaxes(title_text=channel_label(channel, context.units), **position)
-    figure.update_xaxes(range=[0.0, context.end], showticklabels=False)
-    for col in range(columns):
-        last_row = -(-(len(channels) - col) // columns)
-        figure.update_xaxes(title_text="t (s)", showticklabels=True, row=last_row, col=col + 1)
+                shown = len(curves) > 1 and first_in_legend(figure, label)
+                trace |= {"name": label, "legendgroup": label, "showlegend": shown, "hovertemplate": f"%{{y:.4g}} {unit}"}
+                figure.add(trace, index)
+        figure.y[index]["title"] = {"text": channel_label(channel, context.units)}
+        lowest = index + columns >= len(channels)
+        figure.x[index] |= {"range": [0.0, context.end], "showticklabels": lowest}
+        figure.x[index] |= {"title": {"text": "t (s)"}} if lowest else {}
+        figure.x[index] |= {"matches": axis("x", followed)} if index != followed else {}
     _shade_intervals(figure, context.intervals, columns, context.end)
-    return set_layout(figure, height, labels=16 if columns == 1 else 6).update_layout(hovermode="x unified")
+    figure.layout["hovermode"] = "x unified"
+    return set_layout(figure, labels=16 if columns == 1 else 6)
 
 
-def subplot(index: int, columns: int) -> dict[str, int]:
-    """Row and column, from 1, of a subplot counted from 0."""
-    return {"row": index // columns + 1, "col": index % columns + 1}
+def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
+    """Set size, margins and colours: the legend and `labels` pixels above the rows, the axis `below` them."""
+    above, rows = 24 * any(trace.get("showlegend") for trace in figure.data) + labels, figure.height * figure.rows
+    for axes, standoff in ((figure.x, 4), (figure.y, 6)):
+        for one in axes:
+            one |= {"gridcolor": GRID, "zerolinecolor": ZERO, "title": one.get("title", {}) | {"standoff": standoff}}
+    figure.layout |= {
+        "height": above + rows + below,
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": INK},
+        "paper_bgcolor": TRANSPARENT,
+        "plot_bgcolor": TRANSPARENT,
+        "modebar": {"bgcolor": TRANSPARENT},
+        "hoverlabel": {"bgcolor": PAPER, "font": {"color": INK}},
+        "margin": {"l": 80, "r": 20, "t": above, "b": below},
+        "legend": {"orientation": "h", "x": 0.0, "y": 1.0 + labels / rows, "yanchor": "bottom", "bgcolor": TRANSPARENT},
+    }
+    return figure
 
 
-def subplot_grid(count: int, columns: int, height: int, **options: Any) -> go.Figure:
-    """An empty figure of `count` subplots, filled row by row, `height` pixels each."""
-    rows = -(-count // columns)
-    cells: list[dict[str, Any] | None] = [{}] * count + [None] * (rows * columns - count)
-    specs = [cells[row * columns :][:columns] for row in range(rows)]
-    spacing = {"vertical_spacing": min(0.14, 24.0 / (rows * height)), "horizontal_spacing": 0.24 / columns}
-    return make_subplots(rows, columns, specs=specs, **(spacing | options))
-
-
-def set_layout(figure: go.Figure, height: int, labels: int = 6, below: int = 40) -> go.Figure:
-    """Set size, margins and colours: rows of `height` pixels, the legend and `labels` above them, the axis `below` them."""
-    rows = len({axis.domain for axis in figure.select_yaxes()})
-    legend = 24 * any(trace.showlegend for trace in figure.data)
-    figure.update_xaxes(gridcolor=GRID, zerolinecolor=ZERO, title_standoff=4)
-    figure.update_yaxes(gridcolor=GRID, zerolinecolor=ZERO, title_standoff=6)
-    return figure.update_layout(
-        height=legend + labels + height * rows + below,
-        template="none",
-        font={"family": "system-ui, sans-serif", "size": 12, "color": INK},
-        paper_bgcolor=TRANSPARENT,
-        plot_bgcolor=TRANSPARENT,
-        modebar_bgcolor=TRANSPARENT,
-        hoverlabel={"bgcolor": PAPER, "font": {"color": INK}},
-        margin={"l": 80, "r": 20, "t": legend + labels, "b": below},
-        legend={
-            "orientation": "h", "x": 0.0, "y": 1.0 + labels / (height * rows), "yanchor": "bottom", "bgcolor": TRANSPARENT,
-        },
-    )  # fmt: skip
-
-
-def first_in_legend(figure: go.Figure, label: str) -> bool:
+def first_in_legend(figure: Figure, label: str) -> bool:
     """Whether the figure has no trace of a label yet; the legend shows each label once."""
-    return all(trace.name != label for trace in figure.data)
+    return all(trace["name"] != label for trace in figure.data)
 
 
 def add_line(
-    figure: go.Figure, row: int, label: str, x: Sequence[float | None], y: Sequence[float], style: Mapping[str, Any]
+    figure: Figure, index: int, label: str, x: Sequence[float | None], y: Sequence[float], style: Mapping[str, Any]
 ) -> None:
-    """Add a line to a row, with one entry in the legend. None in x breaks the line."""
+    """Add a line to a subplot, with one entry in the legend. None in x breaks the line."""
     if not x:
         return
-    trace = go.Scatter(x=x, y=y, mode="lines", name=label, legendgroup=label, line=dict(style), hoverinfo="skip")
-    figure.add_trace(trace.update(showlegend=first_in_legend(figure, label)), row=row, col=1)
+    trace = {"type": "scatter", "x": x, "y": y, "mode": "lines", "name": label, "legendgroup": label, "line": style}
+    figure.add(trace | {"hoverinfo": "skip", "showlegend": first_in_legend(figure, label)}, index)
 
 
-def _trace(context: PlotContext, curve: Curve, channel: str, factor: float, most: int) -> go.Scatter:
+def _trace(context: PlotContext, curve: Curve, channel: str, factor: float, most: int) -> dict[str, Any]:
     t_ns, values = _drawn(context, curve.signal, channel, factor, curve.steps)
     style = {"color": curve.colour, "width": curve.width, "shape": "hv" if curve.steps else "linear"}
-    trace = go.Scatter(
-        mode="lines",
-        line=style | {"simplify": False},  # plotly's simplification cuts off peaks
-        opacity=0.35 if curve.faint else None,
+    # plotly's simplification cuts off peaks
+    trace = {"type": "scatter", "mode": "lines", "line": style | {"simplify": False}} | (
+        {"opacity": 0.35} if curve.faint else {}
     )
     if len(values) <= most:
-        return trace.update(x=t_ns / NANOSECONDS, y=values)
-    return trace.update(meta={"t": context.samples.times(t_ns), "v": context.samples.values(values), "most": most})
+        return trace | {"x": t_ns / NANOSECONDS, "y": values}
+    return trace | {"meta": {"t": context.samples.times(t_ns), "v": context.samples.values(values), "most": most}}
 
 
 def stored(context: PlotContext, signal: Signal, channel: str, factor: float) -> tuple[str, str]:
@@ -202,19 +219,26 @@ def _break_at_gaps(t_ns: NDArray[np.int64], values: FloatArray, steps: bool) -> 
     return np.insert(t_ns, before + 1, t_ns[before]), np.insert(values, before + 1, np.nan)
 
 
-def _shade_intervals(figure: go.Figure, intervals: Sequence[Interval], columns: int, end: float) -> None:
+def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int, end: float) -> None:
     for interval in intervals:
-        for axis in ("x", "x2")[:columns]:
-            style = {"fillcolor": interval.colour, "opacity": INTERVAL_OPACITY, "line_width": 0, "layer": "below"}
-            figure.add_shape(type="rect", xref=axis, yref="paper", x0=interval.start, x1=interval.stop, y0=0, y1=1, **style)
+        for column in range(columns):
+            figure.layout["shapes"].append(
+                {
+                    "type": "rect", "xref": axis("x", column), "yref": "paper", "x0": interval.start, "x1": interval.stop,
+                    "y0": 0, "y1": 1, "fillcolor": interval.colour, "opacity": INTERVAL_OPACITY, "line": {"width": 0},
+                    "layer": "below",
+                }
+            )  # fmt: skip
     if columns > 1:
         return  # too narrow for labels
     for start, text in _merged_labels([interval for interval in intervals if interval.labelled], end).items():
         position = {"x": start, "xanchor": "left", "y": 1.0, "yref": "paper", "yanchor": "bottom"}
-        figure.add_annotation(text=text, **position, showarrow=False, font={"size": 11})
+        figure.layout["annotations"].append({"text": text, **position, "showarrow": False, "font": {"size": 11}})
     for label, colour in {interval.label: interval.colour for interval in intervals if not interval.labelled}.items():
         mark = {"symbol": "square", "size": 12, "color": colour, "opacity": 2 * INTERVAL_OPACITY}
-        figure.add_trace(go.Scatter(x=[None], y=[None], mode="markers", name=label, marker=mark, showlegend=True), row=1, col=1)
+        figure.add(
+            {"type": "scatter", "x": [None], "y": [None], "mode": "markers", "name": label, "marker": mark, "showlegend": True}
+        )
 
 
 def _merged_labels(intervals: Sequence[Interval], end: float) -> dict[float, str]:

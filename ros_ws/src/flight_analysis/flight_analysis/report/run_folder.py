@@ -129,7 +129,7 @@ def write_report(run: Path, outcome: str | None = None) -> FlightResult:
     Without an outcome the report of an old run is written again and runs/latest stays. Raises ParameterError as `read_flight`
     does.
     """
-    from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads plotly, which a flight does not need
+    from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
     flight, folder = read_flight(run, outcome), _folder(run)
     with writing("", folder, "a folder that can"):
