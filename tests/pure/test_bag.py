@@ -24,7 +24,7 @@ from flight_core.tape import Tape
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.message_definitions import definition
-from flight_log.named_vectors import decoder
+from flight_log.named_vectors import JOINT_STATE_TYPES, decoder, joint_state_types
 from flight_log.scan import Scan
 from flight_log.tape_reader import ROSBAG2, read_run
 from flight_log.tape_writer import write_run
@@ -317,6 +317,11 @@ def test_messages_decoded_together_equal_those_decoded_one_by_one(messages: list
         for stamp, values in zip(samples.stamp_ns, samples.values, strict=True)
     ]
     assert sorted(decoded) == one_by_one(messages)
+
+
+def test_the_types_of_a_joint_state_are_those_of_ros_2() -> None:
+    ours = joint_state_types().fielddefs
+    assert {name: ours[name] for name in JOINT_STATE_TYPES} == {name: STORE.fielddefs[name] for name in JOINT_STATE_TYPES}
 
 
 def test_other_types_have_no_decoder_and_malformed_messages_are_counted() -> None:

@@ -23,11 +23,10 @@ class Engagement(NamedTuple):
 
 def engagements(reports: Iterable[tuple[int, bytes]]) -> list[Engagement] | None:
     """The engagements, in order, from the times of sending and the messages of the reports; None without a report."""
-    store = typestore()
     found: list[Engagement] | None = None
     for sent_ns, data in reports:
         try:
-            report: Any = store.deserialize_cdr(data, KEY_VALUE)
+            report: Any = typestore().deserialize_cdr(data, KEY_VALUE)
         except SerdeError:
             continue
         found = found or []
