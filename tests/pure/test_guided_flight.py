@@ -295,6 +295,18 @@ def test_a_scenario_with_guidance_is_restored_from_its_parameters(tmp_path: Path
     assert find_scenario("osprey_gust").guidance is None
 
 
+def test_an_empty_section_is_guidance_by_rule_and_no_section_is_none(tmp_path: Path) -> None:
+    before, route, after = ROUTE.path.read_text(encoding="utf-8").partition("/**/guidance:")
+    path = tmp_path / "empty.yaml"
+    rest = after[after.index("\n/**/") :]
+    path.write_text(f"{before}{route} {{ros__parameters: {{}}}}{rest}", encoding="utf-8")
+    section = load_scenario(path).guidance
+    assert section is not None
+    assert (section.speed, section.natural_frequency, section.route) == (25.0, (4.0, 1.2, 5.0, 4.0), None)
+    path.write_text(before + rest, encoding="utf-8")
+    assert load_scenario(path).guidance is None
+
+
 def test_every_step_of_a_guided_flight_has_a_command_from_t_0_on() -> None:
     tape = simulate(calm(1.0))
     assert tape["u_m"].stamp_ns.tolist() == [nanoseconds(0.02 * k) for k in range(51)]

@@ -48,7 +48,7 @@ BAD = {
     ("bank_rate: p", "bank_rate: roll"): "coordinated_turn.bank_rate: found channel 'roll', expected one of q, V, p, r",
     ("duration: 60.0", "duration: long"): "flight.duration: found 'long', expected a number",
     ("/**/recorder", "/**/recoder"): "bad.yaml: recoder: found a section, expected only flight, aircraft,",
-    ("/**/recorder:\n  ros__parameters:", "/**/recorder:\n  parameters:"): "recorder: found no mapping under ros__parameters",
+    ("/**/recorder:\n  ros__parameters:", "/**/recorder:\n  parameters:"): "recorder: found no parameters under",
     ("duration: 60.0", "duration: [60.0"): "bad.yaml: not valid YAML",
     ("duration: 60.0", "duration: 2001-99-99"): "bad.yaml: not valid YAML",
     ("duration: 60.0", "duration: 0b_"): "bad.yaml: not valid YAML",

@@ -20,7 +20,7 @@ def read_sections(path: Path, expected: tuple[str, ...], optional: tuple[str, ..
     """Sections of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
 
     Raises ParameterError for a file that cannot be read, is no scenario file, has a duplicate key, or lacks or adds a section;
-    those in `optional` may be absent.
+    those in `optional` may be absent, or an empty mapping: every parameter by default.
     """
     tree = read_yaml(path, str(path), "a scenario file")
     require(isinstance(tree, dict), str(path), f"{type(tree).__name__}", f"a mapping with {', '.join(expected)}")
@@ -30,14 +30,13 @@ def read_sections(path: Path, expected: tuple[str, ...], optional: tuple[str, ..
         known = (*expected, *optional)
         require(name in known, f"{path.name}: {name}", "a section", f"only {', '.join(known)}")
         values = content.get("ros__parameters") if isinstance(content, dict) else None
-        values = values if isinstance(values, dict) else {}
         require(
-            bool(values) and set(content) == {"ros__parameters"},
+            isinstance(values, dict) and (bool(values) or name in optional) and set(content) == {"ros__parameters"},
             f"{path.name}: {name}",
-            "no mapping under ros__parameters",
-            "one mapping there, as in every ROS parameter file",
+            "no parameters under ros__parameters",
+            "a mapping of them there, as in every ROS parameter file",
         )
-        sections[name] = values
+        sections[name] = dict(values or {})
     for name in expected:
         require(name in sections, f"{path.name}: {name}", "no such section", f"one for each of {', '.join(expected)}")
     return sections

@@ -100,7 +100,7 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
     }
     scenario = Scenario(name=name, path=path, **checked)
     check_together(scenario)
-    return scenario.vary(**{key: sections[key] for key in OPTIONAL if sections.get(key)})
+    return scenario.vary(**{key: sections[key] for key in OPTIONAL if key in sections})
 
 
 def read_scenario_sections(path: Path) -> Sections:
