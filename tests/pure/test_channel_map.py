@@ -107,10 +107,10 @@ def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name
 
 
 @pytest.mark.parametrize("name", MAPS)
-def test_each_input_of_a_map_states_its_own_trim(name: str) -> None:
-    """A merged row would hand a changed trim of the elevator to the other surfaces."""
+def test_each_input_of_a_map_states_its_own_trim_and_sign(name: str) -> None:
+    """A merged row would hand a changed trim or sign of the elevator to the other inputs."""
     inputs = (LIBRARY / f"{name}.yaml").read_text(encoding="utf-8").split("\ninputs:\n")[1].split("\n\n")[0]
-    assert inputs.count("\n    trim: ") == len(load_map(name).inputs)
+    assert [inputs.count(f"\n    {key}: ") for key in ("trim", "sign")] == 2 * [len(load_map(name).inputs)]
 
 
 MEASURED = {  # Hz, as the stack receives them from PX4 1.16.0 and ArduPlane 4.8.0-dev in SITL
