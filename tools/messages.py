@@ -66,6 +66,9 @@ def in_order(package: str, sources: Mapping[str, Source]) -> list[str]:
     while waiting:
         name = waiting.pop()
         if name not in graph:
+            folder = sources[name].folder
+            if not (folder / "CMakeLists.txt").is_file():
+                raise MessagesError(f"SOURCE: found no CMakeLists.txt in {folder}, expected sources, not an installed package")
             graph[name] = sources[name].dependencies & sources.keys()
             waiting += graph[name]
     return list(TopologicalSorter(graph).static_order())

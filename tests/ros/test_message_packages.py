@@ -71,6 +71,12 @@ def test_a_package_is_built_after_those_that_it_contains_messages_of(sources: Pa
     assert in_order("plane_msgs", find_sources([sources / "plane"])) == ["plane_msgs"]  # air_msgs may be installed
 
 
+def test_an_installed_package_in_place_of_sources_is_one_sentence(sources: Path) -> None:
+    (sources / "air" / "air_msgs" / "CMakeLists.txt").unlink()
+    with pytest.raises(MessagesError, match=r"SOURCE: found no CMakeLists\.txt in .*air_msgs, expected sources"):
+        in_order("plane_msgs", find_sources([sources]))
+
+
 def test_a_part_of_a_package_holds_what_its_messages_contain(sources: Path) -> None:
     plane = sources / "plane" / "plane_msgs"
     assert closure("plane_msgs", plane, ["State"]) == {"State", "Mode"}
