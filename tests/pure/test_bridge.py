@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge without ROS: engagement, failsafe, pilot override, saturation, stamps; the tests give the time."""
 
+import signal
 import time
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
@@ -12,7 +14,8 @@ import pytest
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import to_raw
 from autopilot_bridge.params import ChannelMap, load_map
-from flight_bringup.fly import _follow_real_time
+from flight_bringup.fly import _follow_real_time, _interrupt
+from flight_bringup.processes import handle_signals
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError
@@ -458,3 +461,16 @@ def test_an_experiment_without_an_engagement_ends_when_too_little_time_is_left()
     scenario = find_scenario("osprey_gust")
     outcome = _follow_real_time(scenario, *nodes, lambda t, text: None, lambda line: None, scenario.flight.duration - 0.2)
     assert outcome == "not engaged within 0.2 s"
+
+
+def test_a_second_signal_does_not_interrupt_the_clean_up_after_the_first() -> None:
+    """`subprocess` releases a lock in a `finally`; one that stays locked made a flight wait for its nodes without end."""
+    before, clean = signal.getsignal(signal.SIGINT), False
+    with suppress(KeyboardInterrupt), handle_signals(_interrupt):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.raise_signal(signal.SIGTERM)
+            clean = True
+    assert clean
+    assert signal.getsignal(signal.SIGINT) is before

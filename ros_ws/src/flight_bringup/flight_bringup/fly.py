@@ -4,6 +4,7 @@
 
 import math
 import re
+import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -32,6 +33,9 @@ Progress = Callable[[float, str], None]  # flight time in s, and the text beside
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    """End the flight. A second signal would interrupt the clean-up, in which `subprocess` releases a lock of each process."""
+    for handled in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(handled, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 
