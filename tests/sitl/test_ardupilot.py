@@ -67,9 +67,9 @@ def test_a_dry_run_measures_what_the_autopilot_logs(plane: ArduPlane) -> None:
 
 
 def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
-    """The errors of q and p stay below what y_m commands, and every tick of the log replays.
+    """While they are commanded the errors of q and p stay below y_m, and every tick of the log replays.
 
-    An aircraft that does not follow has a ratio of 1 or more. On two busy cores a calm flight had 0.62 and 0.48.
+    An aircraft that does not follow has a ratio of 1 or more. Calm flights had 0.63, 0.49; with identified gains 0.43, 0.17.
     """
     with engaged(plane, SCENARIO.flight.duration) as flight:
         flight.succeed(SCENARIO.flight.duration + 30.0)
@@ -78,12 +78,12 @@ def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
     tape = read_run(plane.run).tape
     y, y_m = tape["y"], tape["y_m"]
     t = (y.stamp_ns - tape.start_ns) / 1e9
-    pulses = SCENARIO.reference_model.pulses.values()
-    first, last = min(pulse.start[0] for pulse in pulses), max(pulse.stop[-1] for pulse in pulses)
-    assert one["start"] < first, "engaged after the first command"
-    commanded = (t > first) & (t < last)
+    pulses = SCENARIO.reference_model.pulses
+    assert one["start"] < min(pulse.start[0] for pulse in pulses.values()), "engaged after the first command"
     figures = {}
-    for name in "qp":
+    for name in pulses.keys() & set("qp"):
+        edges = zip(pulses[name].start, pulses[name].stop, strict=True)
+        commanded = in_spans(t, [(start, stop + 1.0) for start, stop in edges])  # elsewhere y_m is 0, and e is noise
         reference = np.interp(y.stamp_ns[commanded], y_m.stamp_ns, y_m[name])
         figures[name] = float(np.std(y[name][commanded] - reference) / np.std(reference))
     assert max(figures.values()) < 0.75
