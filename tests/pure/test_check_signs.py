@@ -86,7 +86,7 @@ def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> No
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     result = CliRunner().invoke(app, ["check-signs", str(path)])
     assert result.exit_code == 1
-    sentence = "error: with the map ardupilot D of q and elevator is -1, the controller has +1: a positive elevator makes"
+    sentence = "error: with the map ardupilot D of q and elevator is -1, the controller has +1: a positive elevator means nose"
     assert sentence in result.stderr
 
 

@@ -159,15 +159,15 @@ def _show_response(console: Console, name_of_map: str, response: Response, trims
 
 
 def _show_models(console: Console, response: Response, models: list[ChannelModel | None]) -> None:
-    parameters = ("channel", "Omega", "lag", "delay", "damping", "stiffness", "zero", "misfit")
-    table = new_table("Models of the channels, SI, fitted to the output error", parameters, left=("channel",))
+    parameters = ("input", "Omega", "lag", "delay", "damping", "stiffness", "zero", "misfit")
+    table = new_table("Models of the channels, SI, fitted to the output error", parameters, left=("input",))
     estimates = ("channel", "abs(y / u)", "+-", "y behind u, rad", "+-", "used")
     loop = new_table("The models at the frequency of the loop, standard errors", estimates, left=("channel", "used"))
     for output, name, model in zip(response.outputs, response.inputs, models, strict=True):
         channel = f"{output} by {name}"
         if model is not None:
             values = (model.Omega, model.lag, model.delay, model.damping, model.stiffness, model.slow / model.Omega)
-            table.add_row(channel, *(f"{value:.3g}" for value in values), f"{100 * model.misfit:.0f} %")
+            table.add_row(name, *(f"{value:.3g}" for value in values), f"{100 * model.misfit:.0f} %")
             numbers = [value for estimate in model.at_loop_frequency() for value in estimate]
             loop.add_row(channel, *(f"{value:.3g}" for value in numbers), "model" if model.usable else "step response")
     console.print(table, loop)

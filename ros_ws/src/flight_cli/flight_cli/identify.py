@@ -60,7 +60,10 @@ def identify(
     ] = None,
     log: Annotated[Path | None, typer.Option(help="Log of a flight: the folder of a run, or an MCAP file.")] = None,
     airframe: Annotated[str | None, typer.Option(help="With --log: the nominal airframe, a name or a file (.yaml).")] = None,
-    write: Annotated[Path | None, typer.Option(help="With --log: airframe file for the model, with a page.")] = None,
+    write: Annotated[
+        Path | None,
+        typer.Option(help="With --log: airframe file for the model, with a page. With --bridge: folder for what flies it."),
+    ] = None,
     scenario: Annotated[
         str | None, typer.Option(help="With --log: scenario with lags and delay of the controller; by default that in the log.")
     ] = None,

@@ -118,7 +118,7 @@ def check(
         if D_mapped[i] != D[i]:
             sentences.append(
                 f"with the map {channel_map.name} D of {output} and {name} is {D_mapped[i]:+d}, the controller has {D[i]:+d}:"
-                f" a positive {name} makes the aircraft {motion_as_channel_grows(channel_map.inputs[name])}"
+                f" a positive {name} means {motion_as_channel_grows(channel_map.inputs[name])}"
             )
         if measured is None or effect is None or ratio is None:
             continue
