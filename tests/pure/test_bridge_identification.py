@@ -33,12 +33,14 @@ from flight_analysis.design.bridge_identification import (
 from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
 from flight_analysis.design.response_identification import Response, identify_response
 from flight_analysis.metrics import best_error, error_metrics
+from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
+from flight_log.tape_writer import write_run
 
 MAP, SPEED, DELAY = load_map("ardupilot"), 25.0, 0.05  # m/s; s, by which y is late
 OSPREY = load_airframe("osprey")
@@ -323,6 +325,17 @@ def test_a_refused_experiment_leaves_no_folder(tmp_path: Path) -> None:
         assert isinstance(result.exception, ParameterError)
         assert str(result.exception).startswith(sentence)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_the_log_of_a_flight_under_feedback_is_no_experiment(tmp_path: Path) -> None:
+    scenario = find_scenario("osprey_gust", 1.0)
+    (tmp_path / "run").mkdir()
+    write_run(simulate(scenario), tmp_path / "run", attachments_for(scenario, tmp_path / "run"))
+    arguments = ["--speed", "25", "--write", str(tmp_path / "found"), "--log", str(tmp_path / "run")]
+    result = CliRunner().invoke(application([*COMMANDS]), ["identify", "--bridge", "ardupilot", *arguments])
+    assert isinstance(result.exception, ParameterError)
+    assert "law: found rise_di, expected excitation: the log of an experiment" in str(result.exception)
+    assert not (tmp_path / "found").exists()
 
 
 def test_a_written_map_has_the_trims_that_were_sent() -> None:

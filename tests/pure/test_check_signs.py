@@ -17,13 +17,15 @@ from autopilot_bridge.params import LIBRARY, ChannelMap, load_map
 from autopilot_bridge.signs import through
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.response_identification import MIN_RATIO, Response, identify_response
-from flight_analysis.design.sign_check import SignCheck, check
+from flight_analysis.design.sign_check import SignCheck, check, recorded_response
+from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_log.tape_writer import write_run
 from rise_di_controller.params import ControllerParameters
 
 app = application([*COMMANDS])
@@ -201,6 +203,14 @@ def test_commands_that_move_the_aircraft_more_than_disturbances_show_the_signs_i
     wrong = Tape({**tape.signals, "u": turned(tape["u"], "aileron")})
     checked = check_osprey(load_map("ardupilot"), measured=response(wrong, tape["y_m"]))
     assert [sentence for sentence in checked.contradictions if "p_dot fall with aileron" in sentence]
+
+
+def test_a_flight_under_guidance_is_refused_since_its_commands_follow_y(tmp_path: Path) -> None:
+    scenario = find_scenario("osprey_route", 1.0)
+    (tmp_path / "run").mkdir()
+    write_run(simulate(scenario), tmp_path / "run", attachments_for(scenario, tmp_path / "run"))
+    with pytest.raises(ParameterError, match="found a flight under guidance, whose y_m follows y, expected an experiment"):
+        recorded_response(tmp_path / "run", OUTPUTS, INPUTS)
 
 
 def test_a_flight_that_does_not_show_a_sign_says_which_input_to_excite() -> None:

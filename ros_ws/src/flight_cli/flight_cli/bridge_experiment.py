@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from autopilot_bridge.params import ChannelMap, load_map
+from flight_analysis.closed_loop.replay import recorded_parameters
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.design.bridge_identification import (
     Channels,
@@ -27,6 +28,7 @@ from flight_analysis.design.bridge_identification import (
 )
 from flight_analysis.design.open_loop_fit import ChannelModel
 from flight_analysis.design.response_identification import Response, identify_response
+from flight_analysis.design.sign_check import OPEN_LOOP
 from flight_analysis.report.run_folder import link_latest, new_run
 from flight_analysis.report.summary import finite_or_null
 from flight_bringup.fly import fly_over_topics
@@ -131,9 +133,14 @@ def _announce(console: Console, planned: Experiment, duration: float) -> None:
 
 
 def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]]]:
-    """The tape of a run and its engaged spans, ns. Raises ParameterError for a log without an engagement."""
+    """The tape of an experiment and its engaged spans, ns.
+
+    Raises ParameterError for a log without an engagement, and for a flight under feedback: its u follows y.
+    """
     recorded = read_run(run)
     tape, flown = recorded.tape, recorded.engagements
+    law = "not recorded" if recorded.scenario is None else recorded_parameters(recorded.scenario).law
+    require(law == OPEN_LOOP, f"{run}: law", law, f"{OPEN_LOOP}: the log of an experiment, identify --bridge without --log")
     for topic in ("y", "u", "bridge/would_send"):
         require(topic in tape, str(run), f"no {topic}", "a log of a flight with a bridge")
     if not flown:

@@ -71,7 +71,8 @@ def recorded_response(bag: Path, outputs: tuple[str, ...], inputs: tuple[str, ..
     """Response of the aircraft in a log, from the time in which u acted: all of it, or while its bridge was engaged.
 
     y_m excites the loop of a flight under a law. Without y_m, and under the law `excitation`, u itself is the excitation.
-    Raises ParameterError for a log without y and u, or one in which the bridge was never engaged.
+    Raises ParameterError for a log without y and u, one in which the bridge was never engaged, or one under guidance: its y_m
+    follows y.
     """
     recorded = read_run(bag)
     tape = recorded.tape
@@ -85,6 +86,10 @@ def recorded_response(bag: Path, outputs: tuple[str, ...], inputs: tuple[str, ..
         require(bool(flown), str(bag), "a bridge that was never engaged", "a flight with an engaged bridge")
         spans = [(one.start_ns, one.stop_ns or int(tape["u"].stamp_ns[-1])) for one in flown]
     open_loop = recorded.scenario is not None and recorded_parameters(recorded.scenario).law == OPEN_LOOP
+    if not open_loop:
+        require(
+            "guidance" not in tape, str(bag), "a flight under guidance, whose y_m follows y", "an experiment, or one without"
+        )
     excitation: Signal | None = tape["y_m"] if "y_m" in tape and not open_loop else None
     return identify_response(tape["y"], tape["u"], outputs, inputs, excitation=excitation, engaged=spans)
 
