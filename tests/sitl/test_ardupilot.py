@@ -109,11 +109,12 @@ def test_turbulence_moves_the_aircraft_as_much_as_under_the_autopilots_own_law(p
     ended = began + (one["stop"] or SCENARIO.flight.duration) - one["start"]
     t, q = plane.log("ATTITUDE", "pitchspeed")
     own, law = (np.std(q[(t > start) & (t < stop)]) for start, stop in ((began - before, began), (began, ended)))
+    assert ended - began > before / 2.0, "too short for an rms"
     assert law < 2.0 * own
     assert one["stop"] is None or "outside the envelope" in one["reason"]
 
 
-@pytest.mark.parametrize("turns", [1, pytest.param(9, marks=[pytest.mark.long, pytest.mark.timeout(900)])])
+@pytest.mark.parametrize("turns", [1, pytest.param(10, marks=[pytest.mark.long, pytest.mark.timeout(1000)])])
 def test_guidance_holds_heading_altitude_and_airspeed(plane: ArduPlane, turns: int) -> None:
     """A minute for each turn, climb and change of airspeed: engaged to the end, and all are held again after 45 s.
 
@@ -218,27 +219,33 @@ def test_sticks_that_the_bridge_overrides_do_not_show_and_do_not_act_before_the_
 def test_the_pilot_has_the_aircraft_again(
     plane: ArduPlane, name: str, record_testsuite_property: Callable[[str, object], None]
 ) -> None:
-    """Within the time of the event the sticks act, and the log says why the engagement ended."""
+    """Within the time of the event the sticks act, and the log says why the engagement ended.
+
+    The time of a release begins with it in the log: `rise-di engage --off` takes half a second to start.
+    """
     event = EVENTS[name]
     channel_map = map_of(plane) if event.change is None else plane.patient_map("ardupilot", event.change)
     with ExitStack() as afterwards, plane.engaged(SCENARIO.path, channel_map, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
+        began = time.time()
         if (undo := event.act(plane, flight)) is not None:
             afterwards.callback(undo)
-        until_sticks = sticks_act(plane, since=time.time())
+        sticks_at = sticks_act(plane, began)
         if "killed" not in name or event.act is kill_agent:  # without one of its nodes the flight ends by itself
             flight.interrupt()
         flight.end()
         afterwards.close()
-    record_testsuite_property(f"ArduPlane, {name}", f"{until_sticks:.3f}")
-    assert event.sticks_act[0] <= until_sticks <= event.sticks_act[1]
-    flown = plane.summary()
+    flown, (engagement,) = plane.summary(), read_run(plane.run).engagements or []
+    if event.act is release:
+        began = (engagement.stop_ns or 0) / 1e9
+    record_testsuite_property(f"ArduPlane, {name}", f"{sticks_at - began:.3f}")
+    assert event.sticks_act[0] <= sticks_at - began <= event.sticks_act[1]
     (one,) = flown["engagements"]
     assert event.reason in f"{one['reason']}; {flown['outcome']}"
 
 
 def sticks_act(plane: ArduPlane, since: float) -> float:
-    """Seconds until the rudder channel is where its stick is, and stays there for 0.5 s."""
+    """The time from which on the rudder channel is where its stick is, for 0.5 s at least; s of the system clock."""
     deadline = time.monotonic() + 10.0
     while time.monotonic() < deadline:
         plane.state()  # writes the log
@@ -246,7 +253,7 @@ def sticks_act(plane: ArduPlane, since: float) -> float:
         away = np.flatnonzero((np.abs(channels[:, 0] - MARK) > 1) & (t > since))
         last = t[away[-1]] if len(away) else since
         if t[-1] > last + 0.5:
-            return float(last - since)
+            return float(last)
     pytest.fail("the sticks do not act")
 
 
@@ -257,7 +264,8 @@ def test_an_overloaded_machine_leaves_the_aircraft_to_the_law_or_to_the_pilot(pl
         for one in burn(3.0):
             one.wait()
         plane.start("engage", "--off").succeed()
-        assert sticks_act(plane, since=time.time()) <= RC_PERIOD + LATE
+        released = time.time()
+        assert sticks_act(plane, released) - released <= RC_PERIOD + LATE
         flight.interrupt()
         flight.end()
     (one,) = plane.summary()["engagements"]
