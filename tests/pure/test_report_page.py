@@ -120,7 +120,8 @@ def test_the_replay_shows_the_pose_and_the_surfaces_of_the_flight(browser: Brows
     assert "ENGAGED" in browser.run("document.getElementById('replay-now').textContent")
     assert "grid" in browser.run("document.getElementById('replay-legend').textContent")
     stored = page.read_text(encoding="utf-8")
-    topics = json.loads(stored.partition('id="replay-data">')[2].partition("</script>")[0])["topics"]
+    topics, info = json.loads(stored.partition('id="replay-data">')[2].partition("</script>")[0]).values()
+    assert info["positive"]["rudder"] == "nose right"
     figures = stored.partition('id="replay-data">')[0] + stored.partition("replay-code")[2]
     assert all(f'"v":"{place}"' in figures for place, _ in topics["truth"]["channels"].values())  # stored once, for the figure
     browser.run("void document.getElementById('replay-play').click()")

@@ -3,6 +3,7 @@
 """The live page in a browser: a flight that grows, replay, signs of the scene, states, hostile names, phone and dark scheme."""
 
 import asyncio
+import json
 import math
 import threading
 from collections.abc import Callable, Iterator
@@ -257,6 +258,24 @@ def test_surfaces_deflect_in_the_sense_of_their_input(page: Browser) -> None:
     assert roll[right_aileron, 2] < 0 < roll[left_aileron, 2]  # roll right: the right one goes up, the left one down
     yaw = np.array(seen(page, edges % "rudder: 0.3")) - still
     assert yaw[rudder, 1] > 0  # nose right: it goes to the right
+
+
+@pytest.mark.parametrize(
+    ("scenario", "senses"),
+    [
+        ("osprey_gust", {"elevator": 1, "aileron": 1, "rudder": 1}),
+        ("jsbsim_c172p", {"elevator": -1, "aileron": 1, "rudder": -1}),  # positive is nose down, roll right, nose left
+    ],
+)
+def test_a_surface_is_drawn_in_the_sense_that_its_aircraft_gives_the_input(
+    page: Browser, tmp_path: Path, scenario: str, senses: dict[str, int]
+) -> None:
+    truth = Signal(np.array([0], dtype=np.int64), tuple(f"actuator.{name}" for name in senses), np.full((1, 3), 0.1))
+    write_run(Tape({"truth": truth}), tmp_path / "run", LogAttachments(find_scenario(scenario).path))
+    flight = Flight(tmp_path / "run")
+    flight.update()
+    found = seen(page, f"m.deflections({{info: {json.dumps(flight.description)}, get: () => ({{at: () => 0.1}})}}, 0)")
+    assert {name: np.sign(angle) for name, angle in found.items()} == senses
 
 
 def test_the_horizon_falls_when_the_nose_rises_and_turns_left_in_a_roll_to_the_right(page: Browser) -> None:

@@ -31,6 +31,7 @@ class AircraftChannels(NamedTuple):
 
     outputs: dict[str, Unit]  # in the order of y
     inputs: dict[str, Unit]  # in the order of u; display units, topics are SI
+    positive: dict[str, str]  # what a positive value of each input does, such as "nose down"
     speed: float  # trim speed V0, m/s
 
 
@@ -265,12 +266,14 @@ class AircraftParameters(KeyedParameters):
         return failsafe_scale(age_ns, nanoseconds(self.max_age + self.hold), nanoseconds(self.ramp))
 
     def channels(self) -> AircraftChannels:
-        """Outputs and inputs with their units, and the trim speed."""
+        """Outputs and inputs with their units, what each input does, and the trim speed."""
         if self.is_jsbsim:
-            return AircraftChannels(dict(OUTPUTS), dict.fromkeys(INPUTS, "1"), self.flight_condition().speed)
+            positive = {name: command.positive for name, command in INPUTS.items()}
+            return AircraftChannels(dict(OUTPUTS), dict.fromkeys(INPUTS, "1"), positive, self.flight_condition().speed)
         airframe = load_airframe(self.airframe)
         inputs = {name: given.unit for name, given in airframe.inputs.items()}
-        return AircraftChannels({name: airframe.states[name] for name in airframe.outputs}, inputs, airframe.speed)
+        positive = {name: given.positive for name, given in airframe.inputs.items()}
+        return AircraftChannels({name: airframe.states[name] for name in airframe.outputs}, inputs, positive, airframe.speed)
 
     def sampled_airframe(self) -> Airframe:
         """The airframe in flight: the named one, or the sample of `uncertainty` around it."""

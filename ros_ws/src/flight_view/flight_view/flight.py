@@ -342,7 +342,10 @@ def _text(text: str) -> str:
 
 
 def _described(scenario: Scenario) -> dict[str, Any]:
-    """Units, limits, gusts, commands and route of a scenario. Raises ParameterError where the airframe cannot be read."""
+    """Units, what a positive input does, limits, gusts, commands and route of a scenario.
+
+    Raises ParameterError where the airframe cannot be read.
+    """
     controller, guided = scenario.controller, scenario.guidance
     bounds = zip(controller.inputs, controller.lower or (), controller.upper or (), strict=False)
     waypoints = () if guided is None else guided.waypoints()
@@ -350,6 +353,7 @@ def _described(scenario: Scenario) -> dict[str, Any]:
         "scenario": controller.summary(),
         "duration": scenario.flight.duration,
         "units": {name: unit._asdict() for name, unit in display_units(scenario).items()},
+        "positive": scenario.aircraft.channels().positive,
         "limits": {name: [one if math.isfinite(one) else None for one in pair] for name, *pair in bounds},
         "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
         "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],

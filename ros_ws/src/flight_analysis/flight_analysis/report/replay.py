@@ -49,6 +49,7 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
     routes = flown_routes(flight.scenario, tape) if flight.summary["guidance"] is not None else []
     info = {
         "units": {name: {"unit": unit.unit} for name, unit in context.units.items()},
+        "positive": flight.scenario.aircraft.channels().positive,
         "modes": {int(mode): mode.name for mode in Mode},
         "route": [point for route in routes for point in route_outline(route)],
     }

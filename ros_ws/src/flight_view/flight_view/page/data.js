@@ -20,7 +20,7 @@ export function decode(buffer) {
 export class Flight { // one flight of the server
   constructor(number) {
     this.number = number;
-    this.info = {name: "", modes: {}, units: {}, limits: {}, gusts: [], commands: []};
+    this.info = {name: "", modes: {}, units: {}, positive: {}, limits: {}, gusts: [], commands: []};
     this.head = {state: "", faults: [], bands: {}, described: "", ghost: false};
     this.clear("");
   }

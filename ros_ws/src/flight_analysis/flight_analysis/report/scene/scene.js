@@ -7,6 +7,7 @@ const SPAN = 3; // m, least drawn span
 const RELATIVE_SPAN = 0.13; // of the distance of the camera: the aircraft stays visible from afar
 const NEAR = 0.2; // m, nothing closer to the camera is drawn
 const FULL_DEFLECTION = 25 * Math.PI / 180; // rad, of an input that is given as a fraction
+const REVERSED = ["nose down", "roll left", "nose left"]; // motions by a positive input that are opposite to those of `aircraft`
 const WHOLE = 2.3; // distance of the map over that of the farthest point of the path
 const MAX_TRAIL = 1500; // points
 const MAX_GAP = 0.5; // s between two poses, above which nothing is interpolated
@@ -93,13 +94,15 @@ export function poseAt(flight, t) {
   };
 }
 
-function deflections(flight, t) { // of the actuators where they are simulated, else of u
+// Deflections for `aircraft`: of the actuators where they are simulated, else of u, each in the sense that its airframe gives it.
+export function deflections(flight, t) {
   const found = {}, internals = flight.get("internals");
   for (const name of ["elevator", "aileron", "rudder"]) {
     let value = flight.get("truth")?.at(`actuator.${name}`, t) ?? NaN;
     if (!Number.isFinite(value)) value = internals?.at(`u.${name}`, t) ?? flight.get("u")?.at(name, t) ?? NaN;
     const scale = ["deg", "rad", "crad"].includes(flight.info.units[name]?.unit) ? 1 : FULL_DEFLECTION;
-    if (Number.isFinite(value)) found[name] = Math.max(-1.2, Math.min(1.2, value * scale));
+    const sense = REVERSED.some(motion => flight.info.positive[name]?.startsWith(motion)) ? -1 : 1;
+    if (Number.isFinite(value)) found[name] = Math.max(-1.2, Math.min(1.2, value * scale * sense));
   }
   return found;
 }
