@@ -513,11 +513,16 @@ def table_of_releases(result: dict[str, Any]) -> str:
     return "\n".join(rows)
 
 
+def listed(values: Sequence[float]) -> str:
+    """Numbers of three digits, separated by commas."""
+    return ", ".join(f"{value:.3g}" for value in values)
+
+
 def table_of_flight(result: dict[str, Any]) -> str:
     """Errors, delays and margin of a flight with identified gains."""
     if "refused" in result:
         return "Refused:\n\n    " + "\n    ".join(result["refused"].splitlines()[-1:]) + "\n"
-    true_rms = result.get("true_rms", {})
+    true_rms, gains = result.get("true_rms", {}), result["controller"]
     rows = ["| channel | rms while commanded | y behind y_m (s) |", "| --- | ---: | ---: |"]
     for name, rms in result["rms"].items():
         shown = f"{rms:.3f} m/s" if name == "V" else f"{1e3 * rms:.1f} mrad/s"
@@ -528,6 +533,8 @@ def table_of_flight(result: dict[str, Any]) -> str:
     stop = "the end of the flight" if one["stop"] is None else f"{one['stop']:.0f} s ({one['reason']})"
     rows += [
         f"\nEngaged from {one['start']:.0f} s to {stop}.",
+        f"Gains of `identify`, in the order {', '.join(gains['outputs'])}: k_g {gains['k_g']:.3g}, k_d {listed(gains['k_d'])}.",
+        f"Their lags {listed(gains['lag'])} s, delay {gains['delay']:.3g} s.",
         f"Delay margin beyond the identified delay: {1e3 * result['delay_margin']:.0f} ms.",
         f"u at a limit: {limited} of the time. Replay: {'every bit' if result['replayed'] else 'different'}.\n",
     ]
@@ -607,7 +614,8 @@ HEAD = f"""# Evidence: real autopilots in software
 Flights of ArduPlane 4.8.0-dev and PX4 1.16.0 in software, on two cores beside other work.
 `python -m benchmarks.autopilots --sitl FOLDER` measures everything and writes this page; docs/autopilots.md
 says what the kit is. Age limits of y and u: 1 s, for the host. The identified gains fly the scenario that `identify` writes:
-pulses of 50 mrad/s in q and 150 mrad/s in p in coordinated turns, a step of at most 2 m/s in V.
+pulses of 50 mrad/s in q and 150 mrad/s in p in coordinated turns, a step of at most 2 m/s in V. The errors of PX4's
+airplane are those of y, which has the low-pass of its map since its first flight; *true* is by the rates of its simulator.
 
 {UNMET}
 """

@@ -26,6 +26,9 @@ MODES = ("position", "velocity", "acceleration", "attitude", "body_rate", "thrus
 STATE = ("p", "q", "r", "va", "phi", "theta", "psi", "p_n", "p_e", "p_d")
 
 PUBLISHED: dict[str, dict[str, str]] = {
+    "ardupilot_msgs/msg/Airspeed": {"true_airspeed": "geometry_msgs/Vector3"},
+    "ardupilot_msgs/msg/Rc": {"channels": "int16[<=32]"},
+    "ardupilot_msgs/msg/Status": {"mode": "uint8", "armed": "bool", "flying": "bool"},
     "px4_msgs/msg/VehicleOdometry": {
         "angular_velocity": "float32[3]",
         "position": "float32[3]",
@@ -63,20 +66,22 @@ class Kind(NamedTuple):
     element: str
     length: int | None  # of an array of fixed length
     is_array: bool
+    most: int | None  # elements of an array of bounded length
 
 
 def kind(field: str) -> Kind:
-    """Parse the type of a field, such as float32, float32[3] or uint16[]."""
-    match = re.fullmatch(r"([\w/]+)(\[(\d*)\])?", field)
+    """Parse the type of a field, such as float32, float32[3], uint16[] or int16[<=32]."""
+    match = re.fullmatch(r"([\w/]+)(\[(?:<=(\d+)|(\d*))\])?", field)
     assert match is not None, field
-    return Kind(match[1], int(match[3]) if match[3] else None, match[2] is not None)
+    most, length = (int(number) if number else None for number in match.groups()[2:])
+    return Kind(match[1], length, match[2] is not None, most)
 
 
 def blank(type_name: str) -> SimpleNamespace:
     """An object with the published fields at zero, as rclpy creates them: arrays of NumPy with the type of the field."""
     message = SimpleNamespace()
     for name, field in PUBLISHED[type_name].items():
-        element, length, is_array = kind(field)
+        element, length, is_array, _ = kind(field)
         if element == HEADER:
             value: object = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0))
         elif is_array:

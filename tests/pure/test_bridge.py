@@ -346,6 +346,26 @@ def test_each_trim_is_captured_from_its_own_stick_at_engagement_and_kept() -> No
     assert [bridge.trim(name) for name in STICKS] == pytest.approx([-0.10472, 0.45, 0.020944, -0.010472], abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("condition", "raw", "sentence"),
+    [
+        ("manual", 15.0, "the mode is not MANUAL (mode is 15)"),  # GUIDED
+        ("armed", 0.0, "the aircraft is not armed (armed is 0)"),
+        ("flying", 0.0, "the aircraft does not fly (flying is 0)"),
+    ],
+)
+def test_ardupilot_is_engaged_in_manual_armed_and_flying_alone(condition: str, raw: float, sentence: str) -> None:
+    bridge = ardupilot_bridge()
+    bridge.take_condition(condition, raw, at(0.0))
+    assert bridge.engage(at(0.0)) == sentence
+
+
+def test_ardupilot_is_not_engaged_while_the_pilots_switch_is_on() -> None:
+    bridge = ardupilot_bridge()
+    bridge.take_override("switch", 1800.0, at(0.0))
+    assert bridge.engage(at(0.0)) == "pilot override active: switch"
+
+
 def test_an_engagement_needs_the_sources_of_the_trims() -> None:
     bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1450.0})
     receive_outputs(bridge, 0.6, tuple(bridge.outputs))

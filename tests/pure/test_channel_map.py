@@ -87,7 +87,7 @@ def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name
     for channel, input_row in channel_map.inputs.items():
         message, kind_ = messages[f"messages.{input_row.message}"], channel_map.messages[input_row.message].type
         ((field, place), *_) = STEP.findall(input_row.field)
-        element, length, is_array = kind(PUBLISHED[kind_][field])
+        element, length, is_array, _ = kind(PUBLISHED[kind_][field])
         assert is_array, channel
         assert int(place) < (length or 0), channel
         for raw in (*input_row.range, input_row.neutral, input_row.release, to_raw(input_row.trim + 0.123, input_row.line)):

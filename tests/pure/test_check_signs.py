@@ -98,6 +98,7 @@ def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> No
         (("--bridge", "ardupilot", "--lockstep"), "--bridge: found a flight in lockstep or in one process"),
         (("--bridge", "ardupilot", "--in-process"), "--bridge: found a flight in lockstep or in one process"),
         (("--send",), "--send: found no --bridge"),
+        (("--bridge", "ardupilot", "--send"), "scenario osprey_gust: controller.lower: found -inf, expected at least"),
         (("--bridge", "nowhere"), "map: found 'nowhere', expected one of ardupilot"),
     ],
     ids=lambda one: " ".join(one) if isinstance(one, tuple) else "",

@@ -45,9 +45,10 @@ def test_the_package_has_the_published_fields(name: str) -> None:
     needs(name.partition("/")[0])
     found: dict[str, str] = message_type(name).get_fields_and_field_types()  # type: ignore[attr-defined]
     for field, published in PUBLISHED[name].items():
-        element, length, is_array = kind(published)
+        element, length, is_array, most = kind(published)
         element = AS_PYTHON.get(element, element)
-        expected = f"{element}[{length}]" if length else f"sequence<{element}>" if is_array else element
+        sequence = f"sequence<{element}, {most}>" if most else f"sequence<{element}>"
+        expected = f"{element}[{length}]" if length else sequence if is_array else element
         assert found[field] == expected
 
 

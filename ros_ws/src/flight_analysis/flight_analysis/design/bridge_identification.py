@@ -177,8 +177,7 @@ def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelMo
             damping[i], stiffness[i], zero[i] = model.damping, model.stiffness, model.slow / model.Omega
             misfit[i] = model.misfit
         elif response.refusal[i] or response.sign_ratio[i] < MIN_RATIO:
-            ratio = f"{output} by {name}: found a response of {response.sign_ratio[i]:.1f} standard errors, expected"
-            refused.append(response.refusal[i] or f"{ratio} {MIN_RATIO:g} or more: excite {name} more strongly")
+            refused.append(response.refusal[i] or response.sign_refusal(i))
             continue
         else:
             Omega[i, i] = response.Omega[i, i]
