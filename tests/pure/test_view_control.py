@@ -195,9 +195,12 @@ def test_faults_and_gusts_become_parameters_of_the_aircraft(desk: Desk) -> None:
         state = await desk.ask("state")
         assert state["aircraft"]["axes"] == ["vertical", "lateral", "longitudinal"]
         stuck: list[float | None] = [0, None, None, None]
-        await desk.ask("fault", values={"actuators.stuck_at": stuck, "sensors.dropout": 0.2})
+        changed = await desk.ask("fault", values={"actuators.stuck_at": stuck, "sensors.dropout": 0.2})
+        assert changed["faults"]["sensors.dropout"] == 0.2
         assert desk.nodes.values["aircraft"]["actuators.stuck_at"] == [0.0, math.inf, math.inf, math.inf]
         assert desk.nodes.values["aircraft"]["sensors.dropout"] == 0.2
+        desk.nodes.values["aircraft"]["sensors.bias"] = [0.0, 0.0, 0.0, 0.3]  # by another program
+        assert (await desk.ask("state"))["faults"]["sensors.bias"] == [0.0, 0.0, 0.0, 0.3]
         await desk.ask("gust", axis="lateral", speed=3, length=20)
         assert desk.nodes.values["aircraft"]["gusts.lateral.start"] == pytest.approx(desk.flight.end + 0.2)
         for do, request, expected in (

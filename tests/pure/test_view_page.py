@@ -343,21 +343,50 @@ def test_a_guided_flight_shows_its_route_and_its_modes(browser: Browser, tmp_pat
 # Control
 
 
+def a_control(flight: Flight, nodes: NodesInMemory, controls: list[Control]) -> Control:
+    """A control of nodes in memory; kept, so that a test can close it."""
+    controls.append(Control(flight, nodes, "ABCD-EFGH", assess=margins))
+    return controls[-1]
+
+
+def take(browser: Browser, key: str = "abcd-efgh") -> None:
+    """Take control, once the page offers it."""
+    browser.wait_for("!document.getElementById('control').hidden")
+    browser.run(f"document.getElementById('control-typed').value = '{key}'")
+    browser.run("void document.getElementById('control-take').click()")
+
+
 def test_the_desk_has_the_parts_of_the_nodes_that_run(browser: Browser, recorded: Path, osprey_gust: Scenario) -> None:
     nodes, controls = NodesInMemory(osprey_gust, "controller"), list[Control]()
 
-    def control(flight: Flight) -> Control:
-        controls.append(Control(flight, nodes, "ABCD-EFGH"))
-        return controls[0]
-
-    with shown(browser, recorded, control=control):
-        browser.wait_for("!document.getElementById('control').hidden")
-        browser.run("document.getElementById('control-typed').value = 'abcd-efgh'")
-        browser.run("void document.getElementById('control-take').click()")
+    with shown(browser, recorded, control=lambda flight: a_control(flight, nodes, controls)):
+        take(browser)
         browser.wait_for("document.getElementById('control-gains') !== null")
         assert browser.run("document.getElementById('control-map') === null")
         nodes.names[:] = ["bridge"]
         browser.wait_for("document.getElementById('control-map') !== null && document.getElementById('control-gains') === null")
+        assert browser.console == []
+    controls[0].close()
+
+
+def test_the_desk_starts_from_the_faults_of_the_aircraft_and_keeps_them(
+    browser: Browser, recorded: Path, osprey_gust: Scenario
+) -> None:
+    nodes, controls = NodesInMemory(osprey_gust, "aircraft"), list[Control]()
+    nodes.values["aircraft"] |= {"actuators.stuck_at": [math.inf, 3.5, math.inf, math.inf], "sensors.dropout": 0.25}
+
+    with shown(browser, recorded, control=lambda flight: a_control(flight, nodes, controls)):
+        take(browser)
+        browser.wait_for("document.querySelectorAll('[data-actuator]').length === 4")
+        chosen = "[...document.querySelectorAll('[data-actuator]')].map(one => one.value)"
+        assert browser.run(chosen) == ["", "stuck", "", ""]
+        assert browser.run("document.querySelector('[aria-label=\"Loss of samples\"]').value") == "0.25"
+        last = "document.querySelector('[data-actuator=\"3\"]')"
+        browser.run(f"{last}.value = 'lost'; void {last}.dispatchEvent(new Event('change'))")
+        browser.wait_for("document.getElementById('control-said').textContent.includes('lost')")
+        assert nodes.values["aircraft"]["actuators.stuck_at"] == [math.inf, 3.5, math.inf, math.inf]
+        assert nodes.values["aircraft"]["actuators.lost_at"] == [math.inf, math.inf, math.inf, 0.0]
+        assert browser.run(chosen) == ["", "stuck", "", "lost"]
         assert browser.console == []
     controls[0].close()
 
@@ -369,24 +398,16 @@ def test_gains_are_pending_until_they_are_applied_and_can_be_undone(
     controls: list[Control] = []
     before = nodes.values["controller"]["k_g"]
 
-    def control(flight: Flight) -> Control:
-        controls.append(Control(flight, nodes, "ABCD-EFGH", assess=margins))
-        return controls[0]
-
     def said(text: str) -> str:
         return f"document.getElementById('control-said').textContent.includes('{text}')"
 
-    def take(key: str) -> None:
-        browser.run(f"document.getElementById('control-typed').value = '{key}'")
-        browser.run("void document.getElementById('control-take').click()")
-
-    with shown(browser, recorded, control=control):
+    with shown(browser, recorded, control=lambda flight: a_control(flight, nodes, controls)):
         browser.wait_for("!document.getElementById('control').hidden")
         assert browser.run("document.getElementById('control-desk').hidden")
-        take("abcd-efgx")
+        take(browser, "abcd-efgx")
         browser.wait_for(said("the control key is wrong"))
         browser.wait_for("new Promise(resume => setTimeout(() => resume(true), 1000))")  # as long as the next key is refused
-        take("abcd-efgh")
+        take(browser)
         browser.wait_for("document.querySelectorAll('#control-gains tr').length > 10")
         slider = "document.querySelector('#control-gains [data-gain=k_g]')"
         browser.run(f"{slider}.value = {1.5 * before}; void {slider}.dispatchEvent(new Event('input'))")

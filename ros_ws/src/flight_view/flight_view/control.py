@@ -113,6 +113,7 @@ class Control:
         self._undo: list[dict[str, Any]] = []  # earlier values, the last change at the end
         self._digest = 0  # of the controller's parameters, as far as known
         self._values: dict[str, Any] = {}  # the controller's tunable parameters that are set
+        self._faults: dict[str, Any] = {}  # those of the aircraft that are no gusts
         self._actions: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
             "state": self._refresh,
             "gains": self._set_gains,
@@ -211,6 +212,7 @@ class Control:
             truth = self._flight.samples.get("truth")
             axes = [] if truth is None else [name.partition(".")[2] for name in truth.names if name.startswith("gust.")]
             found["aircraft"] = {"outputs": list(channels.outputs), "inputs": list(channels.inputs), "axes": axes}
+            found["faults"] = self._faults
         if "bridge" in nodes:
             found["bridge"] = {"map": self._map(), "sends": self._sends()}
         return found
@@ -231,10 +233,13 @@ class Control:
         ]
 
     def _refresh(self, request: Mapping[str, Any]) -> str:
-        """Read the controller's parameters at first, and where the log shows others than those that are known."""
+        """Read the faults; at first, and where the log shows others than the known ones, also the controller's parameters."""
         stale = not self._digest or self._flight.digest not in {0, self._digest}  # 0 before the first tick
-        if stale and self._flight.scenario is not None and "controller" in self._link.nodes():
+        scenario, nodes = self._flight.scenario, self._link.nodes()
+        if scenario is not None and "controller" in nodes and stale:
             self._read()
+        if scenario is not None and "aircraft" in nodes:
+            self._faults = self._link.parameters("aircraft", _faults_of(scenario))
         return ""
 
     def _read(self) -> None:
@@ -307,14 +312,14 @@ class Control:
     def _set_faults(self, request: Mapping[str, Any]) -> str:
         if self._flight.scenario is None:
             return "the log has no scenario"
-        known = {name for name in type(self._flight.scenario.aircraft).tunable() if not name.startswith("gusts.")}
-        values = _mapping(request, "values")
+        known, values = _faults_of(self._flight.scenario), _mapping(request, "values")
         for name in values:
             if name not in known:
-                raise RefusedError(
-                    HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no fault, expected one of {', '.join(sorted(known))}"
-                )
-        return self._link.set_parameters("aircraft", {name: _numbers(name, value) for name, value in values.items()})
+                raise RefusedError(HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no fault, expected one of {', '.join(known)}")
+        chosen = {name: _numbers(name, value) for name, value in values.items()}
+        if not (refusal := self._link.set_parameters("aircraft", chosen)):
+            self._faults |= chosen
+        return refusal
 
     def _begin_gust(self, request: Mapping[str, Any]) -> str:
         axis = str(request.get("axis"))
@@ -355,6 +360,11 @@ def gains_of(controller: ControllerParameters) -> dict[str, Any]:
     own = [name for name in type(controller).model_fields if name not in ControllerParameters.model_fields]
     values = {name: getattr(controller, name) for name in own}
     return {name: value for name, value in values.items() if all(isinstance(one, float) for one in _as_list(value))}
+
+
+def _faults_of(scenario: Scenario) -> list[str]:
+    """The parameters of the aircraft that may change in flight, without the gusts."""
+    return sorted(name for name in scenario.aircraft.tunable() if not name.startswith("gusts."))
 
 
 def _plain(key: str) -> bytes:

@@ -4,6 +4,7 @@ const RENEW = 1500; // ms; the lease lasts 5 s
 const HOLD = 1000; // ms that the button of an engagement is held
 const CHECK = 400; // ms after the last change of a slider
 const ANGLES = ["phi", "theta", "heading", "course"]; // shown in degrees
+const KINDS = ["stuck", "lost"]; // faults of an actuator
 const DEGREE = Math.PI / 180;
 
 const $ = id => document.getElementById(id);
@@ -175,20 +176,25 @@ function guidance() {
     route, element("div", {className: "row"}, button("Fly this route", fly)));
 }
 
+const since = (kind, k) => state.faults[`actuators.${kind}_at`]?.[k] ?? null; // s, from when on; null is never
+
 function faults() {
-  const {inputs, outputs, axes} = state.aircraft, kinds = inputs.map(() => "");
-  const never = kind => kinds.map(one => (one === kind ? 0 : null));
+  const {inputs, outputs, axes} = state.aircraft;
   const actuators = inputs.map((name, k) => {
-    const choice = element("select", {}, ...[["", "works"], ["stuck", "stuck"], ["lost", "lost"]].map(([value, text]) => new Option(text, value)));
+    const choice = element("select", {}, ...["", ...KINDS].map(kind => new Option(kind || "works", kind)));
     choice.setAttribute("aria-label", `Actuator ${name}`);
+    choice.dataset.actuator = k;
     choice.addEventListener("change", () => {
-      kinds[k] = choice.value;
-      act({do: "fault", values: {"actuators.stuck_at": never("stuck"), "actuators.lost_at": never("lost")}}, `${name}: ${choice.selectedOptions[0].text}`);
+      for (const kind of KINDS) { // the others stay as they are
+        state.faults[`actuators.${kind}_at`] = inputs.map((_, j) => (j === k ? (choice.value === kind ? 0 : null) : since(kind, j)));
+      }
+      const values = Object.fromEntries(KINDS.map(kind => [`actuators.${kind}_at`, state.faults[`actuators.${kind}_at`]]));
+      act({do: "fault", values}, `${name}: ${choice.selectedOptions[0].text}`);
     });
     return element("label", {}, `${name} `, choice);
   });
-  const numbers = kind => outputs.map(name => {
-    const input = element("input", {type: "number", step: "any", value: 0});
+  const numbers = kind => outputs.map((name, k) => {
+    const input = element("input", {type: "number", step: "any", value: state.faults[`sensors.${kind}`]?.[k] ?? 0});
     input.setAttribute("aria-label", `${kind} of ${name}`);
     return element("label", {}, `${name} `, input);
   });
@@ -196,7 +202,7 @@ function faults() {
     const fields = numbers(kind), values = () => fields.map(field => Number(field.lastChild.value));
     return row(title, ...fields, button("Set", () => act({do: "fault", values: {[`sensors.${kind}`]: values()}}, `${kind} set`)));
   };
-  const dropout = element("input", {type: "number", min: 0, max: 0.99, step: 0.05, value: 0});
+  const dropout = element("input", {type: "number", min: 0, max: 0.99, step: 0.05, value: state.faults["sensors.dropout"] ?? 0});
   dropout.setAttribute("aria-label", "Loss of samples");
   const parts = [
     row("Actuators", ...actuators), sensor("bias", "Bias (SI)"), sensor("noise", "Noise (SI)"),
@@ -215,8 +221,12 @@ function faults() {
 // ---- What changes
 
 function show() {
+  if (!state) return;
+  for (const choice of document.querySelectorAll("[data-actuator]")) {
+    choice.value = KINDS.findLast(kind => since(kind, Number(choice.dataset.actuator)) !== null) ?? "";
+  }
   const body = $("control-gains");
-  if (!state || !body) return;
+  if (!body) return;
   for (const line of body.children) {
     const slider = line.querySelector("input"), {gain, place} = slider.dataset;
     const now = state.gains.find(one => one.name === gain).values[place], next = pending.get(gain)?.[place];
