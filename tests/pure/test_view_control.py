@@ -5,6 +5,7 @@
 import asyncio
 import json
 import math
+import threading
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_view.control import BURST, LEASE, Control, RefusedError, gains_of, new_key
 from flight_view.flight import Flight
 from flight_view.server import Server
+from rise_di_controller.params import ControllerParameters
 
 KEY, TOKEN = "ABCD-EFGH", "a-token"
 ALL = ("aircraft", "controller", "guidance")
@@ -145,6 +147,9 @@ def test_a_wrong_key_is_refused_and_delays_the_next_one(desk: Desk) -> None:
         desk.time -= 1.0  # the next request comes at the same time
         assert (await desk.refused("state"))[0] == 429
         assert await desk.ask("state", key="abcdefgh")  # as typed
+        assert (await desk.refused("state", key="ABCD-EFGX", lease="another"))[0] == 403
+        desk.time -= 1.0
+        assert await desk.ask("state")  # the page that has control is not delayed
 
     with_desk(desk, steps)
     assert len({new_key() for _ in range(100)}) == 100
@@ -168,6 +173,7 @@ def test_more_than_five_requests_a_second_are_refused(desk: Desk) -> None:
             await desk.control.answer({"do": "state"}, KEY, desk.lease)
         with pytest.raises(RefusedError, match="more than 5 requests a second"):
             await desk.control.answer({"do": "state"}, KEY, desk.lease)
+        await desk.control.answer({"do": "deactivate"}, KEY, desk.lease)  # always
         await desk.ask("state")  # a second later
 
     with_desk(desk, steps)
@@ -242,6 +248,37 @@ def test_a_bridge_engages_by_the_name_of_its_map_and_disengages_while_it_waits(r
         assert desk.nodes.done == [("disengage", None)]
 
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
+
+
+def test_a_controller_under_a_bridge_is_deactivated_by_the_bridge_alone(recorded: Path, osprey_gust: Scenario) -> None:
+    async def steps(desk: Desk) -> None:
+        await desk.ask("state")
+        for action in ("activate", "deactivate"):
+            status, sentence = await desk.refused(action)
+            assert (status, sentence) == (422, "the bridge activates and deactivates the controller: engage or disengage it")
+        assert desk.nodes.done == []
+
+    with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
+
+
+def test_margins_that_are_computed_do_not_delay_a_deactivation(desk: Desk) -> None:
+    begun, end = threading.Event(), threading.Event()
+
+    def assess(scenario: Scenario, params: ControllerParameters) -> dict[str, Any]:
+        begun.set()
+        return {"in time": end.wait(20.0)}
+
+    async def steps(desk: Desk) -> None:
+        desk.control = Control(desk.flight, desk.nodes, KEY, assess=assess, now=lambda: desk.time)
+        await desk.ask("state")
+        margins = asyncio.ensure_future(desk.ask("check", values={"k_g": [1.0]}))
+        await asyncio.get_running_loop().run_in_executor(None, begun.wait, 20.0)
+        await desk.ask("deactivate")
+        end.set()
+        assert await margins == {"in time": True}
+        assert desk.nodes.done == [("activate", False)]
+
+    with_desk(desk, steps)
 
 
 def test_an_engagement_that_waits_for_its_turn_is_cancelled_too(recorded: Path, osprey_gust: Scenario) -> None:

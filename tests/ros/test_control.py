@@ -5,16 +5,25 @@
 import json
 import time
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 from http.cookiejar import CookieJar
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 
+import numpy as np
+import pytest
 from tests.ros.conftest import Process, Start
+from tests.ros.peer import Peer
 from tests.ros.test_lockstep import scenario_file
 
+from flight_bringup.clients import ControlClient
+from flight_core.parameters import ParameterError
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
+from flight_ros.messages import to_message
+
+PEER_TOPICS = ("target",)
 
 
 class Page:
@@ -50,6 +59,19 @@ class Page:
 
         flight.until(as_expected)
         return found
+
+
+def test_a_target_that_guidance_does_not_take_ends_at_once_when_it_is_cancelled(peer_node: Peer) -> None:
+    with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker:
+        sent = worker.submit(client.send_target, {"phi": 0.1})
+        guidance = (["target.phi"], np.array([0.0]), "peer")  # another target stays in force
+        peer_node.until(
+            lambda: peer_node.received["target"],
+            each=lambda: peer_node.publish("guidance", to_message(time.time_ns(), *guidance)),
+        )
+        client.cancel()
+        with pytest.raises(ParameterError, match="cancelled by a later request"):
+            sent.result()
 
 
 def test_a_flight_is_commanded_from_its_page_recorded_and_replayed(start: Start, tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Path
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
-from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
@@ -61,16 +60,20 @@ AT_REST = 20  # so many equal samples of u in a row: it has reached trim
 
 
 class _Client:
-    """A node in the default context, or the `node` of another client. A context manager: the middleware always shuts down."""
+    """A node in the default context, or that of a `parent`, whose cancellation ends the waits of both.
 
-    def __init__(self, name: str, namespace: str = "", node: Node | None = None) -> None:
-        if node is None:
+    A context manager: the middleware always shuts down.
+    """
+
+    def __init__(self, name: str, namespace: str = "", parent: "_Client | None" = None) -> None:
+        if parent is None:
             transport.prepare()
             # The command handles SIGINT, not rclpy.
             rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
             node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False)
-        self._node = node
-        self._cancelled = threading.Event()
+            self._node, self._cancelled = node, threading.Event()
+        else:
+            self._node, self._cancelled = parent._node, parent._cancelled
 
     def __enter__(self) -> Self:
         return self
@@ -153,8 +156,8 @@ class FlightMonitor(_Client):
 class EngagementClient(_Client):
     """Engages and disengages a running bridge without a jump of u (bumpless transfer)."""
 
-    def __init__(self, namespace: str, node: Node | None = None) -> None:
-        super().__init__("engage", namespace, node)
+    def __init__(self, namespace: str = "", parent: _Client | None = None) -> None:
+        super().__init__("engage", namespace, parent)
         self._u: list[tuple[float, ...]] = []
         self._phases: list[tuple[str, str]] = []
         self._waits_for = ""  # the last reason that was reported
@@ -211,8 +214,8 @@ class EngagementClient(_Client):
 class TargetClient(_Client):
     """Commands the guidance of a running flight."""
 
-    def __init__(self, namespace: str, node: Node | None = None) -> None:
-        super().__init__("operator", namespace, node)
+    def __init__(self, namespace: str = "", parent: _Client | None = None) -> None:
+        super().__init__("operator", namespace, parent)
         self._guidance, self._decoder = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True), NamedDecoder()
         self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
         self._in_force: dict[str, float] = {}
@@ -225,6 +228,8 @@ class TargetClient(_Client):
         try:
             self._spin_until(lambda: self._published(values), "", TARGET_TIMEOUT)
         except ParameterError:
+            if self._cancelled.is_set():
+                raise
             return f"guidance did not take them in {TARGET_TIMEOUT:g} s; its log says why"
         return ""
 
@@ -285,7 +290,7 @@ class ControlClient(_Client):
 
     def send_target(self, values: Mapping[str, float]) -> str:
         """Command guidance, as `rise-di target`."""
-        self._targets = self._targets or TargetClient("", self._node)
+        self._targets = self._targets or TargetClient(parent=self)
         return self._targets.send(values)
 
     def send_route(self, points: Sequence[Sequence[float]]) -> str:
@@ -308,8 +313,7 @@ class ControlClient(_Client):
 
     def engage(self) -> str:
         """Engage the bridge, as `rise-di engage`."""
-        self._engagement = self._engagement or EngagementClient("", self._node)
-        self._engagement._cancelled = self._cancelled
+        self._engagement = self._engagement or EngagementClient(parent=self)
         return self._engagement.engage(lambda reason: None)
 
     def disengage(self) -> str:

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control of a flight from its page: who may command it, what may be commanded, and in which order. It needs no ROS.
 
-A `Link` reaches the nodes. One page at a time holds the lease. Requests run one after another on a thread of their own.
+A `Link` reaches the nodes. One page at a time holds the lease. Requests run one after another on a thread of their own;
+to deactivate the controller or disengage the bridge ends the one that runs.
 """
 
 import asyncio
@@ -12,7 +13,6 @@ import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Protocol
@@ -29,6 +29,7 @@ LEASE = 5.0  # s that a page controls after its last request
 RATE, BURST = 5.0, 10.0  # requests a second, and at once
 KEY_PERIOD = 1.0  # s between two wrong keys
 MAX_WAYPOINTS = 200
+AT_ONCE = ("deactivate", "disengage")  # actions that wait for no other request
 GUST_LEAD = 0.2  # s from the request to the begin of a gust
 SYSTEM_TIME_NS = 10**17  # stamps above are of the system clock, those of a lockstep flight begin at 0
 
@@ -106,7 +107,7 @@ class Control:
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         self._flight, self._link, self._key, self._real, self._assess, self._now = flight, link, key, real, assess, now
-        self._worker = ThreadPoolExecutor(max_workers=1)
+        self._worker, self._assessor = ThreadPoolExecutor(max_workers=1), ThreadPoolExecutor(max_workers=1)
         self._lease, self._lease_end = "", -math.inf
         self._wrong_key, self._requests, self._refilled = -math.inf, BURST, now()
         self._cancellations = 0
@@ -124,37 +125,43 @@ class Control:
             "route": self._send_route,
             "hold": lambda _: self._link.hold(),
             "skip": lambda _: self._link.skip(),
-            "activate": lambda _: self._link.activate(active=True),
-            "deactivate": lambda _: self._link.activate(active=False),
+            "activate": lambda _: self._activate(active=True),
+            "deactivate": lambda _: self._activate(active=False),
             "engage": self._engage,
             "disengage": lambda _: self._link.disengage(),
         }
 
     async def answer(self, request: Any, key: str, lease: str) -> dict[str, Any]:
         """Carry out a request and answer with the state. Raises RefusedError."""
-        self._require_key(key)
-        self._require_rate()
         action = request.get("do") if isinstance(request, dict) else None
+        self._require_key(key, lease)
+        if action not in AT_ONCE:
+            self._require_rate()
         if not isinstance(action, str) or action not in {*self._actions, "check"}:
             raise RefusedError(
                 HTTPStatus.BAD_REQUEST, f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}"
             )
         self._take_lease(lease)
-        if action in {"disengage", "deactivate"}:  # at once, also while an engagement waits, or waits for its turn
+        loop = asyncio.get_running_loop()
+        if action == "check":  # takes a while, and reaches no node
+            return await loop.run_in_executor(self._assessor, self._check, request)
+        if action in AT_ONCE:  # also while a request waits, or waits for its turn
             self._cancellations += 1
             self._link.cancel()
-        carry_out = partial(self._carry_out, action, request, self._cancellations)
-        return await asyncio.get_running_loop().run_in_executor(self._worker, carry_out)
+        return await loop.run_in_executor(self._worker, self._carry_out, action, request, self._cancellations)
 
     def close(self) -> None:
         """End the request that runs, and take no further one."""
         self._link.cancel()
-        self._worker.shutdown(cancel_futures=True)
+        for one in (self._worker, self._assessor):
+            one.shutdown(cancel_futures=True)
 
     # Who may command
 
-    def _require_key(self, key: str) -> None:
-        if self._now() - self._wrong_key < KEY_PERIOD:
+    def _require_key(self, key: str, lease: str) -> None:
+        """Refuse a wrong key, and for a while after one any key but that of the page that has control."""
+        holds = bool(self._lease) and hmac.compare_digest(lease.encode(), self._lease.encode())
+        if not holds and self._now() - self._wrong_key < KEY_PERIOD:
             raise RefusedError(HTTPStatus.TOO_MANY_REQUESTS, f"a wrong key less than {KEY_PERIOD:g} s ago")
         if not hmac.compare_digest(_plain(key), _plain(self._key)):
             self._wrong_key = self._now()
@@ -186,8 +193,6 @@ class Control:
         try:
             if cancellations != self._cancellations:
                 raise ParameterError("cancelled by a later request")
-            if action == "check":
-                return self._check(request)
             before, refusal = dict(self._values), self._actions[action](request)
             if refusal:
                 raise RefusedError(HTTPStatus.UNPROCESSABLE_ENTITY, refusal)
@@ -293,7 +298,10 @@ class Control:
             return {}
         values, gains = _mapping(request, "values"), gains_of(self._controller())
         chosen = {name: _like(name, gains[name], value) for name, value in values.items() if name in gains}
-        return self._assess(self._flight.scenario, self._with(self._values | chosen))
+        try:
+            return self._assess(self._flight.scenario, self._with(self._values | chosen))
+        except ParameterError as error:
+            raise RefusedError(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from None
 
     def _map(self) -> str:
         """The name of the channel map of the bridge."""
@@ -308,6 +316,12 @@ class Control:
             raise RefusedError(
                 HTTPStatus.FORBIDDEN, "the bridge sends to an autopilot: gains need rise-di watch --control-real"
             )
+
+    def _activate(self, *, active: bool) -> str:
+        """Activate or deactivate the controller of a flight without a bridge, which engages and disengages with it."""
+        if "bridge" in self._link.nodes():
+            return "the bridge activates and deactivates the controller: engage or disengage it"
+        return self._link.activate(active=active)
 
     def _set_faults(self, request: Mapping[str, Any]) -> str:
         if self._flight.scenario is None:
