@@ -100,7 +100,7 @@ def test_a_set_on_top_of_the_change_of_another_program_is_refused(desk: Desk) ->
         desk.nodes.values["controller"]["k_g"] *= 1.1
         status, sentence = await desk.refused("gains", digest=digest, values={"k_g": [1.0]})
         assert (status, sentence) == (409, "the parameters have been changed meanwhile: look at them, then apply again")
-        assert desk.nodes.notes == []
+        assert desk.nodes.notes == [f"control: {{'do': 'gains', 'values': {{'k_g': [1.0]}}}} refused: {sentence}"]
 
     with_desk(desk, steps)
 
@@ -143,7 +143,8 @@ def test_the_margins_of_pending_gains_are_those_of_the_gain_check(desk: Desk, os
 
 def test_a_wrong_key_is_refused_and_delays_the_next_one(desk: Desk) -> None:
     async def steps(desk: Desk) -> None:
-        assert (await desk.refused("state", key="ABCD-EFGX"))[0] == 403
+        assert (await desk.refused("deactivate", key="ABCD-EFGX"))[0] == 403
+        assert desk.nodes.notes == []  # who lacks the key does not fill the log
         desk.time -= 1.0  # the next request comes at the same time
         assert (await desk.refused("state"))[0] == 429
         assert await desk.ask("state", key="abcdefgh")  # as typed
@@ -246,6 +247,7 @@ def test_a_bridge_engages_by_the_name_of_its_map_and_disengages_while_it_waits(r
         await desk.ask("disengage")
         assert await waiting == (422, "cancelled by a later request")
         assert desk.nodes.done == [("disengage", None)]
+        assert "cancelled by a later request" in desk.nodes.notes[-2]
 
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
 

@@ -3,6 +3,7 @@
 """Control of a real flight over the page's server: gains, faults, a gust, the controller; in the log, and replayed."""
 
 import json
+import re
 import time
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +23,7 @@ from flight_core.parameters import ParameterError
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
+from flight_view.flight import Flight
 
 PEER_TOPICS = ("target",)
 
@@ -109,6 +111,13 @@ def test_a_flight_is_commanded_from_its_page_recorded_and_replayed(start: Start,
     changes = parameter_changes(run, "/aircraft", {"actuators": None, "sensors": None, "gusts": None})
     assert [sorted(one) for one in changes[-3:]] == [
         ["sensors.bias"], ["actuators.stuck_at"], ["gusts.vertical.length", "gusts.vertical.speed", "gusts.vertical.start"],
+    ]  # fmt: skip
+    log = Flight(run)
+    log.update()
+    requests = [one.text for one in log.events if one.kind == "control"]
+    assert [(re.findall(r"'do': '(\w+)'", text)[0], "refused: " in text) for text in requests] == [
+        ("gains", False), ("gains", True), ("gains", True), ("undo", False), ("fault", False), ("fault", False),
+        ("gust", False), ("fault", True), ("deactivate", False), ("activate", False),
     ]  # fmt: skip
     tape = read_run(run).tape
     assert abs(tape["truth"]["gust.vertical"]).max() > 2.0

@@ -11,8 +11,9 @@ import hmac
 import math
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Protocol
@@ -85,6 +86,15 @@ class RefusedError(Exception):
     def __init__(self, status: HTTPStatus, sentence: str) -> None:
         super().__init__(sentence)
         self.status, self.sentence = status, sentence
+
+
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """A ParameterError of the block as a refusal."""
+    try:
+        yield
+    except ParameterError as error:
+        raise RefusedError(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from None
 
 
 def new_key() -> str:
@@ -188,23 +198,27 @@ class Control:
     # What may be commanded
 
     def _carry_out(self, action: str, request: Mapping[str, Any], cancellations: int) -> dict[str, Any]:
-        """Carry out a request that came after so many cancellations; a later one refuses it."""
+        """Carry out a request that came after so many cancellations; a later one refuses it. A line of the log says so."""
         self._link.resume()
+        before = dict(self._values)
+        what = {name: value for name, value in request.items() if name != "digest"}
         try:
-            if cancellations != self._cancellations:
-                raise ParameterError("cancelled by a later request")
-            before, refusal = dict(self._values), self._actions[action](request)
-            if refusal:
-                raise RefusedError(HTTPStatus.UNPROCESSABLE_ENTITY, refusal)
+            with _refusing():
+                if cancellations != self._cancellations:
+                    raise ParameterError("cancelled by a later request")
+                if refusal := self._actions[action](request):
+                    raise ParameterError(refusal)
+        except RefusedError as error:
             if action != "state":
-                what = {name: value for name, value in request.items() if name != "digest"}
-                changes = {
-                    name: f"{before.get(name)} -> {value}" for name, value in self._values.items() if before.get(name) != value
-                }
-                self._link.note(f"control: {short_repr(what | changes)}")
+                self._link.note(f"control: {short_repr(what)} refused: {error.sentence}")
+            raise
+        if action != "state":
+            changes = {
+                name: f"{before.get(name)} -> {value}" for name, value in self._values.items() if before.get(name) != value
+            }
+            self._link.note(f"control: {short_repr(what | changes)}")
+        with _refusing():
             return self.state()
-        except ParameterError as error:
-            raise RefusedError(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from None
 
     def state(self) -> dict[str, Any]:
         """What the page shows: lease, nodes, gains with their ranges, digests, faults, the bridge."""
@@ -298,10 +312,8 @@ class Control:
             return {}
         values, gains = _mapping(request, "values"), gains_of(self._controller())
         chosen = {name: _like(name, gains[name], value) for name, value in values.items() if name in gains}
-        try:
+        with _refusing():
             return self._assess(self._flight.scenario, self._with(self._values | chosen))
-        except ParameterError as error:
-            raise RefusedError(HTTPStatus.UNPROCESSABLE_ENTITY, str(error)) from None
 
     def _map(self) -> str:
         """The name of the channel map of the bridge."""
