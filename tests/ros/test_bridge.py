@@ -11,6 +11,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from typer.testing import CliRunner
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.channel_map import message_type, read_raw, set_field, to_channel, to_raw
 from autopilot_bridge.params import LIBRARY, load_map
+from flight_bringup.clients import ControlClient
 from flight_cli.cli import COMMANDS, application
 from flight_core.rates import NANOSECONDS
 from flight_log.stored_messages import stored_messages
@@ -104,6 +106,14 @@ class BridgeSetup:
         self.peer.until(lambda: command.popen.poll() is not None)
         command.succeed()
         self.wait_for_joys()
+
+    def engage_and_disengage_by_the_page(self) -> None:
+        """Engage and disengage as the live page does."""
+        with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker:
+            for method in (client.engage, client.disengage):
+                pending = worker.submit(method)
+                self.peer.until(pending.done)
+                assert pending.result() == ""
 
     def wait_for_joys(self) -> None:
         """Wait for six further messages to the autopilot."""
@@ -208,6 +218,8 @@ def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the
     setup.peer.spin(0.5)
     assert not setup.joys  # y is fresh again; the bridge does not re-engage by itself
 
+    setup.engage_and_disengage_by_the_page()
+    bridge.wait_for("ENGAGED -> RELEASE: disengaged by request")
     setup.engage_by_command()
     bridge.interrupt().succeed()
     setup.peer.spin(0.1)

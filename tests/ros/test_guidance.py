@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from tests.ros.test_lockstep import LOG_SIZE, ROUGH, fly, scenario_file
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
+from flight_bringup.clients import ControlClient
 from flight_bringup.scenarios import find_scenario
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
@@ -153,6 +155,26 @@ def test_services_hold_skip_and_disengage(flight: Flight) -> None:
     flight.mode = ControllerMode.ENGAGED
     flight.until(lambda: call(SetBool, "engage", SetBool.Request(data=True)) == (True, ""))
     flight.until(lambda: flight.peer.received["u_m"])
+
+
+def test_the_client_of_a_page_commands_guidance(flight: Flight) -> None:
+    with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker:
+
+        def answer(method: Callable[..., str], *arguments: object) -> str:
+            pending = worker.submit(method, *arguments)
+            flight.until(pending.done)
+            return pending.result()
+
+        assert answer(client.send_target, {"phi": 0.2}) == ""
+        assert flight.last("target.phi") == 0.2
+        assert answer(client.skip) == "no route is flown"
+        assert answer(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0], [900.0, 900.0, 55.0]]) == ""
+        flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE)
+        leg = flight.last("leg")
+        assert answer(client.skip) == ""
+        flight.until(lambda: flight.last("leg") > leg)
+        assert answer(client.hold) == ""
+        flight.until(lambda: flight.last("mode.lateral") == Lateral.HEADING)
 
 
 REFUSAL = "the controller is INACTIVE, expected ENGAGED"
