@@ -15,6 +15,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
+from flight_view.control import gains_of
 
 TIMETABLE: dict[str, Any] = {
     "amplitude": [0.02, 0.02, 0.02, 0.06],  # rad and 1
@@ -45,6 +46,10 @@ def flight(**changes: Any) -> Scenario:
         aircraft={"gusts": {}}, reference_model={"pulses": {}, "coordinated_turn": None}, flight={"duration": 12.0}
     )
     return replace(calm, controller=controller(**changes))
+
+
+def test_a_live_page_offers_no_gains_of_a_timetable() -> None:
+    assert gains_of(controller()) == {}
 
 
 def test_only_one_input_is_excited_at_a_time_and_none_in_a_pause() -> None:

@@ -224,7 +224,7 @@ class Control:
         """What the page shows: lease, nodes, gains with their ranges, digests, faults, the bridge."""
         nodes, scenario = self._link.nodes(), self._flight.scenario
         found: dict[str, Any] = {"lease": self._lease, "nodes": nodes, "undo": len(self._undo), "targets": list(TARGETS)}
-        if scenario is not None and "controller" in nodes:
+        if scenario is not None and "controller" in nodes and gains_of(scenario.controller):
             found |= {"gains": self._gains(scenario), "digest": f"{self._digest:012x}", "logged": f"{self._flight.digest:012x}"}
         if scenario is not None and "aircraft" in nodes:
             channels = scenario.aircraft.channels()
@@ -382,8 +382,9 @@ class Control:
 
 
 def gains_of(controller: ControllerParameters) -> dict[str, Any]:
-    """The numeric parameters of a law, by name: a number, or one for each channel."""
-    own = [name for name in type(controller).model_fields if name not in ControllerParameters.model_fields]
+    """The numeric parameters of a law that may change in flight, by name: a number, or one for each channel."""
+    fields = type(controller).model_fields
+    own = [name for name in fields if name not in ControllerParameters.model_fields and name in controller.tunable()]
     values = {name: getattr(controller, name) for name in own}
     return {name: value for name, value in values.items() if all(isinstance(one, float) for one in _as_list(value))}
 
