@@ -76,8 +76,9 @@ def fly(
         chosen = written(chosen, run / f"{chosen.name}.yaml")
     if watch:
         from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
+        from flight_view.watch import services_note  # noqa: PLC0415 - as above
 
-        print(*context.with_resource(watched(run)), sep="\n", file=sys.stderr)
+        print(*context.with_resource(watched(run)), *services_note(chosen), sep="\n", file=sys.stderr)
     with progress_bar(*CLOCK_COLUMNS, quiet=as_json) as bar:
         task = bar.add_task("flight", total=chosen.flight.duration, clock="", shown="")
 
