@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,13 +21,13 @@ CONSOLE_EVENTS = {"Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.en
 class Browser:
     """One browser with one page. `console` holds the exceptions and console messages of the last page that was opened."""
 
-    def __init__(self, profile: Path, width: int = 1280, height: int = 900) -> None:
+    def __init__(self, profile: Path, width: int = 1280, height: int = 900, flags: Sequence[str] = ()) -> None:
         if CHROMIUM is None:
             raise FileNotFoundError("no Chromium on the path")
         commands, self._commands = os.pipe()
         self._responses, responses = os.pipe()
         ends, null = (commands, responses), subprocess.DEVNULL
-        flags = [*FLAGS, f"--window-size={width},{height}", f"--user-data-dir={profile}", "about:blank"]
+        flags = [*FLAGS, *flags, f"--window-size={width},{height}", f"--user-data-dir={profile}", "about:blank"]
         # The shell moves the ends of the pipes to the descriptors that Chromium uses.
         redirect = f'exec "$0" "$@" 3<&{commands} 4>&{responses}'
         command = ["/bin/bash", "-c", redirect, CHROMIUM, *flags]

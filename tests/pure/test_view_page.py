@@ -99,6 +99,34 @@ def colours_of(browser: Browser, selector: str) -> int:
     return int(browser.run(script))
 
 
+PIXELS = """((selector, name) => {
+    const canvas = document.querySelector(selector), copy = new OffscreenCanvas(canvas.width, canvas.height);
+    const ctx = copy.getContext('2d', {willReadFrequently: true});
+    ctx.fillStyle = getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+    ctx.fillRect(0, 0, 1, 1);
+    const wanted = ctx.getImageData(0, 0, 1, 1).data;
+    ctx.clearRect(0, 0, 1, 1);
+    ctx.drawImage(canvas, 0, 0);
+    const {data} = ctx.getImageData(0, 0, canvas.width, canvas.height);
+    let found = 0;
+    for (let k = 0; k < data.length; k += 4) {
+        found += data[k + 3] > 200 && [0, 1, 2].every(i => Math.abs(data[k + i] - wanted[i]) < 40);
+    }
+    return found;
+})"""
+
+
+def pixels_of(browser: Browser, selector: str, name: str) -> int:
+    """Number of pixels of a canvas that have nearly the colour of that name, as the middle of a line has."""
+    return int(browser.run(f"{PIXELS}('{selector}', '{name}')"))
+
+
+def set_camera(browser: Browser, camera: str) -> None:
+    before = browser.run(DRAWN)
+    browser.run(f"void document.querySelector('[data-camera={camera}]').click()")
+    browser.wait_for(f"{DRAWN} > {before}")
+
+
 def press(browser: Browser, key: str) -> None:
     browser.run(f"void document.body.dispatchEvent(new KeyboardEvent('keydown', {{key: '{key}', bubbles: true}}))")
 
@@ -162,16 +190,48 @@ def test_a_flight_that_is_recorded_is_followed_to_its_end(browser: Browser, reco
     leave(browser)
 
 
-def test_a_second_run_is_a_ghost_and_the_pictures_need_no_webgl(browser: Browser, recorded: Path) -> None:
-    with shown(browser, recorded, recorded):
-        browser.wait_for("document.getElementById('name').textContent === 'run and ghost run'")
-        assert browser.run("document.documentElement.outerHTML.includes('webgl')") is False
-        for camera in ("orbit", "map", "chase"):
-            before = browser.run(DRAWN)
-            browser.run(f"void document.querySelector('[data-camera={camera}]').click()")
-            browser.wait_for(f"{DRAWN} > {before}")
-            assert colours_of(browser, "#scene") > 20
-        assert browser.console == []
+def pictures_of(browser: Browser) -> list[str]:
+    """All canvases of the page, in each camera."""
+    found = []
+    for camera in ("chase", "orbit", "map"):
+        set_camera(browser, camera)
+        found += browser.run("[...document.querySelectorAll('canvas')].map(one => one.toDataURL())")
+    return found
+
+
+def test_a_browser_without_webgl_draws_the_same_pixels(browser: Browser, recorded: Path, tmp_path: Path) -> None:
+    with shown(browser, recorded):
+        expected = pictures_of(browser)
+    flags = ("--disable-software-rasterizer", "--disable-webgl", "--disable-webgl2", "--disable-3d-apis")
+    with Browser(tmp_path / "profile", flags=flags) as other, shown(other, recorded):
+        assert other.run("document.createElement('canvas').getContext('webgl') === null")
+        assert pictures_of(other) == expected
+        assert other.console == []
+    assert len(set(expected)) > 10
+
+
+def test_a_second_run_is_drawn_as_a_ghost(browser: Browser, recorded: Path, tape: Tape, tmp_path: Path) -> None:
+    pose, y = tape["pose"], tape["y"]
+    values = pose.values.copy()
+    values[:, pose.names.index("east")] += 20.0 + 0.3 * pose["north"]  # m: aside, and not along the pixels
+    ghost = {"pose": Signal(pose.stamp_ns, pose.names, values), "y": Signal(y.stamp_ns, y.names, y.values + 0.01)}
+    write_run(Tape(ghost), tmp_path / "aside", LogAttachments())
+    least = {"#scene": 20, "#charts canvas": 100}  # pixels; the mark of the ghost in a legend has 32
+    for scheme in ("light", "dark"):
+        browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+        try:
+            with shown(browser, recorded):
+                set_camera(browser, "map")
+                for canvas in least:
+                    assert pixels_of(browser, canvas, "--ghost") == 0  # no colour of the flight is mistaken for it
+            with shown(browser, recorded, tmp_path / "aside"):
+                browser.wait_for("document.getElementById('name').textContent === 'run and ghost aside'")
+                set_camera(browser, "map")
+                for canvas, count in least.items():
+                    browser.wait_for(f"{PIXELS}('{canvas}', '--ghost') > {count}", limit=10.0)
+                assert browser.console == []
+        finally:
+            browser.call("Emulation.setEmulatedMedia", features=[])
 
 
 def test_names_that_are_html_are_shown_as_text(browser: Browser, tmp_path: Path) -> None:
