@@ -180,6 +180,12 @@ def test_a_killed_node_is_timed_from_its_start_and_from_its_being_ready() -> Non
     assert "which publishers keep, 400 / 620 ms after being ready." in page()
 
 
+@pytest.mark.parametrize(("case", "limit"), [("recorder killed under a live page", "1.5"), ("storm on the live page", "2")])
+def test_the_page_of_a_flight_has_the_limit_of_its_fault(case: str, limit: str) -> None:
+    text = page(faults=result("faults", [FAULT | {"case": case, "page": {"median": 1.0, "worst": 1.6}}]))
+    assert f"- Goal: {case}: the page answers, and says so, within {limit} s. Measured: 1.6 s at worst, " in text
+
+
 def test_a_busy_host_is_marked_only_for_timed_measurements() -> None:
     assert "host was busy" not in page(replay=RESULTS["replay"] | {"busy": 1.0})
 
