@@ -3,7 +3,7 @@
 """The cost of watching a flight: opening a long log, the server beside a flight, delays to the screen, missed ticks.
 
 .venv/bin/python -m benchmarks.view                      # all
-.venv/bin/python -m benchmarks.view open --hours 1       # a log of that length, read by the server
+.venv/bin/python -m benchmarks.view open --hours 1       # `rise-di watch` of a log of that length
 .venv/bin/python -m benchmarks.view live --seconds 30    # a flight in real time, a client, and a browser where there is one
 .venv/bin/python -m benchmarks.view frozen               # a page whose process stops for 10 s, and how it comes back
 .venv/bin/python -m benchmarks.view flights --count 10   # that many flights, with a client for half of the time
@@ -82,32 +82,26 @@ def moved(one: StoredMessage, now_ns: int) -> bytes:
     return one.data[: STAMP.start] + seconds.to_bytes(4, "little") + rest.to_bytes(4, "little") + one.data[STAMP.stop :]
 
 
-READ = """
-import json, resource, sys, time
-from pathlib import Path
-begin = time.monotonic()
-from flight_view.flight import Flight
-loaded = time.monotonic()
-flight = Flight(Path(sys.argv[1]))
-flight.update(0.05)
-first = time.monotonic()
-while flight.update(0.05):
-    pass
-rows = {name: samples.count for name, samples in flight.samples.items()}
-print(json.dumps({"import": loaded - begin, "first samples": first - loaded, "whole log": time.monotonic() - loaded,
-    "processor": time.process_time(), "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, "flight": flight.end,
-    "rows": rows, "state": flight.state()}))
-"""
-
-
 def open_log(hours: float) -> dict[str, Any]:
-    """Times in s and memory in MB to read a long log as the server reads it."""
+    """Times in s from the start of `rise-di watch` to answers about a long log, and the memory of the server in MB.
+
+    "first samples" is the first answer that has some, "whole log" the first one with the state "ended".
+    """
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         write_long_log(run, hours)
-        shown = subprocess.run([sys.executable, "-c", READ, str(run)], capture_output=True, text=True, check=True).stdout  # noqa: S603
-        result: dict[str, Any] = json.loads(shown)
-        return result | {"log": sum(path.stat().st_size for path in run.glob("*.mcap")) / 1e6}
+        begin, times = time.monotonic(), dict[str, float]()
+        with watching(run) as (server, address):
+            client, head = Client(address), dict[str, Any]()
+            while head.get("state") != "ended":
+                head = client.news()
+                if head["topics"]:
+                    times.setdefault("first samples", time.monotonic() - begin)
+                time.sleep(1.0 / POLLS)
+            times["whole log"] = time.monotonic() - begin
+            processor, memory = server.cpu_times(), server.memory_info().rss / 1e6
+        size = sum(path.stat().st_size for path in run.glob("*.mcap")) / 1e6
+    return times | {"processor": processor.user + processor.system, "memory": memory, "flight": 3600.0 * hours, "log": size}
 
 
 # Beside a flight
@@ -123,33 +117,39 @@ class Client(threading.Thread):
         self._cookie = ""
         self._get(f"{parts.path}?{parts.query}")
         self._ended = threading.Event()
+        self._head: dict[str, Any] = {}
+        self._rows: dict[str, int] = {}
         self.delays: list[float] = []
         self.bytes = 0
 
     def run(self) -> None:
         """Ask until stopped, or until the server ends."""
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # of this thread: in use the browser is on another host
-        head: dict[str, Any] = {}
-        rows: dict[str, int] = {}
         while not self._ended.wait(1.0 / POLLS):
-            known = {name: head.get(name, "") for name in ("epoch", "state", "described")} | rows
-            query = urllib.parse.urlencode(known)
             try:
-                content = self.ask(query)
+                self.news()
             except (OSError, HTTPException):
                 break
-            now = time.time()
-            self.bytes += len(content)
-            size = int.from_bytes(content[:4], "little")
-            head, place = json.loads(content[4 : 4 + size]), 4 + size
-            rows["events"] = head["first_event"] + len(head["events"])
-            for topic in head["topics"]:
-                count = topic["count"]
-                if topic["name"] == "internals" and head["state"] == "recording":
-                    start = int(head["epoch"].partition(".")[0]) / NANOSECONDS
-                    self.delays.append(now - start - float(np.frombuffer(content, "<f8", count, place)[-1]))
-                rows[topic["name"]] = topic["first"] + count
-                place += 8 * count + -(-4 * count * len(topic["channels"]) // 8) * 8
+
+    def news(self) -> dict[str, Any]:
+        """The head of an answer with what the client lacks, which it knows then. Raises as `ask`."""
+        known = {name: self._head.get(name, "") for name in ("epoch", "state", "described")} | self._rows
+        content = self.ask(urllib.parse.urlencode(known))
+        now = time.time()
+        self.bytes += len(content)
+        size = int.from_bytes(content[:4], "little")
+        head: dict[str, Any] = json.loads(content[4 : 4 + size])
+        place = 4 + size
+        self._rows["events"] = head["first_event"] + len(head["events"])
+        for topic in head["topics"]:
+            count = topic["count"]
+            if topic["name"] == "internals" and head["state"] == "recording":
+                start = int(head["epoch"].partition(".")[0]) / NANOSECONDS
+                self.delays.append(now - start - float(np.frombuffer(content, "<f8", count, place)[-1]))
+            self._rows[topic["name"]] = topic["first"] + count
+            place += 8 * count + -(-4 * count * len(topic["channels"]) // 8) * 8
+        self._head = head
+        return head
 
     def ask(self, query: str = "") -> bytes:
         """What a client lacks that knows so much. Raises OSError or HTTPException where the server has ended."""
@@ -205,7 +205,7 @@ MEASURE = """(start => {
 
 
 def live(seconds: float, *, browser: bool) -> dict[str, Any]:
-    """Processor share and memory of the server beside a flight, traffic, and delays to the client and to the screen."""
+    """Processor share and memory (MB) of the server beside a flight, traffic, and delays to the client and to the screen."""
     with (
         tempfile.TemporaryDirectory() as folder,
         flying(Path(folder), seconds) as (flight, run),
@@ -225,11 +225,12 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
         else:
             time.sleep(seconds - 6.0)
         share = (threads_ns(server.pid) - before) / (time.monotonic() - begin) / NANOSECONDS
-        memory = server.memory_info().rss / 2**20
+        memory = server.memory_info().rss / 1e6
         flight.communicate()
         client.stop()
         traffic = client.bytes / seconds
-    shown = {"processor": share, "memory": memory, "traffic": traffic, "to the client": percentiles(client.delays)}
+    shown: dict[str, Any] = {"flight": seconds, "processor": share, "memory": memory, "traffic": traffic}
+    shown |= {"to the client": percentiles(client.delays)}
     return shown | ({"to the screen": percentiles(drawn[len(drawn) // 5 :])} if browser else {})
 
 
@@ -353,7 +354,7 @@ def main() -> None:
     browser = CHROMIUM is not None and not arguments.no_browser
     found: dict[str, Any] = {}
     if "open" in parts:
-        found["open"] = open_log(arguments.hours)
+        found["opened"] = open_log(arguments.hours)
     if "live" in parts:
         found["live"] = live(arguments.seconds, browser=False)
         if browser:

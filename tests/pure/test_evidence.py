@@ -53,11 +53,11 @@ CAMPAIGN: dict[str, Any] = {"whole": 120_000.0, "flown": 150_000.0, "memory_earl
 CAMPAIGN |= {"plain": 50.0, "integration": {"q": 0.0021, "V": 0.0005}}
 SHARE = {"count": 3, "share": 3e-4, "low": 1e-4, "high": 9e-4}
 DELAYS = {"p50": 0.052, "p99": 0.26}
-BESIDE = {"processor": 0.027, "memory": 76.0, "traffic": 22_000.0}
+BESIDE = {"processor": 0.027, "memory": 76.0, "traffic": 22_000.0, "flight": 30.0}
 PAIRS = {"missed ticks": [3, 0], "late p99 (ms)": [0.5, 1.23]}
 VIEW: dict[str, Any] = {"live": BESIDE, "live with a browser": {"to the screen": DELAYS}}
 VIEW |= {"frozen": {"frozen": 10.0, "recovered after": 0.4}}
-VIEW |= {"open": {"flight": 3600.0, "first samples": 0.4, "whole log": 5.0, "processor": 4.6, "memory": 157.0, "log": 626.0}}
+VIEW |= {"opened": {"flight": 3600.0, "first samples": 0.4, "whole log": 5.0, "processor": 4.6, "memory": 157.0, "log": 626.0}}
 VIEW |= {
     "flights": {"without": PAIRS, "with": PAIRS, "more": dict.fromkeys(PAIRS, 0.05), "probability": dict.fromkeys(PAIRS, 0.5)}
 }
