@@ -3,7 +3,7 @@
 """Pose of the simulated aircraft, Euler's kinematics and the steady wind."""
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from tests.builders import aircraft_parameters
 
 from aircraft_sim import dynamics, pose
+from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
@@ -146,8 +147,26 @@ def test_the_pose_of_jsbsim_is_absolute_and_consistent() -> None:
     at = np.isin(tape["truth"].stamp_ns, found.stamp_ns)
     for name in ("theta", "altitude", "phi"):  # truth holds deviations from trim
         assert found[name] - found[name][0] == pytest.approx(truth[name][at] - truth[name][0], abs=1e-9), name
-    # JSBSim integrates position and altitude itself; the derivatives of what it gives are the velocities that it gives.
+    # JSBSim integrates the altitude, the model the place from JSBSim's velocities: the derivatives of both are the velocities.
     for position, velocity in (("altitude", "climb"), ("north", "v_north"), ("east", "v_east")):
         slope = np.gradient(found[position], t)
         assert slope[1:-1] == pytest.approx(found[velocity][1:-1], abs=0.05), position
     assert np.abs(found["phi"]).max() > 0.1  # the scenario banks
+
+
+def test_the_place_of_jsbsim_is_that_of_its_own_latitude_and_longitude() -> None:
+    """60 s in still air, with a turn after an aileron pulse."""
+    aircraft = C172P.vary(aircraft=QUIET).aircraft
+    simulator = Simulator(aircraft)
+    model = cast(JsbsimModel, simulator._model)  # its properties are not in the pose
+    angles = ("position/lat-gc-rad", "position/long-gc-rad")
+    start = [model._fdm[path] for path in angles]
+    for number in range(int(60.0 * aircraft.rate) + 1):
+        pulse = 2.0 < number / aircraft.rate < 3.0
+        simulator.sample(number, np.array([0.0, 0.0, 0.05 if pulse else 0.0, 0.0]))
+    found = dict(zip(pose.CHANNELS, simulator.pose().tolist(), strict=True))
+    radius = 0.3048 * model._fdm["position/radius-to-vehicle-ft"]
+    north, east = (radius * (model._fdm[path] - before) for path, before in zip(angles, start, strict=True))
+    assert abs(start[0]) < 1e-12  # it flies from the equator: no cosine of the latitude
+    assert (found["north"], found["east"]) == (pytest.approx(north, rel=0.01), pytest.approx(east, rel=0.01))
+    assert east > 300.0  # m: it has turned
