@@ -46,6 +46,7 @@ from guidance.route_file import Waypoint
 
 TOKEN = "a-token"  # noqa: S105 - of a test
 CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())
+INTACT = {"zstd_of_fifty_thousand_messages"}  # valid, and too large for a reader that allocates as it is told
 
 
 def decoded(content: bytes) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np.float64], NDArray[np.float32]]]]:
@@ -195,10 +196,14 @@ def test_a_browser_gets_thinned_samples_again_from_the_start(recorded: Path) -> 
 def test_a_hostile_log_is_shown_as_far_as_it_goes(case: Path, tmp_path: Path) -> None:
     path = tmp_path / "run_0.mcap"
     path.write_bytes(case.read_bytes())
-    flight = Flight(path)
+    now = 0.0
+    flight = Flight(path, now=lambda: now)
     with np.errstate(all="ignore"):
         flight.update()
+        now = 1.5
         head, _ = decoded(answer(flight, {}))
+    assert head["state"] in {"ended", "interrupted"}
+    assert head["faults"] or head["state"] == "interrupted" or case.name in INTACT
     assert all(sentence.isprintable() for sentence in head["faults"])
 
 
@@ -378,7 +383,7 @@ def test_nothing_is_served_without_the_token(path: str, recorded: Path) -> None:
 def test_connections_beyond_the_limit_are_closed_and_free_ones_serve_again(recorded: Path) -> None:
     async def client(server: Server) -> None:
         idle = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(http.MAX_CONNECTIONS)]
-        for _ in range(200):
+        for _ in range(1000):
             reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
             assert await reader.read() == b""  # closed at once
             writer.close()
