@@ -286,11 +286,11 @@ def live_page(flight: Flight) -> Iterator[Page]:
         process.end()
 
 
-CONNECTIONS, PAGE_STORM = 200, 2.0  # s
+CONNECTIONS, PAGE_STORM = 1000, 2.0  # s
 
 
 def storm_on_the_page(flight: Flight, random: Generator) -> None:
-    """Two hundred connections to the live page that ask for all samples at once and read nothing; it answers afterwards."""
+    """A thousand connections to the live page that ask for all samples at once and read nothing; it answers afterwards."""
     with live_page(flight) as page:
         disturb(flight, "clients", page.address, str(CONNECTIONS), str(PAGE_STORM))
         # The goal is 2 s. A busy host takes longer: each connection has one answer of some megabytes ahead of this one.

@@ -122,17 +122,21 @@ def gate(source: str, target: str) -> None:
 
 
 def clients(address: str, count: int, duration: float) -> None:
-    """Connections to a page. Each sends its requests for all samples as fast as the server reads them, and reads no answer."""
+    """So many connections to a page, within `duration` s or longer, of which the server closes all beyond its limit.
+
+    Each sends its requests for all samples as fast as the server reads them, and reads no answer.
+    """
     parts = urlsplit(address)
     request = f"GET /data/0?{parts.query} HTTP/1.1\r\nHost: {parts.netloc}\r\n\r\n".encode()
     print(f"begins at {time.time():.6f}", flush=True)
-    until, sent = time.monotonic() + duration, 0
+    until, sent, opened = time.monotonic() + duration, 0, 0
     connections: list[socket.socket] = []
-    while time.monotonic() < until:
-        if len(connections) < count:
+    while opened < count or time.monotonic() < until:
+        if opened < count:
             with suppress(OSError):  # the server accepts no more for the moment
                 connections.append(socket.create_connection((parts.hostname or "", parts.port or 0), timeout=0.1))
                 connections[-1].setblocking(False)
+                opened += 1
         for place in reversed(range(len(connections))):
             try:
                 connections[place].send(request)
@@ -142,7 +146,7 @@ def clients(address: str, count: int, duration: float) -> None:
             except OSError:  # the server has closed it
                 connections.pop(place).close()
         time.sleep(0.001)
-    print(f"sent {sent} on {len(connections)} connections", flush=True)
+    print(f"sent {sent} on {opened} connections, {len(connections)} at the end", flush=True)
 
 
 if __name__ == "__main__":
