@@ -18,7 +18,9 @@ from tests.joint_states import JOINT_STATE, vector
 from tests.view_link import NodesInMemory
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.gain_selection import margins
+from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
 from flight_log.bag import BagWriter, LogAttachments
@@ -142,6 +144,40 @@ def test_a_recorded_flight_is_drawn_and_asks_no_other_host(browser: Browser, rec
         assert hosts == [address.split("/")[2]]
         assert browser.run("document.getElementById('events').textContent") == "0.00 s  mode: ENGAGED"
         assert browser.run("location.search") == ""  # the token is not in the history
+        assert browser.console == []
+
+
+CURVES = """(() => {
+    const curves = window.curves = {}, {lineTo} = CanvasRenderingContext2D.prototype;
+    CanvasRenderingContext2D.prototype.lineTo = function (x, y) {
+        if (this.canvas.closest('#charts')) {
+            const label = this.canvas.getAttribute('aria-label');
+            const curve = curves[`${label} ${this.strokeStyle} ${this.lineWidth}`] ??= {count: 0, low: y, high: y};
+            Object.assign(curve, {count: curve.count + 1, low: Math.min(curve.low, y), high: Math.max(curve.high, y)});
+        }
+        lineTo.call(this, x, y);
+    };
+})()"""
+
+
+def test_a_flight_with_noise_has_a_dozen_curves_that_are_not_flat(browser: Browser, tmp_path: Path) -> None:
+    scenario = find_scenario("osprey_servo").vary(flight={"duration": 2.0})
+    (tmp_path / "run").mkdir()
+    write_run(simulate(scenario), tmp_path / "run", attachments_for(scenario, tmp_path / "run"))
+    with shown(browser, tmp_path / "run") as address:
+        browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=4000, deviceScaleFactor=1, mobile=False)
+        try:
+            browser.run(CURVES)
+            press(browser, "End")
+            browser.wait_for("Object.keys(curves).some(name => name.startsWith('ticks: lateness'))")  # the last chart
+            curves = browser.run("curves").values()
+        finally:
+            browser.call("Emulation.clearDeviceMetricsOverride")
+        # A chart is 83 pixels high; its grid has 20 lines at most.
+        assert len([one for one in curves if one["count"] > 50 and one["high"] - one["low"] > 20.0]) >= 12
+        assert browser.run("document.getElementById('mode').textContent") == "ENGAGED"
+        hosts = browser.run("[...new Set(performance.getEntriesByType('resource').map(one => new URL(one.name).host))]")
+        assert hosts == [address.split("/")[2]]
         assert browser.console == []
 
 
@@ -386,17 +422,63 @@ def test_a_log_without_pose_shows_the_attitude_of_truth(browser: Browser, tape: 
         assert browser.console == []
 
 
+POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb")
+
+
 def test_a_guided_flight_shows_its_route_and_its_modes(browser: Browser, tmp_path: Path) -> None:
     names = ("mode", "mode.lateral", "mode.vertical", "leg", "xtrack", "to_go", "phi_c", "theta_c", "target.altitude")
     stamps = np.arange(200, dtype=np.int64) * 20_000_000
     guidance = Signal(stamps, names, np.tile([1.0, 4.0, 2.0, 3.0, -2.5, 100.0, 0.1, 0.0, 30.0], (200, 1)))
-    write_run(Tape({"guidance": guidance}), tmp_path / "run", LogAttachments(find_scenario("osprey_route").path))
+    pose = np.tile([0.1, 0.02, 0.0, 0.0, 0.0, 30.0, 25.0, 0.0, 0.0], (200, 1))
+    pose[:, POSE.index("north")] = 25.0 * stamps / 1e9
+    pose[:, POSE.index("altitude")] += np.sin(stamps / 1e9)
+    flown = {"guidance": guidance, "pose": Signal(stamps, POSE, pose)}
+    write_run(Tape(flown), tmp_path / "run", LogAttachments(find_scenario("osprey_route").path))
+    write_run(Tape(flown), tmp_path / "other", LogAttachments(find_scenario("osprey_servo").path))
     with shown(browser, tmp_path / "run"):
         readouts = browser.run("document.getElementById('readouts').innerText")
-        for text in ("ENGAGED", "ROUTE", "ALTITUDE", "-2.5 m"):
+        for text in ("ENGAGED", "ROUTE", "ALTITUDE", "-2.5 m", "30.0 m"):
             assert text in readouts
         titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
-        assert titles == ["phi over its command", "theta over its command", "cross-track"]
+        assert titles == ["phi over its command", "theta over its command", "cross-track", "altitude"]
+        for colour in ("--plant", "--reference"):  # the altitude, and its command
+            assert pixels_of(browser, "[aria-label=altitude]", colour) > 300
+        set_camera(browser, "map")
+        assert pixels_of(browser, "#scene", "--reference") > 100
+        assert browser.console == []
+    with shown(browser, tmp_path / "other"):
+        set_camera(browser, "map")
+        assert pixels_of(browser, "#scene", "--reference") == 0  # nothing but a route has its colour
+
+
+SAID = """(() => {
+    const said = window.said = [], fillText = CanvasRenderingContext2D.prototype.fillText;
+    CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+        said.push(text);
+        fillText.call(this, text, ...place);
+    };
+})()"""
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"), [(("phi", "theta", "climb"), []), (("climb",), ["NO ATTITUDE IN THE LOG", "NO ATTITUDE"])]
+)
+def test_the_pose_of_a_bridge_is_drawn_where_it_has_an_attitude(
+    names: tuple[str, ...], expected: list[str], browser: Browser, tmp_path: Path
+) -> None:
+    stamps, values = np.arange(50, dtype=np.int64) * 20_000_000, {"phi": 0.5, "theta": -0.1, "climb": 2.0}
+    pose = Signal(stamps, names, np.tile([values[name] for name in names], (50, 1)))
+    write_run(Tape({"pose": pose}), tmp_path / "run", LogAttachments())
+    with shown(browser, tmp_path / "run"):
+        browser.run(SAID)
+        set_camera(browser, "orbit")
+        said = browser.run("said")
+        assert [text for text in said if text.startswith("NO ")] == expected
+        readouts = browser.run("document.getElementById('readouts').innerText")
+        assert "2.0 m/s" in readouts
+        assert (f"{math.degrees(0.5):.1f} deg" in readouts) == (not expected)
+        assert (pixels_of(browser, "#scene", "--plant") > 30) == bool(expected)  # a square of 64 in place of the aircraft
+        assert (pixels_of(browser, "#horizon", "--sky") > 1000) == (not expected)
         assert browser.console == []
 
 
