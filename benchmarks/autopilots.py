@@ -468,10 +468,12 @@ def goals(name: str, result: dict[str, Any]) -> list[str]:
             for one, limit in ERROR_GOALS[name].items()
             for factor, unit in (scale[one],)
         ]
-        if name not in BEHIND_GOALS:
-            return rms
-        sentence = f"y behind y_m by less than the loop's delay and {BEHIND_GOALS[name]:g} s"
-        return [*rms, goal(sentence, max(result["behind"].values()), BEHIND_GOALS[name], "s")]
+        late = [
+            goal(f"y behind y_m by less than the loop's delay and {limit:g} s", max(result["behind"].values()), limit, "s")
+            for one, limit in BEHIND_GOALS.items()
+            if one == name
+        ]
+        return rms + late
     if name == "engagements":
         largest = 100.0 * LARGEST_STEP
         return [goal(f"no step beyond {largest:g} % of the range", 100.0 * max(result["steps"]), largest, "%")]
