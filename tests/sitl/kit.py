@@ -40,6 +40,7 @@ OWN_MAP, OWN_SCENARIO = os.environ.get("RISE_DI_MAP"), os.environ.get("RISE_DI_S
 POLL = 0.1  # s, between two questions to the autopilot
 MAX_AGE = 1.0  # s, in place of the shipped maps' 0.2 s: a busy host stops autopilot and agent for half a second
 SAFE_STICKS = (1500, 1500, 1000, 1500, 1800, 1500, 1500)  # us, as the kit begins; the throttle is closed
+CRUISE = (25.0, 65.0)  # %, of the throttle: with the limits of the map around it, -20 and 30 %, within its range
 Program = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 """Commands of guidance by channel: times, s, and values."""
 
@@ -291,7 +292,12 @@ class ArduPlane(Autopilot):
         target = max(self.state()["alt"] - self.home, ALTITUDE)
         self.say("goto", f"{target:.0f}")
         self.until(lambda state: bool(state["alt"] > self.home + target - 20.0), timeout=120.0)
-        self.until(lambda state: max(abs(state["roll"]), abs(state["climb"]) / 20.0, abs(state["pitchspeed"])) < 0.05)
+        self.until(
+            lambda state: (
+                max(abs(state["roll"]), abs(state["climb"]) / 20.0, abs(state["pitchspeed"])) < 0.05
+                and CRUISE[0] < state["throttle"] < CRUISE[1]
+            )
+        )
 
     def hand_over(self) -> None:
         """Change to MANUAL with the sticks where the servos are, so that the aircraft stays in trim."""
