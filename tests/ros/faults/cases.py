@@ -42,6 +42,7 @@ from flight_analysis.closed_loop.scenario import load_scenario
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from flight_log.scan import Scan
+from flight_ros.event_loop import LATE_REQUEST_PAUSE
 from flight_ros.messages import to_message
 from rise_di_controller.guard import Mode
 
@@ -86,6 +87,7 @@ class Case(NamedTuple):
     victim: str = ""  # the role that is killed or stopped
     needs: tuple[str, ...] = ()  # the roles that detect the fault, or that the injection needs
     alone: bool = False  # beside no other fault: it concerns every node, or the log of what it left
+    host_delays: float = 2.0  # by which the time limits grow: the delays of two processes add up, of the node and of the probe
 
 
 # Detection
@@ -660,7 +662,14 @@ CASES = (
     Case("stronger quality of service", stronger_qos, DEADLINE, REPORT + DISCOVERY, needs=("controller",)),
     Case("CPU starved", starve, counts("aircraft", "missed ticks"), REPORT + 3.0, Response.LATE, 0.5, alone=True),
     Case("disk full", full_disk, logs("recorder", "recording ended"), 0.1, alone=True),
-    Case("storm of parameters", parameters, logs("controller", "parameters rejected"), needs=("controller",)),
+    # A request that the host delays is followed by a pause without requests.
+    Case(
+        "storm of parameters",
+        parameters,
+        logs("controller", "parameters rejected"),
+        needs=("controller",),
+        host_delays=2.0 + LATE_REQUEST_PAUSE,
+    ),
     Case(
         "clock set back",
         step_of_clock(-5.0),

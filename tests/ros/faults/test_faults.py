@@ -143,7 +143,7 @@ def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
         reaction = max(detected - flight.begin, 0.0)  # the message of the detection may overtake that of the fault
     engaged = flight.until(lambda: engaged_for(SETTLING, flight), 10.0, "engaged again")
     host_delay = 0.0 if case.response is Response.LATE else flight.host_delay(flight.begin - 0.1, engaged + SETTLING)
-    slack = SLACK + 2.0 * host_delay  # the delays of two processes add up: of the node and of the probe
+    slack = SLACK + case.host_delays * host_delay
     recovery = max(engaged - flight.end, 0.0)
     if reaction is not None:
         allowed = case.within + slack
