@@ -129,8 +129,16 @@ def set_camera(browser: Browser, camera: str) -> None:
     browser.wait_for(f"{DRAWN} > {before}")
 
 
-def press(browser: Browser, key: str) -> None:
-    browser.run(f"void document.body.dispatchEvent(new KeyboardEvent('keydown', {{key: '{key}', bubbles: true}}))")
+def flown(scenario: Scenario, run: Path) -> Path:
+    """The log of a flight, with its attachments."""
+    run.mkdir()
+    write_run(simulate(scenario), run, attachments_for(scenario, run))
+    return run
+
+
+def press(browser: Browser, key: str, shift: bool = False) -> None:
+    options = f"{{key: '{key}', shiftKey: {str(shift).lower()}, bubbles: true}}"
+    browser.run(f"void document.body.dispatchEvent(new KeyboardEvent('keydown', {options}))")
 
 
 def test_a_recorded_flight_is_drawn_and_asks_no_other_host(browser: Browser, recorded: Path) -> None:
@@ -161,10 +169,8 @@ CURVES = """(() => {
 
 
 def test_a_flight_with_noise_has_a_dozen_curves_that_are_not_flat(browser: Browser, tmp_path: Path) -> None:
-    scenario = find_scenario("osprey_servo").vary(flight={"duration": 2.0})
-    (tmp_path / "run").mkdir()
-    write_run(simulate(scenario), tmp_path / "run", attachments_for(scenario, tmp_path / "run"))
-    with shown(browser, tmp_path / "run") as address:
+    run = flown(find_scenario("osprey_servo").vary(flight={"duration": 2.0}), tmp_path / "run")
+    with shown(browser, run) as address:
         browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=4000, deviceScaleFactor=1, mobile=False)
         try:
             browser.run(CURVES)
@@ -200,6 +206,44 @@ def test_keys_step_single_ticks_jump_to_events_and_play(browser: Browser, record
         browser.wait_for(f"{TIME} === {tape.time('y')[-1]:.2f}")  # 10 times
         assert browser.run("document.getElementById('speed').value") == "10"
         assert browser.console == []
+
+
+def test_keys_step_seconds_jump_to_a_command_and_choose_window_and_camera(
+    browser: Browser, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    def chosen(selector: str) -> str:
+        return f"[...document.querySelectorAll('{selector}')].find(one => one.ariaPressed === 'true').textContent"
+
+    run = flown(osprey_gust.vary(flight={"duration": 2.5}), tmp_path / "run")  # its first command begins at 2 s
+    with shown(browser, run):
+        press(browser, "ArrowRight", shift=True)
+        browser.wait_for(f"{TIME} === 1")
+        press(browser, "]")
+        browser.wait_for(f"{TIME} === 2")
+        press(browser, "ArrowLeft", shift=True)
+        browser.wait_for(f"{TIME} === 1")
+        press(browser, "w")
+        browser.wait_for(f"{chosen('#window, #whole')} === '20 s'")
+        press(browser, "a")
+        browser.wait_for(f"{chosen('#window, #whole')} === 'All'")
+        for camera in ("Orbit", "Map", "Chase"):
+            press(browser, "c")
+            browser.wait_for(f"{chosen('#cameras button')} === '{camera}'")
+        press(browser, "l")
+        browser.wait_for(f"{TIME} === 2.5 && document.getElementById('live').ariaPressed === 'true'")
+        assert browser.console == []
+
+
+def test_at_a_tenth_of_the_speed_a_flight_takes_ten_times_as_long(browser: Browser, recorded: Path) -> None:
+    with shown(browser, recorded):
+        for _ in range(9):
+            press(browser, "-")
+        assert browser.run("document.getElementById('speed').value") == "0.1"
+        begun = browser.run("performance.now()")
+        press(browser, " ")
+        browser.wait_for(f"{TIME} >= 0.2")
+        # In ms. A browser that draws late takes longer, and none takes less but by the 0.005 s to which the time is rounded.
+        assert browser.run("performance.now()") - begun > 1900.0
 
 
 def test_a_flight_that_is_recorded_is_followed_to_its_end(browser: Browser, recorded: Path, tmp_path: Path) -> None:
