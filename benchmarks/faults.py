@@ -30,7 +30,10 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 CAMPAIGN = REPOSITORY / "tests" / "ros" / "faults"
 MAX_HOST_DELAY = 0.02  # s
 
-TIMES = ("reaction", "recovery", "ready_to_traffic", "exec_to_traffic", "ready_to_caught_up", "longest_pause", "page")
+STARTS = ("exec_to_ready", "start_run", "start_waited")
+"""From the start of a killed node to its being ready, and of this time: its main thread runs, or waits for a processor."""
+
+TIMES = ("reaction", "recovery", "ready_to_traffic", "exec_to_traffic", "ready_to_caught_up", "longest_pause", "page", *STARTS)
 BANKS = ("bank_deg", "last_bank_deg")  # the largest after the loss of u_m, and that when the wings have to be level
 
 Row = dict[str, Any]

@@ -175,12 +175,14 @@ def restart(flight: Flight, role: str) -> None:
     """Start a killed node again. The end of the fault is when it is ready."""
     started = flight.start(role)
     flight.processes[role].wait_for("ready")
+    run, waited = flight.spent(role)
     flight.end_fault()
     ready = flight.until(lambda: ready_stamp(flight, role, started), 5.0, f"{role} ready, on /rosout")
     traffic = flight.until(lambda: full_traffic(flight, role, ready), 5.0, f"full traffic of {role}")
     traffic = max(traffic, ready)  # the first tick of a recorder writes what it received before it was ready
     flight.end = ready
     flight.measured |= {"ready_to_traffic": traffic - ready, "exec_to_traffic": traffic - started}
+    flight.measured |= {"exec_to_ready": ready - started, "start_run": run, "start_waited": waited}
     if role == "recorder":
         caught_up = flight.until(lambda: recorded_since(flight.runs[-1], ready), 5.0, "new samples in the log")
         flight.measured["ready_to_caught_up"] = caught_up - ready

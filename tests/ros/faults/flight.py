@@ -198,8 +198,14 @@ def _waited_ns(process: int) -> int:
     with suppress(OSError):  # a process that has just been killed
         for path in Path(f"/proc/{process}/task").glob("*/schedstat"):
             with suppress(OSError):  # a thread that has just ended
-                waited += int(path.read_text(encoding="ascii").split()[1])
+                waited += _scheduled_ns(path)[1]
     return waited
+
+
+def _scheduled_ns(path: Path) -> tuple[int, int]:
+    """How long a thread ran, and how long it was ready and waited for a processor (proc_pid_schedstat)."""
+    run, waited, _ = map(int, path.read_text(encoding="ascii").split())
+    return run, waited
 
 
 class Ticks(NamedTuple):
@@ -369,6 +375,11 @@ class Flight:
         self.processes[role] = self.node(role, *parameters)
         self._instances.add(self.instance(role))
         return at
+
+    def spent(self, role: str) -> tuple[float, float]:
+        """Of the main thread of a role's process: processor time, and the time that it was ready and waited for it, s."""
+        run, waited = _scheduled_ns(Path(f"/proc/{self.processes[role].popen.pid}/schedstat"))
+        return seconds(run), seconds(waited)
 
     def kill(self, role: str) -> None:
         """SIGKILL."""
