@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fields of the message types that the channel maps use and that common_interfaces lacks, as their packages publish them.
 
-Only the fields that a map uses, from the definitions at the commits below. tests/ros/test_published_messages.py compares them
+Only the fields that a map uses, from the definitions of the releases below. tests/ros/test_published_messages.py compares them
 with the installed packages.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 PACKAGES = {
     "ardupilot_msgs": "ArduPilot/ardupilot, Tools/ros2/ardupilot_msgs, March 2026",
     "px4_msgs": "PX4/px4_msgs v1.16.2, 392e831c",
-    "mavros_msgs": "mavlink/mavros 2.12.0, f8f462dd",
+    "mavros_msgs": "mavlink/mavros 2.14.0",
     "rosflight_msgs": "rosflight/rosflight_ros_pkgs v2.0.1, cefdb425",
     "rosplane_msgs": "rosflight/rosplane v2.0.0, 79702c09",
 }

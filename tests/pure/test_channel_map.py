@@ -9,6 +9,7 @@ test_published_messages.py.
 
 import math
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace as Message
 from typing import Any
 
@@ -18,7 +19,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.published_messages import FOREIGN_MAPS, PUBLISHED, blank, kind
+from tests.published_messages import FOREIGN_MAPS, PACKAGES, PUBLISHED, blank, kind
 
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.channel_map import STEP, Line, get_field, message_type, read_raw, set_field, to_channel, to_raw
@@ -27,6 +28,7 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
 MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "autopilots.md"
 LINES = st.builds(Line, st.sampled_from((-1, 1)), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
 FLU = Message(x=0.3, y=-0.2, z=-0.1)  # roll right at 0.3 rad/s, nose up at 0.2, nose right at 0.1
 FRD = np.array([0.3, 0.2, 0.1], dtype=np.float32)  # the same motion as a fixed array of a message
@@ -129,6 +131,15 @@ def test_a_lost_message_does_not_end_an_engagement(name: str) -> None:
         found = [age for full, age in ages if full.removeprefix("/fmu/out/").removeprefix("/ap/") == topic]
         assert found, topic
         assert min(found) > 2.0 / rate, topic
+
+
+@pytest.mark.parametrize(
+    ("name", "package"), [("mavros", "mavros_msgs"), ("rosflight", "rosflight_msgs"), ("rosflight", "rosplane_msgs")]
+)
+def test_a_map_and_its_page_name_the_release_of_the_definitions(name: str, package: str) -> None:
+    release = PACKAGES[package].partition(",")[0]
+    assert release in load_map(name).source
+    assert release in PAGE.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", MAPS)
