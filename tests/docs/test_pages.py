@@ -19,7 +19,8 @@ BLOCK = re.compile(
     r"(?:<!-- (?P<reason>not run by the tests of the pages: [^\n]+) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)```", re.DOTALL
 )
 EXECUTED = {"sh", "python"}
-TIMEOUT = 240.0  # s, of a block: the longest takes about 30 s on an idle host
+TIMEOUT = 600.0  # s, of a block: the longest takes about 30 s on an idle host
+pytestmark = pytest.mark.timeout(2.0 * TIMEOUT)
 
 
 def blocks(page: Path) -> list[tuple[str, str, str]]:
