@@ -61,6 +61,8 @@ WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints 
 PERIODS = {"elevator": 4.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}  # s, of the multisines of the experiments on signs
 STRONGER_ELEVATOR = 2.0  # `check-signs` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
 TURBULENCE = (0.25, 0.5, 0.25, 0.5, 1.0)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
+EXCITED = 24.0  # s, of an experiment on signs, without pauses
+EXPERIMENT = 80.0  # s, of one on signs at most: 31 s engaged, and back to level flight
 MODERATE = 0.5  # SIM_WIND_TURB up to which one experiment has to show every sign
 GUIDED, EACH, SETTLED = 300.0, 60.0, 45.0  # s: engaged under guidance, each turn, and from its command until it counts as held
 OBSERVER_MARGIN, OBSERVED_TURBULENCE, OBSERVED_PAIRS = 0.025, 0.5, 2  # s beyond the identified delay; SIM_WIND_TURB; flights
@@ -297,7 +299,7 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         channel_map = plane.patient_map("ardupilot")
         loaded = load_map(channel_map)
         airframe, scenario = plane.folder / "signs_airframe.yaml", plane.folder / "signs.yaml"
-        planned = experiment(loaded, 24.0, 0.2, str(airframe))
+        planned = experiment(loaded, EXCITED, 0.2, str(airframe))
         airframe.write_text(planned.airframe, encoding="utf-8")
         content = yaml.safe_load(planned.scenario)
         controller = content["/**/controller"]["ros__parameters"]
@@ -308,7 +310,7 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         scenario.write_text(yaml.safe_dump(content), encoding="utf-8")
         duration = ExcitationParameters.validate_mapping(controller, "controller").duration
         plane.say("param", "SIM_WIND_SPD", "5")
-        flown = plane.fly(scenario, channel_map, 1000.0, "--send")
+        flown = plane.fly(scenario, channel_map, EXPERIMENT * experiments, "--send")
         flown.wait_for("DISENGAGED")
         begun, earlier = [], len(stored("signs").get("experiments", []))
         winds = [TURBULENCE[number % len(TURBULENCE)] for number in range(earlier, earlier + experiments)]
@@ -326,23 +328,24 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         plane.level()
         flown.interrupt()
         flown.end(60.0)
-    return signs_of_logs([plane.run], lambda number, one: winds[bisect(begun, one.start_ns) - 1], duration)
+    return signs_of_logs([plane.run], lambda number, one: winds[bisect(begun, one.start_ns) - 1])
 
 
-def signs_of_logs(runs: Sequence[Path], wind_of: Callable[[int, Engagement], float], duration: float = 0.0) -> dict[str, Any]:
+def signs_of_logs(runs: Sequence[Path], wind_of: Callable[[int, Engagement], float]) -> dict[str, Any]:
     """The stored experiments on signs, and those of logs; `wind_of` is the turbulence of an engagement.
 
-    An engagement shorter than `duration`, s, was ended by the bridge: it is counted, not judged. Those of a run in strong
-    turbulence are also judged together, as `check-signs` judges a log with several.
+    An engagement shorter than EXCITED was ended by the bridge or with the flight: it is counted, not judged. Those of a run in
+    strong turbulence are also judged together, as `check-signs` judges a log with several.
     """
     earlier, channel_map = stored("signs"), load_map("ardupilot")
     found, ended, together = (earlier.get(key, []) for key in ("experiments", "ended", "together"))
     for run in runs:
         log, strong = read_run(run), dict[float, list[Engagement]]()
+        end_ns = int(log.tape["y"].stamp_ns[-1])
         for number, one in enumerate(log.engagements or []):
             turbulence = wind_of(number, one)
             about = {"run": run.name, "turbulence": turbulence, "reason": one.reason}
-            if one.stop_ns is not None and seconds(one.stop_ns - one.start_ns) < duration:
+            if seconds((one.stop_ns or end_ns) - one.start_ns) < EXCITED:
                 ended.append(about)
                 continue
             found.append(about | judged(channel_map, log.tape, [one]))
@@ -609,7 +612,7 @@ def table_of_signs(result: dict[str, Any]) -> str:
     clean, caught = (sum(map(of, experiments)) for of in (shows_all, finds_each))
     rows.append(
         f"\n{clean} of {len(experiments)} show every sign, right; {caught} find each single sign that is flipped."
-        f" The envelope or the pilot ended {len(result.get('ended', []))} further ones early."
+        f" The envelope, the pilot or the end of the flight ended {len(result.get('ended', []))} further ones early."
     )
     for one in result.get("together", []):
         verdict = "every sign, and find each flipped one" if shows_all(one) and finds_each(one) else "**not every sign**"
