@@ -34,8 +34,8 @@ def store(name: str, result: Any) -> None:
 
 
 def page(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """The page from the stored results by name: "flights NAME", "grid NAME", "rates" and "long flight"."""
-    parts, makers = [INTRODUCTION], {"flights": _flights, "grid": _grid, "rates": _rates, "long": _long}
+    """The page from the stored results by name: "flights NAME", "grid NAME", "rates", "route" and "long flight"."""
+    parts, makers = [INTRODUCTION], {"flights": _flights, "grid": _grid, "rates": _rates, "route": _route, "long": _long}
     for name, stored in results.items():
         kind, _, aircraft = name.partition(" ")
         title, command, lines = makers[kind](aircraft, stored["result"])
@@ -53,12 +53,27 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
 
 def _flights(aircraft: str, rows: Any) -> tuple[str, str, list[str]]:
     """Rows (manoeuvre, air, figure, value, limit, seeds)."""
-    cells = []
-    for manoeuvre, air, figure, value, limit, seeds in rows:
-        shown = f"{value:.3g}" if value <= limit else f"*{value:.3g}*"
-        cells.append((f"{manoeuvre}: {figure}", air + (f", {seeds} seeds" if seeds else ""), shown, f"{limit:.3g}"))
     title, command = f"Holds and paths, {aircraft}", f"python -m benchmarks.guidance --only {aircraft}"
-    return title, command, list(table(("figure", "air", "worst", "limit"), cells))
+    return title, command, list(_figures(rows))
+
+
+def _route(_: str, rows: Any) -> tuple[str, str, list[str]]:
+    """Rows (aircraft, manoeuvre, air, figure, value, limit, seeds)."""
+    sentences = [
+        "Seven waypoints with turns of 45, 45, 63, 117 and -76 deg at the least radius, a climb of 60 m and a sink of as much.",
+        "Nothing of guidance was tried on these aircraft while it was built; each is identified first.\n",
+    ]
+    lines = [*sentences, *_figures((aircraft, *row) for aircraft, _, *row in rows)]
+    return "Another route, other aircraft", "python -m benchmarks.guidance --route", lines
+
+
+def _figures(rows: Iterable[Any]) -> Iterator[str]:
+    """The table of rows (about, air, figure, value, limit, seeds)."""
+    cells = []
+    for about, air, figure, value, limit, seeds in rows:
+        shown = f"{value:.3g}" if value <= limit else f"*{value:.3g}*"
+        cells.append((f"{about}: {figure}", air + (f", {seeds} seeds" if seeds else ""), shown, f"{limit:.3g}"))
+    return table(("figure", "air", "worst", "limit"), cells)
 
 
 def _grid(aircraft: str, points: Any) -> tuple[str, str, list[str]]:
