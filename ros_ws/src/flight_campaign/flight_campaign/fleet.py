@@ -7,7 +7,7 @@ ticks of the controller an aircraft is linear up to a small remainder: all steps
 """
 
 from functools import partial
-from itertools import accumulate, repeat
+from itertools import accumulate, chain, repeat
 from typing import Any, NamedTuple
 
 import jax
@@ -287,12 +287,15 @@ def _fly(
         law, u = jax.lax.switch(segment.phase, (hold, engage, step), now, y, segment, *reference)
         history = jnp.concatenate([u[None], now.u_before])
         acting = u if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
-        command, position, positions = acting[jnp.argsort(vehicle.inputs)], now.position, []
-        for k in range(steps):
-            position, mean = actuators.move(segment.t + k * vehicle.dt, position, command, vehicle.dt, vehicle.actuators)
-            positions.extend(mean)
+        command = acting[jnp.argsort(vehicle.inputs)]
+
+        def move(position: Array, t: Array) -> tuple[Array, Array]:
+            return actuators.move(t, position, command, vehicle.dt, vehicle.actuators)
+
+        # A loop of its own: without one the compiler computes all mean positions again for each state that they act on.
+        position, means = jax.lax.scan(move, now.position, segment.t + np.arange(steps) * vehicle.dt)
         remainder = remainder_of(now.x[vehicle.remainder_states], vehicle.remainder)
-        moves = [*now.x, *positions, *(1.5 * remainder - 0.5 * now.remainder)]
+        moves = [*now.x, *chain(*means), *(1.5 * remainder - 0.5 * now.remainder)]
         parts = [_product(part, [moves[j] for j in block.columns]) for part, block in zip(fleet.tick, blocks, strict=True)]
         x = jnp.concatenate(parts)[places]
         x = jax.lax.cond(
