@@ -58,11 +58,12 @@ PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
 LOCK: Path | None = None  # --lock
 ENGAGEMENTS, LARGEST_STEP = 20, 0.02  # of the range of a setpoint
 WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
-PERIODS = {"elevator": 4.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}  # s, of the multisines of the experiments on signs
+PERIODS = {"elevator": 12.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}
+"""s, of the multisines of the experiments on signs. With 4 s of the elevator 2 of 12 were unsure of it at SIM_WIND_TURB 0.5."""
 STRONGER_ELEVATOR = 2.0  # `check-signs` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
 TURBULENCE = (0.25, 0.5, 0.25, 0.5, 1.0)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
-EXCITED = 24.0  # s, of an experiment on signs, without pauses
-EXPERIMENT = 80.0  # s, of one on signs at most: 31 s engaged, and back to level flight
+EXCITED = 35.0  # s, of an experiment on signs at least
+EXPERIMENT = 80.0  # s, of one on signs at most: 39 s engaged, and back to level flight
 MODERATE = 0.5  # SIM_WIND_TURB up to which one experiment has to show every sign
 GUIDED, EACH, SETTLED = 300.0, 60.0, 45.0  # s: engaged under guidance, each turn, and from its command until it counts as held
 OBSERVER_MARGIN, OBSERVED_TURBULENCE, OBSERVED_PAIRS = 0.025, 0.5, 2  # s beyond the identified delay; SIM_WIND_TURB; flights
@@ -299,7 +300,7 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         channel_map = plane.patient_map("ardupilot")
         loaded = load_map(channel_map)
         airframe, scenario = plane.folder / "signs_airframe.yaml", plane.folder / "signs.yaml"
-        planned = experiment(loaded, EXCITED, 0.2, str(airframe))
+        planned = experiment(loaded, 24.0, 0.2, str(airframe))
         airframe.write_text(planned.airframe, encoding="utf-8")
         content = yaml.safe_load(planned.scenario)
         controller = content["/**/controller"]["ros__parameters"]
@@ -665,7 +666,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sitl", type=Path, help="folder of the kit")
     parser.add_argument("--only", action="append", choices=MEASUREMENTS, help="repeatable")
-    parser.add_argument("--experiments", type=int, default=25, help="number of further ones on signs, 40 s each")
+    parser.add_argument("--experiments", type=int, default=25, help="number of further ones on signs, a minute each")
     parser.add_argument("--log", type=Path, action="append", help="with --only: a flown experiment in place of a new one")
     parser.add_argument("--lock", type=Path, help="file that is locked while an autopilot flies, for a shared host")
     parser.add_argument("--render", action="store_true", help="no flight")
