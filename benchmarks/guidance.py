@@ -17,11 +17,12 @@ import math
 import sys
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -470,24 +471,41 @@ class Row(NamedTuple):
     figure: Figure
 
 
-def rows(aircraft: Sequence[str], manoeuvres: Mapping[str, Manoeuvre], seeds: int) -> Iterator[Row]:
-    """All rows, as they are flown."""
-    for name in aircraft:
-        for title, manoeuvre in manoeuvres.items():
-            for across in manoeuvre.winds:
-                wind = f", wind {across:g} V" if across else ""
-                airs = {f"calm{wind}": [Air("calm", None, across)]}
-                if manoeuvre.turbulent:
-                    airs[f"turbulence{wind}"] = [Air("turbulence", seed + 1, across) for seed in range(seeds)]
-                for shown, several in airs.items():
-                    worst: dict[str, Figure] = {}
-                    for air in several:
-                        for figure in flown(aircraft_of(name), manoeuvre, air):
-                            own = max(figure.limit, EXEMPT.get((name, title, figure.name), figure.limit))
-                            worst[figure.name] = max(
-                                figure._replace(limit=own), worst.get(figure.name, figure), key=lambda one: one.value
-                            )
-                    yield from (Row(name, title, shown, figure) for figure in worst.values())
+class Job(NamedTuple):
+    """One flight: of a manoeuvre by its title, in the air that a row names."""
+
+    title: str
+    shown: str
+    air: Air
+
+
+def jobs(manoeuvres: Mapping[str, Manoeuvre], seeds: int) -> Iterator[Job]:
+    """The flights of one aircraft, those of a row beside each other."""
+    for title, manoeuvre in manoeuvres.items():
+        for across in manoeuvre.winds:
+            wind = f", wind {across:g} V" if across else ""
+            yield Job(title, f"calm{wind}", Air("calm", None, across))
+            for seed in range(seeds if manoeuvre.turbulent else 0):
+                yield Job(title, f"turbulence{wind}", Air("turbulence", seed + 1, across))
+
+
+def fly(scenario: Scenario, job: Job) -> list[Figure]:
+    """The figures of one flight."""
+    return list(flown(scenario, {**MANOEUVRES, **OTHER_ROUTE}[job.title], job.air))
+
+
+def rows(
+    name: str, manoeuvres: Mapping[str, Manoeuvre], seeds: int, over: Callable[..., Iterable[list[Figure]]] = map
+) -> Iterator[Row]:
+    """All rows of an aircraft, as they are flown by `over`, which is `map` or that of a pool of processes."""
+    several = list(jobs(manoeuvres, seeds))
+    done = zip(several, over(partial(fly, aircraft_of(name)), several), strict=True)
+    for (title, shown), those in groupby(done, key=lambda one: one[0][:2]):
+        worst: dict[str, Figure] = {}
+        for figure in (figure for _, figures in those for figure in figures):
+            own = max(figure.limit, EXEMPT.get((name, title, figure.name), figure.limit))
+            worst[figure.name] = max(figure._replace(limit=own), worst.get(figure.name, figure), key=lambda one: one.value)
+        yield from (Row(name, title, shown, figure) for figure in worst.values())
 
 
 def main() -> None:
@@ -532,12 +550,13 @@ def fly_manoeuvres(name: str, manoeuvres: Mapping[str, Manoeuvre], seeds: int) -
     """Fly the manoeuvres of an aircraft and print the table."""
     table = new_table(f"Guidance by rule, {name}", ("manoeuvre", "air", "figure", "worst", "limit", ""), texts=3)
     kept: list[Kept] = []
-    for row in rows([name], manoeuvres, seeds):
-        figure = (row.figure.name, float(row.figure.value), float(row.figure.limit))
-        kept.append((name, row.manoeuvre, row.air, *figure, 0 if row.air.startswith("calm") else seeds))
-        cells = (*row[1:3], figure[0], f"{figure[1]:.3g}", f"{figure[2]:.3g}", "missed" if missed(*kept[-1]) else "")
-        print(name, *cells, sep="\t", file=sys.stderr, flush=True)
-        table.add_row(*cells)
+    with ProcessPoolExecutor() as pool:
+        for row in rows(name, manoeuvres, seeds, pool.map):
+            figure = (row.figure.name, float(row.figure.value), float(row.figure.limit))
+            kept.append((name, row.manoeuvre, row.air, *figure, 0 if row.air.startswith("calm") else seeds))
+            cells = (*row[1:3], figure[0], f"{figure[1]:.3g}", f"{figure[2]:.3g}", "missed" if missed(*kept[-1]) else "")
+            print(name, *cells, sep="\t", file=sys.stderr, flush=True)
+            table.add_row(*cells)
     Console().print(table)
     return kept
 

@@ -14,7 +14,7 @@ from guidance.modes import POSE
 
 
 def test_a_step_of_the_bank_is_flown_within_its_limits() -> None:
-    rows = list(benchmark.rows(["osprey_servo"], {"phi": benchmark.MANOEUVRES["phi"]}, seeds=0))
+    rows = list(benchmark.rows("osprey_servo", {"phi": benchmark.MANOEUVRES["phi"]}, seeds=0))
     assert [row.figure.name for row in rows][:2] == ["overshoot (%)", "settled to 1 deg (s)"]
     for row in rows:
         assert row.figure.value <= row.figure.limit, row
@@ -38,7 +38,7 @@ def test_a_known_step_has_the_figures_that_it_must_have() -> None:
     [("5 Hz, 0.2 s late, noisy", 0.0), ("frozen for 8 s, new stamps", 7.8), ("jump", 0.0), ("one sample off", 0.0)],
 )
 def test_a_poor_pose_is_flown_across_180_deg_and_a_frozen_one_levels_the_wings(pose: str, stale: float) -> None:
-    rows = list(benchmark.rows(["osprey_servo"], {pose: benchmark.MANOEUVRES[f"pose: {pose}"]}, seeds=0))
+    rows = list(benchmark.rows("osprey_servo", {f"pose: {pose}": benchmark.MANOEUVRES[f"pose: {pose}"]}, seeds=0))
     for row in rows:
         assert row.figure.value <= row.figure.limit, row
     assert {row.figure.name: row.figure.value for row in rows}["pose stale (s)"] == pytest.approx(stale)
