@@ -38,12 +38,13 @@ fly: setup
 # Two workers fill two cores: threads of OpenBLAS would only wait for each other.
 test test-fast: export OPENBLAS_NUM_THREADS = 1
 
-# The tests that fly alone mostly wait. The slow ones without ROS compute meanwhile, with the policy SCHED_IDLE: any other
-# thread takes the processor from them at once.
+# The tests that fly alone mostly wait. The slow ones without ROS compute meanwhile, with the policy SCHED_IDLE where there is
+# chrt: any other thread takes the processor from them at once.
+IDLE = $(shell chrt --idle 0 true 2> /dev/null && echo chrt --idle 0)
 test: check
 	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; mkdir -p build; \
 	  $(XDIST) --no-loadscope-reorder -m "not alone and not slow" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
-	  chrt --idle 0 $(XDIST) -m slow tests/pure > build/slow-tests.log 2>&1 & slow=$$!; trap "kill $$slow 2> /dev/null || true" EXIT; \
+	  $(IDLE) $(XDIST) -m slow tests/pure > build/slow-tests.log 2>&1 & slow=$$!; trap "kill $$slow 2> /dev/null || true" EXIT; \
 	  $(BIN)/python -m pytest -m alone tests/ros || status=$$?; \
 	  echo "the slow tests go on: build/slow-tests.log"; wait $$slow || status=$$?; cat build/slow-tests.log; exit $$status)
 
