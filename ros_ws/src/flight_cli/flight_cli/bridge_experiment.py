@@ -148,6 +148,11 @@ def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]]]:
     return tape, [(one.start_ns, one.stop_ns or int(tape["u"].stamp_ns[-1])) for one in flown]
 
 
+def _digits(value: float, digits: int) -> str:
+    """A value by its leading digits, without an exponent up to 1e6: a narrow column would cut it off."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
 def _show_response(console: Console, name_of_map: str, response: Response, trims: dict[str, float]) -> None:
     headings = ("input", "trim", "moves", "Omega", "+-", "lag", "+-", "delay", "+-")
     table = new_table(
@@ -155,13 +160,15 @@ def _show_response(console: Console, name_of_map: str, response: Response, trims
         headings,
         left=("input", "moves"),
     )
+    table.collapse_padding = True  # nine columns in a terminal of 80
     for i, (name, output) in enumerate(zip(response.inputs, response.outputs, strict=True)):
         pairs = (
             (response.Omega[i, i], response.Omega_deviation[i, i]),
             (response.lag[i], response.lag_deviation[i]),
             (response.delay[i], response.delay_deviation[i]),
         )
-        table.add_row(name, f"{trims[name]:.3g}", f"{output}_dot", *(f"{value:.3g}" for pair in pairs for value in pair))
+        numbers = (text for value, deviation in pairs for text in (_digits(value, 3), _digits(deviation, 2)))
+        table.add_row(name, f"{trims[name]:.3g}", f"{output}_dot", *numbers)
     console.print(table)
 
 
