@@ -38,15 +38,15 @@ fly: setup
 # Two workers fill two cores: threads of OpenBLAS would only wait for each other.
 test test-fast: export OPENBLAS_NUM_THREADS = 1
 
-# The tests that fly alone mostly wait. The slow ones without ROS compute meanwhile, with the policy SCHED_IDLE where there is
-# chrt: any other thread takes the processor from them at once.
+# The tests of nodes mostly wait. The slow ones without ROS compute meanwhile, with the policy SCHED_IDLE where there is chrt:
+# any other thread takes the processor from them at once.
 IDLE = $(shell chrt --idle 0 true 2> /dev/null && echo chrt --idle 0)
 test: check
 	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; mkdir -p build; \
+	  $(IDLE) $(XDIST) -m slow --timeout=900 tests/pure > build/slow-tests.log 2>&1 & slow=$$!; trap "kill $$slow 2> /dev/null || true" EXIT; \
 	  $(XDIST) --no-loadscope-reorder -m "not alone and not slow" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
-	  $(IDLE) $(XDIST) -m slow tests/pure > build/slow-tests.log 2>&1 & slow=$$!; trap "kill $$slow 2> /dev/null || true" EXIT; \
 	  $(BIN)/python -m pytest -m alone tests/ros || status=$$?; \
-	  echo "the slow tests go on: build/slow-tests.log"; wait $$slow || status=$$?; cat build/slow-tests.log; exit $$status)
+	  wait $$slow || status=$$?; cat build/slow-tests.log; exit $$status)
 
 test-fast: .venv/.all .venv/.workspace
 	@$(XDIST) --quiet -m "not slow" tests/pure

@@ -83,7 +83,7 @@ class Browser:
             raise RuntimeError(json.dumps(result["exceptionDetails"]))
         return result["result"].get("value")
 
-    def wait_for(self, expression: str, limit: float = 30.0) -> None:
+    def wait_for(self, expression: str, limit: float = 120.0) -> None:
         """Wait until an expression is true. Raises TimeoutError after `limit` seconds."""
         until = time.monotonic() + limit
         while not self.run(expression):

@@ -147,5 +147,5 @@ def command(prog_name):
 cli.application = lambda words: command
 cli.main()
 """
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=50.0, check=False)
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120.0, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")

@@ -200,12 +200,12 @@ def test_a_hang_in_the_isolated_process_times_out() -> None:
 
 def test_a_crash_an_exception_and_an_exit_of_the_isolated_process_are_errors_here() -> None:
     with pytest.raises(isolated.IsolatedCallError, match="was killed by SIGSEGV"):
-        isolated.call(ctypes.string_at, 0, timeout=30.0)
+        isolated.call(ctypes.string_at, 0, timeout=120.0)
     with pytest.raises(isolated.IsolatedCallError, match=r"exited with status 1 \(ValueError: "):
-        isolated.call(math.sqrt, -1.0, timeout=30.0)
+        isolated.call(math.sqrt, -1.0, timeout=120.0)
     with pytest.raises(isolated.IsolatedCallError, match=r"exited with status 5"):
-        isolated.call(os._exit, 5, timeout=30.0)
-    assert isolated.call(math.hypot, 3.0, 4.0, timeout=30.0) == 5.0
+        isolated.call(os._exit, 5, timeout=120.0)
+    assert isolated.call(math.hypot, 3.0, 4.0, timeout=120.0) == 5.0
 
 
 def test_a_crash_of_jsbsim_ends_a_flight_in_one_process_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -308,7 +308,7 @@ async def get(server: Server, path: str, method: str = "GET", token: str = TOKEN
         body=b"" if method in {"POST", "PUT", "PATCH"} else None,
         follow_redirects=False,
         raise_error=False,
-        request_timeout=20.0,
+        request_timeout=60.0,
     )
 
 

@@ -317,7 +317,7 @@ async def post(server: Server, body: object, **headers: str) -> HTTPResponse:
         headers=given,
         body=body if isinstance(body, str) else json.dumps(body),
         raise_error=False,
-        request_timeout=20.0,
+        request_timeout=60.0,
     )
 
 
