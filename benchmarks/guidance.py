@@ -53,15 +53,7 @@ START = 5.0  # s, of the command
 BANK, TURN, CLIMB, FASTER = math.radians(20.0), math.pi / 2.0, 100.0, 0.1  # rad, rad, m, of V0
 WIND = 0.2  # of V0
 RECTANGLE = ((0, 0, 0), (3, 0, 0), (3, 2.5, 0), (0, 2.5, 0), (0, 0, 0))
-ROUTE = (
-    (0.0, 0.0, 0.0),
-    (5.0, 0.0, 0.0),
-    (8.0, 3.0, 60.0),
-    (8.0, 8.0, 60.0),
-    (4.0, 10.0, 0.0),
-    (4.0, 5.0, 0.0),
-    (0.0, 4.0, 0.0),
-)
+ROUTE = ((0, 0, 0), (3, 0, 10), (5, 2, 10), (5, 5, 0), (2.5, 6.25, 0), (2.5, 3, 0), (0, 2.375, 0))
 """Waypoints as of `round_route`. The second route turns by 45, 45, 63, 117 and -76 deg."""
 LOW, LOW_WIND = 100.0, 10.9  # m and m/s at 20 ft, for an airframe without altitude: lateral intensity 1.5 m/s, MIL-F-8785C
 SWITCH_PERIOD = 5.0  # s
@@ -375,8 +367,8 @@ def original_of(name: str) -> Scenario:
 
 
 AIRCRAFT = ("osprey_servo", "c172p", "737", "f16")
-OTHERS = {"A320": (154.0, 6096.0), "F4N": (180.0, 4572.0), "c182": (56.6, 1219.0)}
-"""Aircraft of JSBSim on which nothing of guidance was tried while it was built: an airliner, a fighter, a light aircraft."""
+OTHERS = {"c182": (56.6, 1219.0), "A320": (154.0, 6096.0), "F4N": (180.0, 4572.0)}
+"""Aircraft of JSBSim on which nothing of guidance was tried while it was built: a light aircraft, an airliner, a fighter."""
 
 CONDITIONS: Mapping[str, tuple[float, float]] = {"737": (154.0, 6096.0), **OTHERS}
 """Trim speed, m/s, and altitude, m, of the aircraft that are identified."""

@@ -60,7 +60,7 @@ def _flights(aircraft: str, rows: Any) -> tuple[str, str, list[str]]:
 def _route(_: str, rows: Any) -> tuple[str, str, list[str]]:
     """Rows (aircraft, manoeuvre, air, figure, value, limit, seeds)."""
     sentences = [
-        "Seven waypoints with turns of 45, 45, 63, 117 and -76 deg at the least radius, a climb of 60 m and a sink of as much.",
+        "Seven waypoints with turns of 45, 45, 63, 117 and -76 deg at the least radius, a climb of 10 m and a sink of as much.",
         "Nothing of guidance was tried on these aircraft while it was built; each is identified first.\n",
     ]
     lines = [*sentences, *_figures((aircraft, *row) for aircraft, _, *row in rows)]
