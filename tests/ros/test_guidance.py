@@ -119,7 +119,7 @@ def test_the_command_target_says_what_is_in_force_and_what_is_refused(flight: Fl
     good = start("flight_cli.cli", "target", "heading=90", "altitude=60")
     flight.until(lambda: good.popen.poll() is not None)
     assert "in force: heading=90, altitude=60" in good.succeed().output
-    assert (flight.last("target.heading"), flight.last("target.altitude")) == (math.pi / 2.0, 60.0)
+    flight.until(lambda: (flight.last("target.heading"), flight.last("target.altitude")) == (math.pi / 2.0, 60.0))
     refused = start("flight_cli.cli", "target", "phi=80")  # degrees
     flight.until(lambda: refused.popen.poll() is not None)
     assert refused.end() == 1
@@ -166,7 +166,7 @@ def test_the_client_of_a_page_commands_guidance(flight: Flight) -> None:
             return pending.result()
 
         assert answer(client.send_target, {"phi": 0.2}) == ""
-        assert flight.last("target.phi") == 0.2
+        flight.until(lambda: flight.last("target.phi") == 0.2)
         assert answer(client.skip) == "no route is flown"
         assert answer(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0], [900.0, 900.0, 55.0]]) == ""
         flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE)
