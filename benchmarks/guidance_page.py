@@ -64,7 +64,8 @@ def _route(_: str, rows: Any) -> tuple[str, str, list[str]]:
         "Nothing of guidance was tried on these aircraft while it was built; each is identified first.\n",
     ]
     lines = [*sentences, *_figures((aircraft, *row) for aircraft, _, *row in rows)]
-    return "Another route, other aircraft", "python -m benchmarks.guidance --route", lines
+    seeds = max(row[-1] for row in rows)
+    return "Another route, other aircraft", f"python -m benchmarks.guidance --route --seeds {seeds}", lines
 
 
 def _figures(rows: Iterable[Any]) -> Iterator[str]:
