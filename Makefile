@@ -43,7 +43,7 @@ test test-fast: export OPENBLAS_NUM_THREADS = 1
 IDLE = $(shell chrt --idle 0 true 2> /dev/null && echo chrt --idle 0)
 test: check
 	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; mkdir -p build; \
-	  $(IDLE) $(XDIST) -m slow --timeout=900 tests/pure > build/slow-tests.log 2>&1 & slow=$$!; trap "kill $$slow 2> /dev/null || true" EXIT; \
+	  $(IDLE) $(XDIST) -m slow --timeout=900 tests/pure > build/slow-tests.log 2>&1 & slow=$$!; trap "kill $$slow 2> /dev/null || true" EXIT; trap "exit 130" INT; \
 	  $(XDIST) --no-loadscope-reorder -m "not alone and not slow" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
 	  wait $$slow || status=$$?; cat build/slow-tests.log; \
 	  $(BIN)/python -m pytest -m alone tests/ros || status=$$?; exit $$status)
