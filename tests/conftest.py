@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures of all tests: the default scenario and the log of a flight."""
 
+import os
 import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -36,8 +38,17 @@ SLOW = {
 }  # fmt: skip
 """Modules of tests/pure with seconds of processor time, which `make test-fast` leaves out."""
 
-ALONE = {"faults", "flight", "live_commands", "recorder"}
+ALONE = {"faults", "killed_recorder", "real_time_flight"}
 """Modules of tests/ros that fly in real time and measure it: `make test` runs them one after another, after all others."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let all processes of a session share the programs that JAX has compiled; workers inherit the environment."""
+    if not hasattr(config, "workerinput"):
+        folder = tempfile.TemporaryDirectory(prefix="jax", ignore_cleanup_errors=True)
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder.name
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+        config.add_cleanup(folder.cleanup)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

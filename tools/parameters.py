@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes docs/reference/parameters.md: every parameter of every node, from the classes that validate them."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType, NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from aircraft_sim.params import AircraftParameters
 from autopilot_bridge.params import BridgeParameters
 from flight_analysis.closed_loop.scenario import FlightParameters
+from flight_core.fields import REQUIRED
 from flight_core.parameters import ParameterError, Parameters
 from flight_recorder.params import RecorderParameters
 from guidance.params import GuidanceParameters
@@ -31,6 +33,7 @@ SECTIONS: Mapping[str, type[Parameters]] = {
     "bridge": BridgeParameters,
     "recorder": RecorderParameters,
 }
+TYPES = {float: "number", int: "integer", str: "string", bool: "boolean", dict: "object", object: "any"}
 
 
 def page() -> str:
@@ -45,62 +48,66 @@ def page() -> str:
     return "\n".join(parts)
 
 
-def _section(title: str, schema: type[Parameters], known: set[str] = frozenset()) -> str:  # type: ignore[assignment]
-    content = schema.model_json_schema()
+def _section(title: str, schema: type[Parameters], known: Set[str] = frozenset()) -> str:
     rows = [
         f"| `{key}` | {kind} | {default} | {bounds} | {text} |"
-        for key, kind, default, bounds, text in _rows(content, content.get("$defs", {}))
+        for key, kind, default, bounds, text in _rows(schema)
         if key.split(".")[0] not in known
     ]
     head = ["| parameter | type | default | bounds | meaning |", "|---|---|---|---|---|"]
     return "\n".join([f"## {title}", "", *head, *rows, ""])
 
 
-def _rows(schema: Mapping[str, Any], definitions: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, ...]]:
-    """Key, type, default, bounds and meaning of each parameter of an object; those of a group under a dotted key."""
-    required = schema.get("required", [])
-    for name, given in schema.get("properties", {}).items():
-        one = _resolved(given, definitions)
-        default = "required" if name in required else _value(given.get("default"))
-        group = one if "properties" in one else _resolved(one.get("additionalProperties") or {}, definitions)
+def _rows(schema: type[Parameters], prefix: str = "") -> Iterator[tuple[str, ...]]:
+    """Key, type, default, bounds and meaning of each parameter of a set; those of a group under a dotted key."""
+    for name, field in schema.model_fields.items():
+        one, rules = _resolved(field.annotation, field.rules)
+        named = get_origin(one) is dict
+        group = _resolved(get_args(one)[1])[0] if named else one
         key = f"{prefix}{name}"
-        if "properties" in group:
-            below = key if group is one else f"{key}.NAME"
-            yield key, "group", "" if group is one else "none", "", _text(given, one)
-            yield from _rows(group, definitions, f"{below}.")
+        if isinstance(group, type) and issubclass(group, Parameters):
+            meaning = field.description or ("" if named else group.__doc__ or "")
+            yield key, "group", "none" if named else "", "", _text(meaning)
+            yield from _rows(group, f"{key}.NAME." if named else f"{key}.")
         else:
-            yield key, _type(one), default, _bounds(one.get("items") or one), _text(given, one)
+            default = "required" if field.default is REQUIRED else _value(field.default)
+            item_rules = _resolved(get_args(one)[0])[1] if get_origin(one) is tuple else rules
+            yield key, _type(one), default, _bounds(item_rules), _text(field.description)
 
 
-def _resolved(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A schema without its reference, and without the alternative null."""
-    if "anyOf" in schema:
-        chosen = next(one for one in schema["anyOf"] if one.get("type") != "null")
-        return _resolved(chosen, definitions)
-    if "$ref" in schema:
-        return dict(definitions[schema["$ref"].rsplit("/", 1)[-1]])
-    return schema
+def _resolved(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) -> tuple[Any, Mapping[str, Any]]:
+    """A type without its rules and without the alternative None, and the rules."""
+    if get_origin(annotation) is Annotated:
+        inner, *outer = get_args(annotation)
+        return _resolved(inner, {rule: limit for one in outer for rule, limit in one.rules.items()} | dict(rules))
+    if get_origin(annotation) in (Union, UnionType):
+        return _resolved(next(one for one in get_args(annotation) if one is not NoneType), rules)
+    return annotation, rules
 
 
-def _type(schema: Mapping[str, Any]) -> str:
-    if "enum" in schema or "const" in schema:
-        return ", ".join(f"`{one}`" for one in schema.get("enum", [schema.get("const")]))
-    if schema.get("type") == "array":
-        return f"list of {_type(schema.get('items') or (schema.get('prefixItems') or [{}])[0])}"
-    return str(schema.get("type", "any"))
+def _type(annotation: Any) -> str:
+    if get_origin(annotation) is Literal:
+        return ", ".join(f"`{one}`" for one in get_args(annotation))
+    if get_origin(annotation) is tuple:
+        return f"list of {_type(_resolved(get_args(annotation)[0])[0])}"
+    return TYPES[get_origin(annotation) or annotation]
 
 
-def _bounds(schema: Mapping[str, Any]) -> str:
-    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
-    return ", ".join(f"{sign} {schema[name]:g}" for name, sign in signs.items() if name in schema)
+def _bounds(rules: Mapping[str, Any]) -> str:
+    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+    return ", ".join(f"{sign} {rules[name]:g}" for name, sign in signs.items() if name in rules)
 
 
 def _value(default: object) -> str:
-    return "none" if default in (None, "", [], {}) else f"`{str(default).lower() if isinstance(default, bool) else default}`"
+    if default in (None, "", (), {}):
+        return "none"
+    return (
+        f"`{list(default) if isinstance(default, tuple) else str(default).lower() if isinstance(default, bool) else default}`"
+    )
 
 
-def _text(*schemas: Mapping[str, Any]) -> str:
-    return next((" ".join(one["description"].split()).replace("|", "\\|") for one in schemas if "description" in one), "")
+def _text(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
 
 
 if __name__ == "__main__":

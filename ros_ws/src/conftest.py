@@ -10,7 +10,7 @@ SOURCES = Path(__file__).resolve().parent
 TESTS = SOURCES.parents[1] / "tests"
 
 MODULES = {
-    "flight_core": "pure: authentication parameters vectors",
+    "flight_core": "pure: authentication fields parameters vectors",
     "flight_log": "pure: bag follow full_disk log_contents playback recorded_before repair",
     "flight_ros": "pure: lockstep_inputs publisher_lock ticker; ros: fuzz_messages health messages rclpy_private security",
     "reference_model": "pure: live_commands reference_model; ros: live_commands",
@@ -20,14 +20,14 @@ MODULES = {
     "aircraft_sim": "pure: actuators aircraft airframe_library disturbance faults_in_flight jsbsim pose sensors turbulence"
     " uncertainty; ros: aircraft",
     "autopilot_bridge": "pure: autopilot_examples bridge channel_map; ros: bridge published_messages",
-    "flight_recorder": "ros: recorder",
+    "flight_recorder": "ros: recorder killed_recorder",
     "control_laws": "pure: excitation laws observer_design rival_laws; ros: laws",
     "flight_analysis": "pure: bridge_identification check_signs export gains guided_report identification layouts lyapunov"
     " metrics model_identification observer_selection observer_theory replay report report_page response_identification"
     " servo_world simulate; ros: replay",
     "flight_campaign": "pure: campaign compare fleet",
-    "flight_bringup": "pure: launch_files; ros: flight lockstep node_state nodes own_aircraft policy faults/faults"
-    " faults/lockstep_faults",
+    "flight_bringup": "pure: launch_files; ros: flight real_time_flight lockstep node_state nodes own_aircraft policy"
+    " faults/faults faults/lockstep_faults",
     "flight_view": "pure: view view_control view_foxglove view_page; ros: control",
     "flight_cli": "pure: cli report_command; ros: play; fuzz: fuzz_command_line",
 }

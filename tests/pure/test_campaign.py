@@ -3,6 +3,7 @@
 """Monte Carlo campaigns: statistics of constant size, chunks that do not depend on engine or order, kill and resume."""
 
 import json
+import shlex
 import signal
 import subprocess
 import sys
@@ -19,15 +20,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from tests.closed_loop import error
+from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import control_errors
+from flight_analysis.report.run_folder import REPORT
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk_figures
 from flight_campaign.campaign_report import write_page
 from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
+from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
@@ -212,7 +216,7 @@ def test_a_campaign_of_a_version_without_effects_of_wind_is_not_continued(tmp_pa
     old = json.loads(definition().model_dump_json())
     del old["wind"]
     (tmp_path / "campaign.json").write_text(json.dumps(old), encoding="utf-8")
-    with pytest.raises(ParameterError, match=r"found no campaign \(.*wind, Field required"):
+    with pytest.raises(ParameterError, match=r"found no campaign \(.*wind: missing, expected"):
         Campaign.resume(tmp_path)
 
 
@@ -260,6 +264,58 @@ def test_a_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
 def test_an_invalid_sweep_is_refused(sweep: Sweep, sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"^{sentence}"):
         definition(20, 20, sweep)
+
+
+@pytest.mark.parametrize("text", ["beta=inf", "beta=1,nan", "beta="])
+def test_the_factors_of_a_sweep_are_finite(text: str, tmp_path: Path) -> None:
+    assert refusal("osprey_servo", "--sweep", text, "--runs", str(tmp_path)).startswith(f"--sweep: found '{text}', expected a")
+
+
+def test_an_address_without_a_port_is_refused() -> None:
+    with pytest.raises(ParameterError, match="--scheduler: found host, expected a reachable dask scheduler"):
+        next(engines.dask(1, "host")(square, [(1,)]))
+
+
+@pytest.fixture
+def flown(tmp_path: Path) -> Campaign:
+    """A campaign of one chunk, whose figures are made up."""
+    campaign, score = Campaign.begin(tmp_path, definition(20, 20)), np.linspace(1.0, 2.0, 20)
+    tally = Tally.of(0, np.zeros(20), {"score": score, "rms.q": score})
+    (tmp_path / CHUNKS / "0-000000.json").write_text(tally.model_dump_json(), encoding="utf-8")
+    return campaign
+
+
+def refusal(*words: str) -> str:
+    """The sentence with which the command ends."""
+    result = CliRunner().invoke(application(["campaign"]), ["campaign", *words])
+    assert isinstance(result.exception, ParameterError), result.exception
+    return str(result.exception)
+
+
+@pytest.mark.parametrize("content", ["", Tally.of(0, np.zeros(9), {"score": np.ones(9)}).model_dump_json()])
+def test_a_chunk_that_is_damaged_or_of_another_campaign_is_named(flown: Campaign, content: str) -> None:
+    path = flown.folder / CHUNKS / "0-000000.json"
+    path.write_text(content, encoding="utf-8")
+    assert refusal("--resume", str(flown.folder)).startswith(
+        f"{path}: found {'9' if content else 'none'}, expected the figures"
+    )
+
+
+def test_results_that_cannot_be_written_are_a_sentence(flown: Campaign) -> None:
+    (flown.folder / REPORT).mkdir()
+    assert refusal("--resume", str(flown.folder)).startswith(f"{flown.folder} cannot be written (Is a directory)")
+
+
+def test_a_printed_command_quotes_a_path_with_spaces(flown: Campaign) -> None:
+    folder = flown.folder.rename(flown.folder.with_name("my runs"))
+    result = CliRunner().invoke(application(["campaign"]), ["campaign", "--resume", str(folder), "--json"])
+    words = shlex.split(json.loads(result.stdout)["cases"][0]["fly_again"][0]["command"])
+    assert words == ["rise-di", "fly", str(folder / "osprey_servo_19.yaml"), "--in-process"]
+
+
+def test_a_campaign_is_not_continued_with_another_definition(flown: Campaign) -> None:
+    sentence = refusal("--resume", str(flown.folder), "--aircraft", "1000")
+    assert sentence == "--aircraft: found it beside --resume, expected none: the folder of a campaign holds its definition"
 
 
 def test_a_folder_without_a_campaign_is_refused(tmp_path: Path) -> None:
@@ -329,7 +385,7 @@ def square(job: engines.Job) -> int:
 
 def test_a_campaign_goes_on_with_a_scheduler_that_is_back() -> None:
     def cluster(port: int) -> LocalCluster:
-        where: dict[str, Any] = {"protocol": "tcp", "host": "127.0.0.1", "scheduler_port": port, "dashboard_address": None}
+        where: dict[str, Any] = {"protocol": "tcp", "host": "127.0.0.1", "scheduler_port": port, "dashboard_address": ":0"}
         return LocalCluster(n_workers=2, threads_per_worker=1, processes=False, **where)
 
     with cluster(0) as first:

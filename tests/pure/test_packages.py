@@ -27,7 +27,7 @@ EXECUTABLES = {
 }
 
 # The keys of rosdep (rosdep/python.yaml of ros/rosdistro); a ROS package is its own key.
-PYTHON3 = ("jinja2", "matplotlib", "numpy", "psutil", "pydantic", "rich", "scipy", "tornado", "typer", "yaml")
+PYTHON3 = ("jinja2", "matplotlib", "numpy", "psutil", "rich", "scipy", "tornado", "typer", "yaml")
 KEYS = {name: f"python3-{name}" for name in PYTHON3} | {"markupsafe": "python3-jinja2"}  # which depends on it
 # Without a key, or (rosbags) with one for pip, which Ubuntu 24.04 refuses for its own Python.
 WITHOUT_KEY = {"cma", "distributed", "foxglove", "jax", "jsbsim", "lz4", "mcap", "polars", "rosbags", "zstandard"}

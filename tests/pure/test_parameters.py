@@ -137,7 +137,7 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
     "gusts": [({"up": GUST}, ": found 'up', expected a gust of the airframe osprey: vertical, lateral, longitudinal")],
     "bias": [
         ({"h": STEP}, r"\.h: found 'h', expected a state of osprey: V, alpha"),
-        ({"q": {"start": 0.0, "value": 1.0}}, r"\.q\.rise: missing, expected a value"),
+        ({"q": {"start": 0.0, "value": 1.0}}, r"\.q\.rise: missing, expected the rise time, s"),
         ({"q": STEP | {"rise": -1.0}}, r"\.q\.rise: found -1\.0, expected greater than or equal to 0"),
     ],
     "sines": [

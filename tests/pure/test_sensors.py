@@ -218,7 +218,7 @@ def test_ideal_sensors_give_y_to_the_last_bit() -> None:
 @pytest.fixture(scope="module")
 def servo() -> Scenario:
     slow, controller = {"rate": 100.0}, {"delay": 0.0, "softening": 3.0}
-    return find_scenario("osprey_servo").vary(aircraft=slow, reference_model=slow, controller=controller)
+    return find_scenario("osprey_servo").vary(aircraft=slow | {"step": 0.005}, reference_model=slow, controller=controller)
 
 
 def with_sensors(scenario: Scenario, **sensors: Any) -> Scenario:

@@ -188,7 +188,7 @@ def test_targets_routes_and_services_reach_guidance_and_refusals_come_back(desk:
         assert desk.nodes.done == [
             ("target", {"heading": 1.5, "altitude": 60.0}), ("route", [[0.0, 0.0, 50.0], [500.0, 0.0, 60.5]]), ("hold", None),
         ]  # fmt: skip
-        assert await desk.refused("skip") == (422, "no route is flown")
+        assert await desk.refused("skip") == (422, "no route with a further leg is flown")
         assert (await desk.refused("target", values={"bank": 1.0}))[0] == 400
         for points in ([[0, 0, 0]], [[0, 0], [1, 1]], "north", [["a", 0, 0], [0, 0, 0]], [[0, 0, None], [0, 0, 0]]):
             assert (await desk.refused("route", points=points))[0] == 400
@@ -214,6 +214,7 @@ def test_faults_and_gusts_become_parameters_of_the_aircraft(desk: Desk) -> None:
             ("fault", {"values": {"sensors.dropout": 2.0}}, 422),
             ("fault", {"values": {"rate": 100.0}}, 400),
             ("gust", {"axis": "sideways", "speed": 3, "length": 20}, 422),
+            ("gust", {"axis": "\ud800", "speed": 3, "length": 20}, 400),
             ("gust", {"axis": "lateral", "speed": None, "length": 20}, 400),
         ):
             assert (await desk.refused(do, **request))[0] == expected

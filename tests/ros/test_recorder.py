@@ -1,15 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder: recorded topics, QoS, missing topics, lost messages, a full disk, a killed recorder."""
+"""The recorder: recorded topics, QoS, missing topics, lost messages, a full disk."""
 
-import json
 import re
-import signal
-import subprocess
-import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,35 +15,21 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import FluidPressure, JointState, Temperature
 from std_msgs.msg import String
-from tests.conftest import REPOSITORY
-from tests.recordings import messages
-from tests.ros.conftest import Process, Start, logged
+from tests.recordings import count_messages, messages
+from tests.ros.conftest import Process, Recorder
 from tests.ros.peer import OUTPUTS, Peer
 from tests.small_disk import small_disk
 
-from flight_analysis.closed_loop.scenario import Scenario
-from flight_core.rates import NANOSECONDS, period_ns
+from flight_core.rates import period_ns
 from flight_log.tape_reader import read_run
-from flight_ros.messages import stamp_of, to_message
-from flight_ros.subscriptions import PolledSubscription
-from flight_ros.topics import NEWEST_SAMPLES, PUBLISH, Y, publisher_qos
+from flight_ros.messages import to_message
+from flight_ros.topics import PUBLISH, publisher_qos
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 PEER_TOPICS = ("/diagnostics",)
-SIGNALS = ("/y", "/y_m", "/u", "/internals", "/truth")
-
-Recorder = Callable[..., Process]
-
-
-@pytest.fixture
-def recorder(start_node: Start) -> Recorder:
-    """Start a recorder with a folder and further parameters."""
-    return lambda folder, *parameters: start_node(
-        "flight_recorder", *(word for one in (f"directory:={folder}", *parameters) for word in ("-p", one))
-    )
 
 
 def diagnostics(peer_node: Peer) -> tuple[int, str, dict[str, str]]:
@@ -61,11 +42,6 @@ def diagnostics(peer_node: Peer) -> tuple[int, str, dict[str, str]]:
 
 def recorded(peer_node: Peer, topic: str) -> int:
     return int(diagnostics(peer_node)[2].get(f"messages {topic}", 0))
-
-
-def count_messages(run: Path) -> Counter[str]:
-    """The number of messages in a log, by topic."""
-    return Counter(topic for topic, _, _ in messages(run))
 
 
 def errors(process: Process) -> list[str]:
@@ -203,16 +179,6 @@ def disk(tmp_path: Path) -> Iterator[Path]:
         yield folder
 
 
-@pytest.fixture
-def publisher(domain: int) -> Iterator[subprocess.Popen[str]]:
-    """Six topics at 1 kHz, as wide as those of a flight, until the test ends."""
-    command = [sys.executable, "-m", "benchmarks.recorder", "--publish", "--duration=120"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY)
-    yield process
-    process.terminate()
-    process.communicate(timeout=20.0)
-
-
 @pytest.mark.usefixtures("publisher")
 @pytest.mark.parametrize(
     ("least", "reason"),
@@ -243,87 +209,6 @@ def test_too_little_space_at_the_start_is_rejected(recorder: Recorder, disk: Pat
     assert process.end() == 2
     sentence = r"error: recorder.min_free: found 3.0 MB free in .*/disk/run, expected at least 100 MB"
     assert re.fullmatch(sentence, process.lines[-1])
-
-
-# A recorder that is killed
-
-
-def stamps_and_sequences(folder: Path) -> dict[str, tuple[list[int], list[int]]]:
-    """Stamps and sequences in the file of a recorder, running or not, by topic."""
-    by_topic: dict[str, tuple[list[int], list[int]]] = {}
-    for topic, record in logged(folder):
-        if topic in SIGNALS:
-            stamps, sequences = by_topic.setdefault(topic, ([], []))
-            stamps.append(stamp_of(record.data))
-            sequences.append(record.sequence)
-    return by_topic
-
-
-def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
-    """Delay of a recorder's file behind the messages that another process received, of the topic with the largest delay, s."""
-    received, by_topic = witness.take(), stamps_and_sequences(folder)
-    if not received or set(by_topic) != set(SIGNALS):
-        return float("inf")
-    newest = stamp_of(received[-1].message)
-    return max(newest - stamps[-1] for stamps, _ in by_topic.values()) / NANOSECONDS
-
-
-@pytest.mark.usefixtures("publisher")
-def test_8_killed_recorders_lose_at_most_three_tenths_of_a_second(recorder: Recorder, tmp_path: Path, peer_node: Peer) -> None:
-    generator = np.random.default_rng(1)
-    witness = PolledSubscription(peer_node.node, Y, NEWEST_SAMPLES, raw=True)
-    missing = []
-    following = recorder("run0")
-    for k in range(8):
-        process, folder = following, tmp_path / f"run{k}"
-        process.wait_for_log(folder, 50_000)
-        while missing_seconds(folder, witness) > 0.2:  # at first it receives the history of 2 s that the publishers keep
-            assert process.popen.poll() is None, process.output
-        begin = {topic: sequences[-1] for topic, (_, sequences) in stamps_and_sequences(folder).items()}
-        if k < 7:
-            following = recorder(f"run{k + 1}")  # starts in the meantime
-        with pytest.raises(subprocess.TimeoutExpired):  # the random instant of the kill is the test case
-            process.popen.wait(float(generator.uniform(0.0, 0.3)))
-        process.popen.kill()
-        missing.append(missing_seconds(folder, witness))
-        assert process.end() == -signal.SIGKILL
-        for topic, (_, sequences) in stamps_and_sequences(folder).items():
-            since = [one for one in sequences if one >= begin[topic]]
-            assert since == list(range(since[0], since[-1] + 1)), topic  # no gap before the end
-        assert not (folder / "metadata.yaml").exists()
-        tape = read_run(folder).tape
-        end = max(tape.time(name)[-1] for name in tape.signals)
-        assert tape.notes[0] == f"run{k}_0.mcap is truncated: read up to its last complete chunk, t = {end:.3f} s"
-        assert tape.notes[1] == f"metadata.yaml is missing: rise-di repair {folder}"
-    print([round(one, 3) for one in missing])
-    assert max(missing) < 0.3, missing
-
-
-def test_the_log_of_a_killed_recorder_is_reported_and_repairable(start: Start, osprey_gust: Scenario, tmp_path: Path) -> None:
-    flight = start("flight_cli.cli", "fly", str(osprey_gust.path), "--duration", "30")
-    flight.wait_for_log(tmp_path / "runs", 150_000)
-    node = flight.child("flight_recorder.main")
-    killed_ns = time.time_ns()
-    node.kill()
-    assert flight.end() == 3, flight.output
-    assert "outcome: recorder was killed by SIGKILL" in flight.output
-    run = (tmp_path / "runs" / "latest").resolve()
-    before = read_run(run)
-    assert (killed_ns - before.tape["y"].stamp_ns[-1]) / NANOSECONDS < 0.3
-    assert before.scenario == ("osprey_gust.yaml", osprey_gust.path.read_bytes())
-    assert {stored.name for stored in before.attachments} == {"parameters.yaml", "airframe.yaml"}
-    filled = {name for name in before.metadata if before.metadata[name]}
-    assert filled >= {"rise_di_flight", "rise_di_host", "rise_di_versions"}
-    report = start("flight_cli.cli", "report", str(run)).succeed()
-    assert "is truncated: read up to its last complete chunk, t = " in " ".join(report.output.split())
-    assert (run / "report.html").stat().st_size > 10_000
-    repair = start("flight_cli.cli", "repair", str(run)).succeed()
-    assert "of the 30 s of the scenario" in repair.output
-    assert count_messages(run)["/y"] == len(before.tape["y"].stamp_ns)
-    after = read_run(run)
-    assert after.tape.notes == ()
-    assert after.tape["y"].values.tobytes() == before.tape["y"].values.tobytes()
-    assert json.loads((run / "summary.json").read_text(encoding="utf-8"))["outcome"] == "recorder was killed by SIGKILL"
 
 
 @pytest.mark.parametrize(("rate", "depth"), [(0.1, 1), (100.0, 200), (500.0, 1000), (1000.0, 2000), (5000.0, 2000)])

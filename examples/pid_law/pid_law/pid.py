@@ -5,8 +5,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 
+from flight_core.fields import Field
 from flight_core.parameters import NonNegatives, Positives, require_length
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, without_limits

@@ -9,11 +9,11 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, model_validator
 
 from aircraft_sim.disturbance import AXES
+from flight_core.fields import Field
 from flight_core.files import is_file, parse_yaml, read_file
-from flight_core.parameters import Names, Numbers, Parameters, Positive, as_tuple, require
+from flight_core.parameters import Names, Numbers, Parameters, Positive, require
 from flight_core.units import SI_PER_UNIT
 from flight_core.vectors import FloatArray
 
@@ -22,7 +22,7 @@ EXPECTED = "an airframe file"
 LIBRARY = Path(str(files("aircraft_sim"))) / "airframes"
 
 Unit = Literal["rad", "deg", "crad", "rad/s", "deg/s", "crad/s", "m/s", "ft/s", "1", "%"]
-Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1), BeforeValidator(as_tuple)]
+Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1)]
 
 
 class Input(Parameters):
@@ -59,17 +59,14 @@ class Airframe(Parameters):
     outputs: Names = Field(description="the states that y = C x picks")
     A: Matrix = Field(description="A, a row a state")
     B: Matrix = Field(description="B, a row a state, a column an input")
-    gravity: Annotated[tuple[Gravity, ...], BeforeValidator(as_tuple)] = Field(default=(), description="sine terms of f")
-    inertial_coupling: Annotated[tuple[Product, ...], BeforeValidator(as_tuple)] = Field(
-        default=(), description="terms of f from products of states"
-    )
+    gravity: tuple[Gravity, ...] = Field(default=(), description="sine terms of f")
+    inertial_coupling: tuple[Product, ...] = Field(default=(), description="terms of f from products of states")
     gusts: dict[str, dict[str, float]] = Field(
         default={},
         description="what wind w along each axis adds to each x_dot, per w / V0; axes: longitudinal, lateral, vertical",
     )
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         n, m = len(self.states), len(self.inputs)
         for key, columns in (("A", n), ("B", m)):
             shape = [len(row) for row in getattr(self, key)]
@@ -87,7 +84,6 @@ class Airframe(Parameters):
         named |= {f"gusts.{gust}.{state}": state for gust, direction in self.gusts.items() for state in direction}
         for key, name in named.items():
             require(name in self.states, key, f"{name!r}", f"a state: {', '.join(self.states)}")
-        return self
 
     def index(self, state: str) -> int:
         """Index of a state in x."""

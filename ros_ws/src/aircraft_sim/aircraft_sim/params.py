@@ -3,10 +3,9 @@
 """Parameters of the simulated aircraft, validated once, and their conversion to the arrays of the equations."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
 
 from aircraft_sim import uncertainty
 from aircraft_sim.actuators import Actuators
@@ -20,6 +19,7 @@ from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filte
 from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
 from flight_core import parameters
 from flight_core.failsafe import failsafe_scale
+from flight_core.fields import Field
 from flight_core.parameters import KeyedParameters, NonNegative, Numbers, ParameterError, Parameters, Positive, require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.units import GRAVITY
@@ -53,8 +53,7 @@ class TurbulenceParameters(Parameters):
     sigma: float | None = Field(default=None, ge=0, description="the intensity at high altitude: standard deviation, m/s")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the turbulence")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         for key, acts, where in (
             ("wind", self.altitude < HIGH, f"below {HIGH:g} m"),
             ("sigma", self.altitude > LOW, f"above {LOW:g} m"),
@@ -62,7 +61,6 @@ class TurbulenceParameters(Parameters):
             value = getattr(self, key)
             found, expected = ("none", "a value") if value is None else (f"{value:g} m/s", "none")
             require((value is not None) == acts, key, found, f"{expected} at {self.altitude:g} m: it acts {where}")
-        return self
 
 
 class BiasParameters(Parameters):
@@ -95,11 +93,11 @@ class UncertaintyParameters(Parameters):
 
 
 # One value per channel; an empty list means ideal channels. A limit may be infinite (.inf in YAML): no limit on that channel.
-NonNegativesOrNone = Annotated[tuple[Annotated[float, Field(ge=0)], ...], BeforeValidator(parameters.as_tuple)]
-Lower = Annotated[tuple[Annotated[float, Field(le=0, allow_inf_nan=True)], ...], BeforeValidator(parameters.as_tuple)]
-Upper = Annotated[tuple[Annotated[float, Field(ge=0, allow_inf_nan=True)], ...], BeforeValidator(parameters.as_tuple)]
-Rates = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...], BeforeValidator(parameters.as_tuple)]
-NumbersOrNone = Annotated[tuple[float, ...], BeforeValidator(parameters.as_tuple)]
+NonNegativesOrNone = tuple[Annotated[float, Field(ge=0)], ...]
+Lower = tuple[Annotated[float, Field(le=0, allow_inf_nan=True)], ...]
+Upper = tuple[Annotated[float, Field(ge=0, allow_inf_nan=True)], ...]
+Rates = tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...]
+NumbersOrNone = tuple[float, ...]
 Times = Upper  # from 0 on, .inf for never
 
 
@@ -189,8 +187,7 @@ class AircraftParameters(KeyedParameters):
             gusts | {"actuators.stuck_at", "actuators.lost_at", "sensors.bias", "sensors.noise", "sensors.dropout"}
         )
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         period = period_ns(self.rate, "rate")
         divide(period, self.step_ns, "step", "1 / rate")
         if self.lockstep:
@@ -202,7 +199,7 @@ class AircraftParameters(KeyedParameters):
         else:
             self._check_airframe()
         channels = self.channels()
-        for key, values in self.actuators:
+        for key, values in self.actuators.model_dump().items():
             if values:
                 parameters.require_length(f"actuators.{key}", values, list(channels.inputs))
         for key in ("bias", "drift", "noise", "quantisation"):
@@ -214,7 +211,6 @@ class AircraftParameters(KeyedParameters):
             f"{self.sensors.delay:g} s",
             f"a whole multiple of 1 / rate ({seconds(period):g} s)",
         )
-        return self
 
     def _check_airframe(self) -> None:
         for key in ("speed", "altitude"):
@@ -310,7 +306,9 @@ class AircraftParameters(KeyedParameters):
 
     def actuator_model(self) -> Actuators:
         """The actuators as arrays."""
-        return Actuators(**{key: _array(values, key in {"lag", "dead_zone"}) for key, values in self.actuators})
+        return Actuators(
+            **{key: _array(values, key in {"lag", "dead_zone"}) for key, values in self.actuators.model_dump().items()}
+        )
 
     def flight_condition(self) -> FlightCondition:
         """The aircraft of JSBSim and its flight condition. Raises ParameterError for another aircraft."""

@@ -7,13 +7,12 @@ from importlib.resources import files
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, Self, get_args
-
-from pydantic import BeforeValidator, Field, model_validator
+from typing import Annotated, Any, Literal, get_args
 
 from autopilot_bridge.channel_map import PATH, Line, to_raw
+from flight_core.fields import Field
 from flight_core.files import is_file, read_yaml
-from flight_core.parameters import KeyedParameters, NonNegative, Numbers, Parameters, Positive, as_tuple, require
+from flight_core.parameters import KeyedParameters, NonNegative, Numbers, Parameters, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 
@@ -40,9 +39,9 @@ Function = Literal["value", "norm", "airspeed_of_pressure", "roll_of_quaternion"
 MessageType = Annotated[str, Field(pattern=r"^[a-z]\w*/msg/[A-Z]\w*$")]
 TopicName = Annotated[str, Field(pattern=r"^/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")]
 Raw = Annotated[float, Field(allow_inf_nan=True)]
-Range = Annotated[tuple[Raw, Raw], BeforeValidator(as_tuple)]
-Limits = Annotated[tuple[float, float], BeforeValidator(as_tuple)]
-Value = bool | int | Raw | str | Annotated[tuple[int, ...] | tuple[Raw, ...], BeforeValidator(as_tuple)]
+Range = tuple[Raw, Raw]
+Limits = tuple[float, float]
+Value = bool | int | Raw | str | tuple[int, ...] | tuple[Raw, ...]
 
 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb")
@@ -220,8 +219,7 @@ class ChannelMap(Parameters):
     overrides: dict[str, OverrideRow] = Field(default={}, description="the pilot overrides")
     topics: dict[str, QosRow] = Field(description="the quality of service by topic")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         outputs, messages = ", ".join(self.outputs), ", ".join(self.messages)
         require(self.instant in self.outputs, "instant", f"{self.instant!r}", f"one of the outputs {outputs}")
         self._check_fields()
@@ -256,7 +254,6 @@ class ChannelMap(Parameters):
             thresholds = [key for key in ("above", "below", "moved") if getattr(override, key) is not None]
             found = " and ".join(thresholds) or "no threshold"
             require(len(thresholds) == 1, f"overrides.{name}", found, "one of above, below and moved")
-        return self
 
     def _check_fields(self) -> None:
         rows = self._readers() | {"inputs": self.inputs}
@@ -320,8 +317,6 @@ class BridgeParameters(KeyedParameters):
         default=0.0, description="how long the node waits for its first y before it ends with the reason, s; 0: without end"
     )
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         require(not self.lockstep, "lockstep", "true", "false: a real autopilot does not wait")
         load_map(self.map)
-        return self

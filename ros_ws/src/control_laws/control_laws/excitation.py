@@ -6,8 +6,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
+from flight_core.fields import Field
 from flight_core.parameters import NonNegative, NonNegatives, Positives, require, require_length
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, without_limits

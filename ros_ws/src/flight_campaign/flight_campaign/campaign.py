@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import WindEffect, gust_directions, sampled_matrices
@@ -20,6 +19,7 @@ from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
 from flight_campaign.statistics import Tally, score, score_units
+from flight_core.fields import Field
 from flight_core.files import writing
 from flight_core.parameters import ParameterError, Parameters, require
 from flight_core.vectors import FloatArray
@@ -205,9 +205,9 @@ class Campaign:
         try:
             definition = Definition.model_validate_json((folder / DEFINITION).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            why = ", ".join(line.strip() for line in str(error).splitlines()[:3])
-            raise ParameterError(f"{folder}: found no campaign ({why}), expected the folder of one") from None
-        (folder / CHUNKS).mkdir(exist_ok=True)
+            raise ParameterError(f"{folder}: found no campaign ({error}), expected the folder of one") from None
+        with writing("", folder, "the folder of a campaign, which can"):
+            (folder / CHUNKS).mkdir(exist_ok=True)
         return cls(folder, definition)
 
     def missing(self) -> list[Job]:
@@ -221,12 +221,22 @@ class Campaign:
             yield Tally.model_validate_json(tally).flights
 
     def tally(self, case: int) -> Tally:
-        """Statistics of a case, summed in the order of the chunks."""
+        """Statistics of a case, summed in the order of the chunks. Raises ParameterError for a damaged file."""
         total = Tally()
         for job in self.definition.jobs():
-            if job[0] == case and (path := self._path(job)).exists():
-                total += Tally.model_validate_json(path.read_text(encoding="utf-8"))
+            if job[0] == case and self._path(job).exists():
+                total += self._read(job)
         return total
+
+    def _read(self, job: Job) -> Tally:
+        path, size = self._path(job), self.definition.size(job)
+        try:
+            tally = Tally.model_validate_json(path.read_text(encoding="utf-8"))
+        except ValueError:
+            tally = Tally()
+        again = f"the figures of {size} aircraft of this campaign; remove the file, and --resume flies them again"
+        require(tally.flights == size, str(path), f"{tally.flights or 'none'}", again)
+        return tally
 
     def _path(self, job: Job) -> Path:
         case, chunk = job

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
-from pydantic import Field
 
+from flight_core.fields import Field
 from flight_core.parameters import Parameters, require
 from flight_core.vectors import FloatArray
 

@@ -93,7 +93,7 @@ def main() -> None:
         app = application(words)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.unraisablehook = _repeat_interrupt
-        from flight_core.parameters import ParameterError  # noqa: PLC0415 - loads pydantic, which --help does without
+        from flight_core.parameters import ParameterError  # noqa: PLC0415 - --help does without
 
         try:
             app(prog_name="rise-di")

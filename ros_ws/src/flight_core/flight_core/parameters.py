@@ -2,16 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validated parameter sets: one declaration for each set, one sentence for each error.
 
-A set is a frozen pydantic model. `validate_mapping` builds it from the nested mapping that a scenario file or a ROS node
-holds. The first value that does not fit becomes a `ParameterError` of one sentence: the key, what was found, what is expected.
+A set is a frozen class of annotated fields. `validate_mapping` builds it from the nested mapping that a scenario file or a ROS
+node holds. The first value that does not fit becomes a `ParameterError` of one sentence: the key, what was found, what is
+expected.
+
+Declarations and methods have the names of pydantic 2, which is not used: Ubuntu 24.04 has its release 1.10, with another
+interface and no strict types, and with pydantic 2 the parameters of a node took twice as long to import.
 """
 
 import difflib
-import reprlib
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Annotated, Any, Self
+import inspect
+import json
+from collections.abc import Iterator, Mapping, Sequence, Set
+from typing import Annotated, Any, ClassVar, Literal, Self, dataclass_transform, get_origin
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from flight_core.fields import REQUIRED, Field, FieldInfo, Problems, short_repr
 
 MAX_SENTENCE_LENGTH = 1000  # characters of an error sentence, however long the bad input is
 
@@ -33,28 +38,40 @@ class ParameterError(ValueError):
         super().__init__(printable(sentence))
 
 
-class _ShortRepr(reprlib.Repr):
-    """repr of a value for an error sentence, of limited length."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.maxstring = self.maxother = self.maxlong = 120
-
-    def repr_int(self, value: int, level: int) -> str:
-        try:
-            return super().repr_int(value, level)
-        except ValueError:  # Python converts at most 4300 digits
-            return f"a number of {value.bit_length()} bits"
-
-
-short_repr = _ShortRepr().repr
-"""repr of a value of any size, for an error sentence."""
-
-
-class Parameters(BaseModel):
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
+class Parameters:
     """Base of every parameter set: frozen, finite, strictly typed (an int is accepted as a float), without unknown keys."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_fields: ClassVar[dict[str, FieldInfo]] = {}
+    """The fields by name, those of bases first."""
+
+    def __init_subclass__(cls) -> None:
+        own = {}
+        for name, annotation in inspect.get_annotations(cls).items():
+            origin: Any = get_origin(annotation)
+            if origin is not ClassVar:
+                given = vars(cls).get(name, REQUIRED)
+                own[name] = field = given if isinstance(given, FieldInfo) else Field(given)
+                field.annotation = annotation
+                if given is not REQUIRED:
+                    delattr(cls, name)
+        bases = (base.model_fields for base in reversed(cls.__mro__[1:]) if issubclass(base, Parameters))
+        cls.model_fields = {name: field for fields in (*bases, own) for name, field in fields.items()}
+
+    def __init__(self, **values: Any) -> None:
+        vars(self).update(vars(type(self).validate_mapping(values, type(self).__name__)))
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError(f"{type(self).__name__}.{name}: found an assignment, expected none to a parameter set")
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and all(getattr(self, name) == getattr(other, name) for name in self.model_fields)
+
+    def __hash__(self) -> int:
+        return hash(tuple(getattr(self, name) for name in self.model_fields))
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in self.model_fields)})"
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
@@ -62,16 +79,100 @@ class Parameters(BaseModel):
 
         Raises ParameterError with one sentence for the first key that does not fit.
         """
+        problems = Problems()
         try:
-            return cls.model_validate(dict(values))
-        except ValidationError as error:
-            # A mistyped key is reported before the key that is missing because of it.
-            first, *others = sorted(error.errors(), key=lambda one: one["type"] not in {"extra_forbidden", "invalid_key"})
-            more = f" (and {len(others)} more)" if others else ""
-            raise ParameterError(_sentence(cls, where, first) + more) from None
+            found = cls.read(values, where, problems)
         except ArithmeticError as error:  # of a check that computes with several keys
-            found = f"numbers too large or too small ({error.args[-1]})"
-            raise ParameterError(f"{where}: found {found}, expected those of a flight") from None
+            too_far = f"numbers too large or too small ({error.args[-1]})"
+            raise ParameterError(f"{where}: found {too_far}, expected those of a flight") from None
+        if found is None:
+            first, *others = problems.sentences()
+            raise ParameterError(first + (f" (and {len(others)} more)" if others else ""))
+        return found
+
+    @classmethod
+    def read(cls, values: Mapping[Any, Any], key: str, problems: Problems) -> Self | None:
+        """Build the set from a nested mapping; if a value does not fit, None, and it is added to `problems`."""
+        before, content = len(problems.sentences()), {}
+        for name, field in cls.model_fields.items():
+            if name in values:
+                content[name] = field.kind.read(values[name], f"{key}.{name}", problems)
+            elif field.default is REQUIRED:
+                problems.others.append(f"{key}.{name}: missing, expected {field.description or 'a value'}")
+            else:
+                content[name] = dict(field.default) if isinstance(field.default, dict) else field.default
+        for name in values:
+            if not isinstance(name, str):
+                problems.unknown.append(f"{key}: found the key {short_repr(name)}, expected a name")
+            elif name not in cls.model_fields:
+                near = [f"{one} perhaps, or another" for one in difflib.get_close_matches(name, sorted(cls.model_fields), n=1)]
+                known = f"{(near or ['one'])[0]} of {', '.join(sorted(cls.model_fields))}"
+                problems.unknown.append(f"{key}.{name}: unknown key, expected {known}")
+        if len(problems.sentences()) > before:
+            return None
+        found = cls.__new__(cls)
+        vars(found).update(content, _given=frozenset(values))
+        try:
+            found._check()
+        except ValueError as error:  # `require` raised it, with the rest of the key and the sentence
+            problems.others.append(f"{key}.{error}")
+            return None
+        return found
+
+    def _check(self) -> None:
+        """Check the values against each other. Raises ParameterError."""
+
+    def model_copy(self, *, update: Mapping[str, Any]) -> Self:
+        """A copy with other values, which are not checked."""
+        copy = type(self).__new__(type(self))
+        values = {name: getattr(self, name) for name in self.model_fields}
+        vars(copy).update(values | dict(update), _given=vars(self)["_given"] | update.keys())
+        return copy
+
+    def model_dump(
+        self,
+        *,
+        mode: Literal["python", "json"] = "python",
+        exclude: Set[str] = frozenset(),
+        exclude_none: bool = False,
+        exclude_defaults: bool = False,
+        exclude_unset: bool = False,
+    ) -> dict[str, Any]:
+        """The set as nested dicts, in mode json with lists in place of tuples. `exclude` has fields of this set alone."""
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, Parameters):
+                return value.model_dump(
+                    mode=mode, exclude_none=exclude_none, exclude_defaults=exclude_defaults, exclude_unset=exclude_unset
+                )
+            if isinstance(value, dict):
+                return {name: plain(one) for name, one in value.items()}
+            if isinstance(value, (tuple, list)):
+                return (list if mode == "json" else type(value))(map(plain, value))
+            return value
+
+        dumped = {}
+        for name, field in self.model_fields.items():
+            value = getattr(self, name)
+            without = (exclude_none and value is None) or (exclude_defaults and value == field.default)
+            if not (name in exclude or without or (exclude_unset and name not in vars(self)["_given"])):
+                dumped[name] = plain(value)
+        return dumped
+
+    def model_dump_json(self, *, indent: int | None = None) -> str:
+        """The set as JSON."""
+        separators = (",", ":") if indent is None else None
+        return json.dumps(self.model_dump(mode="json"), indent=indent, separators=separators, ensure_ascii=False)
+
+    @classmethod
+    def model_validate_json(cls, text: str) -> Self:
+        """Build the set from JSON. Raises ValueError, which is a ParameterError if the text is JSON."""
+        try:
+            values = json.loads(text)
+        except RecursionError:
+            raise ParameterError(f"{cls.__name__}: found JSON that is nested too deeply, expected an object") from None
+        require(isinstance(values, dict), cls.__name__, short_repr(values), "an object")
+        return cls.validate_mapping(values, cls.__name__)
 
 
 class NodeParameters(Parameters):
@@ -93,17 +194,11 @@ class KeyedParameters(NodeParameters):
     )
 
 
-def as_tuple(value: object) -> object:
-    """A sequence other than a string as a tuple; any other value unchanged, for the next validator to reject."""
-    return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
-
-
-# Sequences of a YAML file or a ROS parameter arrive as lists; a frozen set keeps tuples.
-Numbers = Annotated[tuple[float, ...], Field(min_length=1), BeforeValidator(as_tuple)]
-Positives = Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1), BeforeValidator(as_tuple)]
-NonNegatives = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1), BeforeValidator(as_tuple)]
-Names = Annotated[tuple[str, ...], Field(min_length=1), BeforeValidator(as_tuple)]
-Signs = Annotated[tuple[int, ...], Field(min_length=1), BeforeValidator(as_tuple)]
+Numbers = Annotated[tuple[float, ...], Field(min_length=1)]
+Positives = Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
+NonNegatives = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)]
+Names = Annotated[tuple[str, ...], Field(min_length=1)]
+Signs = Annotated[tuple[int, ...], Field(min_length=1)]
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 
@@ -140,39 +235,3 @@ def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
         require(leaf not in node, name, "both a value and a group", "one of the two")
         node[leaf] = value
     return tree
-
-
-def _sentence(cls: type[BaseModel], where: str, error: Any) -> str:
-    location, kind, found = error["loc"], error["type"], error["input"]
-    if kind == "invalid_key" or location[-1:] == ("[key]",):
-        key = ".".join([where, *map(str, location[: -1 if kind == "invalid_key" else -2])])
-        return f"{key}: found the key {short_repr(found)}, expected a name"
-    key = where + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location)
-    if kind == "extra_forbidden":
-        known = sorted(_fields_at(cls, location[:-1]))
-        near = difflib.get_close_matches(str(location[-1]), known, n=1)
-        return f"{key}: unknown key, expected {f'{near[0]} perhaps, or another' if near else 'one'} of {', '.join(known)}"
-    if kind == "missing":
-        field = _fields_at(cls, location[:-1]).get(str(location[-1]))
-        meaning = field.description if field is not None and field.description else "a value"
-        return f"{key}: missing, expected {meaning}"
-    if kind == "value_error":
-        return f"{key}.{error['ctx']['error']}"  # `require` raised it, with the rest of the key and the sentence
-    if kind == "too_short":
-        least = error["ctx"]["min_length"]
-        return f"{key}: found {error['ctx']['actual_length']} values, expected at least {least} value{'s' * (least > 1)}"
-    expected = (
-        "a list of values" if kind == "tuple_type" else error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
-    )
-    return f"{key}: found {short_repr(found)}, expected {expected}"
-
-
-def _fields_at(cls: type[BaseModel], location: Sequence[str | int]) -> dict[str, Any]:
-    model: Any = cls
-    for part in location:
-        if not (isinstance(model, type) and issubclass(model, BaseModel)):
-            return {}
-        annotation = model.model_fields[str(part)].annotation if str(part) in model.model_fields else None
-        candidates = [annotation, *getattr(annotation, "__args__", ())]
-        model = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), None)
-    return dict(model.model_fields) if isinstance(model, type) and issubclass(model, BaseModel) else {}

@@ -37,7 +37,6 @@ DEPENDENCIES = (
     "jsbsim",
     "mcap",
     "numpy",
-    "pydantic",
     "PyYAML",
     "rclpy",
     "ros-fastrtps",

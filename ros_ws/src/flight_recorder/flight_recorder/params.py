@@ -4,11 +4,10 @@
 
 from typing import Annotated
 
-from pydantic import BeforeValidator, Field
+from flight_core.fields import Field
+from flight_core.parameters import NodeParameters, NonNegative
 
-from flight_core.parameters import NodeParameters, NonNegative, as_tuple
-
-OptionalNames = Annotated[tuple[str, ...], BeforeValidator(as_tuple)]
+OptionalNames = tuple[str, ...]
 
 
 class RecorderParameters(NodeParameters):

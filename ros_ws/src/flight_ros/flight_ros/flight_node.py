@@ -172,6 +172,11 @@ class FlightNode(Node, Generic[P]):
         """The time of the ticks, ns: the system clock at the start plus the monotonic time since then."""
         return time.monotonic_ns() + self.time_offset_ns
 
+    def clock_step_ns(self) -> int:
+        """How far the system clock is ahead of the time of the ticks; 0 for less than CLOCK_STEP_NS, which is no step."""
+        step_ns = time.time_ns() - self.now_ns()
+        return step_ns if abs(step_ns) > CLOCK_STEP_NS else 0
+
     def warn_no_publisher(self, subscription: PolledSubscription) -> None:
         """Called at each tick without a sample of a topic: logs a warning after 3 s, then every 2 s."""
         now_ns = time.monotonic_ns()

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start of a node's process: an early DDS participant starts discovery while the modules of the node are imported.
 
-Discovery takes 0.2 s, and so does the import of NumPy and pydantic. Both run at the same time, so that a node restarts sooner.
-For this reason this module imports rclpy and little else.
+Discovery takes 0.2 s, and the import of NumPy and of a node nearly as long. Both run at the same time, so that a node restarts
+sooner. For this reason this module imports rclpy and little else.
 """
 
 import gc

@@ -31,7 +31,7 @@ def prepare() -> None:
     try:
         ElementTree.parse(profile)  # noqa: S314 - a configuration file of the user, not foreign input
     except (OSError, ElementTree.ParseError) as error:
-        from flight_core.parameters import ParameterError  # noqa: PLC0415 - imports pydantic, see flight_ros.startup
+        from flight_core.parameters import ParameterError  # noqa: PLC0415 - see flight_ros.startup
 
         raise ParameterError(f"{PROFILE_VARIABLE}: {profile} cannot be read ({error}), expected a Fast DDS profile") from None
 
@@ -42,5 +42,7 @@ def open_to_network() -> list[str]:
         return []
     import psutil  # noqa: PLC0415 - see flight_ros.startup
 
-    sockets = psutil.Process().net_connections(kind="udp")
+    process = psutil.Process()
+    connections = getattr(process, "net_connections", None) or process.connections  # before psutil 6: Ubuntu 24.04 has 5.9
+    sockets = connections(kind="udp")
     return [f"{s.laddr.ip}:{s.laddr.port}" for s in sockets if s.laddr and s.laddr.ip in ("0.0.0.0", "::")]  # noqa: S104 - compared, not bound

@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_core.parameters import ParameterError, flatten, nest, short_repr
+from flight_core.fields import short_repr
+from flight_core.parameters import ParameterError, flatten, nest
 from flight_core.rates import NANOSECONDS
 from flight_view.flight import Flight
 from guidance.modes import TARGETS
@@ -348,7 +349,9 @@ class Control:
         return refusal
 
     def _begin_gust(self, request: Mapping[str, Any]) -> str:
-        axis = str(request.get("axis"))
+        axis = request.get("axis")
+        if not isinstance(axis, str) or not axis.isidentifier():  # ROS has no name for half a surrogate pair
+            raise RefusedError(HTTPStatus.BAD_REQUEST, f"axis: found {short_repr(axis)}, expected the name of an axis")
         speed, length = (_number(key, request.get(key)) for key in ("speed", "length"))
         flight = self._flight
         real = flight.start_ns > SYSTEM_TIME_NS

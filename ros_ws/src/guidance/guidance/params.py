@@ -5,10 +5,9 @@
 import math
 from collections.abc import Sequence
 from itertools import repeat, starmap
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, model_validator
-
+from flight_core.fields import Field
 from flight_core.parameters import (
     KeyedParameters,
     Names,
@@ -17,7 +16,6 @@ from flight_core.parameters import (
     Parameters,
     Positive,
     Positives,
-    as_tuple,
     require,
     require_length,
 )
@@ -50,15 +48,13 @@ STEEPEST = 0.1
 class Steps(Parameters):
     """Commands of one channel of `target`, one after another."""
 
-    start: Annotated[tuple[NonNegative, ...], Field(min_length=1), BeforeValidator(as_tuple)] = Field(description="times, s")
+    start: Annotated[tuple[NonNegative, ...], Field(min_length=1)] = Field(description="times, s")
     value: Numbers = Field(description="values, in the channel's unit")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         require_length("value", self.value, [f"{start:g} s" for start in self.start])
         rises = all(later > earlier for earlier, later in zip(self.start, self.start[1:], strict=False))
         require(rises, "start", list(self.start), "times in rising order")
-        return self
 
 
 class RouteParameters(Parameters):
@@ -67,16 +63,14 @@ class RouteParameters(Parameters):
     north: Numbers = Field(description="m")
     east: Numbers = Field(description="m")
     altitude: Numbers = Field(description="m, as `pose` counts it")
-    V: Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(as_tuple)] = Field(
+    V: tuple[Annotated[float, Field(gt=0)], ...] = Field(
         default=(), description="airspeed on the way to each waypoint, m/s; the trim speed where left out"
     )
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         waypoints = [f"waypoint {k}" for k in range(len(self.north))]
         for key in ("east", "altitude", *(["V"] if self.V else [])):
             require_length(key, getattr(self, key), waypoints)
-        return self
 
 
 class GuidanceParameters(KeyedParameters):
@@ -90,7 +84,7 @@ class GuidanceParameters(KeyedParameters):
     outputs: Names = Field(default=OUTPUTS, description="the names of the commands u_m: q, V, p, r in any order")
     natural_frequency: Positives = Field(description="those of the reference model, one per output, rad/s")
     speed: Positive = Field(description="the trim speed V0, m/s: airspeed is speed + V")
-    throttle_authority: Annotated[tuple[Positive, ...], BeforeValidator(as_tuple)] = Field(
+    throttle_authority: tuple[Positive, ...] = Field(
         default=(), description="deceleration and acceleration of full throttle down and up from trim, m/s^2"
     )
     roll_authority: Positive | None = Field(
@@ -136,8 +130,7 @@ class GuidanceParameters(KeyedParameters):
     program: dict[str, Steps] = Field(default={}, description="targets over flight time by channel")
     route: RouteParameters | None = Field(default=None, description="the route, flown from the start on")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         period_ns(self.rate, "rate")
         require(sorted(self.outputs) == sorted(OUTPUTS), "outputs", ", ".join(self.outputs), ", ".join(OUTPUTS))
         require_length("natural_frequency", self.natural_frequency, self.outputs)
@@ -160,7 +153,6 @@ class GuidanceParameters(KeyedParameters):
         if self.route is not None:
             self.plan(self.waypoints())
         require(self.route is not None or "leg" not in self.program, "program.leg", "no route", "a section route beside it")
-        return self
 
     def by_rule(self) -> list[tuple[str, Any]]:
         """Parameters that follow from the other sections of a scenario, in which they may be left out."""

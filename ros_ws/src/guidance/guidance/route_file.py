@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import ParseError, TreeBuilder, XMLParser
 
+from flight_core.fields import short_repr
 from flight_core.files import parse_yaml, read_file
-from flight_core.parameters import ParameterError, require, short_repr
+from flight_core.parameters import ParameterError, require
 from guidance.path import Point
 
 SEMI_MAJOR, FLATTENING = 6378137.0, 1.0 / 298.257223563

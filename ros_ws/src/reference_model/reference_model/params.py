@@ -2,18 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the reference model: validation, and conversion to the arrays of model and profile."""
 
-from typing import Annotated, Self
+from typing import Annotated
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from flight_core import parameters
-from flight_core.parameters import KeyedParameters, Names, Numbers, ParameterError, Parameters, Positive, Positives, require
+from flight_core.fields import Field
+from flight_core.parameters import (
+    KeyedParameters,
+    Names,
+    Numbers,
+    ParameterError,
+    Parameters,
+    Positive,
+    Positives,
+    require,
+)
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
 from reference_model.command import Profile
 from reference_model.live import LiveParams
-from reference_model.model import Model, second_order
+from reference_model.model import Model, second_order, stepper
 
 RATES_AND_SPEED = ("q", "V", "p", "r")
 """Channels by which the ending of u_m levels the wings."""
@@ -26,13 +35,11 @@ class Pulses(Parameters):
     stop: Numbers = Field(description="start times of the falling edges, s")
     value: Numbers = Field(description="heights of the pulses, in the channel's unit")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         for key in ("stop", "value"):
             parameters.require_length(key, getattr(self, key), [f"pulse {k + 1}" for k in range(len(self.start))])
         for k, (start, stop) in enumerate(zip(self.start, self.stop, strict=True)):
             require(stop > start, f"stop[{k}]", stop, f"later than start[{k}] = {start:g} s")
-        return self
 
 
 class Sine(Parameters):
@@ -99,8 +106,7 @@ class ReferenceModelParameters(KeyedParameters):
         default=0.0, ge=0, le=1000, description="in lockstep: the rate of u_m, at whose instants it is waited for, Hz; 0: none"
     )
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         period = period_ns(self.rate, "rate")
         if self.u_m_rate:
             divides = period_ns(self.u_m_rate, "u_m_rate") % period == 0
@@ -117,7 +123,6 @@ class ReferenceModelParameters(KeyedParameters):
         levels = self.live.speed is None or (not missing and self.second_order is not None)
         expected = f"none: wings are levelled by {', '.join(RATES_AND_SPEED)} of a second_order model"
         require(levels, "live.speed", self.live.speed, expected)
-        return self
 
     def _check_model(self) -> None:
         one = (self.second_order is None) != (self.linear is None)
@@ -140,6 +145,11 @@ class ReferenceModelParameters(KeyedParameters):
         require(finite, "second_order", "an A_m that is not finite", "frequencies and dampings whose products are")
         largest = float(np.linalg.eigvals(A_m).real.max())
         require(largest < 0, key, f"an eigenvalue of A_m with real part {largest:.3g}", "A_m Hurwitz: all of them negative")
+        with np.errstate(over="ignore", invalid="ignore"):
+            Phi = stepper(1.0 / self.rate, self.model()).Phi
+        # 1e-6: equal eigenvalues, of a damping of 1, are computed to 1e-8
+        stable = bool(np.isfinite(Phi).all()) and float(np.abs(np.linalg.eigvals(Phi)).max()) < 1.0 + 1e-6
+        require(stable, "rate", f"{self.rate:g} Hz", "a higher one: the Runge-Kutta steps of the model diverge")
 
     def model(self) -> Model:
         """The matrices of equation (2)."""

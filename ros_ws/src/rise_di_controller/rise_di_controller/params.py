@@ -11,8 +11,8 @@ from hashlib import blake2b
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
 
+from flight_core.fields import Field
 from flight_core.parameters import (
     KeyedParameters,
     Names,
@@ -165,8 +165,7 @@ class ControllerParameters(KeyedParameters):
         common = {"lag", "delay", "max_age", "hold", "ramp", "lower", "upper", "slew"}
         return frozenset(common | (set(cls.model_fields) - set(ControllerParameters.model_fields)))
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check(self) -> None:
         period = period_ns(self.rate, "rate")
         if self.lockstep:
             require(self.y_rate > 0, "y_rate", "0 Hz", "the rate of y in lockstep")
@@ -193,7 +192,6 @@ class ControllerParameters(KeyedParameters):
             if nominal is None:
                 raise ParameterError("observer: found no feedforward beside it, expected that section too: it has the model")
             self._check_observer(self.observer, nominal)
-        return self
 
     def _check_state(self) -> None:
         """The log holds each array of the law's state by output, beside groups of its own."""

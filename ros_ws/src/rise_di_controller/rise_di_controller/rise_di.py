@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
 
-from flight_core.parameters import Parameters, Positive, Positives, as_tuple, require, require_length
+from flight_core.fields import Field
+from flight_core.parameters import Parameters, Positive, Positives, require, require_length
 from rise_di_controller.control_law import ControlLaw, TunedLaw
 from rise_di_controller.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
 from rise_di_controller.params import ControllerParameters
@@ -32,7 +32,7 @@ class RiseDiParameters(ControllerParameters):
     """The controller under RISE dynamic inversion, the paper's law."""
 
     k_g: Positive = Field(description="k_g of equation (22), 1/s")
-    k_d: Annotated[tuple[Annotated[float, Field(gt=0)], ...], BeforeValidator(as_tuple)] = Field(
+    k_d: tuple[Annotated[float, Field(gt=0)], ...] = Field(
         description="k_d of equation (22), one per channel except the last, 1/s"
     )
     Lambda: Positives = Field(description="the diagonal of Lambda (4), 1/s")

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import Field
 
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.pose import every
+from flight_core.fields import Field
 from flight_core.parameters import ParameterError, Parameters, require
 from flight_core.rates import NANOSECONDS, period_ns
 from flight_core.scenario import Sections, read_sections

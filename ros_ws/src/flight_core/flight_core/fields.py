@@ -1,0 +1,248 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Values of a parameter set: what an annotation permits, and the sentence about a value that does not fit.
+
+Types are strict. An int is accepted as a float and a sequence as a tuple; nothing else is converted. The annotations are float,
+int, bool, str, object, Literal, tuple, dict, unions of them, and parameter sets, with `Field(...)` in Annotated for the rules.
+"""
+
+import math
+import operator
+import re
+import reprlib
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from types import MappingProxyType, NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+
+
+class _ShortRepr(reprlib.Repr):
+    """repr of a value for an error sentence, of limited length."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxstring = self.maxother = self.maxlong = 120
+
+    def repr_int(self, value: int, level: int) -> str:
+        try:
+            return super().repr_int(value, level)
+        except ValueError:  # Python converts at most 4300 digits
+            return f"a number of {value.bit_length()} bits"
+
+
+short_repr = _ShortRepr().repr
+"""repr of a value of any size, for an error sentence."""
+
+
+class Problems:
+    """Sentences about values that do not fit."""
+
+    def __init__(self) -> None:
+        self.unknown: list[str] = []  # keys
+        self.others: list[str] = []
+
+    def sentences(self) -> list[str]:
+        """All of them. A mistyped key is before the key that is missing because of it."""
+        return self.unknown + self.others
+
+    def refuse(self, key: str, value: object, expected: str) -> None:
+        """Add that a key has a value other than the expected one."""
+        self.others.append(f"{key}: found {short_repr(value)}, expected {expected}")
+
+
+class Kind(NamedTuple):
+    """What an annotation permits."""
+
+    expected: str  # for the sentence about a value of another type
+    takes: Callable[[Any], bool]  # whether a value has the type
+    content: Callable[[Any, str, Problems], Any]  # (value of the type, its key, problems) -> the value that the set holds
+
+    def read(self, value: object, key: str, problems: Problems) -> Any:
+        """The value that the set holds; a value that does not fit is added to `problems`."""
+        if self.takes(value):
+            return self.content(value, key, problems)
+        return problems.refuse(key, value, self.expected)
+
+
+def _same(value: Any, _key: str, _problems: Problems) -> Any:
+    return value
+
+
+LIMITS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = MappingProxyType(
+    {
+        "le": (operator.le, "less than or equal to"),
+        "lt": (operator.lt, "less than"),
+        "ge": (operator.ge, "greater than or equal to"),
+        "gt": (operator.gt, "greater than"),
+    }
+)
+"""Comparison and words of each limit of a number."""
+
+
+def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) -> Kind:
+    """An int, or a float, which may be infinite or NaN only with `allow_inf_nan`."""
+    if unknown := limits.keys() - LIMITS.keys():
+        raise TypeError(f"a number has no rule {', '.join(sorted(unknown))}")
+    checks = [(*LIMITS[rule], limits[rule]) for rule in LIMITS if rule in limits]
+
+    def content(value: Any, key: str, problems: Problems) -> Any:
+        try:
+            number = kind(value)
+        except OverflowError:  # of an int beyond the range of a float
+            return problems.refuse(key, value, "a finite number")
+        if kind is float and not allow_inf_nan and not math.isfinite(number):
+            return problems.refuse(key, value, "a finite number")
+        for holds, words, limit in checks:
+            if not holds(number, limit):
+                return problems.refuse(key, value, f"{words} {int(limit) if limit == int(limit) else limit}")
+        return number
+
+    types = (int, kind)
+    expected = "an integer" if kind is int else "a number"
+    return Kind(expected, lambda value: isinstance(value, types) and not isinstance(value, bool), content)
+
+
+def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
+    def content(value: str, key: str, problems: Problems) -> Any:
+        if len(value) < min_length:
+            return problems.refuse(key, value, f"at least {min_length} character{'s' * (min_length > 1)}")
+        if pattern and not re.fullmatch(pattern, value):
+            return problems.refuse(key, value, f"a string that matches {pattern}")
+        return value
+
+    return Kind("a string", lambda value: isinstance(value, str), content)
+
+
+def _choice(choices: Sequence[object], expected: str = "") -> Kind:
+    """One of some values, of the same type: 1 is neither True nor 1.0."""
+    named = expected or _either([repr(one) for one in choices])
+    return Kind(named, lambda value: any(type(value) is type(one) and value == one for one in choices), _same)
+
+
+def _check_count(count: int, key: str, problems: Problems, least: float, most: float) -> None:
+    for fits, words, limit in ((count >= least, "at least", least), (count <= most, "at most", most)):
+        if not fits:
+            problems.others.append(f"{key}: found {count} values, expected {words} {limit} value{'s' * (limit > 1)}")
+
+
+def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
+    """A tuple: of any length with values of one kind, or of a value of each of some kinds."""
+    repeated = parts[-1] is Ellipsis
+    kinds = [kind_of(one) for one in parts if one is not Ellipsis]
+    least, most = (min_length, max_length) if repeated else (len(kinds), len(kinds))
+
+    def content(value: Sequence[Any], key: str, problems: Problems) -> tuple[Any, ...]:
+        _check_count(len(value), key, problems, least, most)
+        each = zip(kinds * len(value) if repeated else kinds, value, strict=False)
+        return tuple(kind.read(one, f"{key}[{i}]", problems) for i, (kind, one) in enumerate(each))
+
+    def takes(value: object) -> bool:
+        return isinstance(value, Sequence) and not isinstance(value, (str, bytes))  # of YAML and of ROS it is no tuple
+
+    return Kind("a list of values", takes, content)
+
+
+def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
+    """A dict."""
+    keys, values = map(kind_of, parts)
+
+    def content(value: Mapping[Any, Any], key: str, problems: Problems) -> dict[Any, Any]:
+        _check_count(len(value), key, problems, min_length, max_length)
+        table = {}
+        for given, one in value.items():
+            is_number = parts[0] is int and isinstance(given, str) and re.fullmatch(r"-?\d{1,18}", given)  # a key of JSON
+            name = int(given) if is_number else given
+            if keys.takes(name):
+                table[name] = values.read(one, f"{key}.{name}", problems)
+            else:
+                problems.others.append(f"{key}: found the key {short_repr(name)}, expected a name")
+        return table
+
+    return Kind("a dictionary", lambda value: isinstance(value, Mapping), content)
+
+
+def _group(schema: Any) -> Kind:
+    """A parameter set."""
+    if not hasattr(schema, "model_fields"):
+        raise TypeError(f"{schema} is no type of a parameter")
+
+    def content(value: Any, key: str, problems: Problems) -> Any:
+        return value if isinstance(value, schema) else schema.read(value, key, problems)
+
+    expected = f"a dictionary or instance of {schema.__name__}"
+    return Kind(expected, lambda value: isinstance(value, (schema, Mapping)), content)
+
+
+def _union(kinds: Sequence[Kind]) -> Kind:
+    """A value of the first kind that it fits."""
+
+    def content(value: Any, key: str, problems: Problems) -> Any:
+        trial = Problems()
+        for kind in kinds:
+            if kind.takes(value):
+                trial = Problems()
+                found = kind.content(value, key, trial)
+                if not trial.sentences():
+                    return found
+        problems.unknown += trial.unknown
+        problems.others += trial.others
+        return None
+
+    expected = _either(list(dict.fromkeys(kind.expected for kind in kinds if kind.expected != "None")))
+    return Kind(expected, lambda value: any(kind.takes(value) for kind in kinds), content)
+
+
+def _either(words: Sequence[str]) -> str:
+    return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+GENERIC: Mapping[Any, Callable[..., Kind]] = MappingProxyType({Literal: _choice, tuple: _values, dict: _table})
+SIMPLE: Mapping[Any, Callable[..., Kind]] = MappingProxyType(
+    {
+        float: lambda **rules: _number(float, **rules),
+        int: lambda **rules: _number(int, **rules),
+        bool: lambda: _choice((False, True), "a boolean"),
+        str: _string,
+        object: lambda: Kind("a value", lambda _value: True, _same),
+        NoneType: lambda: _choice((None,)),
+    }
+)
+
+
+def kind_of(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) -> Kind:
+    """What an annotation permits under rules such as gt. Raises TypeError for an annotation or a rule that is not known."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return kind_of(parts[0], {rule: limit for one in parts[1:] for rule, limit in one.rules.items()} | dict(rules))
+    if origin in (Union, UnionType):
+        return _union([kind_of(one, {} if one is NoneType else rules) for one in parts])
+    if origin in GENERIC:
+        return GENERIC[origin](parts, **rules)
+    return SIMPLE[annotation](**rules) if annotation in SIMPLE else _group(annotation, **rules)
+
+
+REQUIRED: Any = object()
+"""Default of a field without one."""
+
+
+class FieldInfo:
+    """Declaration of a field; in Annotated its rules alone."""
+
+    annotation: Any = None
+
+    def __init__(self, default: Any, description: str, rules: Mapping[str, Any]) -> None:
+        self.default, self.description, self.rules = default, description, rules
+
+    @cached_property
+    def kind(self) -> Kind:
+        """What the field permits."""
+        return kind_of(self.annotation, self.rules)
+
+
+def Field(default: Any = REQUIRED, *, description: str = "", **rules: Any) -> Any:  # noqa: N802 - the name in pydantic
+    """Declare the default of a field, its meaning and its rules.
+
+    Rules are gt, ge, lt, le and allow_inf_nan of a number, min_length and pattern of a string, min_length and max_length of a
+    tuple and of a dict.
+    """
+    return FieldInfo(default, description, rules)
