@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Builders that the tests of logs and reports share: signals, scenario files, damaged logs."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -61,3 +62,8 @@ def messages(run: Path) -> list[tuple[str, int, bytes]]:
         for one, _, data in reader.messages():
             reader.deserialize(data, one.msgtype)
     return read
+
+
+def count_messages(run: Path) -> Counter[str]:
+    """The number of messages in a log, by topic."""
+    return Counter(topic for topic, _, _ in messages(run))

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writing and reading bags: with independent readers, truncated and damaged files, bags of other recorders."""
 
+import tracemalloc
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from flight_log.bag import BagWriter, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.message_definitions import definition
 from flight_log.named_vectors import JOINT_STATE_TYPES, decoder, joint_state_types
+from flight_log.playback import read_playback
 from flight_log.scan import Scan
 from flight_log.tape_reader import ROSBAG2, read_run
 from flight_log.tape_writer import write_run
@@ -38,6 +40,41 @@ def test_a_written_tape_is_read_back_bit_by_bit(tape: Tape, recorded: Path) -> N
         assert back[name].names == signal.names
         assert (back[name].stamp_ns == signal.stamp_ns).all()
         assert back[name].values.tobytes() == signal.values.tobytes()
+
+
+def test_a_log_has_the_bytes_that_the_library_writes_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    messages = [(k % 3, NANOSECONDS + (7919 * k) % 1000, k, bytes(k % 5) * k) for k in range(3000)]  # not in order of time
+    logs = []
+    for name in ("ours", "library"):
+        if name == "library":
+            monkeypatch.setattr("flight_log.bag.CHUNK_BUILDER", "unused")
+            monkeypatch.setattr("flight_log.bag.CHUNK_INDEXES", "unused")
+        with BagWriter(tmp_path / name / "run") as bag:
+            channels = [bag.add_topic(f"/{topic}", JOINT_STATE, "") for topic in "abc"]
+            for channel, received_ns, sequence, data in messages:
+                bag.write(channels[channel], received_ns, received_ns - sequence, sequence, data)
+                if sequence % 500 == 100:
+                    bag.flush()
+        logs.append(bag.path.read_bytes())
+    assert logs[0] == logs[1]
+
+
+def test_the_memory_of_a_long_recording_does_not_grow(tmp_path: Path) -> None:
+    with BagWriter(tmp_path) as bag:
+        channels = [bag.add_topic(f"/{k}", JOINT_STATE, "") for k in range(9)]
+        tracemalloc.start()
+        try:
+            for k in range(1000):  # chunks: 100 s of flight
+                for channel in channels:
+                    bag.write(channel, k, k, k, b"")
+                bag.flush()
+                if k == 500:
+                    middle, _ = tracemalloc.get_traced_memory()
+            end, _ = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    assert end - middle < 500 * 20  # bytes; an index of a chunk in memory has 1 kB
+    assert len(summary_of(bag.path).chunk_indexes) == 1000
 
 
 def test_the_scenario_is_stored_unchanged(recorded: Path, osprey_gust: Scenario) -> None:
@@ -236,6 +273,19 @@ def test_bags_of_other_recorders_are_read(storage: StoragePlugin, compression: C
     assert back.notes == ()
     assert back["y"].stamp_ns.tolist() == [2_000_000 * k for k in range(50)]
     assert back["y"]["q"].tolist() == [0.1 * k for k in range(50)]
+
+
+def test_the_scenario_of_a_log_keeps_a_name_with_spaces(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
+    path = tmp_path / "my plane (2).yaml"
+    path.write_bytes(osprey_gust.path.read_bytes())
+    run = write_run(Tape({"y": tape["y"]}), tmp_path / "run", LogAttachments(path)).parent
+    assert read_run(run).scenario == (path.name, path.read_bytes())
+
+
+def test_compressed_messages_are_not_played(tmp_path: Path) -> None:
+    record(tmp_path / "bag", {"/y": SAMPLES}, StoragePlugin.MCAP, CompressionMode.MESSAGE)
+    with pytest.raises(ParameterError, match=r"bag: found compressed messages, expected plain ones: see ros2 bag convert$"):
+        read_playback(tmp_path / "bag")
 
 
 def test_a_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:

@@ -144,6 +144,33 @@ def test_an_index_that_points_outside_its_messages_counts_as_damage(recorded: Pa
     assert (follower.complete, follower.damaged) == (True, 1)  # the rest of that chunk is left out
 
 
+def test_an_index_with_more_entries_than_its_chunk_has_messages_counts_as_damage(recorded: Path, tmp_path: Path) -> None:
+    content, place = (recorded / "run_0.mcap").read_bytes(), len(MCAP0_MAGIC)
+    while content[place] != Opcode.MESSAGE_INDEX:
+        place += RECORD.size + RECORD.unpack_from(content, place)[1]
+    start = place + RECORD.size
+    (identity, _), entry = struct.unpack_from("<HI", content, start), content[start + 6 : start + 22]
+    index = struct.pack("<HI", identity, 16 * 100_000) + entry * 100_000
+    path = tmp_path / "run_0.mcap"
+    path.write_bytes(content[:place] + RECORD.pack(Opcode.MESSAGE_INDEX, len(index)) + index)
+    follower = Follower(path, all_of)
+    assert not any(isinstance(one, Messages) for one in follower.read())
+    assert follower.damaged == 1
+
+
+@pytest.mark.parametrize("part", [0.4, 1.0])
+def test_a_file_that_is_replaced_is_not_read_on(part: float, run: Path) -> None:
+    path, content = run / "run_0.mcap", (run / "run_0.mcap").read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    follower = Follower(run, all_of)
+    assert list(follower.read())
+    fresh = run / "fresh"
+    fresh.write_bytes(content[: int(part * len(content))])
+    fresh.replace(path)
+    assert list(follower.read()) == []
+    assert follower.fault == f"{path} was replaced by another file, as rise-di repair does"
+
+
 def test_a_file_is_locked_as_long_as_its_recorder_holds_it(tmp_path: Path) -> None:
     path = tmp_path / "run_0.mcap"
     path.write_bytes(b"")

@@ -106,6 +106,21 @@ def test_an_input_output_error_is_not_a_full_disk(tmp_path: Path, monkeypatch: p
     file.close()
 
 
+def test_what_is_kept_for_the_end_survives_a_disk_that_fills_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = ReservedFile(tmp_path / "file")
+    file.keep(b"reserve")
+
+    def fails(descriptor: int, data: bytes, position: int) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", fails)
+    file.keep(b", memory")
+    assert file.full
+    file.keep(b", too")
+    assert file.kept() == b"reserve, memory, too"
+    file.close()
+
+
 def test_short_writes_are_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file, write_all = ReservedFile(tmp_path / "file"), os.write
     monkeypatch.setattr(os, "write", lambda descriptor, data: write_all(descriptor, data[:3]))

@@ -469,6 +469,30 @@ def test_other_gains_are_shown_beside_what_was_recorded(run: Path, tmp_path: Pat
     assert max(float(row["u.elevator.computed"]) for row in rows) == 0.01
 
 
+def test_json_of_figures_that_overflow_has_null(run: Path) -> None:
+    with np.errstate(over="ignore"):
+        result = command(str(run), "--set", "controller.k_g=1.0e+300", "--json")
+    figures = json.loads(result.stdout, parse_constant=pytest.fail)["u_difference"]["elevator"]
+    assert (figures["rms"], figures["max"] > 1e200) == (None, True)
+
+
+def test_parameters_with_which_the_controller_never_engages_have_no_figures_of_u(tape: Tape, tmp_path: Path) -> None:
+    log = tape["internals"]
+    late = log.values.copy()
+    late[:, log.names.index("age")] = 0.02
+    signals = {**tape.signals, "internals": Signal(log.stamp_ns, log.names, late)}
+    run = write_run(replace(tape, signals=signals), tmp_path / "run", LogAttachments(busy_scenario(tmp_path))).parent
+    result = command(str(run), "--set", "controller.max_age=0.01", "--json")
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["u_difference"]["elevator"]["t_max"] is None
+    assert command(str(run), "--set", "controller.max_age=0.01").exit_code == 1
+
+
+def test_a_parameter_is_set_once() -> None:
+    result = command("nowhere", "--set", "controller.k_g=1.0", "--set", "controller.k_g=2.0")
+    assert str(result.exception) == "--set: found a parameter twice, expected each once"
+
+
 @pytest.mark.parametrize(
     ("setting", "sentence"),
     [
@@ -527,3 +551,8 @@ def test_changes_of_parameters_are_read_from_the_log(tmp_path: Path) -> None:
         "/controller": [{"upper": [1.0, 2.0]}, {"k_g": 2.5, "sign": "soft", "upper": None}],
         "/one/controller": [{"Lambda": [1.0, 2.0]}],
     }
+    # of a flight that `ros2 bag record` recorded the log beside holds attachments alone
+    with BagWriter(tmp_path / "launched") as bag:
+        bag.add_metadata("rise_di_flight", {})
+    (tmp_path / "run").rename(tmp_path / "launched" / "rosbag2")
+    assert len(parameter_changes(tmp_path / "launched", "/controller", known)) == 2

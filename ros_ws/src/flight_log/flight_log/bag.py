@@ -2,11 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes a bag in the layout of rosbag2: one MCAP file of CDR messages, and metadata.yaml beside it. Needs no ROS."""
 
-from collections.abc import Mapping
+import struct
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple, Self, cast
 
+from mcap._chunk_builder import ChunkBuilder
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex, Message, MessageIndex
 from mcap.writer import CompressionType, Writer
 
 from flight_core.files import read_yaml
@@ -14,6 +20,7 @@ from flight_core.parameters import require
 from flight_log.disk import ReservedFile, replace_text
 from flight_log.message_definitions import Definition, definition
 from flight_log.rosbag2_metadata import METADATA, FileContents, TopicCount, bag_metadata_yaml
+from flight_log.scan import RECORD
 
 SCENARIO_MEDIA_TYPE, FILE_MEDIA_TYPE = "application/yaml", "text/yaml"  # of attachments: the scenario, and other files
 LOST_MESSAGES = "rise_di_lost"  # name of the metadata record that counts the messages the recorder lost, by topic
@@ -23,6 +30,12 @@ CHUNK_BYTES = 256 * 1024
 # chunk indexes grow with the file: 77 bytes for each chunk and 10 for each topic in it (MCAP specification, Chunk Index).
 END_BYTES = 2 * CHUNK_BYTES
 INDEX_BYTES, INDEX_BYTES_BY_TOPIC = 77, 10
+
+# Private attributes of mcap's Writer, as in mcap 1.6. Another version would use its own.
+CHUNK_BUILDER, CHUNK_INDEXES = "_Writer__chunk_builder", "_Writer__chunk_indices"
+MESSAGE = int(Opcode.MESSAGE)
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # RECORD, then channel, sequence, log time and publish time (MCAP specification)
+INDEX_HEAD = struct.Struct("<BQHI")  # RECORD, then channel and size
 
 
 class LogAttachments(NamedTuple):
@@ -44,6 +57,52 @@ class BagChannel:
     messages: int = 0
 
 
+class _MessageIndex(MessageIndex):
+    """The places of a channel's messages in a chunk, packed at once."""
+
+    def write(self, stream: RecordBuilder) -> None:
+        size = 16 * len(self.records)
+        head = INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, INDEX_HEAD.size - RECORD.size + size, self.channel_id, size)
+        stream.write(head + struct.pack(f"<{size // 8}Q", *chain.from_iterable(self.records)))
+
+
+class _ChunkBuilder(ChunkBuilder):
+    """The same bytes as mcap's, in half the time: that one writes each field by itself, and the length afterwards."""
+
+    def add_message(self, message: Message) -> None:
+        time_ns = message.log_time
+        self.message_start_time = time_ns if self.num_messages == 0 else min(self.message_start_time, time_ns)
+        self.message_end_time = max(self.message_end_time, time_ns)
+        index = self.message_indices.get(message.channel_id)
+        if index is None:
+            index = self.message_indices[message.channel_id] = _MessageIndex(message.channel_id, [])
+        index.records.append((time_ns, self.record_writer.count))
+        self.num_messages += 1
+        length = MESSAGE_HEAD.size - RECORD.size + len(message.data)
+        self.record_writer.write(
+            MESSAGE_HEAD.pack(MESSAGE, length, message.channel_id, message.sequence, time_ns, message.publish_time)
+        )
+        self.record_writer.write(message.data)
+
+
+class _ChunkIndexes:
+    """In place of mcap's list, which grows by 1 kB with each chunk, 36 MB an hour: records on disk, written as one."""
+
+    def __init__(self, file: ReservedFile) -> None:
+        self._file = file
+
+    def append(self, index: ChunkIndex) -> None:
+        record = RecordBuilder()
+        index.write(record)
+        self._file.keep(record.end())
+
+    def __iter__(self) -> Iterator["_ChunkIndexes"]:
+        yield self
+
+    def write(self, stream: RecordBuilder) -> None:
+        stream.write(self._file.kept())
+
+
 class BagWriter:
     """Writes one bag into a folder. `flush` closes the chunk: when the process is killed, closed chunks stay readable.
 
@@ -59,6 +118,8 @@ class BagWriter:
         self._file = ReservedFile(self.path)
         self._file.reserve(END_BYTES)
         self._writer = Writer(cast(Any, self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        setattr(self._writer, CHUNK_BUILDER, _ChunkBuilder())
+        setattr(self._writer, CHUNK_INDEXES, _ChunkIndexes(self._file))
         try:
             self._writer.start(profile="ros2", library="rise-di flight_recorder")
         except OSError:

@@ -53,7 +53,7 @@ class ReservedFile:
     """A new unbuffered file with a reserve of disk space, so that it can be finished on a full disk.
 
     A second, unnamed file takes up the reserve. The first write that finds no space closes that file and then succeeds. The
-    reserve also ends with the process.
+    reserve also ends with the process. Until then it holds what `keep` is given, for the end of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -65,6 +65,7 @@ class ReservedFile:
             raise
         try_lock(self._descriptor)
         self._reserved_bytes = 0
+        self._kept_bytes, self._kept = 0, bytearray()  # in the reserve; in memory once that is free
         self._position = 0
         self._closed = False
         self.full = False  # the reserve was needed
@@ -79,9 +80,29 @@ class ReservedFile:
         except OSError as error:  # on a file system without fallocate there is no reserve
             self.full = error.errno in NO_SPACE
 
+    def keep(self, data: bytes) -> None:
+        """Keep data for the end of the file: in the reserve as long as there is one, then in memory."""
+        if not self._reserve.closed:
+            try:
+                if os.pwrite(self._reserve.fileno(), data, self._kept_bytes) == len(data):
+                    self._kept_bytes += len(data)
+                    return
+            except OSError as error:  # on a file system without fallocate there may be no space
+                if error.errno not in NO_SPACE:
+                    raise
+            self.full = True
+            self.release()
+        self._kept += data
+
+    def kept(self) -> bytes:
+        """All that was kept, once the reserve is free."""
+        return bytes(self._kept)
+
     def release(self) -> None:
         """Free the reserve."""
-        self._reserve.close()
+        if not self._reserve.closed:
+            self._kept += os.pread(self._reserve.fileno(), self._kept_bytes, 0)
+            self._reserve.close()
 
     def write(self, data: bytes | memoryview) -> int:
         """Write all data. Raises OSError when the reserve does not suffice, or for another reason."""

@@ -12,15 +12,12 @@ import struct
 from collections import deque
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import IO, NamedTuple
 
-import numpy as np
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from flight_core.rates import NANOSECONDS
@@ -31,8 +28,11 @@ from flight_log.scan import DECODE_ERRORS, MAX_CHUNK_BYTES, RECORD, decode, deco
 MESSAGE_INDEX = struct.Struct(
     "<HI"
 )  # channel and size, before pairs of log time and offset (MCAP specification, Message Index)
-HEAD = struct.Struct("<BQHIQQ")  # RECORD and MESSAGE: opcode, length, channel, sequence, log time, publish time
-ENDS = (Opcode.DATA_END, Opcode.FOOTER)
+HEAD = struct.Struct("<BQ14xQ")  # of RECORD and MESSAGE: opcode, length, publish time
+# As plain numbers: of a log of one hour 400,000 records are compared.
+CHUNK, MESSAGE, INDEX = int(Opcode.CHUNK), int(Opcode.MESSAGE), int(Opcode.MESSAGE_INDEX)
+ENDS = (int(Opcode.DATA_END), int(Opcode.FOOTER))
+READ_BYTES = 1 << 20  # read from the file at once
 
 
 class Messages(NamedTuple):
@@ -73,6 +73,7 @@ class Follower:
     def _begin_file(self) -> None:
         self._path: Path | None = None
         self._position = self._size = 0  # bytes: read, and there at the last look
+        self._identity = (0, 0)  # device and inode of the file, once something of it has been read
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, _Channel] = {}
         self._chunk = b""  # the last chunk
@@ -105,10 +106,15 @@ class Follower:
         while not self.fault and (path := self.path) is not None:
             if path.stat().st_size == self._size:
                 return
-            with path.open("rb") as stream:
-                size = os.fstat(stream.fileno()).st_size
+            with path.open("rb", buffering=READ_BYTES) as stream:
+                status = os.fstat(stream.fileno())
+                size, identity = status.st_size, (status.st_dev, status.st_ino)
+                if self._position > 0 and (identity != self._identity or size < self._position):
+                    self.fault = f"{path} was replaced by another file, as rise-di repair does"
+                    return
+                self._identity = identity
                 for opcode, content in self._records(stream, size):
-                    self._pending.extend(self._decoded(opcode, content))
+                    self._take(opcode, content)
                     if opcode in ENDS:
                         break
                     yield from self._pending_records()
@@ -143,29 +149,32 @@ class Follower:
             self._position += RECORD.size + length
             yield opcode, stream.read(length)
 
-    def _decoded(self, opcode: int, content: bytes) -> Iterator[Messages | Attachment | Metadata]:
+    def _take(self, opcode: int, content: bytes) -> None:
+        """Add what a record holds to the pending records."""
         try:
-            if opcode == Opcode.MESSAGE_INDEX:
-                yield from self._indexed_messages(content)
+            if opcode == INDEX:
+                self._take_indexed(content)
                 return
-            yield from self._walk_unindexed()
-            if opcode == Opcode.CHUNK:
-                self._chunk = decompress(Chunk.read(ReadDataStream(BytesIO(content))))
+            self._take_unindexed()
+            if opcode == CHUNK:
+                self._chunk = decompress(content)
                 self._indexed = False
                 return
             for record in decode(opcode, content):
-                yield from self._whole(record)
+                self._take_whole(record)
         except DECODE_ERRORS:
             self.damaged += 1
             self._chunk, self._indexed = b"", True
 
-    def _indexed_messages(self, content: bytes) -> Iterator[Messages]:
+    def _take_indexed(self, content: bytes) -> None:
         """The messages of one channel in the last chunk. Raises one of DECODE_ERRORS."""
         identity, size = MESSAGE_INDEX.unpack_from(content)
         if len(content) != MESSAGE_INDEX.size + size or size % 16:
             raise McapError("a message index of a wrong size")
         if not self._chunk:
             return
+        if size // 16 > len(self._chunk) // HEAD.size:
+            raise McapError("a message index longer than its chunk")
         self._indexed = True
         if identity not in self._channels:
             for record in split(self._chunk):
@@ -174,44 +183,43 @@ class Follower:
             raise McapError("messages without their channel")
         if size == 0 or channel.rate <= 0.0:
             return
-        places = np.frombuffer(content, "<u8", offset=MESSAGE_INDEX.size)[1::2]
+        places: Sequence[int] = struct.unpack_from(f"<{size // 8}Q", content, MESSAGE_INDEX.size)[1::2]
         if channel.rate < math.inf:
             if channel.step == 0:
-                ends = self._messages_at([int(places[0]), int(places[-1])])[1]
-                channel.step = _step(channel.rate, len(places), ends)
-            chosen = places[channel.skip :: max(channel.step, 1)]
-            channel.skip = (channel.skip - len(places)) % max(channel.step, 1)
-            places = chosen
-        if len(places):
-            yield Messages(channel.topic, channel.type_name, *self._messages_at(places.tolist()))
+                channel.step = _step(channel.rate, len(places), self._messages_at((places[0], places[-1]))[1])
+            step = max(channel.step, 1)
+            skipped, channel.skip = channel.skip, (channel.skip - len(places)) % step
+            places = places[skipped::step]
+        if places:
+            self._pending.append(Messages(channel.topic, channel.type_name, *self._messages_at(places)))
 
     def _messages_at(self, places: Sequence[int]) -> tuple[list[int], list[bytes]]:
         """Publish times in ns and data of messages of the last chunk. Raises one of DECODE_ERRORS."""
         chunk, sent_ns, data = self._chunk, [], []
         for place in places:
-            opcode, length, _, _, _, sent = HEAD.unpack_from(chunk, place)
+            opcode, length, sent = HEAD.unpack_from(chunk, place)
             end = place + RECORD.size + length
-            if opcode != Opcode.MESSAGE or end > len(chunk):
+            if opcode != MESSAGE or end > len(chunk):
                 raise McapError("a message index without its message")
             sent_ns.append(sent)
             data.append(chunk[place + HEAD.size : end])
         return sent_ns, data
 
-    def _walk_unindexed(self) -> Iterator[Messages | Attachment | Metadata]:
+    def _take_unindexed(self) -> None:
         """The messages of a chunk without a message index. Raises one of DECODE_ERRORS."""
         if not self._indexed:
             self._indexed = True
             for record in split(self._chunk):
-                yield from self._whole(record)
+                self._take_whole(record)
 
-    def _whole(self, record: object) -> Iterator[Messages | Attachment | Metadata]:
+    def _take_whole(self, record: object) -> None:
         """A record outside a chunk, or of a chunk without an index."""
         if isinstance(record, Message):
             channel = self._channels.get(record.channel_id)
             if channel is not None and channel.rate > 0.0:
-                yield Messages(channel.topic, channel.type_name, [record.publish_time], [record.data])
+                self._pending.append(Messages(channel.topic, channel.type_name, [record.publish_time], [record.data]))
         elif isinstance(record, Attachment | Metadata):
-            yield record
+            self._pending.append(record)
         else:
             self._learn(record)
 

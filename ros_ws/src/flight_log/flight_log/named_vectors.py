@@ -173,7 +173,7 @@ class _JointStateDecoder:
         rest += [message for message, matches in zip(same_size, same, strict=True) if not matches]
         table = table[same]
         stamps = np.ascontiguousarray(table[:, STAMP])
-        stamp_ns = stamps.view("<i4")[:, 0] * np.int64(NANOSECONDS) + stamps.view("<u4")[:, 1]
+        stamp_ns = stamps.view("<i4")[:, 0].astype(np.int64) * NANOSECONDS + stamps.view("<u4")[:, 1]
         values = np.ascontiguousarray(table[:, self._values]).view("<f8")
         return [Samples(self._names, stamp_ns, values)] if len(table) else [], rest
 

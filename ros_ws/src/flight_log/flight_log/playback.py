@@ -5,11 +5,12 @@
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_log.named_vectors import JOINT_STATE, decoder, flight_start_ns, stamp_of
+from flight_log.rosbag2_metadata import is_compressed, read_bag_metadata
 from flight_log.stored_messages import StoredMessage, stored_messages
 
 CLOCK = "/clock"  # never played: the player publishes its own clock
@@ -48,8 +49,9 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0) -> 
 
     A message is due at its time of sending. In a log of a lockstep flight the host's clock has no meaning: there a message is
     due at its stamp, but not before the messages sent before it. Raises ParameterError when the log cannot be read, lacks a
-    topic, or ends before the start.
+    topic, ends before the start, or holds compressed messages.
     """
+    require(not is_compressed(_information(run)), str(run), "compressed messages", "plain ones: see ros2 bag convert")
     stored = sorted((one for one in stored_messages(run) if one.topic != CLOCK), key=_sent_ns)
     known = {one.topic: one for one in stored}
     wanted = {full for name in topics for full in _matching(name, known, str(run))} if topics else set(known) - set(SHARED)
@@ -79,6 +81,14 @@ def begins_with_stamp(definition: str) -> bool:
     """Whether the first field of a message type is a header or a time, by its definition as text."""
     first = next((line for line in definition.splitlines() if not NO_FIELD.match(line)), "")
     return bool(STAMPED.match(first))
+
+
+def _information(run: Path) -> Mapping[str, Any]:
+    """The content of metadata.yaml; empty where it cannot be read."""
+    try:
+        return read_bag_metadata(run)[0]
+    except ParameterError:
+        return {}
 
 
 def _matching(name: str, known: Mapping[str, StoredMessage], where: str) -> list[str]:

@@ -72,6 +72,11 @@ def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
     return information, end_ns
 
 
+def is_compressed(information: Mapping[str, Any]) -> bool:
+    """Whether `ros2 bag record` compressed the files or the messages of a bag, by the content of metadata.yaml."""
+    return str(information.get("compression_mode") or "none").lower() != "none"
+
+
 def bag_metadata_yaml(files: Sequence[FileContents], previous: Mapping[str, Any] | None = None) -> str:
     """The text of metadata.yaml. Compression, custom data and distribution are those of the `previous` content."""
     counts: dict[str, TopicCount] = {}

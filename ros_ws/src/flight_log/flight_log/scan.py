@@ -4,6 +4,7 @@
 
 import os
 import struct
+import threading
 import zlib
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +21,6 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    Chunk,
     ChunkIndex,
     McapRecord,
     Message,
@@ -37,6 +37,8 @@ DECODE_ERRORS = (McapError, MemoryError, OverflowError, UnicodeDecodeError, stru
 RECORD = struct.Struct("<BQ")  # opcode and length, before each record (MCAP specification, Records)
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time and publish time, before each message
 TIMES = struct.Struct("<QQ")  # log times of the first and the last message, before each chunk
+CHUNK = struct.Struct("<QQQII")  # these, size and checksum of the records, length of the compression's name before this name
+LENGTH = struct.Struct("<Q")  # before the records of a chunk
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, offsets of the summary and of its offsets, checksum
 CRC = struct.Struct("<I")
 
@@ -56,6 +58,16 @@ RECORD_READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
     Opcode.METADATA_INDEX: MetadataIndex.read,
 }
+
+
+class _Decompressor(threading.local):
+    """One of each thread. A new one for each chunk would take as long as the chunk."""
+
+    def __init__(self) -> None:
+        self.zstd = zstandard.ZstdDecompressor()
+
+
+_OF_THREAD = _Decompressor()
 
 
 class Scan:
@@ -173,7 +185,7 @@ def split(data: bytes) -> Iterator[McapRecord]:
 def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
     """The record, or the records of a chunk. Raises one of DECODE_ERRORS."""
     if opcode == Opcode.CHUNK:
-        yield from split(decompress(Chunk.read(ReadDataStream(BytesIO(content)))))
+        yield from split(decompress(content))
     elif opcode == Opcode.MESSAGE:
         channel, sequence, log_time, publish_time = MESSAGE.unpack_from(content)
         yield Message(channel, log_time, content[MESSAGE.size :], publish_time, sequence)
@@ -185,24 +197,28 @@ def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
         yield RECORD_READERS[opcode](ReadDataStream(BytesIO(content)))
 
 
-def decompress(chunk: Chunk) -> bytes:
-    """The bytes of a chunk's records, limited to the size that the chunk gives. Raises one of DECODE_ERRORS."""
-    size = chunk.uncompressed_size
-    if size > max(MAX_CHUNK_BYTES, len(chunk.data)):
+def decompress(chunk: bytes) -> bytes:
+    """The bytes of the records in the content of a chunk, limited to the size that it gives. Raises one of DECODE_ERRORS."""
+    _, _, size, crc, name_length = CHUNK.unpack_from(chunk)
+    (length,), start = LENGTH.unpack_from(chunk, CHUNK.size + name_length), CHUNK.size + name_length + LENGTH.size
+    compression, compressed = chunk[CHUNK.size : CHUNK.size + name_length], memoryview(chunk)[start : start + length]
+    if len(compressed) != length:
+        raise McapError("a chunk longer than its record")
+    if size > max(MAX_CHUNK_BYTES, len(compressed)):
         raise McapError(f"a chunk with a size of {size} bytes")
-    if chunk.compression == "zstd":
-        if zstandard.frame_content_size(chunk.data) > size:  # the decompressor would allocate that much
+    if compression == b"zstd":
+        if zstandard.frame_content_size(compressed) > size:  # the decompressor would allocate that much
             raise McapError("a chunk that holds more than its size")
-        data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
-    elif chunk.compression == "lz4":
+        data = _OF_THREAD.zstd.decompress(compressed, max_output_size=size)
+    elif compression == b"lz4":
         try:
-            data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size)
+            data = lz4.frame.LZ4FrameDecompressor().decompress(compressed, max_length=size)
         except RuntimeError as error:
             raise McapError(str(error)) from None
-    elif chunk.compression:
-        raise McapError(f"a chunk with the unknown compression {chunk.compression}")
+    elif compression:
+        raise McapError(f"a chunk with the unknown compression {compression!r}")
     else:
-        data = chunk.data
-    if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        data = bytes(compressed)
+    if len(data) != size or crc not in (0, zlib.crc32(data)):
         raise McapError("a chunk whose bytes were changed")
     return data

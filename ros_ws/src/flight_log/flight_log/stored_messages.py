@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from flight_core.rates import NANOSECONDS
 from flight_log.named_vectors import typestore
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.scan import Scan
+from flight_log.tape_reader import ROSBAG2
 
 PARAMETER_EVENTS = "/parameter_events"
 PARAMETER_EVENT = "rcl_interfaces/msg/ParameterEvent"
@@ -57,11 +59,12 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
     """The changes of a node's parameters on `/parameter_events`, in the order of the stamps.
 
     `node` is the node's full name, as in "/one/controller". Each change maps dotted names to values, for `known` parameters
-    or groups of them. None stands for a deleted parameter. SI units.
+    or groups of them. None stands for a deleted parameter. SI units. The bag in the folder ROSBAG2 of a run is read, too.
     """
     store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []
-    for stored in stored_messages(run):
+    beside = run / ROSBAG2
+    for stored in chain(stored_messages(run), stored_messages(beside) if bag_files(beside) else ()):
         if stored.topic != PARAMETER_EVENTS or stored.type_name != PARAMETER_EVENT:
             continue
         try:

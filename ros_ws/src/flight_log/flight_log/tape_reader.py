@@ -3,6 +3,7 @@
 """Reads a bag as a Tape, without ROS: bags of this stack and of `ros2 bag record`, also truncated ones."""
 
 import re
+import shlex
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagement
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import latency
 from flight_log.named_vectors import PATH, STAMP, Decoder, decode_routes, decoder, flight_start_ns, stamp_of
-from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
+from flight_log.rosbag2_metadata import METADATA, bag_files, is_compressed, read_bag_metadata
 from flight_log.scan import Scan
 
 ROUTE = "route"
@@ -31,7 +32,7 @@ AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace 
 ROSBAG2 = "rosbag2"
 """In the folder of a run: the bag of `ros2 bag record` where that recorded the flight. A log beside it has the attachments."""
 
-SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w.-]{0,99}\.yaml")
+SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w .()-]{0,99}\.yaml")
 """Names under which the scenario of a log may be written beside it: not metadata.yaml, and no path to another folder."""
 
 
@@ -230,8 +231,7 @@ def _add(run: Path, log: _Log) -> None:
     """Add the content of a bag."""
     files = bag_files(run)
     information = _bag_metadata(run, log) if files and is_folder(run) else {}
-    compressed = str(information.get("compression_mode") or "none").lower() != "none"
-    if compressed or run.suffix == ".db3" or (not files and is_file(run / METADATA)):
+    if is_compressed(information) or run.suffix == ".db3" or (not files and is_file(run / METADATA)):
         _read_other(run, log)
     else:
         require(bool(files), str(run), "no .mcap file", "the folder of a run or an MCAP file")
@@ -245,7 +245,7 @@ def _bag_metadata(run: Path, log: _Log) -> Mapping[str, Any]:
         information, log.known_end_ns = read_bag_metadata(run)
     except ParameterError:
         fault = "cannot be read" if is_file(run / METADATA) else "is missing"
-        log.notes.append(f"{METADATA} {fault}: rise-di repair {run}")
+        log.notes.append(f"{METADATA} {fault}: rise-di repair {shlex.quote(str(run))}")
         return {}
     return information
 

@@ -4,6 +4,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from flight_core.files import writing
 from flight_core.tape import Tape
 from flight_log.bag import BagWriter, LogAttachments
@@ -18,11 +20,11 @@ def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
     """
     signals = list(tape.signals.values())
     messages = [encoded("in_process", Samples(one.names, one.stamp_ns, one.values)) for one in signals]
-    rows = sorted(
-        (stamp_ns, column, index)
-        for column, signal in enumerate(signals)
-        for index, stamp_ns in enumerate(signal.stamp_ns.tolist())
-    )
+    stamps = np.concatenate([one.stamp_ns for one in signals])
+    columns = np.repeat(np.arange(len(signals)), [len(one.stamp_ns) for one in signals])
+    indexes = np.concatenate([np.arange(len(one.stamp_ns)) for one in signals])
+    order = np.argsort(stamps, kind="stable")
+    rows = zip(*(values[order].tolist() for values in (stamps, columns, indexes)), strict=True)
     with writing("", directory, "a folder and a disk that can"), BagWriter(directory) as bag:
         bag.add_attachments(attachments, tape.start_ns)
         channels = [bag.add_topic(f"/{name}", JOINT_STATE, "") for name in tape.signals]
