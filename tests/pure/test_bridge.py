@@ -389,12 +389,14 @@ def test_u_that_times_out_sends_the_captured_trim_where_the_map_says_so() -> Non
     assert bridge.raw() == pytest.approx([-0.2, -0.1, 0.04, -0.02], abs=1e-9)
 
 
-def test_an_override_by_a_stick_counts_its_way_since_engagement() -> None:
+@pytest.mark.parametrize("earlier", [0.7, 0.1], ids=["where it is", "elsewhere a minute ago"])
+def test_an_override_by_a_stick_counts_its_way_since_engagement(earlier: float) -> None:
     content = CHANNEL_MAP.model_dump()
     content["overrides"]["gamepad"] |= {"above": None, "moved": 0.2}
     bridge = ready_bridge(channel_map=ChannelMap.validate_mapping(content, "map"))
-    bridge.take_override("gamepad", 0.7, at(0.0))
+    bridge.take_override("gamepad", earlier, at(0.0 if earlier == 0.7 else -60.0))
     assert bridge.engage(at(0.0)) == ""
+    bridge.take_override("gamepad", 0.7, at(0.005))
     bridge.take_override("gamepad", 0.55, at(0.01))
     assert bridge.step(at(0.01)) is Phase.ENGAGED
     bridge.take_override("gamepad", 0.45, at(0.02))

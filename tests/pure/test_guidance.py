@@ -3,6 +3,7 @@
 """Equations of guidance against closed forms: attitude, altitude, course, paths, protection."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -195,6 +196,14 @@ def test_a_route_that_cannot_be_flown_is_refused_with_what_would_do(
 ) -> None:
     with pytest.raises(ParameterError, match=sentence):
         path.route(waypoints, radius, 100.0)
+
+
+def test_waypoints_on_a_straight_line_have_no_fillet_by_rounding() -> None:
+    waypoints = [(0.0, 0.0), (141.4213562373095, 989.9494936611666), (424.26406871192864, 2969.848480983499)]  # k (0.1, 0.7)
+    first, second = (path.course_of(*leg) for leg in pairwise(waypoints))
+    assert 0.0 < abs(second - first) < 1e-15  # the arc of such a turn has no length to draw: it divided by zero
+    legs = path.route(waypoints, 200.0, 100.0)
+    assert [type(leg) for leg in legs] == [Line, Line, Arc]
 
 
 def test_rules_of_radius_and_period() -> None:

@@ -13,6 +13,7 @@ from scipy.signal import StateSpace, lsim
 from tests.closed_loop import reference_outputs
 
 from flight_core.integrators import rk4
+from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from reference_model import model
 from reference_model.command import command
@@ -99,3 +100,14 @@ def test_the_general_form_and_the_second_order_form_are_the_same_model() -> None
     linear = {"states": ["q", "q_rate", "p", "p_rate", "r", "r_rate"], "A_m": A_m, "B_m": B_m}
     for general_matrix, matrix in zip(parameters(second_order=None, linear=linear).model(), same, strict=True):
         assert (general_matrix == matrix).all()
+
+
+def test_a_rate_at_which_the_runge_kutta_steps_diverge_is_refused() -> None:
+    # 1 + z + z^2/2 + z^3/6 + z^4/24 = 1 at z = -2.785, here a pole of 278.5 1/s at 100 Hz.
+    def first_order(pole: float) -> ReferenceModelParameters:
+        linear = {"states": ["q"], "A_m": [-pole], "B_m": [pole]}
+        return parameters(rate=100.0, outputs=["q"], second_order=None, linear=linear)
+
+    assert first_order(278.0).model().A_m.tolist() == [[-278.0]]
+    with pytest.raises(ParameterError, match=r"reference_model.rate: found 100 Hz, expected a higher one: the"):
+        first_order(279.0)

@@ -8,6 +8,7 @@ the map, not that the map agrees with ArduPilot.
 
 import json
 import math
+import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -25,13 +26,14 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import FluidPressure, Imu, Joy
 from std_srvs.srv import SetBool
 from tests.conftest import REPOSITORY
-from tests.ros.conftest import Process, Start
+from tests.ros.conftest import Process, Start, settable_clock
 from tests.ros.peer import Peer, peer
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.channel_map import message_type, read_raw, set_field, to_channel, to_raw
 from autopilot_bridge.params import LIBRARY, load_map
+from flight_bringup import processes
 from flight_bringup.clients import ControlClient
 from flight_cli.cli import COMMANDS, application
 from flight_core.rates import NANOSECONDS
@@ -239,6 +241,31 @@ def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the
     assert not released
 
 
+def test_a_step_of_the_system_clock_leaves_the_engagement_and_its_release_as_they_are(
+    setup: BridgeSetup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step, command = tmp_path / "step", partial(setup.peer.command, 0.0, 0.0, 0.0, 0.0)
+    step.write_bytes(bytes(8))
+    setup.autopilot()
+    with monkeypatch.context() as environment:
+        environment.setenv("LD_PRELOAD", str(settable_clock(tmp_path)))
+        environment.setenv("FAULTS_CLOCK", str(step))
+        bridge = setup.bridge("-p", "dry_run:=false")
+    received = setup.peer.received
+    setup.peer.until(lambda: received["y"] and received["bridge/would_send"], each=command)
+    assert setup.engage(each=command) == ""
+    for seconds in (5, -5):
+        with step.open("r+b") as stream:
+            stream.write(struct.pack("=q", seconds * NANOSECONDS))
+        received["y"].clear()
+        setup.peer.until(lambda: len(received["y"]) > 40, timeout=30.0, each=command)  # 0.8 s, above MAX_AGE
+    assert "ENGAGED -> " not in bridge.output.replace("DISENGAGED -> ", "")
+    setup.joys.clear()
+    bridge.interrupt().succeed()
+    setup.peer.spin(0.1)
+    assert all(map(math.isnan, setup.joys[-1].axes))
+
+
 def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(setup: BridgeSetup) -> None:
     """The publisher of u stays alive and u returns: the age of u counts, not the presence of a publisher."""
     setup.autopilot()
@@ -310,7 +337,7 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
 
 def test_rise_di_fly_starts_the_bridge_and_logs_the_autopilot_topics(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:
     setup.autopilot()
-    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "12", "--json")
+    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "9", "--json")
     setup.peer.until(lambda: setup.peer.received["bridge/would_send"])
     refused = start("flight_cli.cli", "engage")
     setup.peer.until(lambda: flight.popen.poll() is not None)
@@ -327,7 +354,7 @@ def test_rise_di_fly_starts_the_bridge_and_logs_the_autopilot_topics(setup: Brid
     assert summary["notes"][0].startswith("never engaged")
     assert Path(setup.map).read_bytes() in [file.content for file in log.attachments]
     counts = Counter(one.topic for one in stored_messages(run))
-    assert counts["/ap/twist/filtered"] > 100  # of 600
+    assert counts["/ap/twist/filtered"] > 100  # of 450
     assert counts["/ap/joy"] == 0  # a dry run
     assert not setup.joys
 
@@ -336,16 +363,18 @@ def test_the_controller_is_active_only_while_engaged_and_the_summary_says_when_a
     setup: BridgeSetup, start: Start, tmp_path: Path
 ) -> None:
     setup.autopilot()
-    duration = "25"
-    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send", "--duration", duration, "--json")
+    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send", "--duration", "120", "--json")
     engaged = start("flight_cli.cli", "engage")  # before the nodes run: it waits for the first u
     setup.peer.until(lambda: engaged.popen.poll() is not None)
     engaged.succeed()
     setup.peer.until(lambda: any(any(u.position) for u in setup.peer.received["u"]))
     off = start("flight_cli.cli", "engage", "--off")
-    setup.peer.until(lambda: flight.popen.poll() is not None)
+    setup.peer.until(lambda: off.popen.poll() is not None)
     off.succeed()
-    flight.succeed()
+    setup.peer.spin(3.0)  # a second beyond what is checked
+    flight.interrupt()
+    setup.peer.until(lambda: flight.popen.poll() is not None)
+    assert flight.end() == 130, flight.output
     run = tmp_path / "runs" / "latest"
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     (engagement,) = summary["engagements"]
@@ -357,6 +386,7 @@ def test_the_controller_is_active_only_while_engaged_and_the_summary_says_when_a
     assert engagement["stop"] - 0.1 < flies[-1] < engagement["stop"] + LATE
     u, t_u = tape["u"].values, tape.time("u")
     assert not u[t_u < flies[0]].any()  # no integral before the engagement, none 2 s after it
+    assert (t_u > engagement["stop"] + 2.0).any()
     assert not u[t_u > engagement["stop"] + 2.0].any()
     assert (
         summary["notes"][0] == f"engaged from {engagement['start']:.1f} s to {engagement['stop']:.1f} s: disengaged by request"
@@ -394,13 +424,14 @@ def test_identify_excites_the_autopilot_and_writes_what_flies_it(setup: BridgeSe
 
 
 def test_a_flight_without_the_topics_of_its_autopilot_ends_with_the_sentence_of_the_bridge(
-    setup: BridgeSetup, start: Start
+    setup: BridgeSetup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "60")
+    monkeypatch.setattr(processes, "FIRST_Y", 3.0)  # in place of 20 s
     setup.peer.node.create_publisher(TwistStamped, "/ap/airspeed", 10)
-    setup.peer.until(lambda: flight.popen.poll() is not None)
-    assert flight.end() == 3
-    assert "bridge ended with status 3: no y after 20 s: " in flight.output
+    words = ("fly", str(SCENARIO), "--bridge", setup.map, "--duration", "60", "--runs", str(tmp_path / "runs"))
+    flight = CliRunner().invoke(app, words)
+    assert flight.exit_code == 3, flight.output
+    assert "bridge ended with status 3: no y after 3 s: " in flight.output
     assert (
         "/ap/twist/filtered: no publisher. The autopilot's agent needs the same DDS profile, FASTRTPS_DEFAULT_" in flight.output
     )

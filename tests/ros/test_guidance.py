@@ -17,7 +17,7 @@ from nav_msgs.msg import Path as PathMessage
 from std_srvs.srv import SetBool, Trigger
 from tests.ros.conftest import Start
 from tests.ros.peer import OUTPUTS, Peer
-from tests.ros.test_lockstep import LOG_SIZE, ROUGH, fly, scenario_file
+from tests.ros.test_lockstep import FIRST_CHUNKS, ROUGH, fly, scenario_file
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
@@ -34,18 +34,19 @@ LEVEL = {"altitude": 50.0, "v_north": 25.0}
 
 
 def test_a_lockstep_flight_repeats_the_bytes_of_one_process(start: Start, tmp_path: Path) -> None:
-    scenario = scenario_file(tmp_path, 3.0, "osprey_route", aircraft=ROUGH)
+    scenario = scenario_file(tmp_path, 2.0, "osprey_route", aircraft=ROUGH)
     recorded = read_run(fly(start, scenario, "runs")).tape
     for name, signal in simulate(load_scenario(scenario)).signals.items():
         assert signal.names == recorded[name].names
         assert signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
         assert signal.values.tobytes() == recorded[name].values.tobytes(), name
-    assert len(recorded["u_m"].stamp_ns) == 150  # one at each instant but the first: y takes 10 ms
+    assert len(recorded["u_m"].stamp_ns) == 100  # one at each instant but the first: y takes 10 ms
 
 
-def test_the_loss_of_guidance_ends_a_lockstep_flight_with_its_name(start: Start, tmp_path: Path) -> None:
+def test_a_lockstep_flight_takes_a_target_and_ends_with_the_name_of_a_lost_guidance(start: Start, tmp_path: Path) -> None:
     command = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5, "osprey_route")), "--lockstep", "--runs", "runs")
-    command.wait_for_log(tmp_path / "runs", LOG_SIZE)
+    command.wait_for_log(tmp_path / "runs", FIRST_CHUNKS)
+    assert "in force: altitude=60" in start("flight_cli.cli", "target", "altitude=60").succeed().output
     command.child("guidance.main").kill()
     assert command.end() == 3
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
@@ -69,7 +70,8 @@ class Flight:
 
     def __init__(self, start: Start, peer_node: Peer, scenario: Path) -> None:
         self.peer, self.process = peer_node, start("guidance.main", "--ros-args", "--params-file", str(scenario))
-        self.mode, self.rng = ControllerMode.ENGAGED, np.random.default_rng(1)
+        self.mode: float = ControllerMode.ENGAGED
+        self.rng = np.random.default_rng(1)
 
     def send(self, sender: str = "/aircraft#1") -> None:
         """One y, one pose and one sample of internals, stamped now."""
@@ -104,6 +106,22 @@ def flight(start: Start, peer_node: Peer, calm: Path) -> Flight:
     made = Flight(start, peer_node, calm)
     made.until(lambda: peer_node.received["u_m"])
     return made
+
+
+def test_there_is_no_command_before_the_controller_is_engaged(start: Start, peer_node: Peer, calm: Path) -> None:
+    made = Flight(start, peer_node, calm)
+    made.mode = ControllerMode.WAITING
+
+    def has_both() -> bool:
+        keys = {pair.key for array in peer_node.received["/diagnostics"] for status in array.status for pair in status.values}
+        return {"age of y (s)", "age of pose (s)"} <= keys
+
+    made.until(has_both)
+    made.mode = 17  # no mode of the controller
+    made.until(partial(peer_node.counted, "refused internals: mode"))
+    assert not peer_node.received["u_m"]
+    made.mode = ControllerMode.ENGAGED
+    made.until(lambda: peer_node.received["u_m"])
 
 
 def test_targets_select_the_modes_and_bad_ones_are_refused(flight: Flight) -> None:
@@ -146,7 +164,7 @@ def test_services_hold_skip_and_disengage(flight: Flight) -> None:
 
     flight.until(lambda: flight.last("mode.lateral") == Lateral.PHI, lambda: flight.target(phi=0.2))
     flight.until(lambda: flight.last("mode.lateral") == Lateral.HEADING, lambda: call(Trigger, "hold", Trigger.Request()))
-    assert call(Trigger, "skip", Trigger.Request()) == (False, "no route is flown")
+    assert call(Trigger, "skip", Trigger.Request()) == (False, "no route with a further leg is flown")
     assert call(SetBool, "engage", SetBool.Request(data=False)) == (True, "")
     flight.until(lambda: "ENGAGED -> OFF" in flight.process.output)
     flight.peer.received["u_m"].clear()
@@ -167,7 +185,7 @@ def test_the_client_of_a_page_commands_guidance(flight: Flight) -> None:
 
         assert answer(client.send_target, {"phi": 0.2}) == ""
         flight.until(lambda: flight.last("target.phi") == 0.2)
-        assert answer(client.skip) == "no route is flown"
+        assert answer(client.skip) == "no route with a further leg is flown"
         assert answer(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0], [900.0, 900.0, 55.0]]) == ""
         flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE)
         leg = flight.last("leg")
@@ -188,9 +206,15 @@ def test_a_route_is_flown_when_it_arrives_and_refused_when_it_cannot_be_flown(fl
         message.poses = [pose_at(*point) for point in points]
         return message
 
-    alone = route((0.0, 0.0, 50.0))
-    flight.until(lambda: flight.peer.counted("refused route: route"), lambda: publisher.publish(alone))
-    good = route((0.0, 0.0, 50.0), (0.0, 900.0, 55.0))  # east, north, up
+    good, alone = route((0.0, 0.0, 50.0), (0.0, 900.0, 55.0)), route((0.0, 0.0, 50.0))  # east, north, up
+    good.header.frame_id = "odom"
+
+    def logged(sentence: str) -> bool:
+        return sentence in flight.process.output
+
+    for message, sentence in ((good, "route: found the frame 'odom', expected 'map'"), (alone, "route: found 1 waypoints")):
+        flight.until(partial(logged, sentence), partial(publisher.publish, message))
+    good.header.frame_id = "map"
     flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE, lambda: publisher.publish(good))
     assert flight.last("to_go") == pytest.approx(900.0)
     assert flight.last("target.altitude") == 55.0

@@ -4,6 +4,7 @@
 
 import json
 import shutil
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,7 +27,7 @@ from flight_core.authentication import MessageAuthenticator
 from flight_core.vectors import ChannelError
 from flight_ros.messages import Decoder, Encoder
 from flight_ros.topics import U
-from flight_ros.transport import LOOPBACK_PROFILE
+from flight_ros.transport import LOOPBACK_PROFILE, open_to_network
 
 Keys = tuple[Path, Path]
 PEER_TOPICS = ("/diagnostics",)
@@ -206,6 +208,34 @@ def test_an_invalid_key_is_an_error(content: bytes | None, mode: int, sentence: 
     node = start_node("aircraft_sim", "-p", f"key_file:={path}")
     assert node.end(BUSY) == 2
     assert f"error: aircraft.key_file: found {path} {sentence}" in node.output or sentence in node.output
+
+
+# Sockets
+
+
+class EarlierProcess(psutil.Process):
+    """As psutil has it before release 6."""
+
+    connections = psutil.Process.net_connections
+
+    @property
+    def net_connections(self) -> None:  # type: ignore[override]
+        """Raise AttributeError."""
+        raise AttributeError
+
+
+@pytest.mark.parametrize("process", [psutil.Process, EarlierProcess])
+def test_a_socket_on_all_interfaces_is_found_in_spite_of_the_loopback_profile(
+    process: type[psutil.Process], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(psutil, "Process", process)
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(LOOPBACK_PROFILE))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as local:
+        opened.bind(("0.0.0.0", 0))  # noqa: S104 - on purpose, for nothing to read
+        local.bind(("127.0.0.1", 0))
+        found = open_to_network()
+        assert f"0.0.0.0:{opened.getsockname()[1]}" in found
+        assert not any(one.endswith(f":{local.getsockname()[1]}") for one in found)
 
 
 # Attacks from another host: a separate network namespace, connected by a pair of virtual Ethernet devices

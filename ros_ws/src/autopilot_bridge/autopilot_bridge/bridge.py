@@ -138,11 +138,14 @@ class Bridge:
     def _is_active(self, name: str, now_ns: int) -> bool:
         """Whether a pilot override is active. It ends with its topic: an old one does not block an engagement."""
         row, reading = self.channel_map.overrides[name], self._overrides.get(name)
-        if reading is None or now_ns - reading.stamp_ns > nanoseconds(row.max_age):
+        if reading is None or self._override_is_old(name, now_ns):
             return False
         engaged = self.phase in {Phase.ENGAGED, Phase.NEUTRAL}
         at_engagement = self._overrides_at_engagement.setdefault(name, reading.value) if engaged else None
         return row.is_active(reading.value, at_engagement)
+
+    def _override_is_old(self, name: str, now_ns: int) -> bool:
+        return now_ns - self._overrides[name].stamp_ns > nanoseconds(self.channel_map.overrides[name].max_age)
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
@@ -215,7 +218,9 @@ class Bridge:
         elif not self.reason:
             self._trim = {name: self.trim(name) for name in self.channel_map.trims}
             self._zero = {name: self._readings[name].value for name, row in self.channel_map.outputs.items() if row.captured}
-            self._overrides_at_engagement = {name: reading.value for name, reading in self._overrides.items()}
+            self._overrides_at_engagement = {
+                name: reading.value for name, reading in self._overrides.items() if not self._override_is_old(name, now_ns)
+            }
             self._enter(Phase.ENGAGED, now_ns)
 
     def disengage(self, reason: str, now_ns: int) -> None:

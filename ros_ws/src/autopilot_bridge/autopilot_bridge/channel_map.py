@@ -65,6 +65,8 @@ def set_field(message: Any, path: str, value: Any) -> None:
         if not math.isfinite(value):
             raise ChannelError("range", f"{path} takes integers, not {value:g}")
         value = round(value)
+    if isinstance(current, np.integer) and not np.iinfo(current).min <= value <= np.iinfo(current).max:
+        raise ChannelError("range", f"{path} cannot be {value!r}, which {current.dtype} does not hold")  # NumPy 1.26 wraps it
     parents, _, last = path.rpartition(".")
     parent, ((name, place),) = get_field(message, parents), STEP.findall(last)
     try:

@@ -115,9 +115,10 @@ class BridgeNode(FlightNode[BridgeParameters]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         now_ns += tick.late_ns
+        step_ns = self.clock_step_ns()
         for subscription, rows in self._readers:
             for received in subscription.take():
-                self._read(subscription, rows, received.message, received.received_ns or now_ns, now_ns)
+                self._read(subscription, rows, received.message, received.received_ns or now_ns + step_ns, now_ns, step_ns)
         sample = self._bridge.y(now_ns)
         if sample is None:
             self._require_first_y(now_ns)
@@ -139,7 +140,10 @@ class BridgeNode(FlightNode[BridgeParameters]):
         self._send(now_ns, self.period_ns() // 2)
         self._warn_stale_inputs(now_ns)
 
-    def _read(self, subscription: PolledSubscription, rows: list[NamedRow], raw: bytes, arrived_ns: int, now_ns: int) -> None:
+    def _read(
+        self, subscription: PolledSubscription, rows: list[NamedRow], raw: bytes, arrived_ns: int, now_ns: int, step_ns: int
+    ) -> None:
+        """Give the fields of a message to the bridge. The system clock, of which its stamps are, is ahead by `step_ns`."""
         try:
             message = deserialize_message(raw, subscription.topic.type)
         except DeserializationError as error:
@@ -155,7 +159,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
                 if row.stamp == "header":
                     stamp = get_field(message, "header.stamp")
                     stamp_ns = stamp.sec * NANOSECONDS + stamp.nanosec
-                self._bridge.take_output(name, read_raw(message, row.field, row.function), stamp_ns, now_ns)
+                self._bridge.take_output(name, read_raw(message, row.field, row.function), stamp_ns - step_ns, now_ns)
             except ChannelError as error:
                 self.reject(subscription, error.reason, str(error))
 
@@ -285,9 +289,9 @@ class BridgeNode(FlightNode[BridgeParameters]):
     def close(self) -> None:
         if self._bridge.phase is Phase.DISENGAGED or self._map.silence.release == 0.0:
             return
-        self._bridge.disengage("bridge shut down", time.time_ns())
+        self._bridge.disengage("bridge shut down", self.now_ns())
         for _ in range(RELEASES_AT_SHUTDOWN):
-            self._send(time.time_ns(), NANOSECONDS)  # this slack makes every message due
+            self._send(self.now_ns(), NANOSECONDS)  # this slack makes every message due
             time.sleep(0.01)
 
 

@@ -178,8 +178,8 @@ class Guidance:
         self._given |= values
 
     def take_route(self, route: Route) -> None:
-        """Fly a route from its first leg on."""
-        self.route = route
+        """Fly a route from its first leg on. Commands given before it and not taken by a step yet are void."""
+        self.route, self._given = route, {}
         self.take_target({"leg": 0.0})
 
     def hold(self) -> bool:
@@ -191,10 +191,13 @@ class Guidance:
         return True
 
     def skip(self) -> bool:
-        """Fly the next leg of the route; False while none is flown."""
-        if self.mode is not Mode.ENGAGED or self._state is None or self._state.lateral is not Lateral.ROUTE:
+        """Fly the next leg of the route; False while none is flown, and on the last leg."""
+        state, route = self._state, self.route
+        if self.mode is not Mode.ENGAGED or state is None or state.lateral is not Lateral.ROUTE or route is None:
             return False
-        self.take_target({"leg": self._state.leg + 1.0})
+        if state.leg + 1 >= len(route.legs):
+            return False
+        self.take_target({"leg": state.leg + 1.0})
         return True
 
     def engage(self, *, engaged: bool) -> None:

@@ -227,7 +227,9 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
     held = holding(inputs.t_ns, dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params), params)
     if state is None or inputs.begin is Begin.HOLD:
         return held
-    again = held._replace(lateral=state.lateral, vertical=state.vertical, target=state.target, leg=state.leg)
+    again = held._replace(
+        mode=state.mode, lateral=state.lateral, vertical=state.vertical, target=state.target, leg=state.leg
+    )  # the mode, since after a lost pose the wings are levelled
     # Up to its age limit the reference model still flies the last u_m.
     return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
 
@@ -381,7 +383,7 @@ def _bank(
     position = (pose["north"], pose["east"])
     error = path.error(leg, position)
     entry = error.curvature if following is None else path.error(following, leg.end or (0.0, 0.0)).curvature
-    wanted = follow(error, entry, partial(path.passed, leg), pose, speed, params)
+    wanted = follow(error, entry, partial(path.entered, leg, following), pose, speed, params)
     return wanted, error.e, path.to_go(leg, position)
 
 
@@ -395,15 +397,15 @@ def _over_ground(pose: Mapping[str, Scalar]) -> tuple[Scalar, Scalar]:
 def follow(
     error: PathError,
     entry: Scalar,
-    passed: Callable[[Point], Any],
+    entered: Callable[[Point], Any],
     pose: Mapping[str, Scalar],
     speed: Scalar,
     params: GuidanceParams,
 ) -> Scalar:
     """Bank that follows a path, rad, before protection. `entry` is the curvature of the following leg at its start, 1/m.
 
-    It takes the place of that of the leg as early as the bank lags its command: where `passed` says that the position then
-    lies beyond the end of the leg. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp, then
+    It takes the place of that of the leg as early as the bank lags its command: where `entered` says that the position then
+    lies on the following leg. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp, then
     the loop of the bank.
     """
     course, ground_speed = _over_ground(pose)
@@ -411,7 +413,7 @@ def follow(
     change = xp.atan(ground_speed**2 * entry / GRAVITY) + xp.atan(ground_speed**2 * -error.curvature / GRAVITY)
     lag = abs(change) / (2.0 * params.attitude.roll_rate) + 0.5 / params.attitude.k_phi
     ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
-    error = error._replace(curvature=xp.where(passed(ahead), entry, error.curvature))
+    error = error._replace(curvature=xp.where(entered(ahead), entry, error.curvature))
     return bank_for(path_acceleration(error, course, ground_speed, params.path), path_angle(pose["climb"], speed), STEEPEST)
 
 

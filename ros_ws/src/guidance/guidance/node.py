@@ -14,7 +14,7 @@ from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError, StampedVector, require_not_future, select
 from flight_ros.flight_node import FlightNode
@@ -87,6 +87,7 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
             self._empty_encoder = self.encoder(U_M, ())
         else:
             self._controller_mode = ControllerMode.WAITING
+            self._guidance.pause(paused=True, forget=False)
             self._internals, self._internals_decoder = self.subscribe(INTERNALS), self.decoder(INTERNALS, ["mode"])
         self._odometry, self._path, self._markers = (
             self.create_publisher(topic.type, topic.name, publisher_qos(period))
@@ -96,7 +97,7 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         for kind, name, answer in (
             (SetBool, "engage", self._engage),
             (Trigger, "hold", lambda _: self._guidance.hold() or "guidance does not fly"),
-            (Trigger, "skip", lambda _: self._guidance.skip() or "no route is flown"),
+            (Trigger, "skip", lambda _: self._guidance.skip() or "no route with a further leg is flown"),
         ):
             self.create_service(kind, f"~/{name}", _service(answer))
 
@@ -202,7 +203,8 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         for received in self._target_subscription.take(MAX_TARGETS):
             try:
                 sample = self._target_decoder.decode(received.message)
-                require_not_future(sample.stamp_ns, now_ns, nanoseconds(self.parameters.max_age))
+                if not self.parameters.lockstep:  # an operator has the system clock, not the flight time of lockstep
+                    require_not_future(sample.stamp_ns, now_ns, nanoseconds(self.parameters.max_age))
                 self._guidance.take_target(sample.channels)
             except ChannelError as error:
                 self.reject(self._target_subscription, error.reason, str(error))
@@ -211,6 +213,8 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         for received in self._route_subscription.take()[-1:]:
             try:
                 message = deserialize_message(received.message, Path)
+                frame = message.header.frame_id
+                require(frame in {MAP, ""}, "route", f"the frame {frame!r}", f"{MAP!r}, or none named")
                 points = [one.pose.position for one in message.poses]
                 route = self.parameters.plan([Waypoint(one.y, one.x, one.z) for one in points])
             except (ParameterError, DeserializationError) as error:
@@ -224,10 +228,12 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         for received in self._internals.take()[-1:]:
             try:
                 sample = self._internals_decoder.decode(received.message)
-            except ChannelError:
+                mode = self._controller_mode if sample is None else ControllerMode(int(sample.value[0]))
+            except ValueError as error:  # of the decoder, and of a number that is no mode
+                self.reject(self._internals, "mode", str(error))
                 continue
-            if sample is not None and sample.value[0] != self._controller_mode:
-                self._controller_mode = ControllerMode(int(sample.value[0]))
+            if mode is not self._controller_mode:
+                self._controller_mode = mode
                 engaged, inactive = (
                     self._controller_mode is mode for mode in (ControllerMode.ENGAGED, ControllerMode.INACTIVE)
                 )

@@ -16,6 +16,9 @@ Point = tuple[Scalar, Scalar]  # north, east, m
 SHARPEST = math.radians(150.0)
 """Largest change of course at a waypoint: beyond it the fillet cuts the corner by more than 2.8 radii."""
 
+SHORTEST = 1e-3
+"""m. A fillet whose ends are nearer to its waypoint is left out: waypoints on a straight line have one by rounding alone."""
+
 
 class Line(NamedTuple):
     """A straight leg."""
@@ -89,6 +92,11 @@ def beyond(end: Point, course: Scalar, position: Point) -> Any:
     return north * xp.cos(course) + east * xp.sin(course) >= 0.0
 
 
+def entered(leg: Leg, following: Leg | None, position: Point) -> bool:
+    """Whether a position lies beyond the end of a leg, but not beyond an arc that follows it."""
+    return passed(leg, position) and not (isinstance(following, Arc) and passed(following, position))
+
+
 def to_go(leg: Leg, position: Point) -> float:
     """Distance along a leg from its point nearest to a position to its end, m; 0 for an orbit."""
     if leg.end is None:
@@ -154,7 +162,7 @@ def route(waypoints: Sequence[Point], radius: float, least: float) -> tuple[Leg,
         course, turn = course_of(here, there), turns[k + 1]
         end = _along(there, course, -cut[k + 1])
         legs.append(Line(start, end))
-        if turn:
+        if cut[k + 1] > SHORTEST:
             side = math.copysign(1.0, turn)
             start = _along(there, course + turn, cut[k + 1])
             legs.append(Arc(_along(end, course + side * math.pi / 2.0, radius), side * radius, start))
