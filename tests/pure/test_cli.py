@@ -76,6 +76,10 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
         (["fly", "nowhere"], "error: scenario: found 'nowhere', expected one of"),
         (["fly", "--duration", "-1"], "error: flight.duration: found -1.0, expected greater than 0"),
         (["fly", "--in-process", "--runs", "/proc/none"], "error: runs: /proc/none cannot be written"),
+        (
+            ["fly", "--in-process", "--lockstep"],
+            "error: --in-process: found a flight over topics, in lockstep, expected one of",
+        ),
         (["report", "nowhere"], "error: nowhere: found no .mcap file"),
     ],
 )

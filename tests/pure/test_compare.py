@@ -153,6 +153,14 @@ def test_the_share_of_lost_aircraft_is_that_of_the_first_level_by_the_delay_of_u
     assert found.levels[0].scores[GUST].lost == 0.0
 
 
+def test_tuned_gains_are_written_to_a_new_folder_or_refused_in_a_sentence(tmp_path: Path) -> None:
+    path, found = tmp_path / "one" / "two" / "gains.yaml", TuningResult({"K": [1.0]}, 2.0, 1, [2.0, 3.0], 100)
+    tuned_gains.save(path, {"pi": {"gust": found}}, ["gust"], "a command")
+    assert tuned_gains.load(path) == {"pi": {"gust": found}}
+    with pytest.raises(ParameterError, match=r"cannot be written \(.*\), expected a file of tuned gains that can$"):
+        tuned_gains.save(path / "gains.yaml", {"pi": {"gust": found}}, ["gust"], "a command")
+
+
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_law_ships_with_gains_for_gusts_and_turbulence(name: str) -> None:
     shipped = tuned_gains.load(tuned_gains.TUNED / f"{name}.yaml")
@@ -224,11 +232,20 @@ def gains_file(short: Benchmark, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return path
 
 
-def test_the_command_writes_what_it_shows(gains_file: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def brief_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scenario file with the first 4 s of osprey_servo."""
+    path = tmp_path_factory.mktemp("brief") / "brief.yaml"
+    text = find_scenario("osprey_servo").path.read_text(encoding="utf-8")
+    path.write_text(text.replace("duration: 60.0 ", "duration: 4.0 "), encoding="utf-8")
+    return path
+
+
+def test_the_command_writes_what_it_shows(gains_file: Path, brief_file: Path, tmp_path: Path) -> None:
     path = tmp_path / "compared.json"
     arguments = ["--laws", "rise,l1", "--aircraft", "2", "--uncertainty", "0.3", "--tuning", "gust", "--gains", str(gains_file)]
     arguments += ["--wind", "published"]
-    result = CliRunner().invoke(app, ["compare", "osprey_servo", *arguments, "--json", str(path)])
+    result = CliRunner().invoke(app, ["compare", str(brief_file), *arguments, "--json", str(path)])
     assert result.exit_code == 0, result.output
     found = json.loads(path.read_text(encoding="utf-8"))
     assert found["wind"] == "published"
@@ -249,7 +266,7 @@ def test_the_command_writes_what_it_shows(gains_file: Path, tmp_path: Path) -> N
 
 
 def test_an_interrupted_tuning_resumes_with_the_missing_laws(
-    short: Benchmark, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short: Benchmark, brief_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, tuned = tmp_path / "gains.yaml", list[str]()
     names = {law.title: name for name, law in LAWS.items()}
@@ -261,10 +278,7 @@ def test_an_interrupted_tuning_resumes_with_the_missing_laws(
         return initial(names[law.title], short)
 
     monkeypatch.setattr(tuning, "tune", tune)
-    scenario = tmp_path / "brief.yaml"
-    text = find_scenario("osprey_servo").path.read_text(encoding="utf-8")
-    scenario.write_text(text.replace("duration: 60.0 ", "duration: 4.0 "), encoding="utf-8")
-    arguments = ["compare", str(scenario), "--laws", "rise,pi,l1", "--aircraft", "1", "--tune", "--gains", str(path)]
+    arguments = ["compare", str(brief_file), "--laws", "rise,pi,l1", "--aircraft", "1", "--tune", "--gains", str(path)]
     CliRunner().invoke(app, arguments)
     assert list(tuned_gains.load(path)) == ["rise"]
     result = CliRunner().invoke(app, arguments)

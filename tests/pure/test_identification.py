@@ -5,16 +5,21 @@
 import math
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner, Result
 
 from aircraft_sim.jsbsim_trim import trim_solution
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design import identification
 from flight_analysis.design.identification import (
     AUTHORITY_FRACTION,
     HEIGHTS,
@@ -22,6 +27,7 @@ from flight_analysis.design.identification import (
     SPAN,
     Fly,
     IdentifiedAircraft,
+    ManoeuvreResult,
     Responses,
     fly_all,
     identify,
@@ -32,7 +38,9 @@ from flight_analysis.design.identification import (
     step_responses,
 )
 from flight_bringup.scenarios import find_scenario
+from flight_cli.cli import application
 from flight_core.outcome import COMPLETED, FlightEnded
+from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelParameters
@@ -207,10 +215,22 @@ def test_the_shipped_scenario_is_what_the_command_writes(cessna: IdentifiedAircr
             assert found == (pytest.approx(value, rel=1e-3, abs=1e-6) if numbers else value), key
 
 
+def identified_by(name: str, speed: float, altitude: float, flight: str, **options: Any) -> IdentifiedAircraft:
+    """An identified aircraft that flies one of the three flights of `fly_all`."""
+
+    def fly_one(scenario: Scenario, progress: Callable[[str], None]) -> dict[str, ManoeuvreResult]:
+        turbulence = {"turbulence": moderate_turbulence(altitude)} if flight == "turbulence" else {}
+        return {flight: manoeuvre_result(simulate(scenario.vary(aircraft={"gusts": {}} | turbulence)))}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(identification, "fly_all", fly_one)
+        return identify(name, speed, altitude, **options)
+
+
 @pytest.fixture(scope="module")
 def f15() -> IdentifiedAircraft:
     """An aircraft whose sideslip grows while p and r are held, under guidance by rule."""
-    return identify("f15", 180.0, 4572.0, guided=True)
+    return identified_by("f15", 180.0, 4572.0, "calm", guided=True)
 
 
 def test_the_stall_speed_of_guidance_is_the_slowest_trim(f15: IdentifiedAircraft) -> None:
@@ -238,7 +258,7 @@ def test_without_sideslip_feedback_the_f15_is_lost(f15: IdentifiedAircraft) -> N
 
 def test_an_extended_state_observer_lowers_every_error_in_turbulence(cessna: IdentifiedAircraft) -> None:
     # measured 0.53, 0.81, 0.87, 0.56 in q, V, p, r; half of V is the wind itself
-    observed = identify("c172p", 46.3, 1219.2, observer_margin=0.015).flights["turbulence"].rms
+    observed = identified_by("c172p", 46.3, 1219.2, "turbulence", observer_margin=0.015).flights["turbulence"].rms
     for output, alone in cessna.flights["turbulence"].rms.items():
         assert observed[output] < 0.95 * alone
 
@@ -257,30 +277,42 @@ def test_shipped_aircraft_fly_closer_than_the_prototype_did(name: str, cessna: I
     assert max(flights["turbulence"].rms[output] for output in ("q", "p", "r")) < 0.01
 
 
-def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command_ = [sys.executable, "-m", "flight_cli.cli", "identify", *arguments]
-    return subprocess.run(command_, cwd=cwd, capture_output=True, text=True, timeout=120, check=False)
+def rise_di(*arguments: str) -> Result:
+    """`rise-di identify` in this process."""
+    return CliRunner().invoke(application(["identify"]), ["identify", *arguments])
 
 
 @pytest.mark.parametrize(
-    ("airframe", "status", "sentence"),
+    ("airframe", "sentence"),
     [
-        ("osprey", 2, "error: airframe: found 'osprey', expected an aircraft of JSBSim, jsbsim:NAME"),
-        ("jsbsim:f61", 2, "error: airframe: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim: and another of 737, "),
-        ("jsbsim:dr1", 3, "error: jsbsim:dr1 does not trim at 46 m/s and 900 m: its model needs the property "),
+        ("osprey", "airframe: found 'osprey', expected an aircraft of JSBSim, jsbsim:NAME"),
+        ("jsbsim:f61", "airframe: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim: and another of 737, "),
     ],
 )
-def test_an_unidentifiable_airframe_gives_one_sentence(airframe: str, status: int, sentence: str, tmp_path: Path) -> None:
-    done = rise_di(airframe, "--speed", "46", "--altitude", "900", cwd=tmp_path)
-    assert done.returncode == status
-    assert done.stderr.startswith(sentence)
+def test_an_airframe_that_is_none_of_jsbsim_is_refused_with_one_sentence(
+    airframe: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused = rise_di(airframe, "--speed", "46", "--altitude", "900").exception
+    assert isinstance(refused, ParameterError)
+    assert str(refused).startswith(sentence)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
+    """In a process of its own: JSBSim itself prints nothing either."""
+    words = [sys.executable, "-m", "flight_cli.cli", "identify", "jsbsim:dr1", "--speed", "46", "--altitude", "900"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 3
+    assert done.stderr.startswith("error: jsbsim:dr1 does not trim at 46 m/s and 900 m: its model needs the property ")
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_is_overwritten_only_if_it_is_named(tmp_path: Path) -> None:
+def test_a_file_is_overwritten_only_if_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "jsbsim_c172p.yaml").write_text("mine\n", encoding="utf-8")
-    done = rise_di("jsbsim:c172p", "--speed", "46", "--altitude", "900", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "jsbsim_c172p.yaml exists" in done.stderr
+    refused = rise_di("jsbsim:c172p", "--speed", "46", "--altitude", "900").exception
+    assert isinstance(refused, ParameterError)
+    assert "jsbsim_c172p.yaml exists" in str(refused)
     assert (tmp_path / "jsbsim_c172p.yaml").read_text(encoding="utf-8") == "mine\n"

@@ -10,8 +10,9 @@ import pytest
 from tests.joint_states import JOINT_STATE, vector
 from tests.recordings import EPOCH, MS
 
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report import run_folder
-from flight_analysis.report.run_folder import new_run, read_flight, write_report
+from flight_analysis.report.run_folder import new_run, read_flight, write_empty_summary, write_report
 from flight_analysis.report.summary import empty_summary
 from flight_bringup.fly import fly_in_process
 from flight_bringup.scenarios import find_scenario
@@ -109,3 +110,14 @@ def test_latency_is_the_time_between_the_sending_of_y_and_of_its_u(tmp_path: Pat
 
 def test_a_flight_in_one_process_has_no_latency(runs: list[Path]) -> None:
     assert read_run(runs[0]).latency is None
+
+
+def test_a_summary_or_a_link_that_cannot_be_written_is_a_sentence(osprey_gust: Scenario, tmp_path: Path) -> None:
+    run = new_run(osprey_gust, tmp_path)
+    (tmp_path / "latest").mkdir()
+    with pytest.raises(ParameterError, match=r"latest cannot be written \(Is a directory\), expected a link to the last run$"):
+        write_empty_summary(run, osprey_gust, "interrupted")
+    (run / "summary.json").unlink()
+    (run / "summary.json").mkdir()
+    with pytest.raises(ParameterError, match=r"cannot be written \(Is a directory\), expected a folder that can$"):
+        write_empty_summary(run, osprey_gust, "interrupted")

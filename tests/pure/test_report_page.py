@@ -183,11 +183,11 @@ def test_no_table_is_wider_than_the_page(browser: Browser, page: Path) -> None:
     assert browser.run("[...document.querySelectorAll('.tables > div')].every(table => table.scrollWidth <= table.clientWidth)")
 
 
-def test_ten_minutes_at_500_hz_are_decimated_and_a_zoom_shows_every_sample(
+def test_two_minutes_at_500_hz_are_decimated_and_a_zoom_shows_every_sample(
     browser: Browser, tmp_path: Path, servo: RecordedFlight
 ) -> None:
     # White noise in y, u and the truth hardly compresses.
-    count, random, signals = 300_001, np.random.default_rng(1), {}
+    count, random, signals = 60_001, np.random.default_rng(1), {}
     for topic in ("y", "y_m", "u", "truth"):
         names = servo.tape[topic].names
         signals[topic] = Signal(np.arange(count) * 2_000_000, names, random.standard_normal((count, len(names))))
@@ -196,6 +196,6 @@ def test_ten_minutes_at_500_hz_are_decimated_and_a_zoom_shows_every_sample(
     open_page(browser, path)
     x, _ = curve(browser, 0, "y")
     assert len(x) < 5000
-    zoom(browser, 300.0, 300.2)
+    zoom(browser, 60.0, 60.2)
     x, _ = curve(browser, 0, "y")
-    assert len([t for t in x if 300.0 <= t <= 300.2]) == 101
+    assert len([t for t in x if 60.0 <= t <= 60.2]) == 101

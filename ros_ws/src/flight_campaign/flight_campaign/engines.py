@@ -70,7 +70,7 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                         )
                     client = stack.enter_context(Client(scheduler or cluster, timeout=f"{patience:g}s"))
                     ahead = AHEAD * max(count, len(client.scheduler_info()["workers"]))
-                except OSError as error:
+                except (OSError, ValueError) as error:  # ValueError: no address at all
                     where = f"found {scheduler}, expected a reachable dask scheduler"
                     raise ParameterError(f"--scheduler: {where} ({error})") from None
                 try:

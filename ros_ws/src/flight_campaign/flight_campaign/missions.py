@@ -214,12 +214,15 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
     def passed(leg: Legs, place: path.Point) -> Array:
         return leg.has_end & path.beyond((leg.end[0], leg.end[1]), leg.end_course, place)
 
+    def entered(leg: Legs, following: Legs, place: path.Point) -> Array:
+        return passed(leg, place) & (following.is_line | ~passed(following, place))
+
     def fly(before: GuidanceState, number: Array) -> MissionState:
-        leg = at(number)
+        leg, following = at(number), at(number + 1)
         origin = (leg.origin[0], leg.origin[1])
         line, circle = path.line_error(origin, leg.track, position), path.circle_error(origin, leg.radius, position)
         error = PathError(*(jnp.where(leg.is_line, one, other) for one, other in zip(line, circle, strict=True)))
-        wanted = modes.follow(error, leg.entry, lambda place: passed(leg, place), pose, speed, params)
+        wanted = modes.follow(error, leg.entry, partial(entered, leg, following), pose, speed, params)
         target = Target(altitude=leg.altitude, V=leg.V)
         flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.ALTITUDE, target=target)
         after, _ = modes.command(flies, pose, y_of, wanted, seconds(params.period_ns), params)

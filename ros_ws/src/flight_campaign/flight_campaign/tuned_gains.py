@@ -10,7 +10,7 @@ import yaml
 
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_core.files import read_yaml
+from flight_core.files import read_yaml, writing
 from flight_core.parameters import ParameterError
 
 TUNED = Path(__file__).parent / "tuned"  # folder of the tuned gains, one file a scenario
@@ -58,8 +58,10 @@ def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
 
 
 def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Sequence[str], command: str) -> None:
-    """Write tuned gains, their costs and the command that finds them; laws as in the catalogue, objectives as given."""
-    path.parent.mkdir(exist_ok=True)
+    """Write tuned gains, their costs and the command that finds them; laws as in the catalogue, objectives as given.
+
+    Raises ParameterError where the file cannot be written.
+    """
     objectives = [name for name in order if any(name in sets for sets in tuned.values())]
     head = (
         "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
@@ -68,4 +70,6 @@ def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Seq
     )
     laws = {law: {name: tuned[law][name] for name in objectives if name in tuned[law]} for law in LAWS if law in tuned}
     text = yaml.dump({"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160)
-    path.write_text(head + text, encoding="utf-8")
+    with writing("", path, "a file of tuned gains that can"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(head + text, encoding="utf-8")

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di airframes`: the assumptions of the theorem, checked on every airframe of the library."""
 
-import json
 from typing import Annotated, Any
 
 import typer
@@ -10,14 +9,14 @@ from rich.console import Console
 from rich.table import Table
 
 from flight_analysis.design.airframe_properties import AirframeFacts, ComplexArray, library
-from flight_cli.output import new_table
+from flight_cli.output import new_table, print_json
 
 
 def airframes(as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON, nothing else.")] = False) -> None:
     """Show the airframes of the library: poles, zeros, the minors of Omega = C B, D as published and what gives D = I."""
     facts = library()
     if as_json:
-        print(json.dumps([_as_json(one) for one in facts]))
+        print_json([_as_json(one) for one in facts])
         return
     console = Console()
     signs = _table("Signs and pairing", "airframe", "D", "for D = I", "coupling")

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of `rise-di identify` that excites the aircraft behind a channel map, and writes a scenario that flies it."""
 
-import json
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,10 +30,9 @@ from flight_analysis.design.open_loop_fit import ChannelModel
 from flight_analysis.design.response_identification import Response, identify_response
 from flight_analysis.design.sign_check import OPEN_LOOP
 from flight_analysis.report.run_folder import link_latest, new_run
-from flight_analysis.report.summary import finite_or_null
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
-from flight_cli.output import CLOCK_COLUMNS, display_path, new_table, progress_bar
+from flight_cli.output import CLOCK_COLUMNS, display_path, new_table, print_json, progress_bar
 from flight_core.files import writing
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Tape
@@ -66,10 +65,10 @@ def identify_behind_bridge(
     _write(folder, files)
     load_scenario(folder / "scenario.yaml")
     if as_json:
-        print(json.dumps(_as_json(response, found, flyable, trims, folder)))
+        print_json(_as_json(response, found, flyable, trims, folder))
         return
     _show_gains(console, found, response, flyable)
-    scenario, copied = folder / "scenario.yaml", folder / "map.yaml"
+    scenario, copied = (shlex.quote(str(folder / f"{name}.yaml")) for name in ("scenario", "map"))
     console.print(f"to fly it: rise-di fly {scenario} --bridge {copied} --send", highlight=False, soft_wrap=True)
 
 
@@ -210,7 +209,7 @@ def _show_gains(console: Console, found: Channels, response: Response, flyable: 
 def _as_json(response: Response, found: Channels, flyable: Flyable, trims: dict[str, float], folder: Path) -> dict[str, object]:
     def numbers(values: Any) -> dict[str, Any]:
         arrays = {key: value for key, value in values._asdict().items() if isinstance(value, np.ndarray)}
-        return {key: finite_or_null(value.tolist()) for key, value in arrays.items()}
+        return {key: value.tolist() for key, value in arrays.items()}
 
     return {
         "outputs": list(response.outputs),

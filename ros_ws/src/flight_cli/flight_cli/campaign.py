@@ -3,6 +3,8 @@
 """`rise-di campaign`: a Monte Carlo campaign, a scenario flown by thousands of uncertain aircraft."""
 
 import json
+import math
+import shlex
 import time
 from enum import StrEnum
 from pathlib import Path
@@ -20,10 +22,21 @@ from flight_campaign import engines
 from flight_campaign.campaign import Campaign, Definition, Sweep, define
 from flight_campaign.campaign_report import WIND_EFFECTS, write_page
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
-from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, SHOWN_COLUMN, display_path, new_table, parse_numbers, progress_bar
+from flight_cli.output import (
+    COUNT_COLUMNS,
+    INTERRUPTED,
+    SHOWN_COLUMN,
+    display_path,
+    new_table,
+    parse_numbers,
+    print_json,
+    progress_bar,
+)
+from flight_core.files import writing
 from flight_core.parameters import require
 
 CHUNK = 1000  # aircraft computed at once
+OF_DEFINITION = ("aircraft", "uncertainty", "wind", "seed", "sweep", "duration", "chunk", "runs")  # options of a new campaign
 RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
 
 
@@ -35,6 +48,7 @@ class EngineName(StrEnum):
 
 
 def campaign(
+    context: typer.Context,
     scenario: Annotated[
         str | None, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml); none with --resume.")
     ] = None,
@@ -69,6 +83,10 @@ def campaign(
     require((scenario is None) == (resume is not None), "SCENARIO", scenario, "one of a scenario and --resume")
     require(scheduler is None or engine is EngineName.DASK, "--scheduler", scheduler, "--engine dask with it")
     if resume is not None:
+        for name in OF_DEFINITION:
+            given = context.get_parameter_source(name)
+            own = given is None or given.name != "COMMANDLINE"
+            require(own, f"--{name}", "it beside --resume", "none: the folder of a campaign holds its definition")
         monte_carlo = Campaign.resume(resume)
     else:
         chosen = find_scenario(str(scenario), duration)
@@ -77,9 +95,10 @@ def campaign(
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
     speed = _fly_missing(monte_carlo, flies, quiet=as_json)
-    figures = _write_results(monte_carlo)
+    with writing("", monte_carlo.folder, "a folder and a disk that can"):
+        figures = _write_results(monte_carlo)
     if as_json:
-        print(json.dumps(figures))
+        print_json(figures)
         return
     console = Console()
     for case in range(monte_carlo.definition.cases):
@@ -92,7 +111,8 @@ def campaign(
 def _parse_sweep(text: str) -> Sweep:
     name, _, values = text.partition("=")
     factors = parse_numbers(values)
-    require(bool(factors), "--sweep", repr(text), "a parameter and factors, as in beta=0.5,1,2")
+    fits = bool(factors) and all(map(math.isfinite, factors))
+    require(fits, "--sweep", repr(text), "a parameter and factors, as in beta=0.5,1,2")
     return Sweep(parameter=name.removeprefix("controller."), factors=tuple(factors))
 
 
@@ -114,7 +134,7 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
     except KeyboardInterrupt:
         print(
             f"interrupted after {there + done} of {total}; continue with:"
-            f" rise-di campaign --resume {display_path(monte_carlo.folder)}"
+            f" rise-di campaign --resume {shlex.quote(display_path(monte_carlo.folder))}"
         )
         raise typer.Exit(INTERRUPTED) from None
     return done * seconds / (time.monotonic() - begin)
@@ -149,7 +169,7 @@ def _write_worst(monte_carlo: Campaign, case: int, tally: Tally) -> list[dict[st
         suffix = "" if monte_carlo.definition.sweep is None else f"_{monte_carlo.definition.factor(case):g}"
         path = monte_carlo.folder / f"{monte_carlo.definition.name}{suffix}_{one.number}.yaml"
         path.write_text(scenario_yaml(monte_carlo.definition.aircraft_scenario(one.number, case)), encoding="utf-8")
-        command = f"rise-di fly {display_path(path)} --in-process"
+        command = f"rise-di fly {shlex.quote(display_path(path))} --in-process"
         again.append({"number": one.number, "score": one.score, "command": command})
     return again
 

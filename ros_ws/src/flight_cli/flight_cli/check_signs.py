@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di check-signs`: compare D of the controller with the signs of a channel map and of a recorded flight."""
 
-import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -14,9 +13,8 @@ from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.params import ChannelMap, InputRow, OutputRow, load_map
 from flight_analysis.design.response_identification import MIN_RATIO
 from flight_analysis.design.sign_check import SignCheck, check_scenario, motion_as_channel_grows
-from flight_analysis.report.summary import finite_or_null
 from flight_bringup.scenarios import find_scenario
-from flight_cli.output import new_table
+from flight_cli.output import new_table, print_json
 
 CONTRADICTS = 1
 
@@ -40,9 +38,9 @@ def check_signs(
     frame = load_airframe(airframe or chosen.aircraft.airframe)
     checked = check_scenario(channel_map, chosen, frame, bag)
     if as_json:
-        channels, sentences = [finite_or_null(one._asdict()) for one in checked.channels], list(checked.contradictions)
+        channels, sentences = [one._asdict() for one in checked.channels], list(checked.contradictions)
         result = {"map": channel_map.name, "channels": channels, "seconds": checked.seconds, "contradictions": sentences}
-        print(json.dumps(result))
+        print_json(result)
     else:
         _show(Console(), channel_map, checked, frame.name)
     for sentence in checked.uncertain:

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di fly`: fly a scenario over topics or in one process, then show its figures."""
 
-import json
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +14,16 @@ from flight_analysis.report.run_folder import new_run, write_empty_summary, writ
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario, with_route, written
-from flight_cli.output import CLOCK_COLUMNS, ENDED_EARLY, INTERRUPTED, display_path, parse_numbers, progress_bar, show_flight
+from flight_cli.output import (
+    CLOCK_COLUMNS,
+    ENDED_EARLY,
+    INTERRUPTED,
+    display_path,
+    parse_numbers,
+    print_json,
+    progress_bar,
+    show_flight,
+)
 from flight_core import outcome as ends
 from flight_core.parameters import ParameterError, require
 from guidance.route_file import Origin, read_route
@@ -56,6 +64,9 @@ def fly(
     Exit status: 0 completed, 2 bad input, 3 ended early, 130 interrupted.
     """
     chosen = find_scenario(scenario, duration)
+    require(
+        not (in_process and (lockstep or one_process)), "--in-process", "a flight over topics, in lockstep", "one of the two"
+    )
     stepping = lockstep or one_process or chosen.flight.lockstep
     autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
     if autopilot is not None:
@@ -109,13 +120,12 @@ def fly(
         print(f"error: {outcome}, before the first sample; see {display_path(run)}", file=sys.stderr)
         raise typer.Exit(status) from None
     outcome = result.flight.summary["outcome"]
-    status = STATUS.get(outcome, ENDED_EARLY)
     if as_json:
-        print(json.dumps(result.flight.summary))
+        print_json(result.flight.summary)
     else:
         show_flight(Console(), result.flight)
         print(f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  {display_path(result.report)}")
-    raise typer.Exit(status)
+    raise typer.Exit(STATUS.get(outcome, ENDED_EARLY))
 
 
 def _origin(text: str | None) -> Origin | None:

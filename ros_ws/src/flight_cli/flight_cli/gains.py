@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di gains`: select gains by Theorem 1 and by the engineering procedure, or check those of a scenario."""
 
-import json
 import math
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,10 +22,9 @@ from flight_analysis.design.observer_selection import (
     model_for,
     with_aircraft_observer,
 )
-from flight_analysis.report.summary import finite_or_null
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import tuned_gains
-from flight_cli.output import new_table, parse_numbers, write_text
+from flight_cli.output import new_table, parse_numbers, print_json, write_text
 from flight_core.parameters import ParameterError, require
 from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
 from rise_di_controller.rise_di import RiseDiParameters
@@ -126,7 +124,7 @@ def gains(
     if write is not None and text is not None:
         write_text("--write", write, HEADER + text)
     if as_json:
-        print(json.dumps(_as_json(found, answers, seed)))
+        print_json(_as_json(found, answers, seed))
     else:
         _show(console, found, answers)
         if origin:
@@ -294,8 +292,8 @@ def _as_json(found: Study, answers: dict[str, GainAssessment], seed: int) -> dic
     } | {
         name: {
             "controller": answer.controller.model_dump(exclude_none=True),
-            "delay_margin": finite_or_null(answer.delay_margin),
-            "channel_margins": finite_or_null(answer.channel_margins),
+            "delay_margin": answer.delay_margin,
+            "channel_margins": answer.channel_margins,
             "stable_speed_ratio": _stable_speed_ratio(found, answer),
             "bounds": {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")}
             | {"rho": answer.bounds.rho},
@@ -304,9 +302,9 @@ def _as_json(found: Study, answers: dict[str, GainAssessment], seed: int) -> dic
                     "name": condition.name,
                     "part": part,
                     "channel": None if condition.channel is None else answer.controller.outputs[condition.channel],
-                    "found": finite_or_null(condition.found),
-                    condition.side.replace(" ", "_"): finite_or_null(condition.bound),
-                    "margin": finite_or_null(condition.margin),
+                    "found": condition.found,
+                    condition.side.replace(" ", "_"): condition.bound,
+                    "margin": condition.margin,
                     "holds": condition.holds,
                     "estimate": condition.estimate,
                 }

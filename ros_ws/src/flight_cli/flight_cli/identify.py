@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di identify`: an aircraft of JSBSim by step tests, with its scenario, or A and B of an airframe from a flight's log."""
 
-import json
 import math
 import sys
 from dataclasses import replace
@@ -35,7 +34,7 @@ from flight_analysis.report.summary import DisplayUnit
 from flight_bringup.scenarios import find_scenario
 from flight_cli.bridge_experiment import identify_behind_bridge
 from flight_cli.gains import observed, speed_of_margin
-from flight_cli.output import COUNT_COLUMNS, new_table, progress_bar, write_text
+from flight_cli.output import COUNT_COLUMNS, new_table, print_json, progress_bar, write_text
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
@@ -171,7 +170,7 @@ def _identify_by_steps(
         raise typer.Exit(CANNOT_FLY) from None
     write_text("--output", path, found.text)
     if as_json:
-        print(json.dumps(_as_json(found, path)))
+        print_json(_as_json(found, path))
     else:
         _show(console, found)
         console.print(f"scenario: {path}", highlight=False)
@@ -224,7 +223,7 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_
             again = _refly(recorded_scenario(recorded.scenario), recorded.tape, found.airframe, refly_margin)
         _show_flights_of_model(console, again, _units(found))
     if as_json:
-        print(json.dumps(_model_as_json(found, write) | ({} if again is None else {"refly": again._asdict()})))
+        print_json(_model_as_json(found, write) | ({} if again is None else {"refly": again._asdict()}))
 
 
 class _Reflight(NamedTuple):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the commands share: tables, JSON, paths, exit statuses."""
 
+import json
 from collections.abc import Container, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +21,7 @@ from flight_analysis.report.summary import (
     RecordedFlight,
     columns_of,
     display_units,
+    finite_or_null,
     format_value,
     input_rows,
     parts_legend,
@@ -117,6 +119,11 @@ def parse_numbers(text: str) -> list[float]:
         return [float(part) for part in text.split(",")]
     except ValueError:
         return []
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON, with null for NaN and infinity, which JSON does not have."""
+    print(json.dumps(finite_or_null(value)))
 
 
 def write_text(option: str, path: Path, text: str) -> None:

@@ -3,7 +3,7 @@
 """`rise-di replay`: compute a recorded flight again and compare it bit by bit, or with other gains in open loop."""
 
 import csv
-import json
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,8 +16,7 @@ from flight_analysis.closed_loop.guidance_replay import GuidanceReplay, replay_g
 from flight_analysis.closed_loop.replay import Difference, ReplayResult, recorded_parameters, recorded_scenario, vary
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
-from flight_analysis.report.summary import finite_or_null
-from flight_cli.output import LATEST, new_table
+from flight_cli.output import LATEST, new_table, print_json
 from flight_core.files import parse_yaml, writing
 from flight_core.parameters import ParameterError, require
 from flight_log.stored_messages import parameter_changes
@@ -41,12 +40,14 @@ def replay(
     --set computes u from the recorded y and y_m with other parameters. That is an open loop: the aircraft did not fly this u.
     Exit status: 0 every bit equal, 1 a tick differs or flew with other parameters, 2 bad input.
     """
+    changed = dict(map(_parse_setting, settings or []))
+    require(len(changed) == len(settings or []), "--set", "a parameter twice", "each once")
     with Console(stderr=True, quiet=as_json).status(f"computing {run} again"):
         recorded = read_run(run, namespace)
         if recorded.scenario is None:
             raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
         parameters = recorded_parameters(recorded.scenario)
-        others = vary(parameters, dict(map(_parse_setting, settings))) if settings else None
+        others = vary(parameters, changed) if changed else None
         controller = f"{recorded.namespace}/controller"
         changes = parameter_changes(run, controller, type(parameters).model_fields) if others is None else []
         result = recompute(recorded.tape, parameters, others, changes)
@@ -60,7 +61,7 @@ def replay(
     notes += () if guided is None else guided.notes
     if as_json:
         of_guidance = None if guided is None else _guidance_as_json(guided)
-        print(json.dumps({**_as_json(result, notes, parameters.inputs, settings or []), "guidance": of_guidance}))
+        print_json({**_as_json(result, notes, parameters.inputs, settings or []), "guidance": of_guidance})
     else:
         _show(result, notes, parameters.inputs, open_loop=others is not None)
         if guided is not None:
@@ -84,7 +85,7 @@ def _difference(first: Difference) -> str:
 
 def _guidance_as_json(guided: GuidanceReplay) -> dict[str, Any]:
     first = guided.first
-    shown = None if first is None else {**finite_or_null(first._asdict()), "ulps": first.ulps}
+    shown = None if first is None else {**first._asdict(), "ulps": first.ulps}
     return {"steps": guided.steps, "checked": guided.checked, "differing": guided.differing, "first": shown}
 
 
@@ -138,14 +139,14 @@ def _count_by_group(result: ReplayResult) -> dict[str, int]:
 
 
 def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """Difference of u by input, in its unit: rms, largest, its time, and the rms of the recorded u."""
+    """Difference of u by input, in its unit: rms, largest, its time, and the rms of the recorded u; NaN without a u."""
     known = np.isfinite(result.computed).all(axis=1)
     recorded, computed = result.group(result.recorded[known], "u"), result.group(result.computed[known], "u")
     figures = {}
     for name in inputs:
         difference = computed[name] - recorded[name]
         rms, largest = error_metrics(difference)
-        at = float(result.t[known][np.argmax(np.abs(difference))])
+        at = float(result.t[known][np.argmax(np.abs(difference))]) if len(difference) else math.nan
         figures[name] = {"rms": rms, "max": largest, "t_max": at, "rms_recorded": error_metrics(recorded[name]).rms}
     return figures
 
@@ -161,7 +162,7 @@ def _as_json(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ..
         "other_parameters": int(result.other_parameters.sum()),
         "differing": int(result.different().any(axis=1).sum()),
         "differing_by_group": _count_by_group(result),
-        "first": None if first is None else {**finite_or_null(first._asdict()), "ulps": first.ulps},
+        "first": None if first is None else {**first._asdict(), "ulps": first.ulps},
         "u_difference": _u_figures(result, inputs),
         "notes": list(notes),
     }

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di report`: tables, report page, figures and data of recorded runs."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +14,7 @@ from flight_analysis.report.export import write_csv, write_parquet, write_png
 from flight_analysis.report.html import write_page
 from flight_analysis.report.run_folder import read_flight, write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
-from flight_cli.output import LATEST, display_path, new_table, show_flight
+from flight_cli.output import LATEST, display_path, new_table, print_json, show_flight
 from flight_core.files import writing
 
 
@@ -49,7 +48,7 @@ def report(
                 write(path, flights)
     if as_json:
         summaries = [flight.summary for flight in flights]
-        print(json.dumps(summaries[0] if len(runs) == 1 else summaries))
+        print_json(summaries[0] if len(runs) == 1 else summaries)
         return
     if len(flights) == 1:
         show_flight(Console(), flights[0])

@@ -225,7 +225,7 @@ def study_airframe(
         ahead, behind = (dynamics.f(t + step, x + step * x_dot, aircraft) for step in (near, -near))
         drift_dot: FloatArray = times(A, x_dot) + (ahead - behind) / (2.0 * near)
         u_dot[k] = times(inverse, y_m_ddot[2 * k][:, None] - C @ drift_dot).T
-        if k < steps:
+        if k < steps and n > m:
             eta = rk4(eta_dot, t, eta, None, None, STEP)
     undisturbed, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
     return Study(airframe, A[:-1], B[:-1], C, airframe.matrix_gravity(), u_dot[:, :-1], slew, undisturbed, stable, uncertainty)

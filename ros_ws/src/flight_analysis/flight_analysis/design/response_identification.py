@@ -53,6 +53,7 @@ SCALE = np.array([0.05, 0.05, 5.0, 5.0, 50.0, 50.0])
 SPREAD = np.array([1.0, 0.2, 1e3, 50.0, 2500.0, 5000.0])  # before the fit
 ORDERS = ((1, 1, 1, 0, 0, 0), (1, 1, 1, 1, 0, 0), (1, 1, 1, 1, 1, 1))  # an integrator, first order, second order
 MIN_GAIN = 6.0  # of chi squared per parameter that a higher order has to gain
+TOLERANCE = 1e-6  # of chi squared, relative, at which a search ends: far below what MIN_GAIN or a standard error can show
 EARLY = 0.3  # s after delay and lag in which the sign of a response shows
 COUPLING_SPAN = 0.25  # s after delay and lag in which other outputs respond by Omega
 
@@ -492,7 +493,10 @@ def _search(
             starts.append(np.array([delay, lag, slope, 2.0, 0.0, 0.0]))
     bounds = LOWER[fitted], UPPER[fitted]
     best: Any = min(
-        (least_squares(residuals, np.clip(one[fitted], *bounds), bounds=bounds, x_scale=SCALE[fitted]) for one in starts),
+        (
+            least_squares(residuals, np.clip(one[fitted], *bounds), bounds=bounds, x_scale=SCALE[fitted], ftol=TOLERANCE)
+            for one in starts
+        ),
         key=lambda one: float(one.cost),
     )
     jacobian = np.zeros((len(best.fun), len(free)))

@@ -135,14 +135,15 @@ def write_report(run: Path, outcome: str | None = None) -> FlightResult:
     with writing("", folder, "a folder that can"):
         (folder / SUMMARY).write_text(json.dumps(flight.summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         write_page(folder / REPORT, [flight])
-        if outcome is not None:
-            link_latest(folder)
+    if outcome is not None:
+        link_latest(folder)
     return FlightResult(flight, min(bag_files(run), default=folder), folder / REPORT)
 
 
 def write_empty_summary(run: Path, scenario: Scenario, outcome: str) -> None:
-    """Write summary.json of a flight that ended before its first sample. The log stays as it is."""
-    (run / SUMMARY).write_text(json.dumps(empty_summary(scenario, outcome), indent=2) + "\n", encoding="utf-8")
+    """Write summary.json of a flight that ended before its first sample. The log stays as it is. Raises ParameterError."""
+    with writing("", run, "a folder that can"):
+        (run / SUMMARY).write_text(json.dumps(empty_summary(scenario, outcome), indent=2) + "\n", encoding="utf-8")
     link_latest(run)
 
 
@@ -167,11 +168,12 @@ def _until_last_input(tape: Tape) -> Tape:
 
 
 def link_latest(run: Path) -> None:
-    """Point runs/latest at a run, atomically."""
+    """Point runs/latest at a run, atomically. Raises ParameterError where it cannot be a link."""
     latest, temporary = run.parent / "latest", run.parent / f".latest-{os.getpid()}"
-    temporary.symlink_to(run.name)
-    try:
-        temporary.replace(latest)
-    except OSError:
-        temporary.unlink()
-        raise
+    with writing("", latest, "a link to the last run"):
+        temporary.symlink_to(run.name)
+        try:
+            temporary.replace(latest)
+        except OSError:
+            temporary.unlink()
+            raise
