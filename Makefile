@@ -39,11 +39,12 @@ fly: setup
 test test-fast: export OPENBLAS_NUM_THREADS = 1
 
 # The tests of nodes mostly wait. The slow ones without ROS compute meanwhile, with the policy SCHED_IDLE where there is chrt:
-# any other thread takes the processor from them at once. Those that fly in real time and measure it come last, by themselves.
+# any other thread takes the processor from them at once. They wait too, for a browser or a process: a worker more than cores.
+# Those that fly in real time and measure it come last, by themselves.
 IDLE = $(shell chrt --idle 0 true 2> /dev/null && echo chrt --idle 0)
 test: check
 	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; mkdir -p build; \
-	  $(IDLE) $(XDIST) -m slow --timeout=900 tests/pure > build/slow-tests.log 2>&1 & slow=$$!; trap "kill $$slow 2> /dev/null || true" EXIT; trap "exit 130" INT; \
+	  $(IDLE) $(XDIST) -n $$(($$(nproc) + 1)) -m slow --timeout=900 tests/pure > build/slow-tests.log 2>&1 & slow=$$!; trap "kill $$slow 2> /dev/null || true" EXIT; trap "exit 130" INT; \
 	  $(XDIST) --no-loadscope-reorder -m "not alone and not slow" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
 	  wait $$slow || status=$$?; cat build/slow-tests.log; \
 	  $(BIN)/python -m pytest -m alone tests/ros || status=$$?; exit $$status)

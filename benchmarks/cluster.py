@@ -28,6 +28,7 @@ from flight_campaign.campaign import CHUNKS, Campaign, Definition, define
 PORT = 8790
 ADDRESS = f"tcp://127.0.0.1:{PORT}"
 WORKERS = 4
+FAULTS = "worker killed, worker stopped for 10 s, scheduler killed and started with new workers"
 STOPPED = 10.0  # s that a worker is stopped: longer than a chunk takes, shorter than its lease at the scheduler (300 s)
 
 
@@ -91,11 +92,12 @@ def main(
         found = chunks_of(Path(folder) / "dask", definition, engines.dask(WORKERS, ADDRESS), faults)
     same = sum(found.get(name) == content for name, content in expected.items())
     table = new_table(f"{aircraft} aircraft, {WORKERS} workers", ("figure", "value"), texts=1)
-    table.add_row("faults", "worker killed, worker stopped 10 s, scheduler killed and started with new workers")
+    table.add_row("faults", FAULTS)
     table.add_row("chunks with the bytes of one process", f"{same} of {len(expected)}")
     Console().print(table)
     if json_file is not None:
-        json_file.write_text(json.dumps({"chunks": len(expected), "same": same}), encoding="utf-8")
+        result = {"faults": FAULTS, "workers": WORKERS, "aircraft": aircraft, "chunks": len(expected), "same": same}
+        json_file.write_text(json.dumps(result), encoding="utf-8")
     if same != len(expected):
         raise typer.Exit(1)
 

@@ -53,6 +53,7 @@ RANDOM_FAULTS = (PYTHON, "-m", "benchmarks.random_faults", "--json", FILE, "--co
 CAMPAIGN = (PYTHON, "-m", "benchmarks.campaign", "--json", FILE)
 FUZZ, REPLAY = ((PYTHON, "-m", "benchmarks.evidence", "--do", task, "--json", FILE) for task in ("fuzz", "replay"))
 QUICK_CAMPAIGN = (*CAMPAIGN, "--aircraft", "2000", "--chunk", "200", "--exact", "1")
+CLUSTER = (PYTHON, "-m", "benchmarks.cluster", "--json", FILE)
 VIEW = (PYTHON, "-m", "benchmarks.view", "--json", FILE)
 QUICK_VIEW = (*VIEW, "--hours", "0.05", "--seconds", "20", "--count", "2")
 SECURITY = (*PYTEST, "tests/ros/test_security.py")
@@ -79,6 +80,7 @@ MEASUREMENTS = (
     Measurement("campaign", CAMPAIGN, QUICK_CAMPAIGN, "speed and accuracy of campaigns", "3 min", timed=True),
     Measurement("campaign-fleet", (*FLEET, "10000"), (*FLEET, "1000"), "uncertain aircraft flown by the same law", "1 min"),
     Measurement("campaign-missions", (*MISSIONS, "5000"), (*MISSIONS, "200"), "uncertain aircraft on a route", "3 min"),
+    Measurement("cluster", CLUSTER, (*CLUSTER, "--aircraft", "1000"), "a campaign on a cluster of dask with faults", "1 min"),
     Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), "other laws on the same aircraft and course", "5 min"),
     Measurement("view", VIEW, QUICK_VIEW, "the page beside a flight, and a log of one hour on it", "11 min", timed=True),
     Measurement("replay", REPLAY, (*REPLAY, "--seconds", "5"), "every scenario flown and replayed", "2 min"),

@@ -14,7 +14,7 @@ from benchmarks.guidance_grid import Point
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "build" / "guidance"
 PAGE = REPOSITORY / "docs" / "evidence_guidance.md"
-REPORT = "At its end flight_cli writes the report."
+REPORT = "At its end `rise-di fly` writes the report."
 INTRODUCTION = """\
 # Evidence: guidance
 
@@ -34,7 +34,7 @@ def store(name: str, result: Any) -> None:
 
 
 def page(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """The page from the stored results by name: "flights NAME", "grid NAME", "rates", "route" and "long flight"."""
+    """The page from the stored results by name: "flights NAME", "grid NAME", "rates", "route" and "long FLIGHT"."""
     parts, makers = [INTRODUCTION], {"flights": _flights, "grid": _grid, "rates": _rates, "route": _route, "long": _long}
     for name, stored in results.items():
         kind, _, aircraft = name.partition(" ")
@@ -109,17 +109,17 @@ def _rates(_: str, rows: Any) -> tuple[str, str, list[str]]:
     return "Errors of the rates", "python -m benchmarks.guidance --rates", lines
 
 
-def _long(_: str, figures: Any) -> tuple[str, str, list[str]]:
+def _long(flight: str, figures: Any) -> tuple[str, str, list[str]]:
     """The figures of benchmarks/long_flight.py."""
-    text = "; ".join(f"{name}: {_shown(value)}" for name, value in figures.items()) + "."
-    lines = textwrap.wrap(
-        f"The c172p round a triangle in turbulence of 1.5 m/s, in lockstep over topics. {text} {REPORT}",
-        118,
-    )
-    return "A long flight", f"python -m benchmarks.long_flight --minutes {figures['minutes']:.0f}", lines
+    shown = {name: value for name, value in figures.items() if name not in ("flight", "options")}
+    text = "; ".join(f"{name}: {_shown(value)}" for name, value in shown.items()) + "."
+    lines = textwrap.wrap(f"Round a triangle in turbulence of 1.5 m/s, over topics. {text} {REPORT}", 118)
+    return f"A long flight, {flight}", " ".join(["python -m benchmarks.long_flight", *figures["options"]]), lines
 
 
 def _shown(value: Any) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {_shown(one)}" for name, one in value.items())
-    return ", ".join(map(_shown, value)) if isinstance(value, list) else str(value)
+    if isinstance(value, list):
+        return ", ".join(map(_shown, value))
+    return f"{value:.3g}" if isinstance(value, float) and value < 10.0 else str(value)

@@ -1,11 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A long guided flight over topics in lockstep: the c172p round a triangle in turbulence.
+"""A long guided flight over topics, round a triangle in turbulence, watched by a client of the live page.
 
-    .venv/bin/python -m benchmarks.long_flight [--minutes 60] [--runs FOLDER]
+    .venv/bin/python -m benchmarks.long_flight                                  # the c172p of JSBSim, 60 min in lockstep
+    .venv/bin/python -m benchmarks.long_flight --observer                       # the osprey, with an observer beside the law
+    .venv/bin/python -m benchmarks.long_flight --observer --real-time
 
-Prints JSON and writes it to docs/evidence_guidance.md: the outcome, the samples that the log lacks, the largest cross-track
-error, the memory of each process in the middle and at the end of the flight, and how long a browser takes to open the report.
+Prints JSON and writes it to docs/evidence_guidance.md: the outcome, the samples that the log lacks, missed ticks, the largest
+cross-track error, the memory of each process in the middle and at the end of the flight, and the times to write and to open the
+report.
 """
 
 import argparse
@@ -16,64 +19,85 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
 from benchmarks import guidance_page
+from benchmarks.host_delays import Intervals
+from benchmarks.processes import delay_monitors, real_time
+from benchmarks.view import RISE_DI, Client, figures_of_ticks, watching
 from tests.browser import CHROMIUM, Browser
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
+from flight_analysis.report.run_folder import write_report
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import NANOSECONDS, period_ns
 from flight_core.tape import Tape
+from flight_log.bag import LOST_MESSAGES
 from flight_log.tape_reader import read_run
 
 SIDE = 6000.0  # m, of the triangle
-SIGMA = 1.5  # m/s, of the turbulence
+TURBULENCE = {  # of 1.5 m/s: at the altitude of the c172p; moderate at 100 m above ground (MIL-F-8785C)
+    "c172p": {"altitude": 1219.2, "sigma": 1.5, "seed": 1},
+    "osprey": {"altitude": 100.0, "wind": 15.4, "seed": 1},
+}
 PERIOD = 2.0  # s between samples of the memory
 MIB = 2**20
+MODES = {"in lockstep": ["--lockstep"], "in lockstep in one process": ["--one-process"], "in real time": []}
 
 
-def triangle(minutes: float) -> Scenario:
+def triangle(minutes: float, *, observer: bool) -> Scenario:
     """The flight: laps round an equilateral triangle in turbulence, without wind."""
-    base = find_scenario("jsbsim_c172p_route")
-    speed, altitude = base.aircraft.channels().speed, base.aircraft.altitude
+    base = find_scenario("osprey_route" if observer else "jsbsim_c172p_route")
+    if observer:
+        base = replace(base, controller=find_scenario("osprey_observer").controller)
+    speed, altitude = base.aircraft.channels().speed, base.aircraft.altitude or 0.0  # above the start
     laps = math.ceil(60.0 * minutes * speed / (2.0 * SIDE))  # the fillets shorten a lap
     corners = [(0.0, 0.0), (SIDE, 0.0), (SIDE / 2.0, SIDE * math.sqrt(0.75))] * laps
     north, east = (list(values) for values in zip(*corners, strict=True))
     return base.vary(
         flight={"duration": 60.0 * minutes},
-        aircraft={"wind": [0.0, 0.0], "turbulence": {"altitude": altitude, "sigma": SIGMA, "seed": 1}},
+        aircraft={"wind": [0.0, 0.0], "turbulence": TURBULENCE["osprey" if observer else "c172p"]},
         guidance={"wind": 0.0, "route": {"north": north, "east": east, "altitude": [altitude] * len(north)}},
     )
 
 
-def fly(scenario: Path, runs: Path, *, together: bool) -> dict[str, list[int]]:
-    """Fly in lockstep; the memory of each process by its command, bytes every PERIOD."""
-    command = [
-        sys.executable,
-        "-m",
-        "flight_cli.cli",
-        "fly",
-        str(scenario),
-        "--one-process" if together else "--lockstep",
-        "--runs",
-        str(runs),
-    ]
+def fly(scenario: Path, runs: Path, mode: str) -> dict[str, list[int]]:
+    """Fly, with a client of the live page; the memory of each process by its command, bytes every PERIOD."""
+    command = [RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
     memory: dict[str, list[int]] = {}
-    with psutil.Popen(command, stdout=subprocess.DEVNULL) as flight:
+    with ExitStack() as stack:
+        flight = stack.enter_context(psutil.Popen(command, stdout=subprocess.DEVNULL))
+        stack.callback(end, flight)
+        while flight.poll() is None and not any(runs.glob("*/*.mcap")):
+            time.sleep(0.1)
+        (log,) = runs.glob("*/*.mcap")
+        server, address = stack.enter_context(watching(log.parent))
+        client = Client(address)
+        stack.callback(client.stop)
+        client.start()
         while flight.poll() is None:
-            for process in (flight, *flight.children(recursive=True)):
+            for process in (flight, *flight.children(recursive=True), server):
                 with suppress(psutil.Error):
-                    modules = [word for word in process.cmdline() if word.endswith((".main", ".cli"))]
-                    if modules:
-                        memory.setdefault(modules[0], []).append(process.memory_info().rss)
+                    words = process.cmdline()
+                    name = next((word for word in words if word.endswith(".main")), f"rise-di {words[2]}")
+                    memory.setdefault(name, []).append(process.memory_info().rss)
             time.sleep(PERIOD)
+    if flight.returncode != 0:
+        sys.exit(f"the flight ended with status {flight.returncode}")
     return memory
+
+
+def end(flight: psutil.Popen) -> None:
+    """End the flight where it goes on, with its processes."""
+    if flight.poll() is None:
+        flight.terminate()
+        flight.wait()
 
 
 def missing(tape: Tape, scenario: Scenario) -> dict[str, int]:
@@ -101,8 +125,11 @@ def opened(report: Path) -> float | None:
         return time.monotonic() - begin
 
 
-def figures(run: Path, memory: Mapping[str, list[int]]) -> dict[str, Any]:
-    """The figures of a flight from its run."""
+def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None) -> dict[str, Any]:
+    """The figures of a flight from its run. `delays` are those of the host, by the clock of the stamps; None where unknown."""
+    begin = time.monotonic()
+    write_report(run)
+    written = time.monotonic() - begin
     read = read_run(run)
     tape, scenario = read.tape, load_scenario(run.parent / "flown.yaml")
     log = tape["guidance"]
@@ -114,6 +141,8 @@ def figures(run: Path, memory: Mapping[str, list[int]]) -> dict[str, Any]:
         "minutes": round((tape["y"].stamp_ns[-1] - tape.start_ns) / NANOSECONDS / 60.0, 3),
         "legs": int(log["leg"].max()),
         "samples missing": missing(tape, scenario),
+        "messages lost": sum(int(count) for count in read.metadata.get(LOST_MESSAGES, {}).values()),
+        **figures_of_ticks(tape["internals"], delays, period_ns(scenario.controller.rate, "rate")),
         "steps of guidance that replay differently": [replay.differing, replay.steps],
         "largest cross-track error (m)": round(float(np.abs(xtrack).max()), 1),
         "largest bank (deg)": round(math.degrees(float(np.abs(log["pose.phi"]).max())), 1),
@@ -122,6 +151,7 @@ def figures(run: Path, memory: Mapping[str, list[int]]) -> dict[str, Any]:
             name: [round(half[name] / MIB, 1), round(values[-1] / MIB, 1)] for name, values in memory.items()
         },
         "report (MB)": round((run / "report.html").stat().st_size / 1e6, 2),
+        "report written in (s)": round(written, 1),
         "report opened in (s)": opened(run / "report.html"),
     }
 
@@ -131,19 +161,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0, help="of flight time")
     parser.add_argument("--runs", type=Path, help="folder for the run; by default it is removed")
-    parser.add_argument("--one-process", action="store_true", help="all nodes in one process")
+    parser.add_argument("--observer", action="store_true", help="the osprey with its observer, in place of the c172p")
+    mode = parser.add_mutually_exclusive_group()
+    for name, words in (("--one-process", "in lockstep in one process"), ("--real-time", "in real time")):
+        mode.add_argument(name, dest="mode", action="store_const", const=words, default="in lockstep", help=words)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, delay_monitors(bool(real_time())) as delays:
         runs = options.runs or Path(folder)
         runs.mkdir(parents=True, exist_ok=True)
         path = runs / "flown.yaml"
-        path.write_text(scenario_yaml(triangle(options.minutes)), encoding="utf-8")
+        path.write_text(scenario_yaml(triangle(options.minutes, observer=options.observer)), encoding="utf-8")
         begin = time.monotonic()
-        memory = fly(path, runs, together=options.one_process)
+        memory = fly(path, runs, options.mode)
         took = time.monotonic() - begin
-        run = (runs / "latest").resolve()
-        found = {"minutes it took": round(took / 60.0, 1)} | figures(run, memory)
-        guidance_page.store("long flight", found)
+        clock = time.time_ns() - time.monotonic_ns()
+        host = [(since + clock, until + clock) for since, until in delays()] if delays else None
+        aircraft = "osprey with an observer" if options.observer else "c172p"
+        found = {"flight": f"the {aircraft}, {options.mode}", "minutes it took": round(took / 60.0, 1)}
+        found |= figures((runs / "latest").resolve(), memory, host)
+        guidance_page.store(f"long {aircraft}, {options.mode}", found | {"options": sys.argv[1:]})
         print(json.dumps(found, indent=1))
 
 

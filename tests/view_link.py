@@ -64,7 +64,7 @@ class NodesInMemory:
 
     def skip(self) -> str:
         """Refused."""
-        return "no route is flown"
+        return "no route with a further leg is flown"
 
     def engage(self) -> str:
         """Waits until it is cancelled."""

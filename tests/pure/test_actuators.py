@@ -23,6 +23,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.integrators import rk4
 from flight_core.rates import NANOSECONDS
+from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.law import Sign
 
@@ -301,13 +302,19 @@ def servo() -> Scenario:
     return find_scenario("osprey_servo").vary(aircraft={"sensors": {}})
 
 
+@pytest.fixture(scope="module")
+def gusty(servo: Scenario) -> Tape:
+    """The whole flight, with gusts."""
+    return simulate(servo)
+
+
 def test_the_servo_scenario_uses_the_softened_sign(servo: Scenario) -> None:
     assert servo.rise_di().sampled_sign()[0] is Sign.SOFT
 
 
-def test_error_through_servos_with_and_without_gusts(servo: Scenario) -> None:
+def test_error_through_servos_with_and_without_gusts(servo: Scenario, gusty: Tape) -> None:
     # Measured 7.604, 0.0874, 9.75, 6.39. The prototype that these gains come from: 7.6, 0.088, 9.9, 6.4.
-    assert (rms(simulate(servo)) <= [7.61, 0.088, 9.9, 6.4]).all()
+    assert (rms(gusty) <= [7.61, 0.088, 9.9, 6.4]).all()
     # Measured 1.97, 0.0552, 9.75, 2.19. The prototype: 2.0, 0.058, 9.9, 2.2.
     assert (rms(simulate(servo.vary(aircraft={"gusts": {}}))) <= [2.0, 0.058, 9.9, 2.2]).all()
 
@@ -318,15 +325,14 @@ def test_error_through_servos_with_sensor_noise() -> None:
     assert (np.round(rms(simulate(find_scenario("osprey_servo"))) * [10, 1000, 10, 10]) <= [76, 88, 99, 64]).all()
 
 
-def test_the_softened_sign_leaves_no_limit_cycle_behind_servos(servo: Scenario) -> None:
-    tape = simulate(servo)
-    rest = tape.time("u") > 55.0  # gusts and commands end before 50 s
+def test_the_softened_sign_leaves_no_limit_cycle_behind_servos(servo: Scenario, gusty: Tape) -> None:
+    rest = gusty.time("u") > 55.0  # gusts and commands end before 50 s
     # The literal sign would keep moving every input by beta: 15 deg/s, 60 %/s. Here the slow spiral mode is left.
-    slew = np.abs(np.diff(tape["u"].values[rest], axis=0)).mean(axis=0) / 0.01
+    slew = np.abs(np.diff(gusty["u"].values[rest], axis=0)).mean(axis=0) / 0.01
     beta = np.array(servo.rise_di().beta) * np.array(servo.controller.input_scale)
     assert (slew < 0.01 * beta).all()
-    e = error(tape)
-    assert np.abs(e.values[(e.stamp_ns - tape.start_ns) > 55 * 10**9]).max() < 5e-4
+    e = error(gusty)
+    assert np.abs(e.values[(e.stamp_ns - gusty.start_ns) > 55 * 10**9]).max() < 5e-4
 
 
 def test_without_the_sign_term_the_same_gains_have_twice_the_error(servo: Scenario) -> None:
@@ -335,8 +341,8 @@ def test_without_the_sign_term_the_same_gains_have_twice_the_error(servo: Scenar
     assert pi == pytest.approx([13.7, 0.178, 22.2, 14.0], rel=0.05)
 
 
-def test_the_actuators_stay_inside_their_limits_in_flight(servo: Scenario) -> None:
-    positions = simulate(servo.vary(flight={"duration": 14.0}))["truth"].group("actuator").values
+def test_the_actuators_stay_inside_their_limits_in_flight(servo: Scenario, gusty: Tape) -> None:
+    positions = gusty["truth"].group("actuator").values
     limits = servo.aircraft.actuators
     assert (positions >= limits.lower).all()
     assert (positions <= limits.upper).all()

@@ -73,6 +73,7 @@ RESULTS = {
     "fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE}),
     "campaign": result("campaign", CAMPAIGN),
     "campaign-fleet": result("campaign-fleet", {"cases": [FLEET]}),
+    "cluster": result("cluster", {"faults": "worker killed", "workers": 4, "aircraft": 2000, "chunks": 40, "same": 39}),
     "compare": result("compare", COMPARED | {"laws": [LAW, PI]}),
     "view": result("view", VIEW),
     "replay": result("replay", {"osprey_gust": {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": True}}),

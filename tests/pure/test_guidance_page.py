@@ -15,7 +15,7 @@ def test_the_page_marks_what_misses_its_limit_and_names_what_was_lost() -> None:
             "flights c172p": flights,
             "grid c172p": grid,
             "rates": [("c172p", "calm", {"q": 0.9, "p": 1.6}, 1.5)],
-            "long flight": {"minutes": 60.0, "legs": [1, 2]},
+            "long c172p, in lockstep": {"minutes": 60.0, "legs": [1, 2], "options": ["--minutes", "60"]},
         }.items()
     }
     lines = page(dated).splitlines()

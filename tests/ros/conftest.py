@@ -5,6 +5,7 @@
 import fcntl
 import itertools
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,21 +20,24 @@ from typing import Self
 import psutil
 import pytest
 from mcap.records import Channel, Message
+from tests.conftest import REPOSITORY
 from tests.ros.peer import HANG, Peer, peer
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_bringup.processes import end_with_parent
 from flight_log.scan import Scan
 
 _numbers = itertools.count(os.getpid())  # a domain is used again late: processes may take a while to leave it
 
 Start = Callable[..., "Process"]
+Recorder = Callable[..., "Process"]
 
 
 class Process:
-    """A process under test and the lines of its output."""
+    """A process under test and the lines of its output. It ends with pytest, also where no fixture ends it."""
 
     def __init__(self, *arguments: str, cwd: Path, within: Sequence[str] = (), stdin: int | None = None) -> None:
-        command, pipe = [*within, sys.executable, "-m", *arguments], subprocess.PIPE
+        command, pipe = [*within, *end_with_parent(), sys.executable, "-m", *arguments], subprocess.PIPE
         self.popen = subprocess.Popen(command, cwd=cwd, stdin=stdin, stdout=pipe, stderr=subprocess.STDOUT, text=True)
         self.lines: list[str] = []
         self._changed = threading.Condition()
@@ -112,6 +116,16 @@ class Process:
         return status
 
 
+def settable_clock(folder: Path) -> Path:
+    """A library that gives the processes that load it a system clock that can be set: tests/ros/faults/clock.c."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler for a clock that can be set")
+    library, source = folder / "clock.so", Path(__file__).parent / "faults" / "clock.c"
+    subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl", "-lpthread"], check=True)
+    return library
+
+
 @contextmanager
 def reserved_domain() -> Iterator[int]:
     """A ROS domain that no other test of this host has until the block is left, also of another worker or checkout.
@@ -164,6 +178,24 @@ def start_node(start: Start, osprey_gust: Scenario) -> Start:
     return lambda package, *arguments, within=(): start(
         f"{package}.main", "--ros-args", "--params-file", str(osprey_gust.path), *arguments, within=within
     )
+
+
+@pytest.fixture
+def recorder(start_node: Start) -> Recorder:
+    """Start a recorder with a folder and further parameters."""
+    return lambda folder, *parameters: start_node(
+        "flight_recorder", *(word for one in (f"directory:={folder}", *parameters) for word in ("-p", one))
+    )
+
+
+@pytest.fixture
+def publisher(domain: int) -> Iterator[subprocess.Popen[str]]:
+    """Six topics at 1 kHz, as wide as those of a flight, until the test ends."""
+    command = [sys.executable, "-m", "benchmarks.recorder", "--publish", "--duration=120"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY)
+    yield process
+    process.terminate()
+    process.communicate(timeout=20.0)
 
 
 @pytest.fixture

@@ -70,7 +70,7 @@ def scenario_file(path: Path, controller: dict[str, Any] | None, name: str = "os
 @pytest.mark.parametrize(
     ("law", "options"),
     [
-        ("pi", ["--lockstep"]),
+        ("pi", ["--one-process"]),
         ("l1", ["--one-process"]),
         ("pid", OPTIONS),
         ("osprey_observer", ["--one-process"]),

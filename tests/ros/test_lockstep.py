@@ -66,7 +66,7 @@ def both_cores_busy() -> Iterator[None]:
 
 
 def test_runs_repeat_to_the_byte_on_a_busy_host_in_one_process_and_without_ros(start: Start, tmp_path: Path) -> None:
-    scenario = scenario_file(tmp_path, 2.0, aircraft=ROUGH)
+    scenario = scenario_file(tmp_path, 1.0, aircraft=ROUGH)
     first = payloads(fly(start, scenario, "idle"))
     with both_cores_busy():
         second = payloads(fly(start, scenario, "busy"))
@@ -74,21 +74,21 @@ def test_runs_repeat_to_the_byte_on_a_busy_host_in_one_process_and_without_ros(s
     for topic in TOPICS:
         assert first[topic] == second[topic] == third[topic], topic
     assert "airframe.yaml" in [path.name for path in (tmp_path / "idle" / "latest").iterdir()]  # the sampled matrices
-    assert len(first["/y"]) == 2 * 500 + 1  # one at each instant, also without a sample
-    assert len(first["/u"]) == 2 * 100 + 1
+    assert len(first["/y"]) == 500 + 1  # one at each instant, also without a sample
+    assert len(first["/u"]) == 100 + 1
     tape, recorded = simulate(load_scenario(scenario)), read_run(tmp_path / "idle" / "latest").tape
-    assert len(tape["y"].stamp_ns) < 2 * 500  # samples were lost
+    assert len(tape["y"].stamp_ns) < 500  # samples were lost
     for name, signal_ in tape.signals.items():
         assert signal_.names == recorded[name].names
         assert signal_.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
         assert signal_.values.tobytes() == recorded[name].values.tobytes(), name
 
 
-def test_eight_successive_flights_complete(tmp_path: Path) -> None:
+def test_four_successive_flights_complete(tmp_path: Path) -> None:
     scenario = load_scenario(scenario_file(tmp_path, 0.5))
-    for k in range(8):
+    for k in range(4):
         run = tmp_path / f"run{k}"
-        assert fly_over_topics(scenario, run, lambda t, shown: None, lockstep=True, one_process=k % 4 == 3) == "completed"
+        assert fly_over_topics(scenario, run, lambda t, shown: None, lockstep=True, one_process=k == 3) == "completed"
         assert len(payloads(run)["/u"]) == 51
 
 
@@ -104,10 +104,11 @@ def nodes(start: Start, scenario: Path) -> dict[str, Process]:
     return {role: start(f"{package}.main", *shared, *words) for role, (package, words) in overrides.items()}
 
 
+FIRST_CHUNKS = 100_000  # bytes of a log
 LOG_SIZE = 1_000_000  # bytes; by then the liveliness monitor of every node is active
 
 
-@pytest.mark.parametrize("victim", ["aircraft", "reference_model", "controller", "recorder"])
+@pytest.mark.parametrize("victim", ["aircraft", "controller", "recorder"])  # the next test kills the reference model
 def test_other_nodes_end_within_two_seconds_of_a_kill_and_name_the_lost_peer(victim: str, start: Start, tmp_path: Path) -> None:
     processes = nodes(start, scenario_file(tmp_path, 1e6))
     processes["aircraft"].wait_for_log(tmp_path / "run", LOG_SIZE)
@@ -124,7 +125,7 @@ def test_other_nodes_end_within_two_seconds_of_a_kill_and_name_the_lost_peer(vic
 
 def test_a_killed_node_ends_the_flight_with_its_name_in_the_summary(start: Start, tmp_path: Path) -> None:
     command = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5)), "--lockstep", "--runs", "runs")
-    command.wait_for_log(tmp_path / "runs", LOG_SIZE)
+    command.wait_for_log(tmp_path / "runs", FIRST_CHUNKS)
     command.child("reference_model.main").kill()
     assert command.end() == 3
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))

@@ -18,8 +18,9 @@ from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.design.gain_selection import with_feedforward
 from flight_core.parameters import flatten, nest
+from flight_core.rates import period_ns
 from flight_log.tape_reader import read_run
-from flight_ros.topics import PUBLISH
+from flight_ros.topics import publisher_qos
 from rise_di_controller.guard import Mode
 
 PEER_TOPICS = ("internals",)
@@ -110,10 +111,11 @@ def test_a_late_recorder_leaves_its_first_tick_unchecked_and_notes_the_missing_s
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
     scenario = scenario_file(tmp_path, 1e3, "osprey_gust")
+    period = period_ns(load_scenario(scenario).controller.rate, "rate")
     parameters = ("--ros-args", "--params-file", str(scenario))
     for package in ("rise_di_controller", "aircraft_sim", "reference_model"):
         start(f"{package}.main", *parameters)
-    more_than_history = PUBLISH.depth + 200
+    more_than_history = publisher_qos(period).depth + 200
     peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_history)
     recorder = start("flight_recorder.main", *parameters, "-p", f"scenario_file:={scenario}", "-p", "directory:=run")
     recorder.wait_for("recording to")

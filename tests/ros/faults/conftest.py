@@ -3,14 +3,12 @@
 """Fixtures of the fault tests: one flight for all faults, replaced when a fault ended it."""
 
 import json
-import shutil
-import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from tests.ros.conftest import reserved_domain
+from tests.ros.conftest import reserved_domain, settable_clock
 from tests.ros.faults.draws import Draw, draw, found
 from tests.ros.faults.flight import Flight, Kind
 
@@ -114,7 +112,7 @@ class Flights:
         folder = self._folder / f"flight{len(self.all) + 1}"
         folder.mkdir()
         flight = self._running[kind] = Flight(
-            folder, self._scenarios[kind].path, kind, _clock(folder) if kind is Kind.OWN_CLOCK else None
+            folder, self._scenarios[kind].path, kind, settable_clock(folder) if kind is Kind.OWN_CLOCK else None
         )
         self.all.append(flight)
         return flight
@@ -123,16 +121,6 @@ class Flights:
         """End the running flight."""
         for kind in list(self._running):
             self._running.pop(kind).close()
-
-
-def _clock(folder: Path) -> Path:
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("no C compiler for a clock that can be set")
-    library = folder / "clock.so"
-    source = Path(__file__).with_name("clock.c")
-    subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl", "-lpthread"], check=True)
-    return library
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,6 @@ from tests.ros.peer import peer
 
 from autopilot_bridge.params import LIBRARY
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
-from flight_bringup.processes import end_with_parent
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.vectors import FloatArray, StampedVector
 from flight_ros import transport
@@ -75,7 +74,7 @@ TOPICS = (Y, Y_M, U, U_M, TRUE_POSE, INTERNALS, TRUTH, DIAGNOSTICS, ROSOUT)
 
 
 # Linux gives a process in its own session its own share of a busy processor (man 7 sched, autogroup).
-OWN_SESSION = (*(command for command in (shutil.which("setsid"),) if command), *end_with_parent())
+OWN_SESSION = tuple(command for command in (shutil.which("setsid"),) if command)
 
 PUBLISHED = {
     "aircraft": ("truth", "y"),
