@@ -15,7 +15,7 @@ from typing import NamedTuple
 from aircraft_sim.airframe import Unit
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.turbulence import Turbulence
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from flight_core.units import SI_PER_UNIT
 from flight_core.vectors import FloatArray
 
@@ -108,8 +108,11 @@ class WindModel(NamedTuple):
 
 @cache
 def aircraft_names() -> tuple[str, ...]:
-    """Names of all aircraft that come with JSBSim."""
-    import jsbsim  # noqa: PLC0415 - other aircraft fly without it
+    """Names of all aircraft that come with JSBSim. Raises ParameterError where it is not installed."""
+    try:
+        import jsbsim  # noqa: PLC0415 - other aircraft fly without it
+    except ModuleNotFoundError:
+        raise ParameterError("airframe: found no Python package jsbsim, expected it for an aircraft of JSBSim") from None
 
     library = Path(jsbsim.get_default_root_dir()) / "aircraft"
     return tuple(sorted(path.parent.name for path in library.glob("*/*.xml") if path.stem == path.parent.name))

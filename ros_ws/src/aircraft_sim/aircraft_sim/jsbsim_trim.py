@@ -37,7 +37,7 @@ TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])  # m/s^2, rad/s^2:
 
 PROBE_TIME = 2.0  # s of the test flight in the isolated process
 PROBE_SIZE = 0.02  # how far the test flight moves each command
-TIMEOUT = 30.0  # s for trim and test flight; every aircraft that trims needs less than one
+TIMEOUT = 30.0  # s of processor time for trim and test flight; every aircraft that trims needs less than one
 
 TrimSolution = tuple[float, ...] | None
 """The solver's unknowns of frozen flight, scaled; None where JSBSim's own trim succeeds. It gives the same bits everywhere."""
