@@ -333,7 +333,7 @@ def new(aircraft: int, *more: str) -> tuple[str, ...]:
 
 
 def figures(process: "subprocess.Popen[str]") -> list[object]:
-    output, errors = process.communicate(timeout=120)
+    output, errors = process.communicate()
     assert process.returncode == 0, errors
     cases = json.loads(output)["cases"]
     for case in cases:
@@ -343,14 +343,10 @@ def figures(process: "subprocess.Popen[str]") -> list[object]:
 
 def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") -> Path:
     """Wait until so many chunks of the one campaign in `runs` are done; return its folder."""
-    until = time.monotonic() + 120.0
-    while time.monotonic() < until:
-        found = list(runs.glob(f"*/{CHUNKS}/*.json"))
-        if len(found) >= count:
-            return found[0].parents[1]
+    while len(found := list(runs.glob(f"*/{CHUNKS}/*.json"))) < count:
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
-    pytest.fail(f"no {count} chunks within two minutes")
+    return found[0].parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -372,7 +368,7 @@ def test_ctrl_c_prints_the_command_to_resume(tmp_path: Path) -> None:
     stopped = command(*new(4000, "--runs", "part", "--workers", "1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 1, stopped)
     stopped.send_signal(signal.SIGINT)
-    output, errors = stopped.communicate(timeout=60)
+    output, errors = stopped.communicate()
     assert stopped.returncode == 130, errors
     assert "Traceback" not in errors
     assert f"continue with: rise-di campaign --resume {folder.relative_to(tmp_path)}" in output + errors

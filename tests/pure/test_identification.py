@@ -302,7 +302,7 @@ def test_an_airframe_that_is_none_of_jsbsim_is_refused_with_one_sentence(
 def test_an_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
     """In a process of its own: JSBSim itself prints nothing either."""
     words = [sys.executable, "-m", "flight_cli.cli", "identify", "jsbsim:dr1", "--speed", "46", "--altitude", "900"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 3
     assert done.stderr.startswith("error: jsbsim:dr1 does not trim at 46 m/s and 900 m: its model needs the property ")
     assert done.stderr.count("\n") == 1
