@@ -8,7 +8,8 @@
     make evidence ARGS=--render                # only the page, from the stored results
 
 build/evidence/ holds one file for each result, with its command, date, host, and the load of the host before. A failed
-measurement is stored as failed and marked on the page. The text around the figures is in evidence.md.jinja.
+measurement is stored as failed and marked on the page. A section of the page without any result here stays as it is. The text
+around the figures is in evidence.md.jinja.
 """
 
 import argparse
@@ -154,8 +155,8 @@ def host_details() -> dict[str, Any]:
 
 
 def revision() -> str:
-    """The commit, with -dirty if any file but the page differs from it."""
-    changed = _run("git", "status", "--porcelain", "--", ".", f":(exclude){PAGE.relative_to(REPOSITORY)}").stdout.strip()
+    """The commit, with -dirty if any file but a page of evidence differs from it."""
+    changed = _run("git", "status", "--porcelain", "--", ".", ":(exclude)docs/evidence*.md").stdout.strip()
     return _run("git", "describe", "--always").stdout.strip() + ("-dirty" if changed else "")
 
 
@@ -205,6 +206,12 @@ def load() -> dict[str, Result]:
     return {name: json.loads(path.read_text(encoding="utf-8")) for name, path in paths.items() if path.exists()}
 
 
+def write_page(results: Mapping[str, Result]) -> None:
+    """Write the page from the results; sections without any stay."""
+    before = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
+    PAGE.write_text(render(MEASUREMENTS, results, before), encoding="utf-8")
+
+
 def wanted(names: Sequence[str], stored: Mapping[str, Result], *, quick: bool) -> list[Measurement]:
     """Measurements to run: missing, failed, short (unless `quick`), and those whose names begin with one of `names`."""
 
@@ -243,11 +250,11 @@ def main() -> int:
         result = measure(one, quick=options.quick)
         (RESULTS / f"{one.name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
         results[one.name] = result
-        PAGE.write_text(render(MEASUREMENTS, results), encoding="utf-8")  # after each result: a long run may be interrupted
+        write_page(results)  # after each result: a long run may be interrupted
         ended = "done" if result["status"] == 0 else f"exit status {result['status']}, see build/evidence/{one.name}.log"
         failed = failed or result["status"] != 0
         print(f"{ended}, {result['seconds']:.0f} s", flush=True)
-    PAGE.write_text(render(MEASUREMENTS, results), encoding="utf-8")
+    write_page(results)
     print(f"page: {PAGE.relative_to(REPOSITORY)}")
     return int(failed)
 

@@ -19,6 +19,7 @@ WIDTH = 120  # characters of a line of prose
 HARD_SPACE = "\u00a0"  # no line is broken here
 BUSY = 0.1  # share of the processors in use just before a measurement; the page marks results above it
 ECHOES = ("bare echo, single", "bare echo, multi", "bare echo, events")  # rows of the group "node"
+MEASURED = re.compile(r"^    .+    # \d{4}-\d\d-\d\d ", re.MULTILINE)  # a command with its date
 GOAL, NOT_MET, UNMET = "- Goal: ", "**not met**", "UNMET"
 WITHOUT_RATIO = ("missed", "missed excluding host delays", "lost", "ticks", "max (us)")  # counts and single outliers
 
@@ -47,14 +48,31 @@ SPEED = {
 """What each group of benchmarks/speed.py measures, s a figure, and the time it takes."""
 
 
-def render(measurements: Sequence[Measurement], results: Mapping[str, Result]) -> str:
-    """The page from the results by name of the measurement; lines of prose are at most WIDTH long."""
+def render(measurements: Sequence[Measurement], results: Mapping[str, Result], before: str = "") -> str:
+    """The page from the results by name of the measurement; lines of prose are at most WIDTH long.
+
+    A section without any result stays as it is on the page `before`: another machine may have measured it.
+    """
+    hosts = [host(result["machine"]) for result in results.values()]
     page = TEMPLATES.get_template("evidence.md.jinja").render(
         measurements={one.name: one for one in measurements},
         results=results,
+        hosts=sorted({*hosts, *re.findall(r"^- (.+, Python \S+)$", before, re.MULTILINE)}),
         value=lambda name: results[name]["result"] if name in results else None,
     )
-    return finished(page)
+    kept = {_heading(section): section for section in _sections(before) if MEASURED.search(section)}
+    return finished(
+        "".join(section if MEASURED.search(section) else kept.get(_heading(section), section) for section in _sections(page))
+    )
+
+
+def _sections(page: str) -> list[str]:
+    """A page in parts that begin with a heading, but for the first."""
+    return re.split(r"^(?=##)", page, flags=re.MULTILINE)
+
+
+def _heading(section: str) -> str:
+    return section.partition("\n")[0]
 
 
 def finished(page: str) -> str:

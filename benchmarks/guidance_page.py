@@ -3,12 +3,14 @@
 """Results of guidance, stored in build/guidance, and the page docs/evidence_guidance.md that is written from them."""
 
 import json
+import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from benchmarks.evidence import revision
 from benchmarks.guidance_grid import Point
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -25,22 +27,26 @@ turbulence a figure is the worst of the seeds.
 
 
 def store(name: str, result: Any) -> None:
-    """Keep a result with its date, and write the page again."""
+    """Keep a result with its date and revision, and write the page again."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    dated = {"date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "result": result}
+    dated = {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M UTC}, {revision()}", "result": result}
     (FOLDER / f"{name}.json").write_text(json.dumps(dated, indent=1), encoding="utf-8")
     results = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(FOLDER.glob("*.json"))}
-    PAGE.write_text(page(results), encoding="utf-8")
+    PAGE.write_text(page(results, PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""), encoding="utf-8")
 
 
-def page(results: Mapping[str, Mapping[str, Any]]) -> str:
-    """The page from the stored results by name: "flights NAME", "grid NAME", "rates", "route" and "long FLIGHT"."""
-    parts, makers = [INTRODUCTION], {"flights": _flights, "grid": _grid, "rates": _rates, "route": _route, "long": _long}
+def page(results: Mapping[str, Mapping[str, Any]], before: str = "") -> str:
+    """The page from the stored results by name: "flights NAME", "grid NAME", "rates", "route" and "long FLIGHT".
+
+    A section without a result stays as it is on the page `before`: another machine may have measured it.
+    """
+    makers = {"flights": _flights, "grid": _grid, "rates": _rates, "route": _route, "long": _long}
+    sections = {one.partition("\n")[0]: one.strip() + "\n" for one in re.split(r"^## ", before, flags=re.MULTILINE)[1:]}
     for name, stored in results.items():
         kind, _, aircraft = name.partition(" ")
         title, command, lines = makers[kind](aircraft, stored["result"])
-        parts += [f"## {title}\n\n    {command}    # {stored['date']}\n", "\n".join(lines) + "\n"]
-    return "\n".join(parts)
+        sections[title] = "\n".join([f"{title}\n\n    {command}    # {stored['date']}\n", *lines]) + "\n"
+    return "\n## ".join([INTRODUCTION, *sections.values()])
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:

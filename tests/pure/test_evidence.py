@@ -104,6 +104,21 @@ def test_without_results_the_page_holds_no_figure_but_the_command_for_each() -> 
     assert not [line for line in empty.splitlines() if line.startswith("|")]
 
 
+def test_sections_that_another_machine_measured_stay_and_their_goals_that_are_not_met_are_said_first() -> None:
+    other = {"faults": RESULTS["faults"] | {"machine": MACHINE | {"processor": "another processor"}}}
+    before = render(MEASUREMENTS, other)
+    after = render(MEASUREMENTS, {"view": RESULTS["view"]}, before)
+    for part in ("    measure faults    #", "    measure view    #", "- another processor, ", "- a processor, "):
+        assert part in after
+    assert "- Faults: a killed node is back" in after.partition("## ")[0]
+    assert render(MEASUREMENTS, {"view": RESULTS["view"]}, after) == after
+    assert "0.41 s at worst" in render(MEASUREMENTS, {"faults": changed_fault(0.41)}, after)
+
+
+def changed_fault(worst: float) -> Result:
+    return result("faults", [FAULT | {"exec_to_traffic": {"median": 0.4, "worst": worst}}])
+
+
 def test_each_table_stands_below_its_command() -> None:
     for name in RESULTS:
         assert f"\n    measure {name}    # 2020-01-02 03:04 UTC, abc1234\n" in page()
@@ -189,6 +204,13 @@ def test_a_killed_node_is_timed_from_its_start_and_from_its_being_ready() -> Non
 def test_the_page_of_a_flight_has_the_limit_of_its_fault(case: str, limit: str) -> None:
     text = page(faults=result("faults", [FAULT | {"case": case, "page": {"median": 1.0, "worst": 1.6}}]))
     assert f"- Goal: {case}: the page answers, and says so, within {limit} s. Measured: 1.6 s at worst, " in text
+
+
+@pytest.mark.parametrize(("probability", "verdict"), [(0.05, "0.05, met."), (0.04, "0.04, **not met**.")])
+def test_missed_ticks_of_a_watched_flight_are_told_from_chance(probability: float, verdict: str) -> None:
+    flights = VIEW["flights"] | {"probability": dict.fromkeys(PAIRS, probability)}
+    text = page(view=result("view", VIEW | {"flights": flights}))
+    assert f"beyond chance (3 with a client, 3 without): probability at least 0.05. Measured: {verdict}" in text
 
 
 def test_a_busy_host_is_marked_only_for_timed_measurements() -> None:
