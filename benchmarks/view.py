@@ -10,6 +10,7 @@
 """
 
 import argparse
+import asyncio
 import itertools
 import json
 import os
@@ -21,7 +22,7 @@ import time
 import urllib.parse
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http.client import HTTPConnection, HTTPException
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ import psutil
 from benchmarks.host_delays import Intervals, excluding_delays, missed_excluding_delays
 from benchmarks.processes import delay_monitors, real_time, threads_ns
 from tests.browser import CHROMIUM, Browser
+from tornado.httpclient import HTTPRequest
+from tornado.websocket import WebSocketClientConnection, WebSocketClosedError, websocket_connect
 
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
@@ -113,14 +116,21 @@ class Client(threading.Thread):
     def __init__(self, address: str) -> None:
         super().__init__(daemon=True)
         parts = urllib.parse.urlsplit(address)
-        self._connection = HTTPConnection(parts.netloc)  # one for all requests, as a browser has it
-        self._cookie = ""
-        self._get(f"{parts.path}?{parts.query}")
+        connection = HTTPConnection(parts.netloc)
+        connection.request("GET", f"{parts.path}?{parts.query}")
+        self._cookie = connection.getresponse().headers["Set-Cookie"].partition(";")[0]
+        connection.close()
+        self._loop = asyncio.Runner()
+        self._socket = self._loop.run(self._connect(parts.netloc))
         self._ended = threading.Event()
         self._head: dict[str, Any] = {}
         self._rows: dict[str, int] = {}
         self.delays: list[float] = []
         self.bytes = 0
+
+    async def _connect(self, netloc: str) -> WebSocketClientConnection:
+        headers = {"Cookie": self._cookie, "Origin": f"http://{netloc}"}
+        return await websocket_connect(HTTPRequest(f"ws://{netloc}/news/0", headers=headers))
 
     def run(self) -> None:
         """Ask until stopped, or until the server ends."""
@@ -128,11 +138,11 @@ class Client(threading.Thread):
         while not self._ended.wait(1.0 / POLLS):
             try:
                 self.news()
-            except (OSError, HTTPException):
+            except EOFError:
                 break
 
     def news(self) -> dict[str, Any]:
-        """The head of an answer with what the client lacks, which it knows then. Raises as `ask`."""
+        """The head of an answer with what the client lacks, which it knows then. Raises EOFError where the server has ended."""
         known = {name: self._head.get(name, "") for name in ("epoch", "state", "described")} | self._rows
         content = self.ask(urllib.parse.urlencode(known))
         now = time.time()
@@ -152,19 +162,25 @@ class Client(threading.Thread):
         return head
 
     def ask(self, query: str = "") -> bytes:
-        """What a client lacks that knows so much. Raises OSError or HTTPException where the server has ended."""
-        return self._get(f"/data/0?{query}")
+        """What a client lacks that knows so much. Raises EOFError where the server has ended."""
+        return self._loop.run(self._ask(query))
 
-    def _get(self, target: str) -> bytes:
-        self._connection.request("GET", target, headers={"Cookie": self._cookie})
-        response = self._connection.getresponse()
-        self._cookie = response.headers.get("Set-Cookie", self._cookie).partition(";")[0]
-        return response.read()
+    async def _ask(self, query: str) -> bytes:
+        try:
+            await self._socket.write_message(query)
+        except WebSocketClosedError:
+            raise EOFError("the server has ended") from None
+        content = await self._socket.read_message()
+        if isinstance(content, bytes):
+            return content
+        raise EOFError("the server has ended")
 
     def stop(self) -> None:
         """Ask no more."""
         self._ended.set()
         self.join()
+        self._socket.close()
+        self._loop.close()
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import socket
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -23,7 +24,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from tests.conftest import REPOSITORY
 from tests.joint_states import JOINT_STATE, vector
-from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPResponse
+from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest, HTTPResponse
+from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_bringup.scenarios import find_scenario
@@ -449,6 +451,101 @@ def test_a_browser_that_knows_all_waits_for_news_and_gets_the_next_samples(
         assert rows == {name: samples.count for name, samples in server.flights[0].samples.items()}
 
     against(tmp_path)(client)
+
+
+async def stream(server: Server) -> WebSocketClientConnection:
+    """A WebSocket as the page opens it."""
+    address = f"127.0.0.1:{server.port}"
+    given = {"Cookie": f"rise_di_{server.port}={TOKEN}", "Origin": f"http://{address}"}
+    return await websocket_connect(HTTPRequest(f"ws://{address}/news/0", headers=given))
+
+
+async def left(server: Server) -> None:
+    """Wait until all WebSockets are closed."""
+    while server.streams:
+        await asyncio.sleep(0.01)
+
+
+UPGRADE = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA=="}
+UPGRADE |= {"Sec-WebSocket-Version": "13"}  # RFC 6455, 4.1
+
+
+def test_a_websocket_answers_each_message_as_a_request_and_waits_for_news(recorded: Path) -> None:
+    async def client(server: Server) -> None:
+        socket = await stream(server)
+        await socket.write_message("")
+        first = (await get(server, "/data/0")).body
+        assert await socket.read_message() == first
+        head, columns = decoded(first)
+        rows = "&".join(f"{name}={len(t)}" for name, (t, _) in columns.items())
+        known = f"epoch={head['epoch']}&state={head['state']}&described={head['described']}&events={len(head['events'])}&{rows}"
+        begin = time.monotonic()
+        await socket.write_message(known)
+        content = await socket.read_message()
+        assert isinstance(content, bytes)
+        head, columns = decoded(content)
+        assert time.monotonic() - begin >= http.MAX_WAIT
+        assert (columns, head["events"], "flight" in head) == ({}, [], False)
+        socket.close()
+
+    against(recorded)(client)
+
+
+@pytest.mark.parametrize(
+    ("path", "token", "headers", "expected"),
+    [
+        ("/news/0", "another", {}, 401),
+        ("/news/0", TOKEN, {"Host": "evil.example"}, 403),
+        ("/news/0", TOKEN, {"Origin": "http://evil.example"}, 403),
+        ("/news/0", TOKEN, {"Origin": "http://127.0.0.1:1"}, 403),
+        ("/news/0", TOKEN, {"Origin": "null"}, 403),
+        ("/news/1", TOKEN, {}, 404),
+        ("/news/2", TOKEN, {}, 404),
+    ],
+)
+def test_a_websocket_of_another_page_host_user_or_flight_is_refused(
+    path: str, token: str, headers: dict[str, str], expected: int, recorded: Path
+) -> None:
+    async def client(server: Server) -> None:
+        assert (await get(server, path, token=token, **UPGRADE | headers)).code == expected
+
+    against(recorded)(client)
+
+
+@pytest.mark.parametrize(
+    ("message", "code", "reason"),
+    [
+        ("y=" + "9" * 4301, 1008, "A number of rows has more than 18 digits"),
+        ("a" * (http.MAX_REQUEST_BYTES + 1), 1009, "message too big"),
+    ],
+)
+def test_a_websocket_whose_message_is_no_request_is_closed(message: str, code: int, reason: str, recorded: Path) -> None:
+    async def client(server: Server) -> None:
+        socket = await stream(server)
+        await socket.write_message(f"epoch={decoded((await get(server, '/data/0')).body)[0]['epoch']}&{message}")
+        assert await socket.read_message() is None
+        assert (socket.close_code, socket.close_reason) == (code, reason)
+        socket.close()
+
+    against(recorded)(client)
+
+
+def test_websockets_that_ask_nothing_and_those_beyond_the_limit_are_closed(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def client(server: Server) -> None:
+        sockets = [await stream(server) for _ in range(http.MAX_CONNECTIONS)]
+        assert (await get(server, "/news/0", **UPGRADE)).code == 503
+        for one in sockets:
+            one.close()
+        await left(server)
+        monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.3)
+        silent = await stream(server)
+        assert await silent.read_message() is None
+        await left(server)
+        silent.close()
+
+    against(recorded)(client)
 
 
 def test_the_server_listens_on_this_host_alone(recorded: Path) -> None:

@@ -138,7 +138,7 @@ class _JointStateDecoder:
         self._store = joint_state_types()
         self._names: tuple[str, ...] = ()
         self._template = np.zeros(0, dtype=np.uint8)  # the bytes of the message that the layout was learnt from
-        self._is_constant = np.zeros(0, dtype=np.bool_)  # the bytes that are equal in all messages of the layout
+        self._constant = np.zeros(0, dtype=np.uint8)  # 255 for the bytes that are equal in all messages of the layout, else 0
         self._values = slice(0, 0)
 
     def __call__(self, messages: Sequence[bytes]) -> Decoded:
@@ -169,7 +169,7 @@ class _JointStateDecoder:
         if not same_size:
             return [], rest
         table = np.frombuffer(b"".join(same_size), dtype=np.uint8).reshape(-1, size)
-        same = (table == self._template)[:, self._is_constant].all(axis=1)
+        same = ((table ^ self._template) & self._constant).max(axis=1) == 0
         rest += [message for message, matches in zip(same_size, same, strict=True) if not matches]
         table = table[same]
         stamps = np.ascontiguousarray(table[:, STAMP])
@@ -193,6 +193,5 @@ class _JointStateDecoder:
             return
         self._names, self._values = tuple(one.name), values
         self._template = np.frombuffer(message, dtype=np.uint8)
-        self._is_constant = np.ones(len(message), dtype=np.bool_)
-        self._is_constant[STAMP] = self._is_constant[self._values] = False
-        self._is_constant[mac_slice(message)] = False
+        self._constant = np.full(len(message), 255, dtype=np.uint8)
+        self._constant[STAMP] = self._constant[self._values] = self._constant[mac_slice(message)] = 0

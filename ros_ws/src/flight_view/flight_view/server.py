@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Serves the page and the samples of one or two flights to browsers on this host, over HTTP.
 
-A browser asks for what is new, and draws the answer before it asks again: nothing queues for a slow one. Only GET is answered,
-for a fixed list of names. The Host header has to name this host, against DNS rebinding. The token of the address is kept in a
-cookie, against other users of this host. With `Control` there is one POST, which takes a second key and the origin of the page.
+A browser asks for what is new, and draws the answer before it asks again: nothing queues for a slow one. After the first
+answer it asks by a WebSocket, where a request takes 0.3 ms of the processor in place of 0.8. Only GET is answered, for a fixed
+list of names. The Host header has to name this host, against DNS rebinding. The token of the address is kept in a cookie,
+against other users of this host. A WebSocket has to come from the page itself. With `Control` there is one POST, which takes a
+second key and the origin of the page.
 """
 
 import asyncio
@@ -19,11 +21,13 @@ from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl
 
 import numpy as np
 from tornado.httpserver import HTTPServer
 from tornado.iostream import IOStream, StreamClosedError
 from tornado.web import Application, HTTPError, RequestHandler
+from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from flight_analysis.report.summary import finite_or_null
 from flight_core.rates import NANOSECONDS
@@ -50,6 +54,7 @@ MAX_REQUEST_BYTES = 8192
 MAX_WAIT = 2.0  # s that a request for samples waits for new ones
 MAX_ROWS = 10_000  # of a topic in one answer
 MAX_DIGITS = 18  # of a number of rows: below 2^63
+POLICY_VIOLATION = 1008  # status of a closed WebSocket, RFC 6455, 7.4.1
 REST, POLL_PERIOD = 0.09, 0.03  # s, after a chunk and until the next: the recorder closes one each 0.1 s
 STATE_PERIOD = 0.25  # s, between two looks at the state of the recording
 BUDGET = 0.05  # s of reading between two answers
@@ -63,13 +68,16 @@ class Server:
         self.control = control
         self.token = token
         self.port = 0
+        self.streams: set[_News] = set()  # open WebSockets
         self._news = asyncio.Event()
+        names = [(r"/(|[a-z]+\.[a-z]+)", _File), (r"/data/([01])", _Data), (r"/news/([01])", _News)]
         self._http = _LimitedServer(
             Application(
-                [(r"/(|[a-z]+\.[a-z]+)", _File), (r"/data/([01])", _Data), *([(r"/control", _Control)] if control else [])],
+                [*names, *([(r"/control", _Control)] if control else [])],
                 default_handler_class=_Handler,
                 log_function=lambda handler: None,
                 flight_server=self,
+                websocket_max_message_size=MAX_REQUEST_BYTES,
             ),
             idle_connection_timeout=REQUEST_TIMEOUT,
             body_timeout=REQUEST_TIMEOUT,
@@ -87,6 +95,8 @@ class Server:
     async def close(self) -> None:
         """Stop listening and close all connections."""
         self._http.stop()
+        for stream in [*self.streams]:
+            stream.close()
         await self._http.close_all_connections()
 
     def accepts(self, host: str) -> bool:
@@ -256,6 +266,47 @@ class _Data(_Handler):
         self.set_header("Content-Type", "application/octet-stream")
         with suppress(StreamClosedError):  # the browser has left
             await self.finish(content)
+
+
+class _News(_Handler, WebSocketHandler):
+    """The samples of a flight, again and again: each message is the query of a request for `_Data`, and gets its answer."""
+
+    def prepare(self) -> None:
+        super().prepare()
+        if len(self.server.streams) >= MAX_CONNECTIONS:
+            raise HTTPError(HTTPStatus.SERVICE_UNAVAILABLE)
+
+    async def get(self, *names: str) -> None:
+        if int(names[0]) >= len(self.server.flights):
+            raise HTTPError(HTTPStatus.NOT_FOUND)
+        await WebSocketHandler.get(self, *names)
+
+    def check_origin(self, origin: str) -> bool:
+        """Whether the WebSocket is opened by the page itself."""
+        return origin == f"http://{self.request.host}"
+
+    def open(self, *names: str) -> None:
+        self.flight = self.server.flights[int(names[0])]
+        self.server.streams.add(self)
+        self._await_request()
+
+    def _await_request(self) -> None:
+        self._end = asyncio.get_running_loop().call_later(REQUEST_TIMEOUT, self.close)
+
+    async def on_message(self, message: str | bytes) -> None:
+        self._end.cancel()
+        known = dict(parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True))
+        try:
+            await self.write_message(await self.server.news(self.flight, known), binary=True)
+        except HTTPError as error:
+            self.close(POLICY_VIOLATION, error.reason)
+        except WebSocketClosedError:  # the browser has left
+            return
+        self._await_request()
+
+    def on_close(self) -> None:
+        self.server.streams.discard(self)
+        self._end.cancel()
 
 
 class _Control(_Handler):

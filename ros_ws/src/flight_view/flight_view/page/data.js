@@ -1,4 +1,4 @@
-// The samples of a flight: fetched from the server, kept in typed arrays by topic and channel.
+// The samples of a flight: asked from the server, kept in typed arrays by topic and channel.
 import {Series} from "./series.js";
 
 const PATIENCE = 10_000; // ms; the server answers within 2 s, also without news
@@ -20,6 +20,7 @@ export function decode(buffer) {
 export class Flight { // one flight of the server
   constructor(number) {
     this.number = number;
+    this.socket = null;
     this.info = {name: "", modes: {}, units: {}, positive: {}, limits: {}, gusts: [], commands: []};
     this.head = {state: "", faults: [], bands: {}, described: "", ghost: false};
     this.clear("");
@@ -33,10 +34,10 @@ export class Flight { // one flight of the server
     this.end = -Infinity;
   }
 
-  query() {
+  query() { // what this page knows
     const known = {epoch: this.epoch, state: this.head.state, described: this.head.described, events: this.events.length};
     for (const [name, series] of this.series) known[name] = series.count;
-    return new URLSearchParams(known);
+    return new URLSearchParams(known).toString();
   }
 
   take(head) { // true when samples came
@@ -60,9 +61,32 @@ export class Flight { // one flight of the server
   }
 
   async poll() { // one request; true when samples came
+    if (this.socket?.readyState === WebSocket.OPEN) return this.take(decode(await this.ask()));
     const response = await fetch(`data/${this.number}?${this.query()}`, {signal: AbortSignal.timeout(PATIENCE)});
     if (!response.ok) throw new Error(await response.text());
-    return this.take(decode(await response.arrayBuffer()));
+    const content = await response.arrayBuffer();
+    this.socket ??= this.open();
+    return this.take(decode(content));
+  }
+
+  open() { // a socket that never opens stays, and its flight asks by HTTP
+    const socket = new WebSocket(new URL(`news/${this.number}`, location.href.replace("http", "ws")));
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => { socket.onclose = () => { this.socket = null; }; };
+    return socket;
+  }
+
+  ask() { // the answer to a message that holds what this page knows
+    return new Promise((answer, refuse) => {
+      const {socket} = this, patience = setTimeout(() => socket.close(), PATIENCE);
+      socket.onmessage = ({data}) => { clearTimeout(patience); answer(data); };
+      socket.onclose = ({reason}) => {
+        clearTimeout(patience);
+        this.socket = null;
+        refuse(new DOMException(reason, "NetworkError"));
+      };
+      socket.send(this.query());
+    });
   }
 
   get(topic) {
