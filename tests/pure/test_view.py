@@ -548,6 +548,32 @@ def test_websockets_that_ask_nothing_and_those_beyond_the_limit_are_closed(
     against(recorded)(client)
 
 
+def test_a_websocket_that_asks_and_reads_no_answer_makes_few_of_them(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[bytes] = []
+
+    def big(*_: object, **__: object) -> bytes:
+        made.append(b"")
+        return bytes(1 << 20)
+
+    monkeypatch.setattr(http, "answer", big)
+
+    async def client(server: Server) -> None:
+        _reader, writer = await asyncio.open_connection("127.0.0.1", server.port, limit=1)
+        head = {"Host": f"127.0.0.1:{server.port}", "Cookie": f"rise_di_{server.port}={TOKEN}"} | UPGRADE
+        writer.write("\r\n".join(["GET /news/0 HTTP/1.1", *(f"{k}: {v}" for k, v in head.items()), "", ""]).encode())
+        writer.write(bytes([0x81, 0x80, 0, 0, 0, 0]) * 10_000)  # empty texts with a mask, RFC 6455, 5.2
+        while not made:
+            await asyncio.sleep(0.01)
+        before = -1
+        while before < len(made):
+            before = len(made)
+            await asyncio.sleep(2.0 * http.STATE_PERIOD)
+        assert len(made) <= 20  # of 1 MiB: what the buffers of the network hold
+        writer.close()
+
+    against(recorded)(client)
+
+
 def test_the_server_listens_on_this_host_alone(recorded: Path) -> None:
     async def client(server: Server) -> None:
         with socket.socket() as other:

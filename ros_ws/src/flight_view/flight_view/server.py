@@ -12,10 +12,11 @@ second key and the origin of the page.
 import asyncio
 import hmac
 import json
+import math
 import socket
 import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Mapping, Sequence
 from contextlib import suppress
 from http import HTTPStatus
 from importlib.resources import files
@@ -104,13 +105,18 @@ class Server:
         return host in {f"{name}:{self.port}" for name in (ADDRESS, "localhost", "[::1]")}
 
     async def follow(self) -> None:
-        """Read the logs until cancelled. Raises as `Flight.update` does."""
+        """Read the logs, and answer the WebSockets, until cancelled. Raises as `Flight.update` does."""
+        looked = -math.inf
         while True:
             found, rest = [flight.update(BUDGET) for flight in self.flights], POLL_PERIOD
             if any(found):
                 self._news.set()
                 self._news.clear()
                 rest = 0.0 if any(flight.state() == "reading" for flight in self.flights) else REST
+            if any(found) or time.monotonic() > looked + STATE_PERIOD:
+                looked = time.monotonic()
+                for stream in [*self.streams]:
+                    stream.look()
             await asyncio.sleep(rest)
 
     async def news(self, flight: Flight, known: Mapping[str, str]) -> bytes:
@@ -119,6 +125,10 @@ class Server:
         while not has_news(flight, known) and (rest := deadline - time.monotonic()) > 0.0:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._news.wait(), min(rest, STATE_PERIOD))
+        return self.answer(flight, known)
+
+    def answer(self, flight: Flight, known: Mapping[str, str]) -> bytes:
+        """The answer to a browser that knows so many rows of each topic. Raises HTTPError for a number that is too long."""
         return answer(flight, known, ghost=len(self.flights) > 1, control=self.control is not None)
 
 
@@ -288,25 +298,45 @@ class _News(_Handler, WebSocketHandler):
     def open(self, *names: str) -> None:
         self.flight = self.server.flights[int(names[0])]
         self.server.streams.add(self)
+        self._sent: asyncio.Future[None] | None = None  # done once the last answer is in the buffers of the network
         self._await_request()
 
     def _await_request(self) -> None:
-        self._end = asyncio.get_running_loop().call_later(REQUEST_TIMEOUT, self.close)
+        self._known: dict[str, str] | None = None  # by the request that waits for an answer
+        self._since = time.monotonic()
 
-    async def on_message(self, message: str | bytes) -> None:
-        self._end.cancel()
-        known = dict(parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True))
+    def on_message(self, message: str | bytes) -> Awaitable[None] | None:
+        self._known = dict(parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True))
+        self._since = time.monotonic()
+        self.look()
+        return self._sent  # before it is done, the next message is not read
+
+    def look(self) -> None:
+        """Answer the request where there is news, or it has waited for so long. Close where there has been none for so long."""
+        waited = time.monotonic() - self._since
+        if self._known is None:
+            if waited > REQUEST_TIMEOUT:
+                self.close()
+            return
+        if self._sent is not None and not self._sent.done():
+            return
         try:
-            await self.write_message(await self.server.news(self.flight, known), binary=True)
+            if waited < MAX_WAIT and not has_news(self.flight, self._known):
+                return
+            content = self.server.answer(self.flight, self._known)
         except HTTPError as error:
             self.close(POLICY_VIOLATION, error.reason)
-        except WebSocketClosedError:  # the browser has left
-            return
-        self._await_request()
+        else:
+            self._await_request()
+            with suppress(WebSocketClosedError):  # the browser has left
+                self._sent = asyncio.ensure_future(self._send(content))
+
+    async def _send(self, content: bytes) -> None:
+        with suppress(WebSocketClosedError):
+            await self.write_message(content, binary=True)
 
     def on_close(self) -> None:
         self.server.streams.discard(self)
-        self._end.cancel()
 
 
 class _Control(_Handler):
