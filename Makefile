@@ -27,8 +27,8 @@ ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group docs --gro
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
 
-# Files of tests/ros come first: they wait more than they compute.
-XDIST = $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+# Files of tests/ros come first. They wait more than they compute: a worker more than cores fills the pauses.
+XDIST = $(BIN)/python -m pytest -n $$(($$(nproc) + 1)) --maxprocesses 4 --dist loadfile
 
 .PHONY: fly test test-fast test-sitl check docs evidence foxglove messages setup setup-all lock clean
 
@@ -38,15 +38,10 @@ fly: setup
 # Two workers fill two cores: threads of OpenBLAS would only wait for each other.
 test test-fast: export OPENBLAS_NUM_THREADS = 1
 
-# The tests of nodes mostly wait. The slow ones without ROS compute meanwhile, with the policy SCHED_IDLE where there is chrt:
-# any other thread takes the processor from them at once. They wait too, for a browser or a process: a worker more than cores.
 # Those that fly in real time and measure it come last, by themselves.
-IDLE = $(shell chrt --idle 0 true 2> /dev/null && echo chrt --idle 0)
 test: check
-	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; mkdir -p build; \
-	  $(IDLE) $(XDIST) -n $$(($$(nproc) + 1)) -m slow --timeout=900 tests/pure > build/slow-tests.log 2>&1 & slow=$$!; trap "kill $$slow 2> /dev/null || true" EXIT; trap "exit 130" INT; \
-	  $(XDIST) --no-loadscope-reorder -m "not alone and not slow" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
-	  wait $$slow || status=$$?; cat build/slow-tests.log; \
+	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; trap "exit 130" INT; \
+	  $(XDIST) --no-loadscope-reorder -m "not alone" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
 	  $(BIN)/python -m pytest -m alone tests/ros || status=$$?; exit $$status)
 
 test-fast: .venv/.all .venv/.workspace
