@@ -186,7 +186,7 @@ def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False, con
         "described": flight.described,
     }
     if known.get("described") != str(flight.described):
-        head["flight"] = flight.description
+        head["flight"] = finite_or_null(flight.description)
     text = json.dumps(head, allow_nan=False).encode()
     text += b" " * (-(len(text) + 4) % 8)
     return b"".join([struct.pack("<I", len(text)), text, *columns])
@@ -328,11 +328,10 @@ class _News(_Handler, WebSocketHandler):
             self.close(POLICY_VIOLATION, error.reason)
         else:
             self._await_request()
-            with suppress(WebSocketClosedError):  # the browser has left
-                self._sent = asyncio.ensure_future(self._send(content))
+            self._sent = asyncio.ensure_future(self._send(content))
 
     async def _send(self, content: bytes) -> None:
-        with suppress(WebSocketClosedError):
+        with suppress(WebSocketClosedError):  # the browser has left
             await self.write_message(content, binary=True)
 
     def on_close(self) -> None:
