@@ -20,6 +20,7 @@ from flight_cli.report import report
 from flight_core.parameters import ParameterError
 from flight_log.bag import BagWriter
 from flight_log.engagements import Engagement
+from flight_log.rosbag2_metadata import bag_files
 from flight_log.tape_reader import read_run
 
 
@@ -54,6 +55,19 @@ def test_an_engagement_shorter_than_a_sample_leaves_the_figures_of_the_flight(
     assert summary["duration"] > 1.0
     assert summary["notes"][0].endswith("s: lost")
     assert summary["notes"][1] == "the figures are of the whole flight: no y while engaged"
+
+
+def test_a_scenario_beside_a_log_that_is_not_the_one_in_the_log_is_kept(runs: list[Path], tmp_path: Path) -> None:
+    log, own = tmp_path / "run_0.mcap", tmp_path / "osprey_gust.yaml"
+    log.write_bytes(bag_files(runs[0])[0].read_bytes())
+    own.write_text("# mine\n", encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"osprey_gust\.yaml: found another file than the scenario that the log holds"):
+        report([log])
+    assert own.read_text(encoding="utf-8") == "# mine\n"
+    own.unlink()
+    for _ in range(2):
+        report([log])
+    assert own.read_bytes() == (runs[0] / own.name).read_bytes()
 
 
 def test_two_runs_are_compared(

@@ -117,9 +117,14 @@ def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
 def _extract_scenario(recorded: RecordedRun, run: Path) -> Scenario:
     if recorded.scenario is None:
         raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
-    path = _folder(run) / recorded.scenario.name
+    path, content = _folder(run) / recorded.scenario.name, recorded.scenario.content
+    if path.exists() and path.read_bytes() != content:
+        raise ParameterError(
+            f"{path}: found another file than the scenario that the log holds by this name, expected it elsewhere: "
+            "the scenario is written there"
+        )
     with writing("", path.parent, "a folder that can"):
-        path.write_bytes(recorded.scenario.content)
+        path.write_bytes(content)
     return load_scenario(path)
 
 
