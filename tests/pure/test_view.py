@@ -548,7 +548,30 @@ def test_websockets_that_ask_nothing_and_those_beyond_the_limit_are_closed(
     against(recorded)(client)
 
 
-def test_a_websocket_that_asks_and_reads_no_answer_makes_few_of_them(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_websocket_has_one_request_at_a_time(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[str] = []
+
+    def parsed(message: str, **_: object) -> list[tuple[str, str]]:
+        taken.append(message)
+        return []
+
+    monkeypatch.setattr(http, "parse_qsl", parsed)
+    monkeypatch.setattr(http, "has_news", lambda *_: False)
+
+    async def client(server: Server) -> None:
+        socket = await stream(server)
+        for number in range(100):
+            await socket.write_message(str(number))
+        await socket.read_message()
+        assert len(taken) <= 2  # the one that has its answer, and the next
+        socket.close()
+
+    against(recorded)(client)
+
+
+def test_a_websocket_that_asks_and_reads_no_answer_makes_few_of_them_and_the_server_ends_quietly(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     made: list[bytes] = []
 
     def big(*_: object, **__: object) -> bytes:
@@ -558,10 +581,10 @@ def test_a_websocket_that_asks_and_reads_no_answer_makes_few_of_them(recorded: P
     monkeypatch.setattr(http, "answer", big)
 
     async def client(server: Server) -> None:
-        _reader, writer = await asyncio.open_connection("127.0.0.1", server.port, limit=1)
+        browser.connect(("127.0.0.1", server.port))
         head = {"Host": f"127.0.0.1:{server.port}", "Cookie": f"rise_di_{server.port}={TOKEN}"} | UPGRADE
-        writer.write("\r\n".join(["GET /news/0 HTTP/1.1", *(f"{k}: {v}" for k, v in head.items()), "", ""]).encode())
-        writer.write(bytes([0x81, 0x80, 0, 0, 0, 0]) * 10_000)  # empty texts with a mask, RFC 6455, 5.2
+        browser.sendall("\r\n".join(["GET /news/0 HTTP/1.1", *(f"{k}: {v}" for k, v in head.items()), "", ""]).encode())
+        browser.sendall(bytes([0x81, 0x80, 0, 0, 0, 0]) * 10_000)  # empty texts with a mask, RFC 6455, 5.2
         while not made:
             await asyncio.sleep(0.01)
         before = -1
@@ -569,9 +592,10 @@ def test_a_websocket_that_asks_and_reads_no_answer_makes_few_of_them(recorded: P
             before = len(made)
             await asyncio.sleep(2.0 * http.STATE_PERIOD)
         assert len(made) <= 20  # of 1 MiB: what the buffers of the network hold
-        writer.close()
 
-    against(recorded)(client)
+    with socket.socket() as browser:
+        against(recorded)(client)
+    assert caplog.records == []
 
 
 def test_the_server_listens_on_this_host_alone(recorded: Path) -> None:

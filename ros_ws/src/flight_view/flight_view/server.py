@@ -298,18 +298,18 @@ class _News(_Handler, WebSocketHandler):
     def open(self, *names: str) -> None:
         self.flight = self.server.flights[int(names[0])]
         self.server.streams.add(self)
-        self._sent: asyncio.Future[None] | None = None  # done once the last answer is in the buffers of the network
         self._await_request()
 
     def _await_request(self) -> None:
         self._known: dict[str, str] | None = None  # by the request that waits for an answer
         self._since = time.monotonic()
 
-    def on_message(self, message: str | bytes) -> Awaitable[None] | None:
+    def on_message(self, message: str | bytes) -> Awaitable[None]:
         self._known = dict(parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True))
         self._since = time.monotonic()
+        self._answered = asyncio.get_running_loop().create_future()  # done once the answer is in the buffers of the network
         self.look()
-        return self._sent  # before it is done, the next message is not read
+        return self._answered  # before it is done, the next message is not read
 
     def look(self) -> None:
         """Answer the request where there is news, or it has waited for so long. Close where there has been none for so long."""
@@ -318,21 +318,20 @@ class _News(_Handler, WebSocketHandler):
             if waited > REQUEST_TIMEOUT:
                 self.close()
             return
-        if self._sent is not None and not self._sent.done():
-            return
         try:
             if waited < MAX_WAIT and not has_news(self.flight, self._known):
                 return
             content = self.server.answer(self.flight, self._known)
         except HTTPError as error:
             self.close(POLICY_VIOLATION, error.reason)
-        else:
-            self._await_request()
-            self._sent = asyncio.ensure_future(self._send(content))
+            content = b""  # nothing is sent any more
+        self._await_request()
+        self._sending = asyncio.ensure_future(self._send(content))
 
     async def _send(self, content: bytes) -> None:
-        with suppress(WebSocketClosedError):  # the browser has left
+        with suppress(WebSocketClosedError):  # the browser has left, or it is closed
             await self.write_message(content, binary=True)
+        self._answered.set_result(None)
 
     def on_close(self) -> None:
         self.server.streams.discard(self)
