@@ -273,6 +273,29 @@ def test_a_flight_that_is_recorded_is_followed_to_its_end(browser: Browser, reco
     leave(browser)
 
 
+ASKS = """(() => {
+    const {send} = WebSocket.prototype;
+    WebSocket.prototype.send = function (text) { window.asks = true; send.call(this, text); };
+})()"""
+
+
+def test_a_server_that_hangs_is_no_server_until_it_answers_again(
+    browser: Browser, recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs, update = threading.Event(), Flight.update
+    runs.set()
+    monkeypatch.setattr(Flight, "update", lambda *given: runs.wait() and update(*given))
+    with shown(browser, recorded):
+        try:
+            browser.run(ASKS)
+            browser.wait_for("window.asks")
+            runs.clear()
+            browser.wait_for(f"{STATE} === 'NO SERVER'", limit=30.0)  # after 10 s
+        finally:
+            runs.set()
+        browser.wait_for(f"{STATE} === 'ENDED'")
+
+
 def pictures_of(browser: Browser) -> list[str]:
     """All canvases of the page, in each camera."""
     found = []

@@ -78,13 +78,16 @@ export class Flight { // one flight of the server
 
   ask() { // the answer to a message that holds what this page knows
     return new Promise((answer, refuse) => {
-      const {socket} = this, patience = setTimeout(() => socket.close(), PATIENCE);
-      socket.onmessage = ({data}) => { clearTimeout(patience); answer(data); };
-      socket.onclose = ({reason}) => {
+      const {socket} = this, lost = () => {
         clearTimeout(patience);
+        socket.onclose = null;
+        socket.close();
         this.socket = null;
-        refuse(new DOMException(reason, "NetworkError"));
+        refuse(new DOMException("", "NetworkError"));
       };
+      const patience = setTimeout(lost, PATIENCE); // without the close event: it waits for a server that hangs
+      socket.onclose = lost;
+      socket.onmessage = ({data}) => { clearTimeout(patience); answer(data); };
       socket.send(this.query());
     });
   }
