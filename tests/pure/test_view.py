@@ -194,6 +194,13 @@ def test_a_browser_gets_thinned_samples_again_from_the_start(recorded: Path) -> 
     assert topics["internals"] == 0
 
 
+def test_a_page_that_shows_another_run_gets_the_description_of_this_one(recorded: Path) -> None:
+    flight = Flight(recorded)
+    flight.update()
+    head, _ = decoded(answer(flight, {"epoch": "of the run before", "described": str(flight.described)}))
+    assert head["flight"]["name"] == "run"
+
+
 @pytest.mark.parametrize("case", CORPUS, ids=lambda path: path.name)
 def test_a_hostile_log_is_shown_as_far_as_it_goes(case: Path, tmp_path: Path) -> None:
     path = tmp_path / "run_0.mcap"
@@ -270,7 +277,8 @@ def test_a_route_that_is_given_in_flight_replaces_that_of_the_scenario(tmp_path:
     expected = route_outline(scenario.guidance.plan([Waypoint(north, east, altitude) for east, north, altitude in given]))
     assert [tuple(one) for one in head_of["flight"]["route"]] == expected
     assert [(one.kind, one.text) for one in flight.events] == [("route", "3 waypoints")]
-    assert "flight" not in decoded(answer(flight, {"described": str(head_of["described"])}))[0]
+    known = {"described": str(head_of["described"]), "epoch": head_of["epoch"]}
+    assert "flight" not in decoded(answer(flight, known))[0]
 
 
 # The server

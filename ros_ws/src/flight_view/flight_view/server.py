@@ -185,7 +185,7 @@ def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False, con
         "events": events,
         "described": flight.described,
     }
-    if known.get("described") != str(flight.described):
+    if known.get("described") != str(flight.described) or known.get("epoch") != head["epoch"]:
         head["flight"] = finite_or_null(flight.description)
     text = json.dumps(head, allow_nan=False).encode()
     text += b" " * (-(len(text) + 4) % 8)

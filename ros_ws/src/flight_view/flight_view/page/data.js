@@ -21,13 +21,13 @@ export class Flight { // one flight of the server
   constructor(number) {
     this.number = number;
     this.socket = null;
-    this.info = {name: "", modes: {}, units: {}, positive: {}, limits: {}, gusts: [], commands: []};
     this.head = {state: "", faults: [], bands: {}, described: "", ghost: false};
     this.clear("");
   }
 
   clear(epoch) {
     this.epoch = epoch;
+    this.info = {name: "", modes: {}, units: {}, positive: {}, limits: {}, gusts: [], commands: []};
     this.series = new Map();
     this.events = [];
     this.begin = Infinity;
