@@ -507,6 +507,8 @@ def test_a_websocket_answers_each_message_as_a_request_and_waits_for_news(record
         ("/news/0", TOKEN, {"Origin": "http://evil.example"}, 403),
         ("/news/0", TOKEN, {"Origin": "http://127.0.0.1:1"}, 403),
         ("/news/0", TOKEN, {"Origin": "null"}, 403),
+        ("/news/0", TOKEN, {"Origin": "http://["}, 403),
+        ("/news/0", TOKEN, {"Origin": ""}, 403),  # none is sent
         ("/news/1", TOKEN, {}, 404),
         ("/news/2", TOKEN, {}, 404),
     ],
@@ -515,7 +517,8 @@ def test_a_websocket_of_another_page_host_user_or_flight_is_refused(
     path: str, token: str, headers: dict[str, str], expected: int, recorded: Path
 ) -> None:
     async def client(server: Server) -> None:
-        assert (await get(server, path, token=token, **UPGRADE | headers)).code == expected
+        given = UPGRADE | {"Origin": f"http://127.0.0.1:{server.port}"} | headers
+        assert (await get(server, path, token=token, **{name: text for name, text in given.items() if text})).code == expected
 
     against(recorded)(client)
 
@@ -590,7 +593,8 @@ def test_a_websocket_that_asks_and_reads_no_answer_makes_few_of_them_and_the_ser
 
     async def client(server: Server) -> None:
         browser.connect(("127.0.0.1", server.port))
-        head = {"Host": f"127.0.0.1:{server.port}", "Cookie": f"rise_di_{server.port}={TOKEN}"} | UPGRADE
+        address = f"127.0.0.1:{server.port}"
+        head = {"Host": address, "Origin": f"http://{address}", "Cookie": f"rise_di_{server.port}={TOKEN}"} | UPGRADE
         browser.sendall("\r\n".join(["GET /news/0 HTTP/1.1", *(f"{k}: {v}" for k, v in head.items()), "", ""]).encode())
         browser.sendall(bytes([0x81, 0x80, 0, 0, 0, 0]) * 10_000)  # empty texts with a mask, RFC 6455, 5.2
         while not made:

@@ -234,6 +234,11 @@ class _Handler(RequestHandler):
         if not hmac.compare_digest(given.encode(), self.server.token.encode()):
             raise HTTPError(HTTPStatus.UNAUTHORIZED, reason="Open the whole address that rise-di watch printed")
 
+    def require_page(self) -> None:
+        """Refuse a request that the page itself has not made."""
+        if self.request.headers.get_list("Origin") != [f"http://{self.request.host}"]:
+            raise HTTPError(HTTPStatus.FORBIDDEN, reason="A request of another page")
+
     def get(self, *_: str) -> Any:
         raise HTTPError(HTTPStatus.NOT_FOUND)
 
@@ -287,13 +292,10 @@ class _News(_Handler, WebSocketHandler):
             raise HTTPError(HTTPStatus.SERVICE_UNAVAILABLE)
 
     async def get(self, *names: str) -> None:
+        self.require_page()
         if int(names[0]) >= len(self.server.flights):
             raise HTTPError(HTTPStatus.NOT_FOUND)
         await WebSocketHandler.get(self, *names)
-
-    def check_origin(self, origin: str) -> bool:
-        """Whether the WebSocket is opened by the page itself."""
-        return origin == f"http://{self.request.host}"
 
     def open(self, *names: str) -> None:
         self.flight = self.server.flights[int(names[0])]
@@ -344,8 +346,7 @@ class _Control(_Handler):
         raise HTTPError(HTTPStatus.METHOD_NOT_ALLOWED)
 
     async def post(self) -> None:
-        if self.request.headers.get_list("Origin") != [f"http://{self.request.host}"]:
-            raise HTTPError(HTTPStatus.FORBIDDEN, reason="A request of another page")
+        self.require_page()
         if self.request.headers.get("Content-Type") != "application/json":
             raise HTTPError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE)
         try:
