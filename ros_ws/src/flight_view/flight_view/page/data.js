@@ -2,6 +2,7 @@
 import {Series} from "./series.js";
 
 const PATIENCE = 10_000; // ms; the server answers within 2 s, also without news
+const GRACE = 500; // ms, in which a page that was frozen takes what came meanwhile, before its patience counts
 
 // An answer of the server (server.py, answer): its head, and the time and the columns of each topic in the head.
 export function decode(buffer) {
@@ -61,7 +62,10 @@ export class Flight { // one flight of the server
   }
 
   async poll() { // one request; true when samples came
-    if (this.socket?.readyState === WebSocket.OPEN) return this.take(decode(await this.ask()));
+    if (this.socket?.readyState === WebSocket.OPEN) {
+      const content = await this.ask();
+      if (content) return this.take(decode(content));
+    }
     const response = await fetch(`data/${this.number}?${this.query()}`, {signal: AbortSignal.timeout(PATIENCE)});
     if (!response.ok) throw new Error(await response.text());
     const content = await response.arrayBuffer();
@@ -76,17 +80,21 @@ export class Flight { // one flight of the server
     return socket;
   }
 
-  ask() { // the answer to a message that holds what this page knows
+  ask() { // the answer to a message that holds what this page knows; null where the server closes, as after a pause
     return new Promise((answer, refuse) => {
-      const {socket} = this, lost = () => {
+      const {socket} = this, end = () => {
         clearTimeout(patience);
         socket.onclose = null;
         socket.close();
         this.socket = null;
-        refuse(new DOMException("", "NetworkError"));
+        answer(null);
       };
-      const patience = setTimeout(lost, PATIENCE); // without the close event: it waits for a server that hangs
-      socket.onclose = lost;
+      const hangs = () => { // no close event: it waits for the server
+        refuse(new DOMException("", "NetworkError"));
+        end();
+      };
+      let patience = setTimeout(() => { patience = setTimeout(hangs, GRACE); }, PATIENCE);
+      socket.onclose = end;
       socket.onmessage = ({data}) => { clearTimeout(patience); answer(data); };
       socket.send(this.query());
     });
