@@ -17,6 +17,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "build" / "guidance"
 PAGE = REPOSITORY / "docs" / "evidence_guidance.md"
 REPORT = "At its end `rise-di fly` writes the report."
+OPEN_LIMIT = 3.0  # s, to open the report of a long flight
 INTRODUCTION = """\
 # Evidence: guidance
 
@@ -36,11 +37,11 @@ def store(name: str, result: Any) -> None:
 
 
 def page(results: Mapping[str, Mapping[str, Any]], before: str = "") -> str:
-    """The page from the stored results by name: "flights NAME", "grid NAME", "rates", "route" and "long FLIGHT".
+    """The page from the stored results by name: "flights NAME", "grid NAME", "rates", "route", "long FLIGHT" and "opened".
 
     A section without a result stays as it is on the page `before`: another machine may have measured it.
     """
-    makers = {"flights": _flights, "grid": _grid, "rates": _rates, "route": _route, "long": _long}
+    makers = {"flights": _flights, "grid": _grid, "rates": _rates, "route": _route, "long": _long, "opened": _opened}
     sections = {one.partition("\n")[0]: one.strip() + "\n" for one in re.split(r"^## ", before, flags=re.MULTILINE)[1:]}
     for name, stored in results.items():
         kind, _, aircraft = name.partition(" ")
@@ -121,6 +122,14 @@ def _long(flight: str, figures: Any) -> tuple[str, str, list[str]]:
     text = "; ".join(f"{name}: {_shown(value)}" for name, value in shown.items()) + "."
     lines = textwrap.wrap(f"Round a triangle in turbulence of 1.5 m/s, over topics. {text} {REPORT}", 118)
     return f"A long flight, {flight}", " ".join(["python -m benchmarks.long_flight", *figures["options"]]), lines
+
+
+def _opened(_: str, found: Any) -> tuple[str, str, list[str]]:
+    """Of the report of a run: the flight time, s, the size in bytes, and the times until a browser has drawn it, s."""
+    times = ", ".join(f"{one:.1f}" if one <= OPEN_LIMIT else f"*{one:.1f}*" for one in found["opened"])
+    text = f"A flight of {found['flight'] / 60.0:.0f} min, a report of {found['size'] / 1e6:.1f} MB, nothing else running"
+    lines = [f"{text}: drawn after {times} s (limit {OPEN_LIMIT:g})."]
+    return "The report of a long flight", "python -m benchmarks.long_flight --open RUN", lines
 
 
 def _shown(value: Any) -> str:

@@ -5,6 +5,7 @@
     .venv/bin/python -m benchmarks.long_flight                                  # the c172p of JSBSim, 60 min in lockstep
     .venv/bin/python -m benchmarks.long_flight --observer                       # the osprey, with an observer beside the law
     .venv/bin/python -m benchmarks.long_flight --observer --real-time
+    .venv/bin/python -m benchmarks.long_flight --open RUN                       # only the report of a run, on an idle host
 
 Prints JSON and writes it to docs/evidence_guidance.md: the outcome, the samples that the log lacks, missed ticks, the largest
 cross-track error, the memory of each process in the middle and at the end of the flight, and the times to write and to open the
@@ -165,7 +166,14 @@ def main() -> None:
     mode = parser.add_mutually_exclusive_group()
     for name, words in (("--one-process", "in lockstep in one process"), ("--real-time", "in real time")):
         mode.add_argument(name, dest="mode", action="store_const", const=words, default="in lockstep", help=words)
+    parser.add_argument("--open", type=Path, metavar="RUN", help="only time how long a browser takes to open its report")
     options = parser.parse_args()
+    if options.open is not None:
+        report, summary = options.open / "report.html", json.loads((options.open / "summary.json").read_text(encoding="utf-8"))
+        found = {"flight": summary["duration"], "size": report.stat().st_size, "opened": [opened(report) for _ in range(3)]}
+        guidance_page.store("opened", found)
+        print(json.dumps(found, indent=1))
+        return
     with tempfile.TemporaryDirectory() as folder, delay_monitors(bool(real_time())) as delays:
         runs = options.runs or Path(folder)
         runs.mkdir(parents=True, exist_ok=True)
