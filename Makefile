@@ -27,8 +27,8 @@ ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group docs --gro
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
 
-# Files of tests/ros come first. They wait more than they compute: a worker more than cores fills the pauses.
-XDIST = $(BIN)/python -m pytest -n $$(($$(nproc) + 1)) --maxprocesses 4 --dist loadfile
+# Files of tests/ros come first: they wait more than they compute.
+XDIST = $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 .PHONY: fly test test-fast test-sitl check docs evidence foxglove messages setup setup-all lock clean
 

@@ -144,16 +144,19 @@ def setup(start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
         yield BridgeSetup(start, peer_node, tmp_path)
 
 
-def true_error(autopilot: Process, setup: BridgeSetup) -> dict[str, Any]:
-    """The aircraft's y without noise less y_m, from 7 s of the reference model's time on, by output."""
+def true_error(autopilot: Process, setup: BridgeSetup) -> dict[str, float]:
+    """Rms of the aircraft's y without noise less y_m over that of y_m, from 7 s of the reference model's time on, by output."""
     rows = np.array([[float(part) for part in line.split()[1:]] for line in autopilot.lines if line.startswith("y ")])
     references = setup.peer.received["y_m"]
     t_m = np.array([stamp(message) for message in references])
     t = rows[:, 0] / NANOSECONDS
     window = (t > t_m[0] + 7.0) & (t < t_m[-1])
-    assert window.sum() > 100  # of 350 in 7 s; a busy host simulates fewer, and these are enough for the largest error
-    y_m = {name: np.array([m.position[m.name.index(name)] for m in references]) for name in ("q", "V", "p", "r")}
-    return {name: rows[window, 1 + k] - np.interp(t[window], t_m, y_m[name]) for k, name in enumerate(y_m)}
+    assert window.sum() > 100  # of 350 in 7 s; a busy host simulates fewer
+    ratios = {}
+    for k, name in enumerate(("q", "V", "p", "r")):
+        y_m = np.interp(t[window], t_m, [m.position[m.name.index(name)] for m in references])
+        ratios[name] = float(np.std(rows[window, 1 + k] - y_m) / np.std(y_m))
+    return ratios
 
 
 def test_the_unchanged_controller_tracks_through_the_map_and_when_killed_releases_the_channels(
@@ -171,11 +174,8 @@ def test_the_unchanged_controller_tracks_through_the_map_and_when_killed_release
     begin = stamp(setup.peer.received["y_m"][0])
     setup.peer.until(lambda: stamp(setup.peer.received["y_m"][-1]) > begin + 14.5)
     error = true_error(autopilot, setup)
-    largest = {name: float(np.abs(one).max()) for name, one in error.items()}
-    # Measured 0.033 rad/s, 0.19 m/s, 0.083 and 0.016 rad/s: the loop is little faster than the commands. An aircraft that stays
-    # at trim has errors of the size of the commands: 0.1 rad/s, 1 m/s, 0.2 rad/s, and 0.08 rad/s in the turns.
-    for name, most in {"q": 0.07, "V": 0.5, "p": 0.15, "r": 0.05}.items():
-        assert largest[name] < most, f"{name}: {largest}"
+    # Measured 0.43, 0.32, 0.43 and 0.32: the loop is little faster than the commands. 1 of an aircraft that stays at trim.
+    assert max(error.values()) < 0.7, error
 
     setup.joys.clear()
     controller.popen.kill()
