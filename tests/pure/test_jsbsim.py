@@ -207,6 +207,16 @@ def test_a_computation_without_end_in_the_isolated_process_times_out_by_its_proc
     assert 1.9 < used < 3.5  # Linux looks at the limit once a tick; the rest is what starts and ends a process
 
 
+def test_the_isolated_process_keeps_a_limit_of_processor_time_that_the_user_has() -> None:
+    code = (
+        "import resource; resource.setrlimit(resource.RLIMIT_CPU, (60, 60))\n"
+        "from aircraft_sim import isolated\n"
+        "print(*(isolated.call(resource.getrlimit, resource.RLIMIT_CPU, timeout=one) for one in (30.0, 90.0)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
+    assert done.stdout == "[30, 60] [60, 60]\n"  # raising the second number needs a privilege, setrlimit(2)
+
+
 def test_a_crash_an_exception_and_an_exit_of_the_isolated_process_are_errors_here() -> None:
     with pytest.raises(isolated.IsolatedCallError, match="was killed by SIGSEGV"):
         isolated.call(ctypes.string_at, 0, timeout=120.0)

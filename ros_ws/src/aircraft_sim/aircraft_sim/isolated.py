@@ -63,7 +63,9 @@ def call(function: Callable[..., Any], *arguments: Any, timeout: float) -> Any:
 def main() -> None:
     """Entry point of the subprocess: processor time in s, module, function, arguments as JSON -> a line of JSON."""
     timeout, module, name, arguments = sys.argv[1:]
-    resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(float(timeout)), resource.RLIM_INFINITY))
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]  # that of the user, which no process may raise
+    soft = math.ceil(float(timeout))
+    resource.setrlimit(resource.RLIMIT_CPU, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
     result: dict[str, Any]
     try:
         result = {"value": getattr(import_module(module), name)(*json.loads(arguments))}
