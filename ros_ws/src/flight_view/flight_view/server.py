@@ -3,10 +3,10 @@
 """Serves the page and the samples of one or two flights to browsers on this host, over HTTP.
 
 A browser asks for what is new, and draws the answer before it asks again: nothing queues for a slow one. After the first
-answer it asks by a WebSocket, where a request takes 0.3 ms of the processor in place of 0.8. Only GET is answered, for a fixed
-list of names. The Host header has to name this host, against DNS rebinding. The token of the address is kept in a cookie,
-against other users of this host. A WebSocket has to come from the page itself. With `Control` there is one POST, which takes a
-second key and the origin of the page.
+answer it asks by a WebSocket, where a request takes two fifths of the processor time of one by HTTP. Only GET is answered,
+for a fixed list of names. The Host header has to name this host, against DNS rebinding. The token of the address is kept in a
+cookie, against other users of this host. A WebSocket has to come from the page itself. With `Control` there is one POST,
+which takes a second key and the origin of the page.
 """
 
 import asyncio
