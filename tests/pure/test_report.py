@@ -459,6 +459,12 @@ def test_all_samples_of_long_curves_are_stored_once() -> None:
     assert len(shared.samples.packed) == 1 + 4 + 1  # one time, four y, and the zeros of all y_m
 
 
+def test_the_extremes_are_the_least_the_greatest_and_the_first_gap_of_each_bin() -> None:
+    nan = np.nan
+    values = [1.0, 5.0, 0.0, 2.0, 7.0, nan, nan, 6.0, 3.0, 3.0, 3.0, 3.0, nan, nan, nan, nan, 8.0]  # four to a bin
+    assert plotting.extremes(np.array(values), 10).tolist() == [1, 2, 4, 5, 7, 8, 12, 16]
+
+
 def test_a_curve_of_few_samples_is_drawn_whole_and_not_stored() -> None:
     shared = context(flight())
     assert traces(figures.tracking_figure(shared), "y")[0].meta is None

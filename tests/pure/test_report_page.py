@@ -14,6 +14,7 @@ from tests.browser import CHROMIUM, Browser
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report import plotting
 from flight_analysis.report.html import write_page
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_bringup.scenarios import find_scenario
@@ -199,3 +200,27 @@ def test_two_minutes_at_500_hz_are_decimated_and_a_zoom_shows_every_sample(
     zoom(browser, 60.0, 60.2)
     x, _ = curve(browser, 0, "y")
     assert len([t for t in x if 60.0 <= t <= 60.2]) == 101
+
+
+def test_a_very_long_curve_is_drawn_before_its_samples_are_unpacked_and_a_zoom_shows_every_sample(
+    browser: Browser, tmp_path: Path, servo: RecordedFlight, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count, random = 30_001, np.random.default_rng(1)
+    stamps = np.arange(count, dtype=np.int64) * 2_000_000
+    stamps[20_000:] += 500_000_000  # a gap of 0.5 s
+    names = servo.tape["y"].names
+    signals = {topic: Signal(stamps, names, random.standard_normal((count, 4))) for topic in ("y", "y_m")}
+    found = []
+    for most in (count // 2, plotting.MAX_READ):
+        monkeypatch.setattr(plotting, "MAX_READ", most)
+        write_page(tmp_path / "long.html", [recorded("long", servo.scenario, Tape(signals))])
+        open_page(browser, tmp_path / "long.html")
+        assert (browser.run("kept.size") == 0) == (most < count)
+        found.append([np.array(values, dtype=float) for values in curve(browser, 0, "y")])
+        zoom(browser, 10.0, 10.2)
+        zoomed, _ = curve(browser, 0, "y")
+        assert len([t for t in zoomed if 10.0 <= t <= 10.2]) == 101
+    (x, y), (x_of_page, y_of_page) = found
+    assert np.isnan(y).sum() == 1
+    np.testing.assert_allclose(x, x_of_page, rtol=2.0**-23)  # float32
+    np.testing.assert_allclose(y, y_of_page, rtol=2.0**-15.9)  # plotting.MANTISSA

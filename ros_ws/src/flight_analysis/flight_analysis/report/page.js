@@ -33,7 +33,9 @@ async function unpackTimes(id) { // steps in ns -> s
 }
 
 const kept = new Map();
-function samples(id) {
+const read = new Promise(resume => addEventListener("DOMContentLoaded", resume)); // the samples follow this script
+async function samples(id) {
+  await read;
   if (!kept.has(id)) kept.set(id, id[0] === "t" ? unpackTimes(id) : unpack(id, 4).then(bytes => new Float32Array(bytes)));
   return kept.get(id);
 }
@@ -67,10 +69,10 @@ function view(t, v, [from, to], most) {
   return {x: indices.map(k => t[k]), y: indices.map(k => v[k])};
 }
 
-async function views(data) { // of the traces that the page decimates, by index
+async function views(data) { // of the traces that the page decimates, by index; a trace may have the view of the whole flight
   const [from, to] = range ?? [-Infinity, Infinity], margin = range ? MARGIN * (to - from) : 0;
   const wide = [from - margin, to + margin];
-  const long = [...data.entries()].filter(([, {meta}]) => meta);
+  const long = [...data.entries()].filter(([, {meta, x}]) => meta && (range || !x));
   return new Map(await Promise.all(long.map(
     async ([index, {meta}]) => [index, view(await samples(meta.t), await samples(meta.v), wide, meta.most)])));
 }

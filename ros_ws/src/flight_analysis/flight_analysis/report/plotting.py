@@ -3,7 +3,8 @@
 """Time-series figures for plotly.js: one subplot per channel, shaded intervals over all subplots.
 
 All figures of a page share the time axis and the margins, so their subplots line up. A figure holds curves of few samples
-itself. `SampleStore` holds all samples of a longer one: the page decimates them to what the view can show.
+itself. `SampleStore` holds all samples of a longer one: the page decimates them to what the view can show. A figure also holds
+the extremes of a very long curve, since all its samples take the page long to unpack.
 """
 
 import base64
@@ -21,6 +22,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
 MAX_POINTS = 2400  # of a curve over the page's width: above the smallest and the largest value of each pixel
+MAX_READ = 100_000  # samples: the page unpacks a longer curve only for a zoom, and first draws its extremes
 MANTISSA = 16  # bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4 digits of a hover
 MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
 INTERVAL_OPACITY = 0.25
@@ -195,7 +197,22 @@ def _trace(context: PlotContext, curve: Curve, channel: str, factor: float, most
     )
     if len(values) <= most:
         return trace | {"x": t_ns / NANOSECONDS, "y": values}
-    return trace | {"meta": {"t": context.samples.times(t_ns), "v": context.samples.values(values), "most": most}}
+    trace |= {"meta": {"t": context.samples.times(t_ns), "v": context.samples.values(values), "most": most}}
+    if len(values) <= MAX_READ:
+        return trace
+    rows = extremes(values, most)
+    return trace | {"x": (t_ns[rows] / NANOSECONDS).astype(np.float32), "y": values[rows].astype(np.float32)}
+
+
+def extremes(values: FloatArray, most: int) -> NDArray[np.intp]:
+    """Rows of the minimum, the maximum and the first NaN of each of `most` / 2 bins, as the page decimates a view."""
+    width = -(-len(values) // (most // 2))
+    bins = np.concatenate([values, np.full(-len(values) % width, np.nan)]).reshape(-1, width)
+    gaps = np.isnan(bins)
+    low, high = np.where(gaps, np.inf, bins).argmin(axis=1), np.where(gaps, -np.inf, bins).argmax(axis=1)
+    gap = np.where(gaps.any(axis=1), gaps.argmax(axis=1), low)
+    rows = np.unique(np.array([low, high, gap]) + width * np.arange(len(bins)))
+    return rows[rows < len(values)]
 
 
 def stored(context: PlotContext, signal: Signal, channel: str, factor: float) -> tuple[str, str]:
