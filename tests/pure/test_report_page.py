@@ -224,3 +224,20 @@ def test_a_very_long_curve_is_drawn_before_its_samples_are_unpacked_and_a_zoom_s
     assert np.isnan(y).sum() == 1
     np.testing.assert_allclose(x, x_of_page, rtol=2.0**-23)  # float32
     np.testing.assert_allclose(y, y_of_page, rtol=2.0**-15.9)  # plotting.MANTISSA
+
+
+def test_the_next_figure_drawn_is_the_nearest_to_the_view(browser: Browser, page: Path) -> None:
+    open_page(browser, page)
+    order = browser.run(
+        """(async () => {
+          const order = [], before = draw;
+          draw = (figure, style) => { order.push(figures.indexOf(figure)); scrollTo(0, 0); return before(figure, style); };
+          for (const figure of figures) figure.drawn = "";
+          scrollTo(0, document.body.scrollHeight);
+          await showAll();
+          return order;
+        })()"""
+    )
+    count = browser.run("figures.length")
+    assert order[0] >= count - 3  # at the end of the page, then at its top
+    assert order[1:] == [k for k in range(count) if k != order[0]]

@@ -108,20 +108,19 @@ function moved(figure, change) { // zoom all figures over time together
   showAll();
 }
 
-async function showAll() { // visible figures first
-  const mine = ++turn, distance = ({node}) => {
+async function showAll() { // the figure nearest to the view first, which may be scrolled meanwhile
+  const mine = ++turn, wanted = figure => `${look()} ${figure.inTime && range}`, distance = ({node}) => {
     const {top, bottom} = node.getBoundingClientRect();
     return Math.max(top - innerHeight, -bottom, 0);
   };
-  for (const figure of [...figures].sort((a, b) => distance(a) - distance(b))) {
-    const style = look(), wanted = `${style} ${figure.inTime && range}`;
-    if (figure.drawn !== wanted) {
-      if (figure.drawn.startsWith(style) && range && figure.inTime) await follow(figure);
-      else await draw(figure, style);
-      figure.drawn = wanted;
-      performance.mark("figure");
-      await new Promise(resume => setTimeout(resume)); // keep the page responsive
-    }
+  const next = () => figures.filter(one => one.drawn !== wanted(one)).sort((a, b) => distance(a) - distance(b))[0];
+  for (let figure = next(); figure; figure = next()) {
+    const style = look(), drawn = wanted(figure);
+    if (figure.drawn.startsWith(style) && range && figure.inTime) await follow(figure);
+    else await draw(figure, style);
+    figure.drawn = drawn;
+    performance.mark("figure");
+    await new Promise(resume => setTimeout(resume)); // keep the page responsive
     if (mine !== turn) return; // superseded by a later call
   }
   document.body.dataset.drawn = turn;
