@@ -26,6 +26,12 @@ async function unpack(id, width = 1) {
   return words.buffer;
 }
 
+async function unpackValues(id) { // steps of the bits of float32
+  const bits = new Uint32Array(await unpack(id, 4));
+  for (let k = 1; k < bits.length; k++) bits[k] += bits[k - 1];
+  return new Float32Array(bits.buffer);
+}
+
 async function unpackTimes(id) { // steps in ns -> s
   const t = new Float64Array(await unpack(id, 8));
   let sum = 0;
@@ -36,7 +42,7 @@ const kept = new Map();
 const read = new Promise(resume => addEventListener("DOMContentLoaded", resume)); // the samples follow this script
 async function samples(id) {
   await read;
-  if (!kept.has(id)) kept.set(id, id[0] === "t" ? unpackTimes(id) : unpack(id, 4).then(bytes => new Float32Array(bytes)));
+  if (!kept.has(id)) kept.set(id, id[0] === "t" ? unpackTimes(id) : unpackValues(id));
   return kept.get(id);
 }
 
