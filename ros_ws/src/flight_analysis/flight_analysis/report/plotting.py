@@ -162,6 +162,9 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
     for axes, standoff in ((figure.x, 4), (figure.y, 6)):
         for one in axes:
             one |= {"gridcolor": GRID, "zerolinecolor": ZERO, "title": one.get("title", {}) | {"standoff": standoff}}
+            one |= {"type": one.get("type", "linear")}  # plotly reads the samples of an axis without a type
+    for one in figure.y:
+        one["ticklabeloverflow"] = "allow"  # the margin has room for them: plotly does not measure each
     figure.layout |= {
         "height": above + rows + below,
         "font": {"family": "system-ui, sans-serif", "size": 12, "color": INK},
