@@ -48,12 +48,6 @@ def velocity(
     return forward * north - right * east, forward * east + right * north, climb
 
 
-def psi_dot(phi: Scalar, theta: Scalar, q: Scalar, r: Scalar) -> Scalar:
-    """Rate of the heading, rad/s: (q sin(phi) + r cos(phi)) / cos(theta). Source: Stevens, Lewis, eq. (1.3-22)."""
-    xp = array_namespace(phi)
-    return (q * xp.sin(phi) + r * xp.cos(phi)) / xp.cos(theta)
-
-
 def over_ground(pose: FloatArray, t: float, wind: Sequence[float]) -> FloatArray:
     """A pose relative to the air mass as that over ground after t s of a steady wind (m/s to the north, to the east)."""
     moved = pose.copy()

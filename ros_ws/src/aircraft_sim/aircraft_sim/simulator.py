@@ -14,6 +14,7 @@ from aircraft_sim import plant, pose, sensors, truth
 from aircraft_sim.dynamics import Forcing
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.sensors import DelayLine
+from flight_core.kinematics import heading_rate
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
 from flight_core.rates import divide, period_ns, seconds
@@ -102,7 +103,7 @@ class StateSpaceModel:
     def _heading_rate(self, states: Sequence[float]) -> float:
         """psi_dot in rad/s from the POSE_STATES; r with the linear kinematics."""
         *_, phi, theta, q, r = states
-        return pose.psi_dot(phi, theta, q, r) if self._euler else r
+        return heading_rate(phi, theta, q, r) if self._euler else r
 
     def _air_velocity(self, states: Sequence[float]) -> tuple[float, float, float]:
         """Velocity relative to the air mass: north, east, up, m/s."""

@@ -20,6 +20,7 @@ from aircraft_sim.simulator import POSE_STATES
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import CAPTURE_TIME
 from flight_campaign.benchmark_course import ENGAGE, HOLD, STEP, Course, Segments
+from flight_core.kinematics import heading_rate
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import divide, period_ns, seconds
 from flight_core.vectors import Array, FloatArray
@@ -79,6 +80,7 @@ class MissionState(NamedTuple):
     u_m: Array  # (m, N)
     alpha: Array  # (N,) as in GuidanceState
     alpha_trim: Array
+    slip: Array
     climb_c: Array
     V_c: Array
     leg: Array
@@ -181,6 +183,7 @@ def initial_state(count: int, late: int, mission: Mission) -> MissionState:
         none,
         none,
         none,
+        none,
         jnp.zeros(count, dtype=np.int64),
         none,
         jnp.zeros((3, count)),
@@ -222,7 +225,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
         origin = (leg.origin[0], leg.origin[1])
         line, circle = path.line_error(origin, leg.track, position), path.circle_error(origin, leg.radius, position)
         error = PathError(*(jnp.where(leg.is_line, one, other) for one, other in zip(line, circle, strict=True)))
-        wanted = modes.follow(error, leg.entry, partial(entered, leg, following), pose, speed, params)
+        wanted = modes.follow(error, leg.entry, partial(entered, leg, following), before.slip, pose, speed, params)
         target = Target(altitude=leg.altitude, V=leg.V)
         flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.ALTITUDE, target=target)
         after, _ = modes.command(flies, pose, y_of, wanted, seconds(params.period_ns), params)
@@ -231,6 +234,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             u_m=jnp.stack(after.u_m),
             alpha=after.alpha,
             alpha_trim=after.alpha_trim,
+            slip=after.slip,
             climb_c=after.climb_c,
             V_c=after.V_c,
             leg=number,
@@ -248,6 +252,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
         before = modes.holding(0, pose, speed, params)._replace(
             alpha=state.alpha,
             alpha_trim=state.alpha_trim,
+            slip=state.slip,
             climb_c=state.climb_c,
             V_c=state.V_c,
             u_m=tuple(state.u_m),
@@ -260,7 +265,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
 def advance(state: MissionState, x: Array, mission: Mission) -> MissionState:
     """The state a tick later, from x then: reference model, and pose by the trapezoidal rule."""
     V, alpha, beta, phi, theta, q, r = _states(x, mission)
-    half, psi_dot = mission.period / 2.0, pose_model.psi_dot(phi, theta, q, r)
+    half, psi_dot = mission.period / 2.0, heading_rate(phi, theta, q, r)
     psi = state.psi + half * (state.psi_dot + psi_dot)
     velocity = jnp.stack(pose_model.velocity(mission.speed + V, alpha, beta, phi, theta, psi))
     return state._replace(

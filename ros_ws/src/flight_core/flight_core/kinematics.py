@@ -22,6 +22,12 @@ def euler_rates(phi: Scalar, theta: Scalar, p: Scalar, q: Scalar, r: Scalar) -> 
     return p + xp.tan(tilt(theta)) * turn, q * xp.cos(phi) - r * xp.sin(phi)
 
 
+def heading_rate(phi: Scalar, theta: Scalar, q: Scalar, r: Scalar) -> Scalar:
+    """Rate of the heading, rad/s: psi_dot = (q sin(phi) + r cos(phi)) / cos(theta). Source: Stevens, Lewis, eq. (1.3-22)."""
+    xp = array_namespace(phi)
+    return (q * xp.sin(phi) + r * xp.cos(phi)) / xp.cos(tilt(theta))
+
+
 def turn_rate(phi: Scalar, theta: Scalar, theta_dot: Scalar, speed: Scalar) -> Scalar:
     """R of a coordinated turn: psi_dot cos(phi) cos(theta) - theta_dot sin(phi), psi_dot = g tan(phi) / V; speed V in m/s."""
     xp, phi = array_namespace(phi), tilt(phi)

@@ -35,7 +35,7 @@ ATTITUDE = ("phi", "theta")
 """Channels of u_m beside the commands, for its ending: bank, and pitch above that of level flight, rad."""
 
 LIMITED = ("bank", "theta", "climb", "V", "slew")
-STATE = ("phi", "theta", "alpha", "alpha_trim")
+STATE = ("phi", "theta", "alpha", "alpha_trim", "slip")
 
 
 class GuidanceOutput(NamedTuple):
@@ -94,7 +94,7 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
     given = {name: getattr(target, name) for k, name in enumerate(TARGETS) if mask >> k & 1}
     begin, age_ns = Begin(int(logged["begin"])), nanoseconds(logged["age.pose"])
     inputs = Inputs(t_ns, begin, group("pose", POSE), age_ns, group("y", outputs), given)
-    phi, theta, alpha, alpha_trim = group("state", STATE)
+    phi, theta, alpha, alpha_trim, slip = group("state", STATE)
     state = GuidanceState(
         t_ns,
         Mode(int(logged["mode"])),
@@ -106,6 +106,7 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
         theta,
         alpha,
         alpha_trim,
+        slip,
         logged["climb_c"],
         logged["V_c"],
         group("u_m", outputs),

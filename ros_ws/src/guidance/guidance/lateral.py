@@ -53,6 +53,18 @@ def path_acceleration(error: PathError, course: Scalar, ground_speed: Scalar, pa
     return feedback + xp.sin(look_ahead) ** 2 * bend * ground_speed**2 * xp.cos(course - track)
 
 
+def slip_estimate(slip: Scalar, missing: Scalar, rolling: Scalar, dt: float, time: float) -> Scalar:
+    """Low-pass of what a sideslip takes from the turn of a bank, a step later; `missing` = g tan(phi) - V psi_dot, m/s^2.
+
+        slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (missing - slip)
+
+    `rolling` is abs(p) / p_max: the turn lags the bank by the reference model of r, so that a roll looks like a sideslip.
+    Added to the acceleration that a path needs, the estimate keeps an aircraft on an arc whose turn is not coordinated.
+    """
+    steady = array_namespace(slip).maximum(1.0 - rolling / 0.2, 0.0)
+    return slip + (1.0 - math.exp(-dt / time)) * steady * (missing - slip)
+
+
 def bank_for(acceleration: Scalar, path_angle: Scalar, limit: float) -> Scalar:
     """Bank of a coordinated turn, rad: atan(a / (g cos(gamma))) within +-limit."""
     xp = array_namespace(acceleration)

@@ -14,13 +14,13 @@ from functools import partial, reduce
 from operator import or_
 from typing import Any, NamedTuple
 
-from flight_core.kinematics import clip, euler_rates
+from flight_core.kinematics import clip, euler_rates, heading_rate, tilt
 from flight_core.rates import seconds
 from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, Scalar, array_namespace
 from guidance import path, protection
 from guidance.attitude import AttitudeParams, BodyRates, body_rates
-from guidance.lateral import PathError, PathParams, bank_for, course_acceleration, path_acceleration
+from guidance.lateral import PathError, PathParams, bank_for, course_acceleration, path_acceleration, slip_estimate
 from guidance.path import Arc, Leg, Point, Route
 from guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
 
@@ -147,6 +147,7 @@ class GuidanceState(NamedTuple):
     theta: float
     alpha: float  # estimated angle of attack, rad
     alpha_trim: float  # the same at the start
+    slip: float  # what a sideslip takes from a turn, m/s^2
     climb_c: float  # m/s
     V_c: float  # m/s
     u_m: tuple[float, ...]
@@ -214,6 +215,7 @@ def holding(t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: Guidan
         pose["theta"],
         alpha,
         array_namespace(alpha).maximum(alpha, 0.0),
+        0.0 * speed,
         pose["climb"],
         speed,
         (0.0,) * len(params.outputs),
@@ -280,7 +282,11 @@ def command(
     speed, limits, flies = true_airspeed(y["V"], params), params.limits, state.mode is Mode.ENGAGED
     if flies:
         alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
-        state = state._replace(alpha=alpha)
+        turn = heading_rate(state.phi, state.theta, y["q"], y["r"])
+        missing = GRAVITY * array_namespace(speed).tan(tilt(state.phi)) - speed * turn
+        rolling = abs(y["p"]) / params.attitude.roll_rate
+        slip = slip_estimate(state.slip, missing, rolling, dt, params.vertical.alpha_time)
+        state = state._replace(alpha=alpha, slip=slip)
 
     xp = array_namespace(speed)
     bank = protection.bank_limit(limits.bank, limits.stall_speed, speed)
@@ -383,7 +389,7 @@ def _bank(
     position = (pose["north"], pose["east"])
     error = path.error(leg, position)
     entry = error.curvature if following is None else path.error(following, leg.end or (0.0, 0.0)).curvature
-    wanted = follow(error, entry, partial(path.entered, leg, following), pose, speed, params)
+    wanted = follow(error, entry, partial(path.entered, leg, following), state.slip, pose, speed, params)
     return wanted, error.e, path.to_go(leg, position)
 
 
@@ -398,6 +404,7 @@ def follow(
     error: PathError,
     entry: Scalar,
     entered: Callable[[Point], Any],
+    slip: Scalar,
     pose: Mapping[str, Scalar],
     speed: Scalar,
     params: GuidanceParams,
@@ -414,7 +421,8 @@ def follow(
     lag = abs(change) / (2.0 * params.attitude.roll_rate) + 0.5 / params.attitude.k_phi
     ahead = (pose["north"] + lag * pose["v_north"], pose["east"] + lag * pose["v_east"])
     error = error._replace(curvature=xp.where(entered(ahead), entry, error.curvature))
-    return bank_for(path_acceleration(error, course, ground_speed, params.path), path_angle(pose["climb"], speed), STEEPEST)
+    acceleration = path_acceleration(error, course, ground_speed, params.path) + slip
+    return bank_for(acceleration, path_angle(pose["climb"], speed), STEEPEST)
 
 
 def _climb(
