@@ -150,11 +150,13 @@ HEIGHTS = {"q": PULSE_Q, "V": PULSE_V, "p": PULSE_P, "r": PULSE_Q}  # also the u
 NATURAL_FREQUENCY = {"q": 4.0, "V": 1.2, "p": 5.0, "r": 4.0}  # rad/s, as in osprey_gust
 DAMPING = {"q": 0.9, "V": 1.0, "p": 0.9, "r": 0.9}
 AUTHORITY_FRACTION = 1.0 / 3.0  # of the throttle's authority for the commanded V; the rest is for climbs, turns and gusts
+FASTEST_V = 0.46  # rad, bandwidth of V times the lag of its loop: it costs 26 degrees of phase, for an engine is no lag alone
 DURATION = 60.0  # s
 GUST_SPEED, GUST_LENGTH = 5.0, 30.48  # m/s down, and m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
 GUST_START = 50.0  # s
 TURN, CLIMB = math.pi / 2.0, 100.0  # rad, m: the targets of guidance in place of the pulses
 TURN_START, CLIMB_START = 2.0, 30.0  # s
+LIGHT_SIGMA = 1.52  # m/s, of light turbulence at high altitude: 5 ft/s, MIL-F-8785C 3.7.2
 MODERATE_WIND, MODERATE_SIGMA = 15.4, 3.05  # m/s, of moderate turbulence: 30 kt at 20 ft, MIL-F-8785C 3.7.3.4; 10 ft/s
 
 
@@ -253,11 +255,12 @@ def identify(
 
     1. Trim, first in another process. 2. Step tests: `step_responses`. 3. The pairing, with outputs in units of the manoeuvre,
     and D from the minors. 4. Gains by the engineering procedure for y_dot = Omega u behind the lags; all other terms count as
-    f. 5. A simulation in moderate turbulence with K and Lambda alone: the slew of its u replaces that of the ideal control,
-    and gives beta. With `observer_margin`, the delay margin in s of the loop on y_dot = Omega u, an extended-state observer and
-    the gains beside it replace them. 6. Simulations of the result: in calm air, with a gust, in turbulence. With `guided` the
-    scenario has guidance by rule in place of the pulses: a turn by 90 degrees and a climb by 100 m. Its stall speed is that
-    of `slowest_trim`, and its sideslip feedback flies an aircraft whose `sideslip_zero` is positive, too.
+    f. 5. A simulation in moderate turbulence with K and Lambda alone: the slew of its u replaces that of the ideal control
+    and gives beta; that of V is K Lambda times the rms of light turbulence. With `observer_margin`, the delay margin in s of
+    the loop on y_dot = Omega u, an extended-state observer and the gains beside it replace them. 6. Simulations of the result:
+    in calm air, with a gust, in turbulence. With `guided` the scenario has guidance by rule in place of the pulses: a turn by
+    90 degrees and a climb by 100 m. Its stall speed is that of `slowest_trim`, and its sideslip feedback flies an aircraft
+    whose `sideslip_zero` is positive, too.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its outputs and inputs cannot be
     paired, or if the speed is below guidance's speed floor.
@@ -283,7 +286,8 @@ def identify(
     scaled = measured.Omega / np.array([HEIGHTS[name] for name in outputs])[:, None]
     gain_selection.require_channels(scaled, ChannelPairing(outputs, inputs))
     studied = _study(condition, measured.Omega, commands)
-    setting = _setting(trim, measured.lag)
+    V_bandwidth = airspeed_bandwidth(float(authority), float(measured.lag[throttle]))
+    setting = _setting(trim, measured.lag, V_bandwidth)
 
     def scenario_text(selection: Selection) -> str:
         return _text(condition, trim, measured, commands, selection, stall)
@@ -292,7 +296,11 @@ def identify(
     first = gain_selection.select_gains(studied, setting)
     turbulent = _load(scenario_text(first)).vary(aircraft={"turbulence": moderate_turbulence(altitude)})
     tape = simulate(without_beta(turbulent))
-    chosen = gain_selection.select_gains(studied._replace(slew=_slew(tape, measured.lag)), setting)
+    slew = _slew(tape, measured.lag)
+    # V holds the wind itself: beta = K Lambda sigma, so that the sign moves the throttle no faster than Lambda does
+    sign = V_bandwidth**2 / 4.0 * LIGHT_SIGMA  # m/s^3
+    slew[throttle] = sign / (gain_selection.BETA_TO_SLEW * abs(measured.Omega[throttle, throttle]))
+    chosen = gain_selection.select_gains(studied._replace(slew=slew), setting)
     if observer_margin is not None:
         chosen = _with_observer(chosen, measured.Omega, observer_margin)
     text = scenario_text(chosen)
@@ -373,7 +381,16 @@ def _study(condition: FlightCondition, Omega: FloatArray, commands: Mapping[str,
     return gain_selection.study_airframe(airframe, manoeuvre, samples=SAMPLES)
 
 
-def _setting(trim: Trim, lag: FloatArray) -> LoopSetting:
+def airspeed_bandwidth(authority: float, lag: float) -> float:
+    """Bandwidth of V, rad/s, for an authority of the throttle (m/s^2) behind its lag (s): min(0.46 / total, authority / sigma).
+
+    The airspeed holds the wind along the path itself. In moderate turbulence, sigma = 3.05 m/s rms, the throttle then moves
+    by its authority rms; with more it goes from stop to stop, and V is off by twice the wind (737).
+    """
+    return min(FASTEST_V / float(total_lag(np.array(lag), DELAY, 1.0 / CONTROL_RATE)), authority / MODERATE_SIGMA)
+
+
+def _setting(trim: Trim, lag: FloatArray, V_bandwidth: float) -> LoopSetting:
     """The loop that the gains are selected for. The parameters to be selected are 1."""
     inputs = list(INPUTS)
     ones = [1.0] * len(inputs)
@@ -384,7 +401,11 @@ def _setting(trim: Trim, lag: FloatArray) -> LoopSetting:
         | {"max_age": 0.1, "hold": 0.5, "ramp": 2.0, "lower": trim.lower.tolist(), "upper": trim.upper.tolist()},
         "controller",
     )
-    return LoopSetting(base, CONTROL_RATE, dict(zip(inputs, lag.tolist(), strict=True)), DELAY, {})
+    total = total_lag(lag, DELAY, 1.0 / CONTROL_RATE)
+    products = {**gain_selection.CROSSOVER_LAG_PRODUCTS, "V": V_bandwidth * float(total[inputs.index("throttle")])}
+    return LoopSetting(
+        base, CONTROL_RATE, dict(zip(inputs, lag.tolist(), strict=True)), DELAY, {}, crossover_lag_products=products
+    )
 
 
 def _slew(tape: Tape, lag: FloatArray) -> FloatArray:
@@ -455,6 +476,7 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
 {% endif %}
 
 # Omega and the lags are those of step tests; the slew behind beta is that of u with K and Lambda alone in moderate turbulence.
+# beta of V is K Lambda times the rms of a light one, for V holds the wind itself: more drives the throttle from stop to stop.
 {{ controller }}
 {% if guided %}
 /**/guidance:                  # what is left out follows by rule: docs/guidance.md
