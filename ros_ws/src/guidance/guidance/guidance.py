@@ -65,12 +65,12 @@ def u_m(state: GuidanceState) -> FloatArray:
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
 
 
-def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: Route | None) -> FloatArray:
-    """A sample of the log, in the order of `names`: inputs, state after the step, commands."""
+def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int) -> FloatArray:
+    """A sample of the log, in the order of `names`: inputs, state after the step, commands. `route`: its `digest`."""
     given = sum(1 << k for k, name in enumerate(TARGETS) if name in inputs.given)
     return np.array(
         [
-            *(state.mode, state.lateral, state.vertical, state.leg, digest(route), commands.xtrack, commands.to_go),
+            *(state.mode, state.lateral, state.vertical, state.leg, route, commands.xtrack, commands.to_go),
             *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
             *(getattr(commands, f"{name}_limited") for name in LIMITED),
             *(seconds(inputs.pose_age_ns), inputs.begin, given),
@@ -127,6 +127,7 @@ class Guidance:
         self.period_ns, self.names = self._params.period_ns, names(parameters.outputs)
         waypoints = parameters.waypoints()
         self.route = parameters.plan(waypoints) if waypoints else None
+        self._digest = digest(self.route)
         self._program = deque((nanoseconds(start), target) for start, target in parameters.program_steps())
         self._pose: StampedVector | None = None
         self._y: StampedVector | None = None
@@ -180,7 +181,7 @@ class Guidance:
 
     def take_route(self, route: Route) -> None:
         """Fly a route from its first leg on. Commands given before it and not taken by a step yet are void."""
-        self.route, self._given = route, {}
+        self.route, self._digest, self._given = route, digest(route), {}
         self.take_target({"leg": 0.0})
 
     def hold(self) -> bool:
@@ -245,4 +246,4 @@ class Guidance:
         inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given)
         self._begin, self._given = Begin.NO, {}
         self._state, commands = modes.step(self._state, inputs, self.route, self._params)
-        return GuidanceOutput(u_m(self._state), row(inputs, self._state, commands, self.route))
+        return GuidanceOutput(u_m(self._state), row(inputs, self._state, commands, self._digest))

@@ -69,7 +69,7 @@ def replay_guidance(tape: Tape, parameters: GuidanceParameters | None) -> Guidan
             state, commands = modes.step(previous, inputs, legs[flown], params)
             both = (
                 np.append(row, published.get(stamp_ns, guidance.u_m(recorded))),
-                np.append(guidance.row(inputs, state, commands, legs[flown]), guidance.u_m(state)),
+                np.append(guidance.row(inputs, state, commands, flown), guidance.u_m(state)),
             )
             columns = np.flatnonzero(both[0].view(np.int64) != both[1].view(np.int64))
             if len(columns):
