@@ -299,10 +299,12 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
     """Ticks of flights, for half of the time without and with a watching client: missed, and late p99 in s.
 
     The client is there in the middle of each flight. So the phases of the nodes' timers, which differ from flight to flight,
-    are the same for both, and a drift of the host cancels. The start and the end of the server count as its own.
+    are the same for both, and a drift of the host cancels. The start of the server, until a client has all of the flight so
+    far, has its own figures: its processor time is that of any program that starts.
     """
     period_ns = nanoseconds(1.0 / find_scenario(SCENARIO).controller.rate)
-    found: dict[str, list[dict[str, float]]] = {"without": [], "with": []}
+    found: dict[str, list[dict[str, float]]] = {"without": [], "start": [], "with": []}
+    starting: list[float] = []  # s
     for _ in range(count):
         with (
             tempfile.TemporaryDirectory() as folder,
@@ -311,23 +313,33 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
         ):
             time.sleep(BEGUN)
             begin = time.time_ns()
-            joins, leaves, end = (begin + nanoseconds(seconds) * k // 4 for k in (1, 3, 4))
+            leaves, end = (begin + nanoseconds(seconds) * k // 4 for k in (3, 4))
             time.sleep(seconds / 4.0)
+            starts = time.time_ns()
             with watching(run) as (_, address):
                 client = Client(address)
+                while client.news()["state"] != "recording":
+                    time.sleep(1.0 / POLLS)
+                joins = time.time_ns()
                 client.start()
-                time.sleep((leaves - time.time_ns()) / NANOSECONDS)
+                time.sleep((leaves - joins) / NANOSECONDS)
                 client.stop()
+            gone = time.time_ns()
             flight.communicate()
             clock = time.time_ns() - time.monotonic_ns()
             host_delays = [(since + clock, until + clock) for since, until in delays()] if delays else None
             internals = read_run(run).tape["internals"]
-        for kind, windows in {"without": [(begin, joins), (leaves, end)], "with": [(joins, leaves)]}.items():
+        for kind, windows in {
+            "without": [(begin, starts), (gone, end)],
+            "start": [(starts, joins)],
+            "with": [(joins, leaves)],
+        }.items():
             found[kind].append(figures_of_ticks(internals.within(windows), host_delays, period_ns))
+        starting.append((joins - starts) / NANOSECONDS)
     names = found["with"][0]
     shown: dict[str, Any] = {kind: {name: [one[name] for one in figures] for name in names} for kind, figures in found.items()}
     more = {name: np.subtract(shown["with"][name], shown["without"][name]) for name in names}
-    shown |= {"more": {name: float(np.median(values)) for name, values in more.items()}}
+    shown |= {"more": {name: float(np.median(values)) for name, values in more.items()}, "starting": starting}
     return shown | {"probability": {name: probability(values) for name, values in more.items()}}
 
 

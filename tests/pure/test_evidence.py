@@ -62,7 +62,14 @@ VIEW: dict[str, Any] = {"live": BESIDE, "live with a browser": {"to the screen":
 VIEW |= {"frozen": {"frozen": 10.0, "recovered after": 0.4}}
 VIEW |= {"opened": {"flight": 3600.0, "first samples": 0.4, "whole log": 5.0, "processor": 4.6, "memory": 157.0, "log": 626.0}}
 VIEW |= {
-    "flights": {"without": PAIRS, "with": PAIRS, "more": dict.fromkeys(PAIRS, 0.05), "probability": dict.fromkeys(PAIRS, 0.5)}
+    "flights": {
+        "without": PAIRS,
+        "start": PAIRS,
+        "with": PAIRS,
+        "starting": [1.25, 1.5],
+        "more": dict.fromkeys(PAIRS, 0.05),
+        "probability": dict.fromkeys(PAIRS, 0.5),
+    }
 }
 FLEET = {"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}
 RESULTS = {
@@ -211,6 +218,8 @@ def test_missed_ticks_of_a_watched_flight_are_told_from_chance(probability: floa
     flights = VIEW["flights"] | {"probability": dict.fromkeys(PAIRS, probability)}
     text = page(view=result("view", VIEW | {"flights": flights}))
     assert f"beyond chance (3 with a client, 3 without): probability at least 0.05. Measured: {verdict}" in text
+    assert "| start of the server | 3, 0 | 0.5, 1.23 |" in text  # its ticks are none with a client
+    assert "- The start of the server takes 1.25 to 1.5 s." in text
 
 
 def test_a_busy_host_is_marked_only_for_timed_measurements() -> None:
