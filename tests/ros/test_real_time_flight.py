@@ -38,6 +38,9 @@ def short_scenario(osprey_gust: Scenario, tmp_path: Path) -> Path:
     return path
 
 
+RATES = {"/y": 500, "/y_m": 500, "/truth": 500, "/u": 100, "/internals": 100}  # Hz
+
+
 def rms(error: FloatArray) -> FloatArray:
     figures: FloatArray = np.sqrt(np.mean(error**2, axis=0))
     return figures
@@ -48,7 +51,7 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
 ) -> None:
     scenario = load_scenario(short_scenario)
     bound = 1.5 * rms(tracking_error(simulate(scenario)).values)
-    # The bound is for the loop, not for the host. A flight is repeated when host scheduling delays made the controller late by
+    # The bounds are for the loop, not for the host. A flight is repeated when host delays made the controller late by
     # more than a quarter of its period, or the aircraft or the reference model by more than a sample.
     for _ in range(4):
         start("flight_cli.cli", "fly", str(short_scenario)).succeed()
@@ -59,15 +62,15 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
         delayed = bool(ticks["late_max"] >= 0.0025 or ticks["without_new_y"] > 1 or gap > 4_000_000)
         errors = rms(tracking_error(tape).values)
         accurate = bool((errors <= bound).all())
-        if accurate or not delayed:
+        with AnyReader([run]) as reader:
+            counts = {connection.topic: connection.msgcount for connection in reader.connections}
+            connection, _, raw = next(reader.messages([c for c in reader.connections if c.topic == "/internals"]))
+            internals: Any = reader.deserialize(raw, connection.msgtype)
+        # 500 Hz and 100 Hz for 12 s and some tenths at the end; a few ticks may be missing at the start
+        missing = [topic for topic, rate in RATES.items() if not rate * DURATION * 0.98 <= counts[topic]]
+        if (accurate and not missing) or not delayed:
             break
-    with AnyReader([run]) as reader:
-        counts = {connection.topic: connection.msgcount for connection in reader.connections}
-        connection, _, raw = next(reader.messages([c for c in reader.connections if c.topic == "/internals"]))
-        internals: Any = reader.deserialize(raw, connection.msgtype)
-    # 500 Hz and 100 Hz for 12 s and some tenths at the end; a few ticks may be missing at the start
-    for topic, rate in (("/y", 500), ("/y_m", 500), ("/truth", 500), ("/u", 100), ("/internals", 100)):
-        assert rate * DURATION * 0.98 <= counts[topic] <= rate * (DURATION + 2.0), topic
+    assert all(counts[topic] <= rate * (DURATION + 2.0) for topic, rate in RATES.items()), counts
     assert counts["/diagnostics"] >= 4 * (DURATION - 1)
     assert internals.name[:2] == ["mode", "dt"]
     assert internals.header.frame_id.startswith("/controller#")
@@ -75,6 +78,7 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
     assert delayed or np.diff(tape["y"].stamp_ns).max() <= 20_000_000
     # u carries the stamp of the y from which it was computed
     assert set(tape["u"].stamp_ns.tolist()) <= set(tape["y"].stamp_ns.tolist())
-    if delayed and not accurate:
+    if delayed and (missing or not accurate):
         pytest.skip("host scheduling delayed a node in four flights of four")
+    assert not missing, counts
     assert accurate, f"{errors} over topics, at most {bound}"
