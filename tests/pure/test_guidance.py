@@ -176,7 +176,7 @@ def offset_from_a_circle(*, estimated: bool) -> float:
         phi = bank_for(path_acceleration(error, course, speed, params) + slip, 0.0, 1.0)
         course_dot = 0.9 * GRAVITY * math.tan(phi) / speed
         if estimated:
-            slip = slip_estimate(slip, GRAVITY * math.tan(phi) - speed * course_dot, 0.0, dt, 2.0)
+            slip = slip_estimate(slip, GRAVITY * math.tan(phi), speed * course_dot, 0.0, dt, 2.0)
         middle = course + dt * course_dot / 2.0
         north, east = north + dt * speed * math.cos(middle), east + dt * speed * math.sin(middle)
         course += dt * course_dot
@@ -190,8 +190,17 @@ def test_an_aircraft_that_slips_flies_on_its_circle() -> None:
 
 
 def test_a_roll_in_which_the_turn_lags_the_bank_is_no_sideslip() -> None:
-    assert slip_estimate(0.5, 4.0, 0.2, 0.02, 2.0) == 0.5
-    assert slip_estimate(0.5, 4.0, 0.1, 0.02, 2.0) == pytest.approx(0.5 + 0.5 * 3.5 * (1.0 - math.exp(-0.01)), rel=1e-12)
+    assert slip_estimate(0.5, 4.0, 0.0, 0.2, 0.02, 2.0) == 0.5
+    assert slip_estimate(0.5, 4.0, 0.0, 0.1, 0.02, 2.0) == pytest.approx(0.5 + 0.5 * 3.5 * (1.0 - math.exp(-0.01)), rel=1e-12)
+
+
+def test_a_gyro_with_a_bias_is_no_sideslip_of_a_straight_flight() -> None:
+    # r reads 1 mrad/s too much at 154 m/s: unbounded, 0.15 m/s^2 would hold the aircraft 6.5 m beside a leg.
+    slip = 0.0
+    for _ in range(1000):
+        slip = slip_estimate(slip, 0.0, 0.154, 0.0, 0.02, 2.0)
+    assert slip == 0.0
+    assert slip_estimate(1.0, -2.0, -1.0, 0.0, 0.02, 2.0) == pytest.approx(0.4)  # a fifth of the turn of a bank to the left
 
 
 def test_the_error_of_a_line_is_positive_to_its_right() -> None:

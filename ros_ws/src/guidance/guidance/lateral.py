@@ -9,6 +9,9 @@ from flight_core.kinematics import clip
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
 
+# Largest share of a turn that a sideslip takes; the f16 of JSBSim in an orbit, its rudder at its stop: 0.09.
+LARGEST_SLIP = 0.2
+
 
 class PathError(NamedTuple):
     """Where the aircraft is beside a path."""
@@ -53,16 +56,17 @@ def path_acceleration(error: PathError, course: Scalar, ground_speed: Scalar, pa
     return feedback + xp.sin(look_ahead) ** 2 * bend * ground_speed**2 * xp.cos(course - track)
 
 
-def slip_estimate(slip: Scalar, missing: Scalar, rolling: Scalar, dt: float, time: float) -> Scalar:
-    """Low-pass of what a sideslip takes from the turn of a bank, a step later; `missing` = g tan(phi) - V psi_dot, m/s^2.
+def slip_estimate(slip: Scalar, turn: Scalar, flown: Scalar, rolling: Scalar, dt: float, time: float) -> Scalar:
+    """What a sideslip takes from the turn of a bank, a step later, m/s^2; `turn` = g tan(phi), `flown` = V psi_dot:
 
-        slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (missing - slip)
+        slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (turn - flown - slip) within +-LARGEST_SLIP abs(turn)
 
     `rolling` is abs(p) / p_max: the turn lags the bank by the reference model of r, so that a roll looks like a sideslip.
+    A bias of the gyro of r looks like one too; the bound keeps it out of a straight flight, whose turn is none to take from.
     Added to the acceleration that a path needs, the estimate keeps an aircraft on an arc whose turn is not coordinated.
-    """
+    """  # noqa: D400, D415 - what follows is an equation
     steady = array_namespace(slip).maximum(1.0 - rolling / 0.2, 0.0)
-    return slip + (1.0 - math.exp(-dt / time)) * steady * (missing - slip)
+    return clip(slip + (1.0 - math.exp(-dt / time)) * steady * (turn - flown - slip), LARGEST_SLIP * abs(turn))
 
 
 def bank_for(acceleration: Scalar, path_angle: Scalar, limit: float) -> Scalar:

@@ -282,10 +282,10 @@ def command(
     speed, limits, flies = true_airspeed(y["V"], params), params.limits, state.mode is Mode.ENGAGED
     if flies:
         alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
-        turn = heading_rate(state.phi, state.theta, y["q"], y["r"])
-        missing = GRAVITY * array_namespace(speed).tan(tilt(state.phi)) - speed * turn
+        turn = GRAVITY * array_namespace(speed).tan(tilt(state.phi))
+        flown = speed * heading_rate(state.phi, state.theta, y["q"], y["r"])
         rolling = abs(y["p"]) / params.attitude.roll_rate
-        slip = slip_estimate(state.slip, missing, rolling, dt, params.vertical.alpha_time)
+        slip = slip_estimate(state.slip, turn, flown, rolling, dt, params.vertical.alpha_time)
         state = state._replace(alpha=alpha, slip=slip)
 
     xp = array_namespace(speed)
