@@ -64,11 +64,13 @@ VIEW |= {"opened": {"flight": 3600.0, "first samples": 0.4, "whole log": 5.0, "p
 VIEW |= {
     "flights": {
         "without": PAIRS,
-        "start": PAIRS,
         "with": PAIRS,
+        "start included": PAIRS,
         "starting": [1.25, 1.5],
-        "more": dict.fromkeys(PAIRS, 0.05),
-        "probability": dict.fromkeys(PAIRS, 0.5),
+        "more with": dict.fromkeys(PAIRS, 0.05),
+        "more start included": dict.fromkeys(PAIRS, 0.15),
+        "probability with": dict.fromkeys(PAIRS, 0.5),
+        "probability start included": dict.fromkeys(PAIRS, 0.5),
     }
 }
 FLEET = {"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}
@@ -215,10 +217,11 @@ def test_the_page_of_a_flight_has_the_limit_of_its_fault(case: str, limit: str) 
 
 @pytest.mark.parametrize(("probability", "verdict"), [(0.05, "0.05, met."), (0.04, "0.04, **not met**.")])
 def test_missed_ticks_of_a_watched_flight_are_told_from_chance(probability: float, verdict: str) -> None:
-    flights = VIEW["flights"] | {"probability": dict.fromkeys(PAIRS, probability)}
+    flights = VIEW["flights"] | {"probability with": dict.fromkeys(PAIRS, probability)}
     text = page(view=result("view", VIEW | {"flights": flights}))
-    assert f"beyond chance (3 with a client, 3 without): probability at least 0.05. Measured: {verdict}" in text
-    assert "| start of the server | 3, 0 | 0.5, 1.23 |" in text  # its ticks are none with a client
+    assert f"with a client than without, beyond chance (3 to 3): probability at least 0.05. Measured: {verdict}" in text
+    assert "| with a client, start of the server included | 3, 0 | 0.5, 1.23 |" in text
+    assert "start of the server included within 0.1 ms of that without, median of the differences. Measured: 0.15" in text
     assert "- The start of the server takes 1.25 to 1.5 s." in text
 
 
