@@ -54,6 +54,8 @@ POLLS = 60.0  # Hz: the page asks again once an answer is drawn, a frame later
 FREEZE, RECOVERED = 10.0, 0.3  # s: a page stops for so long, and is back when it is less behind than that
 BEGUN = 3.0  # s, until a flight has begun
 FLIGHT_SECONDS = 60.0  # of each of the flights whose ticks are compared
+TURN = 2.5  # s, with a client and without one in turns: above the second from which a pause is no missed tick
+STARTED = 7.0  # s, for the start of the server, until its client has the flight so far
 RISE_DI = str(Path(sys.executable).parent / "rise-di")
 
 
@@ -123,6 +125,7 @@ class Client(threading.Thread):
         self._loop = asyncio.Runner()
         self._socket = self._loop.run(self._connect(parts.netloc))
         self._ended = threading.Event()
+        self.asks = True
         self._head: dict[str, Any] = {}
         self._rows: dict[str, int] = {}
         self.delays: list[float] = []
@@ -133,11 +136,12 @@ class Client(threading.Thread):
         return await websocket_connect(HTTPRequest(f"ws://{netloc}/news/0", headers=headers))
 
     def run(self) -> None:
-        """Ask until stopped, or until the server ends."""
+        """Ask until stopped, or until the server ends; not while `asks` is off."""
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))  # of this thread: in use the browser is on another host
         while not self._ended.wait(1.0 / POLLS):
             try:
-                self.news()
+                if self.asks:
+                    self.news()
             except EOFError:
                 break
 
@@ -298,41 +302,44 @@ def percentiles(delays: list[float]) -> dict[str, float]:
 def flights(count: int, seconds: float) -> dict[str, Any]:
     """Ticks of flights, for half of the time without and with a watching client: missed, and late p99 in s.
 
-    The client is there in the middle of each flight. So the phases of the nodes' timers, which differ from flight to flight,
-    are the same for both, and a drift of the host cancels. "with" counts from when a client has all of the flight so far,
-    "start included" from the start of the server, whose processor time is that of any program that starts.
+    Client and server stop and go on in turns of TURN. So the phases of the nodes' timers, which differ from flight to flight,
+    are the same for both, and a drift of the host cancels. "start included" counts also the start of the server, whose
+    processor time is that of any program that starts.
     """
     period_ns = nanoseconds(1.0 / find_scenario(SCENARIO).controller.rate)
     found: dict[str, list[dict[str, float]]] = {"without": [], "with": [], "start included": []}
     starting: list[float] = []  # s
-    for _ in range(count):
+    for number in range(count):
+        turns: dict[bool, list[tuple[int, int]]] = {False: [], True: []}  # system time, ns; without and with a client
         with (
             tempfile.TemporaryDirectory() as folder,
             delay_monitors(bool(real_time())) as delays,
-            flying(Path(folder), BEGUN + seconds) as (flight, run),
+            flying(Path(folder), BEGUN + STARTED + seconds) as (flight, run),
         ):
             time.sleep(BEGUN)
-            begin = time.time_ns()
-            leaves, end = (begin + nanoseconds(seconds) * k // 4 for k in (3, 4))
-            time.sleep(seconds / 4.0)
             starts = time.time_ns()
-            with watching(run) as (_, address):
+            with watching(run) as (server, address):
                 client = Client(address)
                 while client.news()["state"] != "recording":
                     time.sleep(1.0 / POLLS)
                 joins = time.time_ns()
                 client.start()
-                time.sleep((leaves - joins) / NANOSECONDS)
+                for turn in range(round(seconds / TURN)):
+                    client.asks = watched = (turn + number) % 2 == 0
+                    (server.resume if watched else server.suspend)()
+                    begin = time.time_ns()
+                    time.sleep(TURN)
+                    turns[watched].append((begin, time.time_ns()))
+                server.resume()
                 client.stop()
-            gone = time.time_ns()
             flight.communicate()
             clock = time.time_ns() - time.monotonic_ns()
             host_delays = [(since + clock, until + clock) for since, until in delays()] if delays else None
             internals = read_run(run).tape["internals"]
         for kind, windows in {
-            "without": [(begin, starts), (gone, end)],
-            "with": [(joins, leaves)],
-            "start included": [(starts, leaves)],
+            "without": turns[False],
+            "with": turns[True],
+            "start included": [(starts, joins), *turns[True]],
         }.items():
             found[kind].append(figures_of_ticks(internals.within(windows), host_delays, period_ns))
         starting.append((joins - starts) / NANOSECONDS)
