@@ -324,13 +324,15 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
                     time.sleep(1.0 / POLLS)
                 joins = time.time_ns()
                 client.start()
-                for turn in range(round(seconds / TURN)):
-                    client.asks = watched = (turn + number) % 2 == 0
-                    (server.resume if watched else server.suspend)()
-                    begin = time.time_ns()
-                    time.sleep(TURN)
-                    turns[watched].append((begin, time.time_ns()))
-                server.resume()
+                try:
+                    for turn in range(round(seconds / TURN)):
+                        client.asks = watched = (turn + number) % 2 == 0
+                        (server.resume if watched else server.suspend)()
+                        begin = time.time_ns()
+                        time.sleep(TURN)
+                        turns[watched].append((begin, time.time_ns()))
+                finally:
+                    server.resume()  # a stopped process would not end
                 client.stop()
             flight.communicate()
             clock = time.time_ns() - time.monotonic_ns()
