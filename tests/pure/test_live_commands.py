@@ -61,6 +61,17 @@ def test_a_command_acts_from_the_step_after_it_and_no_earlier() -> None:
     assert model.sample(11)[0] > 0.0
 
 
+def test_a_bank_is_dead_reckoned_by_the_y_m_that_was_published_where_samples_are_skipped() -> None:
+    model, bank, flown = reference(speed=25.0), math.radians(20.0), 0
+    model.take(0, np.array([0.0, 0.0, 0.35, 0.0]), np.array([bank, 0.0]))
+    p = model.sample(0)[2]
+    # Of the 0.3 s after sample 90 the reference rolls back without a y_m: the law tracks the roll rate of before.
+    for number in [*range(1, 91), *range(150, 2000)]:
+        bank += (number - flown) / RATE * p
+        p, flown = model.sample(number)[2], number
+    assert abs(math.degrees(bank)) < 1.0  # of an aircraft that tracks; 6 deg by the rates that nobody received
+
+
 def test_without_an_attitude_a_command_that_times_out_becomes_zero() -> None:
     model = reference(speed=25.0)
     model.take(0, np.array([0.1, 1.0, 0.2, 0.0]))

@@ -45,7 +45,11 @@ class Reference:
         return "ending" if aged else "live commands"
 
     def sample(self, number: int) -> FloatArray:
-        """y_m at sample `number`, shape (m,), computed in steps of one period."""
+        """y_m at sample `number`, shape (m,), computed in steps of one period.
+
+        The law tracks the last sample until this one: over skipped samples the dead reckoning takes the rates of that one.
+        """
+        tracked: FloatArray = model.output(self._x_m, self._model)
         while self._number < number:
             index = self._number % BLOCK
             if index == 0:
@@ -54,9 +58,7 @@ class Reference:
                 u_m = self._u_m[2 * index : 2 * index + 3].ravel()
             else:
                 u_m = np.tile(self._live_u_m(self._live), 3)
-                self._live = live.dead_reckon(
-                    self._live, model.output(self._x_m, self._model), self.period_ns, self._live_params
-                )
+                self._live = live.dead_reckon(self._live, tracked, self.period_ns, self._live_params)
             self._x_m = model.step(self._x_m, u_m, self._stepper)
             self._number += 1
         y_m: FloatArray = model.output(self._x_m, self._model)
