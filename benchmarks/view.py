@@ -30,6 +30,7 @@ import numpy as np
 import psutil
 from benchmarks.host_delays import Intervals, excluding_delays, missed_excluding_delays
 from benchmarks.processes import delay_monitors, real_time, threads_ns
+from scipy.stats import quantile_test
 from tests.browser import CHROMIUM, Browser
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, WebSocketClosedError, websocket_connect
@@ -350,6 +351,7 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
     for kind in ("with", "start included"):
         more = {name: np.subtract(shown[kind][name], shown["without"][name]) for name in names}
         shown[f"more {kind}"] = {name: float(np.median(values)) for name, values in more.items()}
+        shown[f"interval {kind}"] = {name: interval(values) for name, values in more.items()}
         shown[f"probability {kind}"] = {name: probability(values) for name, values in more.items()}
     return shown | {"starting": starting}
 
@@ -367,6 +369,12 @@ def figures_of_ticks(internals: Signal, delays: Intervals | None, period_ns: int
             late = excluding_delays(np.column_stack((due, at)), known)
             figures["late p99 (ms)" + words] = float(np.percentile(late, 99)) / 1e6
     return figures
+
+
+def interval(differences: FloatArray) -> list[float]:
+    """The 95 % confidence interval of the median, by order statistics: of ten values from the second to the ninth."""
+    ends: list[float] = np.array(quantile_test(differences).confidence_interval(0.95)).tolist()
+    return ends
 
 
 def probability(differences: FloatArray) -> float:

@@ -69,6 +69,8 @@ VIEW |= {
         "starting": [1.25, 1.5],
         "more with": dict.fromkeys(PAIRS, 0.05),
         "more start included": dict.fromkeys(PAIRS, 0.15),
+        "interval with": dict.fromkeys(PAIRS, (-1.5, 2.5)),
+        "interval start included": dict.fromkeys(PAIRS, (-1.5, 2.5)),
         "probability with": dict.fromkeys(PAIRS, 0.5),
         "probability start included": dict.fromkeys(PAIRS, 0.5),
     }
@@ -221,6 +223,7 @@ def test_missed_ticks_of_a_watched_flight_are_told_from_chance(probability: floa
     text = page(view=result("view", VIEW | {"flights": flights}))
     assert f"with a client than without, beyond chance (3 to 3): probability at least 0.05. Measured: {verdict}" in text
     assert "| with a client and the start of its server | 3, 0 | 0.5, 1.23 |" in text
+    assert "| with a client: median of the differences, 95 % interval | 0.05 (-1.5 to 2.5) | " in text
     assert "late p99, with a client and the start of its server within 0.1 ms of that without, " in text
     assert "Measured: 0.15 ms more, **not met**." in text
     assert "- The start of the server takes 1.25 to 1.5 s." in text
