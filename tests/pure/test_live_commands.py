@@ -69,7 +69,7 @@ def test_a_bank_is_dead_reckoned_by_the_y_m_that_was_published_where_samples_are
     for number in [*range(1, 91), *range(150, 2000)]:
         bank += (number - flown) / RATE * p
         p, flown = model.sample(number)[2], number
-    assert abs(math.degrees(bank)) < 1.0  # of an aircraft that tracks; 6 deg by the rates that nobody received
+    assert abs(math.degrees(bank)) < 1.0  # of an aircraft that tracks; 6 deg by the rates of the skipped samples
 
 
 def test_without_an_attitude_a_command_that_times_out_becomes_zero() -> None:
