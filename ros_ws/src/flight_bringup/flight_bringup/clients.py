@@ -21,11 +21,12 @@ from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
+from flight_core.authentication import MessageAuthenticator, read_key
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
 from flight_core.vectors import ChannelError, FloatArray
 from flight_ros import transport
-from flight_ros.messages import Decoder, NamedDecoder, stamp_of, to_message
+from flight_ros.messages import Decoder, Encoder, NamedDecoder, stamp_of
 from flight_ros.player import Player
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import (
@@ -214,7 +215,9 @@ class EngagementClient(_Client):
 class TargetClient(_Client):
     """Commands the guidance of a running flight."""
 
-    def __init__(self, namespace: str = "", parent: _Client | None = None) -> None:
+    def __init__(self, namespace: str = "", parent: _Client | None = None, key_file: str = "") -> None:
+        """`key_file` is that of guidance, empty for a flight without keys. Raises ParameterError for an invalid one."""
+        self._key = read_key(key_file, "--key-file") if key_file else None
         super().__init__("operator", namespace, parent)
         self._guidance, self._decoder = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True), NamedDecoder()
         self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
@@ -235,8 +238,10 @@ class TargetClient(_Client):
 
     def _published(self, values: Mapping[str, float]) -> bool:
         if time.monotonic() - self._sent > TARGET_PERIOD:
-            self._sent, sender = time.monotonic(), self._node.get_fully_qualified_name()
-            self._publisher.publish(to_message(time.time_ns(), [*values], np.array([*values.values()]), sender))
+            self._sent, topic = time.monotonic(), self._publisher.topic_name
+            authenticator = None if self._key is None else MessageAuthenticator(self._key, topic, None)
+            encoder = Encoder([*values], self._node.get_fully_qualified_name(), authenticator)
+            self._publisher.publish(encoder.encode(time.time_ns(), np.array([*values.values()])))
         return all(self._received().get(f"target.{name}") == value for name, value in values.items())
 
     def _received(self) -> dict[str, float]:

@@ -24,6 +24,7 @@ def target(
         ),
     ],
     namespace: Annotated[str, typer.Option(help="Namespace of the aircraft.")] = "",
+    key_file: Annotated[str, typer.Option(metavar="FILE", help="The `key_file` of guidance, where it has one.")] = "",
 ) -> None:
     """Command a running guided flight, as in: rise-di target heading=90 altitude=1300. What is not named stays.
 
@@ -33,7 +34,7 @@ def target(
     require(len(values) == len(commands), "target", "a command twice", "each once")
     from flight_bringup.clients import TargetClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
-    with TargetClient(namespace) as client:
+    with TargetClient(namespace, key_file=key_file) as client:
         refusal = client.send(values)
     if refusal:
         print(f"error: not in force: {refusal}")

@@ -60,6 +60,7 @@ class FlightNode(Node, Generic[P]):
         self.instance = self.get_fully_qualified_name() + process
         key_file = self.parameters.key_file if isinstance(self.parameters, KeyedParameters) else ""
         self._key = read_key(key_file, f"{name}.key_file") if key_file else None
+        self.has_key = self._key is not None
         # Replay protection: samples stamped before the start of this node are rejected. Stamps of a lockstep flight begin at 0.
         self._since_ns = None if self.parameters.lockstep else time.time_ns()
         if self._key is not None:

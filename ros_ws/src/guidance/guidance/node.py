@@ -211,6 +211,9 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
 
     def _take_routes(self) -> None:
         for received in self._route_subscription.take()[-1:]:
+            if self.has_key:
+                self.reject(self._route_subscription, "mac", "a Path has no authentication code, and guidance has a key")
+                continue
             try:
                 message = deserialize_message(received.message, Path)
                 frame = message.header.frame_id
