@@ -21,8 +21,9 @@ from rise_di_controller.params import ControllerParameters
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "parameters.md"
 LEAD = """# Parameters
 
-Every parameter of a scenario file, by section. SI and radians, if nothing else is said. A key that is not here is refused. The
-page is made from the classes that validate a scenario: `python -m tools.parameters`.
+Every parameter of a scenario file, by section, and of the node `bridge`, which has no section: `-p` sets its parameters.
+SI and radians, if nothing else is said. A key that is not here is refused. The page is made from the classes that validate a
+scenario: `python -m tools.parameters`.
 """
 SECTIONS: Mapping[str, type[Parameters]] = {
     "flight": FlightParameters,
