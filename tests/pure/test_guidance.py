@@ -155,6 +155,13 @@ def test_a_line_is_captured_from_far_at_the_capture_angle() -> None:
     assert e.min() > -0.05 * SPEED * FOLLOW.period * FOLLOW.damping  # no limit cycle, small overshoot
 
 
+@pytest.mark.parametrize("away", [180.0, 179.9, -179.0, 170.0])
+def test_on_the_course_opposite_to_a_line_the_aircraft_turns_with_all_it_has(away: float) -> None:
+    full = 4.0 * math.pi * FOLLOW.damping / FOLLOW.period * SPEED
+    turn = path_acceleration(PathError(0.0, 0.0, 0.0), math.radians(away), SPEED, FOLLOW)
+    assert turn == pytest.approx(math.copysign(full, -away), rel=1e-9)  # a sine would leave 0.2 % of it at 179.9 deg
+
+
 @pytest.mark.parametrize("radius", [300.0, -300.0])
 def test_on_a_circle_the_acceleration_is_centripetal_and_drives_an_offset_back(radius: float) -> None:
     orbit = Arc((0.0, 0.0), radius)

@@ -29,10 +29,19 @@ class PathParams(NamedTuple):
     capture: float  # largest angle at which the path is approached, rad
 
 
+def turn_towards(difference: Scalar) -> Scalar:
+    """How far to turn, of at most 1, for a difference of courses: its sine up to 90 deg, +-1 beyond.
+
+    A sine alone would leave an aircraft on the opposite course there.
+    """
+    xp = array_namespace(difference)
+    sine = xp.sin(difference)
+    return xp.where(xp.cos(difference) > 0.0, sine, xp.copysign(1.0, sine))
+
+
 def course_acceleration(course_c: float, course: float, speed: float, k: float) -> float:
-    """A = k V sin(course_c - course), m/s^2; k V from a difference of 90 deg on. Also for a heading."""
-    difference = math.remainder(course_c - course, 2.0 * math.pi)
-    return k * speed * (math.sin(difference) if abs(difference) < math.pi / 2.0 else math.copysign(1.0, difference))
+    """A = k V turn_towards(course_c - course), m/s^2. Also for a heading."""
+    return float(k * speed * turn_towards(math.remainder(course_c - course, 2.0 * math.pi)))
 
 
 def path_acceleration(error: PathError, course: Scalar, ground_speed: Scalar, params: PathParams) -> Scalar:
@@ -40,7 +49,7 @@ def path_acceleration(error: PathError, course: Scalar, ground_speed: Scalar, pa
 
         x       = min(abs(e) / (v_g P zeta), 1),  look-ahead angle l = pi/2 (1 - x)^2
         bearing = track - sign(e) min(pi/2 - l, capture)
-        a       = (4 pi zeta / P) v_g sin(bearing - course) + sin(l)^2 kappa / (1 - kappa e) v_g^2 cos(course - track)
+        a = (4 pi zeta / P) v_g turn_towards(bearing - course) + sin(l)^2 kappa / (1 - kappa e) v_g^2 cos(course - track)
 
     Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The velocity is that over ground, so a wind changes nothing.
     On the inner side of an arc, e is limited to half of its radius.
@@ -51,7 +60,7 @@ def path_acceleration(error: PathError, course: Scalar, ground_speed: Scalar, pa
     x = xp.minimum(abs(e) / (ground_speed * params.period * params.damping), 1.0)
     look_ahead = math.pi / 2.0 * (1.0 - x) ** 2
     bearing = track - xp.copysign(xp.minimum(math.pi / 2.0 - look_ahead, params.capture), e)
-    feedback = 4.0 * math.pi * params.damping / params.period * ground_speed * xp.sin(bearing - course)
+    feedback = 4.0 * math.pi * params.damping / params.period * ground_speed * turn_towards(bearing - course)
     bend = kappa / (1.0 - xp.minimum(kappa * e, 0.5))
     return feedback + xp.sin(look_ahead) ** 2 * bend * ground_speed**2 * xp.cos(course - track)
 
