@@ -203,9 +203,13 @@ def test_the_client_of_a_page_commands_guidance(flight: Flight) -> None:
 
         assert answer(client.send_target, {"phi": 0.2}) == ""
         flight.until(lambda: flight.last("target.phi") == 0.2)
+        # The log has these values already; guidance refuses two lateral commands at once.
+        refused = answer(client.send_target, {"theta": 0.0, "leg": 0.0, "phi": 0.2})
+        assert refused == "guidance did not take them in 3 s; its log says why"
         assert answer(client.skip) == "no route with a further leg is flown"
         assert answer(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0], [900.0, 900.0, 55.0]]) == ""
         flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE)
+        flight.until(lambda: flight.peer.node.count_publishers("route") == 0)  # a later guidance receives no route of before
         leg = flight.last("leg")
         assert answer(client.skip) == ""
         flight.until(lambda: flight.last("leg") > leg)

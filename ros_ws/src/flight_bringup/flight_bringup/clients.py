@@ -16,7 +16,9 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Path
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
@@ -39,7 +41,6 @@ from flight_ros.topics import (
     PUBLISH,
     RECORDED,
     ROUTE,
-    STATE,
     STATES,
     TARGET,
     Y_M,
@@ -47,6 +48,7 @@ from flight_ros.topics import (
     U,
     Y,
 )
+from guidance.modes import TARGETS
 from rise_di_controller.guard import Mode
 
 __all__ = ["ControlClient", "EngagementClient", "FlightMonitor", "Player", "TargetClient"]
@@ -55,6 +57,7 @@ MODES = {float(mode): mode.name for mode in Mode}
 
 SERVICE_TIMEOUT = 10.0  # s
 TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at its ticks
+ROUTE_TIMEOUT = 3.0  # s, in which the middleware of guidance confirms a route
 TARGET_PERIOD = 0.2  # s, between two equal targets
 FIRST_U = 30.0  # s: the nodes of a flight start, and the autopilot may send its first messages late
 AT_REST = 20  # so many equal samples of u in a row: it has reached trim
@@ -221,7 +224,6 @@ class TargetClient(_Client):
         super().__init__("operator", namespace, parent)
         self._guidance, self._decoder = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True), NamedDecoder()
         self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
-        self._in_force: dict[str, float] = {}
         self._sent = -TARGET_PERIOD  # monotonic time of the last target, s
 
     def send(self, values: Mapping[str, float]) -> str:
@@ -242,14 +244,20 @@ class TargetClient(_Client):
             authenticator = None if self._key is None else MessageAuthenticator(self._key, topic, None)
             encoder = Encoder([*values], self._node.get_fully_qualified_name(), authenticator)
             self._publisher.publish(encoder.encode(time.time_ns(), np.array([*values.values()])))
-        return all(self._received().get(f"target.{name}") == value for name, value in values.items())
+        taken = sum(1 << TARGETS.index(name) for name in values)
+        return any(
+            int(sample.get("given", 0.0)) & taken == taken
+            and all(sample.get(f"target.{name}") == value for name, value in values.items())
+            for sample in self._received()
+        )
 
-    def _received(self) -> dict[str, float]:
-        """The channels of the last sample of `guidance`; empty before the first."""
-        for received in self._guidance.take()[-1:]:
+    def _received(self) -> list[dict[str, float]]:
+        """The channels of the samples of `guidance` since the last call."""
+        samples = []
+        for received in self._guidance.take():
             with suppress(ChannelError):
-                self._in_force = self._decoder.decode(received.message).channels
-        return self._in_force
+                samples.append(self._decoder.decode(received.message).channels)
+        return samples
 
 
 class ControlClient(_Client):
@@ -264,7 +272,6 @@ class ControlClient(_Client):
         super().__init__("control", namespace)
         self._targets: TargetClient | None = None
         self._engagement: EngagementClient | None = None
-        self._route = self._node.create_publisher(ROUTE.type, ROUTE.name, STATE)
 
     def nodes(self) -> list[str]:
         """The nodes of the flight that can be commanded and are in the graph."""
@@ -303,10 +310,19 @@ class ControlClient(_Client):
         places = [Point(x=float(east), y=float(north), z=float(altitude)) for north, east, altitude in points]
         route = Path(poses=[PoseStamped(pose=Pose(position=place)) for place in places])
         route.header.frame_id = "map"
-        subscribed = f"{self._route.topic_name}: no subscriber, expected a flight with guidance in this domain"
-        self._spin_until(lambda: bool(self._route.get_subscription_count()), subscribed)
-        self._route.publish(route)
-        return ""
+        publisher = self._node.create_publisher(ROUTE.type, ROUTE.name, PUBLISH)
+        try:
+            subscribed = f"{publisher.topic_name}: no subscriber, expected a flight with guidance in this domain"
+            self._spin_until(lambda: 0 < len(self._subscribers(publisher)) <= publisher.get_subscription_count(), subscribed)
+            publisher.publish(route)
+            received = publisher.wait_for_all_acked(Duration(seconds=ROUTE_TIMEOUT))
+        finally:
+            self._node.destroy_publisher(publisher)  # else guidance that starts later would receive the route, and fly it
+        return "" if received else f"guidance did not confirm its reception in {ROUTE_TIMEOUT:g} s"
+
+    def _subscribers(self, publisher: Publisher) -> list[Any]:
+        """The subscribers of its topic in the graph, of which some may not have discovered it."""
+        return list(self._node.get_subscriptions_info_by_topic(publisher.topic_name))
 
     def hold(self) -> str:
         """Hold heading, altitude and airspeed of now."""
