@@ -232,6 +232,21 @@ def test_names_and_texts_of_a_log_are_bounded_and_printable(tmp_path: Path) -> N
     assert max(map(len, head["topics"][0]["channels"])) <= MAX_TEXT
 
 
+def test_a_pose_is_shown_with_all_channels_that_came_and_one_with_fewer_is_left_out(tmp_path: Path) -> None:
+    names = ["phi", "theta", "psi", "north", "east"]
+    with BagWriter(tmp_path / "run") as bag:
+        pose = bag.add_topic("/pose", JOINT_STATE, "")
+        for k in range(30):  # at 10 Hz. A bridge has no position in the first three, and in one of a stale position
+            known = names[:3] if k < 3 or k == 20 else names
+            bag.write(pose, k * 100_000_000, k * 100_000_000, k, vector(k * 100_000_000, known, [float(k)] * len(known)))
+    flight = Flight(tmp_path / "run")
+    flight.update()
+    head, samples = decoded(answer(flight, {}))
+    assert head["topics"][0]["channels"] == names
+    assert [int(row[0]) for row in samples["pose"][1]] == [*range(3, 20), *range(21, 30)]
+    assert head["faults"] == []
+
+
 def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:
     store: Any = typestore()
     arrays = {f"{kind}_array_value": np.zeros(0) for kind in ("byte", "bool", "integer", "double")}
@@ -267,6 +282,8 @@ def test_a_route_that_is_given_in_flight_replaces_that_of_the_scenario(tmp_path:
         route = bag.add_topic("/route", ROUTE_TYPE, "")
         bag.write(route, 1, 1, 0, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses), ROUTE_TYPE)))
         bag.write(route, 2, 2, 1, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses[:1]), ROUTE_TYPE)))  # cannot be flown
+        odom = header(time(0, 0), "odom")  # a frame that guidance refuses
+        bag.write(route, 2, 2, 2, bytes(store.serialize_cdr(made[ROUTE_TYPE](odom, poses[:2]), ROUTE_TYPE)))
         bag.write(bag.add_topic("/y", JOINT_STATE, ""), 3, 3, 0, vector(3, ["q"], [0.0]))
         other = bag.add_topic("/other/route", ROUTE_TYPE, "")
         bag.write(other, 4, 4, 0, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses[:2]), ROUTE_TYPE)))

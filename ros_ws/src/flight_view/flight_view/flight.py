@@ -50,7 +50,9 @@ GROUPS = {
 LOG, LOG_TYPE, WARN = "/rosout", "rcl_interfaces/msg/Log", 30  # rcl_interfaces/msg/Log: WARN=30
 CONTROL = "control"  # name of the node that carries out the requests of a page
 SHARED = (LOG, PARAMETER_EVENTS)  # topics of all aircraft
+POSE = "pose"
 ROUTE, ROUTE_TYPE = "route", "nav_msgs/msg/Path"
+FRAMES = ("map", "")  # of a route that guidance takes
 LIVE_BACKLOG = 200_000  # bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading"
 MAX_EVENTS, MAX_NOTES, MAX_CHANNELS = 5000, 50, 200
 BATCH = 2000  # messages that are decoded together
@@ -236,14 +238,21 @@ class Flight:
 
     def _take_samples(self, topic: _Topic, decoded: Samples) -> None:
         names, stamp_ns, values = decoded
+        # A pose has the channels that a bridge has received so far: those with fewer than the widest one are left out.
+        if topic.name == POSE and set(names) > set(topic.names):
+            topic.columns = None
         if topic.columns is None:
             kept = GROUPS.get(topic.name)
             chosen = [i for i, name in enumerate(names) if kept is None or name in kept or name.partition(".")[0] in kept]
             if len(chosen) > MAX_CHANNELS:
                 self._note(f"{topic.name}: {len(chosen) - MAX_CHANNELS} of its channels are not shown")
             topic.names, topic.columns = names, np.array(chosen[:MAX_CHANNELS], dtype=np.intp)
-            self.samples[topic.name] = Series(tuple(_text(names[i]) for i in topic.columns))
+            narrower = self.samples.get(topic.name)
+            samples = self.samples[topic.name] = Series(tuple(_text(names[i]) for i in topic.columns))
+            samples.thinned = 0 if narrower is None else narrower.thinned + 1  # pages read the topic again
         samples = self.samples[topic.name]
+        if topic.name == POSE and set(names) < set(topic.names):
+            return
         if names != topic.names or values.shape[1] != len(names):
             self._unreadable += len(stamp_ns)
             return
@@ -295,6 +304,8 @@ class Flight:
                 if text and self._shows(namespace):
                     self._add_event(Event(sent_ns, "parameter", f"{node}: {text}"))
             elif messages.type_name == ROUTE_TYPE:
+                if message.header.frame_id not in FRAMES:
+                    continue
                 places = [one.pose.position for one in message.poses]
                 self._take_route(sent_ns, [Waypoint(one.y, one.x, one.z) for one in places])
             else:
@@ -303,7 +314,7 @@ class Flight:
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
         """A route that was given in flight replaces the one before, unless guidance refuses it."""
         guided = None if self.scenario is None else self.scenario.guidance
-        if guided is None:
+        if guided is None or guided.key_file:
             return
         try:
             self.description["route"] = route_outline(guided.plan(waypoints))
