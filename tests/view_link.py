@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes of a flight in memory, behind the `Link` of the page's control."""
+"""A flight in the air for the page's control: a log whose recording seems to go on, and nodes in memory behind the `Link`."""
 
 import threading
 from collections.abc import Mapping, Sequence
@@ -8,6 +8,22 @@ from typing import Any
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.parameters import ParameterError, flatten, nest
+from flight_view.flight import Flight
+
+
+class InTheAir(Flight):
+    """A recorded flight whose recording seems to go on."""
+
+    def state(self) -> str:
+        """What the recording does."""
+        return "recording"
+
+
+def in_the_air(flight: Flight) -> Flight:
+    """The same flight, whose recording seems to go on."""
+    other = InTheAir.__new__(InTheAir)
+    other.__dict__ = flight.__dict__
+    return other
 
 
 class NodesInMemory:

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.view_link import NodesInMemory
+from tests.view_link import InTheAir, NodesInMemory
 from tornado.httpclient import AsyncHTTPClient, HTTPResponse
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.gain_selection import check_gains, manoeuvre, margins, study_airframe
 from flight_bringup.scenarios import find_scenario
 from flight_view.control import BURST, LEASE, Control, RefusedError, gains_of, new_key
-from flight_view.flight import Flight
 from flight_view.server import Server
 from rise_di_controller.params import ControllerParameters
 
@@ -31,7 +30,7 @@ class Desk:
 
     def __init__(self, run: Path, scenario: Scenario, *names: str, dry_run: bool = True, real: bool = False) -> None:
         self.time = 0.0
-        self.flight, self.nodes = Flight(run), NodesInMemory(scenario, *(names or ALL), dry_run=dry_run)
+        self.flight, self.nodes = InTheAir(run), NodesInMemory(scenario, *(names or ALL), dry_run=dry_run)
         self.flight.update()
         self.control = Control(self.flight, self.nodes, KEY, real=real, assess=margins, now=lambda: self.time)
         self.lease = ""
@@ -80,6 +79,23 @@ def test_gains_are_set_together_seen_in_the_log_and_undone(desk: Desk, osprey_gu
         undone = await desk.ask("undo", digest=changed["digest"])
         assert (undone["undo"], undone["digest"]) == (0, state["digest"])
         assert await desk.refused("undo", digest=undone["digest"]) == (422, "there is nothing to undo")
+
+    with_desk(desk, steps)
+
+
+@pytest.mark.parametrize("state", ["ended", "interrupted"])
+def test_a_page_whose_flight_is_over_commands_no_later_one(state: str, desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(desk.flight, "state", lambda: state)
+    sentence = "the flight of this page is over: rise-di watch --control shows a later one"
+
+    async def steps(desk: Desk) -> None:
+        digest = (await desk.ask("state"))["digest"]
+        values = dict(desk.nodes.values["controller"])
+        assert await desk.refused("gains", digest=digest, values={"k_g": [1.1 * values["k_g"]]}) == (409, sentence)
+        assert await desk.refused("target", values={"phi": 0.1}) == (409, sentence)
+        assert desk.nodes.values["controller"] == values
+        assert desk.nodes.notes == []
+        await desk.ask("deactivate")  # whatever flies: it ends, and begins nothing
 
     with_desk(desk, steps)
 

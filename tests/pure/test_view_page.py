@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from tests.browser import CHROMIUM, Browser
 from tests.joint_states import JOINT_STATE, vector
-from tests.view_link import NodesInMemory
+from tests.view_link import NodesInMemory, in_the_air
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -557,7 +557,7 @@ def test_the_pose_of_a_bridge_is_drawn_where_it_has_an_attitude(
 
 def a_control(flight: Flight, nodes: NodesInMemory, controls: list[Control]) -> Control:
     """A control of nodes in memory; kept, so that a test can close it."""
-    controls.append(Control(flight, nodes, "ABCD-EFGH", assess=margins))
+    controls.append(Control(in_the_air(flight), nodes, "ABCD-EFGH", assess=margins))
     return controls[-1]
 
 

@@ -32,6 +32,7 @@ RATE, BURST = 5.0, 10.0  # requests a second, and at once
 KEY_PERIOD = 1.0  # s between two wrong keys
 MAX_WAYPOINTS = 200
 AT_ONCE = ("deactivate", "disengage")  # actions that wait for no other request
+OVER = ("ended", "interrupted")  # states of a recording: its flight can be commanded no more
 GUST_LEAD = 0.2  # s from the request to the begin of a gust
 SYSTEM_TIME_NS = 10**17  # stamps above are of the system clock, those of a lockstep flight begin at 0
 
@@ -151,6 +152,12 @@ class Control:
         if not isinstance(action, str) or action not in {*self._actions, "check"}:
             raise RefusedError(
                 HTTPStatus.BAD_REQUEST, f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}"
+            )
+        if (
+            action not in {"state", "check", *AT_ONCE} and self._flight.state() in OVER
+        ):  # a later flight in this domain is another
+            raise RefusedError(
+                HTTPStatus.CONFLICT, "the flight of this page is over: rise-di watch --control shows a later one"
             )
         self._take_lease(lease)
         loop = asyncio.get_running_loop()
