@@ -94,6 +94,17 @@ def test_a_speed_is_read_where_a_format_has_one(tmp_path: Path) -> None:
     assert [waypoint.speed for waypoint in read_route(path, ZURICH)] == [None, 31.5]
 
 
+def test_points_beside_a_line_are_no_part_of_the_route_and_may_be_anything(tmp_path: Path) -> None:
+    line_alone, both = tmp_path / "r.geojson", tmp_path / "both.geojson"
+    line_alone.write_text(json.dumps(line()), encoding="utf-8")
+    both.write_text(json.dumps({"features": [point([8.5, 47.4]), line()]}), encoding="utf-8")  # a place without an altitude
+    assert read_route(both, ZURICH) == read_route(line_alone, ZURICH)
+    marked = tmp_path / "both.kml"
+    ground = "<Point><coordinates>8.5,47.4,0</coordinates></Point>"
+    marked.write_text(kml(KML_LINE).replace("<Placemark>", f"<Placemark>{ground}</Placemark><Placemark>", 1), encoding="utf-8")
+    assert len(read_route(marked, ZURICH)) == len(SQUARE)
+
+
 ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
 
 

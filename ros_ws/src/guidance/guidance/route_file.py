@@ -109,17 +109,17 @@ def _read_geojson(content: bytes, key: str, origin: Origin | None) -> Iterator[W
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{key}: not valid JSON ({error}), expected a route file") from None
     features = _member(tree, "features")
-    lines: list[list[Place]] = []
-    points: list[Place] = []
+    lines: list[list[Any]] = []  # positions, each with its V
+    points: list[Any] = []
     for feature in features if isinstance(features, list) else [tree]:
         geometry, speed = _member(feature, "geometry") or feature, _member(_member(feature, "properties"), "V")
         kind, coordinates = _member(geometry, "type"), _member(geometry, "coordinates")
         if kind == "LineString" and isinstance(coordinates, list):
-            lines.append([_lon_lat(f"route[{k}]", one, speed) for k, one in enumerate(coordinates)])
+            lines.append([(one, speed) for one in coordinates])
         elif kind == "Point":
-            points.append(_lon_lat(f"route[{len(points)}]", coordinates, speed))
-    for place in _only_line(key, lines, points):
-        yield _placed(place, origin)
+            points.append((coordinates, speed))
+    for k, (position, speed) in enumerate(_only_line(key, lines, points)):
+        yield _placed(_lon_lat(f"route[{k}]", position, speed), origin)
 
 
 def _member(tree: Any, name: str) -> Any:
@@ -141,11 +141,12 @@ def _read_kml(content: bytes, key: str, origin: Origin | None) -> Iterator[Waypo
         root = parser.close()
     except (ParseError, ValueError, LookupError) as error:  # the last two: of an encoding
         raise ParameterError(f"{key}: found {error}, expected the XML of a KML file") from None
-    lines: list[list[Place]] = []
-    points: list[Place] = []
-    for geometry in root.iter():
-        kind = str(geometry.tag).rpartition("}")[2]
-        if kind not in {"LineString", "Point"}:
+    lines: list[list[Any]] = []  # positions
+    points: list[Any] = []
+    kinds = [(str(one.tag).rpartition("}")[2], one) for one in root.iter()]
+    used = "LineString" if any(kind == "LineString" for kind, _ in kinds) else "Point"
+    for kind, geometry in kinds:
+        if kind != used:
             continue
         texts = {str(child.tag).rpartition("}")[2]: child.text or "" for child in geometry}
         mode = texts.get("altitudeMode", "clampToGround").strip()  # the default of KML
@@ -153,12 +154,12 @@ def _read_kml(content: bytes, key: str, origin: Origin | None) -> Iterator[Waypo
         require(mode == "absolute", key, found, "absolute, for the height of the ground is not known")
         tuples = [one.split(",") for one in texts.get("coordinates", "").split()]
         if kind == "LineString":
-            lines.append([_lon_lat(f"route[{k}]", list(map(_parsed, one))) for k, one in enumerate(tuples)])
+            lines.append(tuples)
         else:
             require(len(tuples) == 1, key, f"a Point with {len(tuples)} positions", "one")
-            points.append(_lon_lat(f"route[{len(points)}]", list(map(_parsed, tuples[0]))))
-    for place in _only_line(key, lines, points):
-        yield _placed(place, origin)
+            points += tuples
+    for k, position in enumerate(_only_line(key, lines, points)):
+        yield _placed(_lon_lat(f"route[{k}]", list(map(_parsed, position))), origin)
 
 
 def _parsed(text: str) -> float | str:
@@ -176,7 +177,8 @@ def _lon_lat(key: str, position: Any, speed: Any = None) -> Place:
     return key, latitude, longitude, altitude, speed
 
 
-def _only_line(key: str, lines: list[list[Place]], points: list[Place]) -> list[Place]:
+def _only_line(key: str, lines: list[list[Any]], points: list[Any]) -> list[Any]:
+    """The positions of the line; of the points where there is none."""
     require(len(lines) <= 1, key, f"{len(lines)} LineStrings", "one, or Points alone")
     places = lines[0] if lines else points
     require(bool(places), key, "no LineString and no Point", "a route")
