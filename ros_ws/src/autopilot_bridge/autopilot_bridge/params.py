@@ -165,11 +165,13 @@ class OverrideRow(WatchedRow):
 
     def is_active(self, raw: float, at_engagement: float | None) -> bool:
         """Whether the override is active. `at_engagement` is its value at engagement; None where it is not engaged."""
-        if self.bits is not None:
-            raw = float(int(raw) & self.bits)
+        raw = self._masked(raw)
         if self.moved is not None:
-            return at_engagement is not None and abs(raw - at_engagement) > self.moved
+            return at_engagement is not None and abs(raw - self._masked(at_engagement)) > self.moved
         return (self.above is not None and raw > self.above) or (self.below is not None and raw < self.below)
+
+    def _masked(self, raw: float) -> float:
+        return raw if self.bits is None else float(int(raw) & self.bits)
 
 
 class QosRow(Parameters):
