@@ -404,6 +404,13 @@ def test_an_override_by_a_stick_counts_its_way_since_engagement(earlier: float) 
     assert bridge.reason == "pilot override by gamepad"
 
 
+def test_an_override_by_a_switch_in_a_bit_field_counts_its_own_bit_since_engagement() -> None:
+    content = CHANNEL_MAP.model_dump()
+    content["overrides"]["gamepad"] |= {"above": None, "moved": 0.5, "bits": 4}
+    row = ChannelMap.validate_mapping(content, "map").overrides["gamepad"]
+    assert [row.is_active(raw, at_engagement=5.0) for raw in (5.0, 6.0, 1.0)] == [False, False, True]
+
+
 def test_an_override_whose_topic_has_ended_does_not_block_an_engagement() -> None:
     bridge = new_bridge()
     bridge.take_override("gamepad", 1.0, at(0.0))
@@ -468,7 +475,7 @@ def test_a_pose_has_the_fresh_channels_and_the_stamp_of_its_first_row() -> None:
 def test_a_flight_announces_each_reason_once_without_those_in_which_a_number_alone_changes() -> None:
     reasons = ["would refuse: u not received yet", "u is 0.30 s old", "u is 0.41 s old", "not engaged yet", "not engaged yet"]
     waiting, announced = [("DISENGAGED", reason) for reason in reasons] + [("ENGAGED", "")], list[str]()
-    processes = SimpleNamespace(start_time=time.time(), ended_early=lambda: None if waiting else "the end")
+    processes = SimpleNamespace(started=time.monotonic(), ended_early=lambda: None if waiting else "the end")
     monitor = SimpleNamespace(engagement=lambda: [waiting.pop(0)], newest=lambda: None)
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     assert _follow_real_time(find_scenario("osprey_gust"), *nodes, lambda t, text: None, announced.append, np.inf) == "the end"
@@ -477,12 +484,22 @@ def test_a_flight_announces_each_reason_once_without_those_in_which_a_number_alo
 
 def test_an_experiment_without_an_engagement_ends_when_too_little_time_is_left() -> None:
     # osprey_gust has 60 s, of which the experiment needs 59.8; it began 0.3 s ago
-    processes = SimpleNamespace(start_time=time.time() - 0.3, ended_early=lambda: None)
+    processes = SimpleNamespace(started=time.monotonic() - 0.3, ended_early=lambda: None)
     monitor = SimpleNamespace(engagement=list, newest=lambda: None)
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     scenario = find_scenario("osprey_gust")
     outcome = _follow_real_time(scenario, *nodes, lambda t, text: None, lambda line: None, scenario.flight.duration - 0.2)
     assert outcome == "not engaged within 0.2 s"
+
+
+def test_a_step_of_the_system_clock_does_not_end_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = iter(["", "", "the end"])
+    processes = SimpleNamespace(started=time.monotonic(), ended_early=lambda: next(calls) or None)
+    monitor = SimpleNamespace(engagement=list, newest=lambda: None)
+    nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
+    later = time.time() + 3600.0
+    monkeypatch.setattr(time, "time", lambda: later)
+    assert _follow_real_time(find_scenario("osprey_gust"), *nodes, lambda t, text: None, lambda line: None, np.inf) == "the end"
 
 
 def test_a_second_signal_does_not_interrupt_the_clean_up_after_the_first() -> None:

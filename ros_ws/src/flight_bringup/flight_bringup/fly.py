@@ -86,7 +86,7 @@ def _follow_real_time(
     units, outputs = display_units(scenario), scenario.controller.outputs
     text, phase, why, announced = "starting", "", "", ""
     engaged_at = math.inf
-    while (t := time.time() - processes.start_time) < scenario.flight.duration:
+    while (t := time.monotonic() - processes.started) < scenario.flight.duration:
         if (reason := processes.ended_early()) is not None:
             return reason
         for phase, why in monitor.engagement():

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 STOP_TIMEOUT = 2.5  # s, for all processes but the recorder together; a node needs 0.2 s
 CLOSE_TIMEOUT = 30.0  # s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log
 READY_TIMEOUT = 20.0  # s
+DISCOVERY_TIME = 0.5  # s, until the publishers of another flight on this host are known, twice the measured 0.25 s
 FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
 POLL_PERIOD = 0.005  # s, while nodes start
 
@@ -124,6 +125,7 @@ class FlightProcesses:
             self._first, self._second = (), (ONE_PROCESS,)
         self.processes: list[NodeProcess] = []
         self.start_time = math.inf  # system time of t = 0, s; set once the first stage is ready
+        self.started = math.inf  # the same on the monotonic clock, as the nodes count: a step of the system clock is none of t
 
     def __enter__(self) -> Self:
         try:
@@ -131,8 +133,11 @@ class FlightProcesses:
             for node in self._first:
                 self._start(node)
             self._wait_until_ready(begin + READY_TIMEOUT)
+            if not self._first:  # whose start gives the monitor the time to discover another flight
+                time.sleep(DISCOVERY_TIME)
             self._monitor.require_free_domain()
-            self.start_time = round(time.time() + start_lead(time.monotonic() - begin), 3)
+            lead = start_lead(time.monotonic() - begin)
+            self.start_time, self.started = round(time.time() + lead, 3), time.monotonic() + lead
             for node in self._second:
                 self._start(node)
         except BaseException:
