@@ -16,6 +16,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import tracking_error
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
+from rise_di_controller.guard import Mode
 
 DURATION = 12.0
 
@@ -76,8 +77,9 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
     assert internals.header.frame_id.startswith("/controller#")
     assert tape["y"].stamp_ns[0] == tape.start_ns  # the log begins with the first sample
     assert delayed or np.diff(tape["y"].stamp_ns).max() <= 20_000_000
-    # u carries the stamp of the y from which it was computed
-    assert set(tape["u"].stamp_ns.tolist()) <= set(tape["y"].stamp_ns.tolist())
+    # u carries the stamp of the y from which it was computed; one that is held on a busy host, that of its tick
+    held = tape["internals"].stamp_ns[tape["internals"]["mode"] != Mode.ENGAGED]
+    assert set(tape["u"].stamp_ns.tolist()) - set(held.tolist()) <= set(tape["y"].stamp_ns.tolist())
     if delayed and (missing or not accurate):
         pytest.skip("host scheduling delayed a node in four flights of four")
     assert not missing, counts
