@@ -69,8 +69,8 @@ VIEW |= {
         "starting": [1.25, 1.5],
         "more with": dict.fromkeys(PAIRS, 0.05),
         "more start included": dict.fromkeys(PAIRS, 0.15),
-        "interval with": dict.fromkeys(PAIRS, (-1.5, 2.5)),
-        "interval start included": dict.fromkeys(PAIRS, (-1.5, 2.5)),
+        "interval with": {name: [-1.5, 2.5] for name in PAIRS},
+        "interval start included": {name: [-1.5, 2.5] for name in PAIRS},
         "probability with": dict.fromkeys(PAIRS, 0.5),
         "probability start included": dict.fromkeys(PAIRS, 0.5),
     }
