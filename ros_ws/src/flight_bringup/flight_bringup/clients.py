@@ -313,16 +313,17 @@ class ControlClient(_Client):
         publisher = self._node.create_publisher(ROUTE.type, ROUTE.name, PUBLISH)
         try:
             subscribed = f"{publisher.topic_name}: no subscriber, expected a flight with guidance in this domain"
-            self._spin_until(lambda: 0 < len(self._subscribers(publisher)) <= publisher.get_subscription_count(), subscribed)
+            self._spin_until(lambda: self._reaches_guidance(publisher), subscribed)
             publisher.publish(route)
             received = publisher.wait_for_all_acked(Duration(seconds=ROUTE_TIMEOUT))
         finally:
             self._node.destroy_publisher(publisher)  # else guidance that starts later would receive the route, and fly it
         return "" if received else f"guidance did not confirm its reception in {ROUTE_TIMEOUT:g} s"
 
-    def _subscribers(self, publisher: Publisher) -> list[Any]:
-        """The subscribers of its topic in the graph, of which some may not have discovered it."""
-        return list(self._node.get_subscriptions_info_by_topic(publisher.topic_name))
+    def _reaches_guidance(self, publisher: Publisher) -> bool:
+        """Whether guidance is among the subscribers in the graph, and each of them has been matched."""
+        known = [one.node_name for one in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
+        return "guidance" in known and len(known) <= publisher.get_subscription_count()
 
     def hold(self) -> str:
         """Hold heading, altitude and airspeed of now."""
