@@ -286,7 +286,7 @@ def check_wings_levelled(case: Case, flight: Flight, window: Window) -> None:
     """
     host_delay = flight.host_delay(flight.begin - 0.1, flight.begin + LEVEL)
     roll_rate = load_scenario(flight.scenario).reference_model.live.roll_rate
-    untracked = 2.0 * roll_rate * host_delay if host_delay > QUIET else 0.0
+    untracked = 2.0 * roll_rate * host_delay if host_delay > MAX_AGE else 0.0  # below it the law stays engaged
     t, phi = flight.bank(flight.begin, flight.begin + LEVEL)
     flight.measured["bank_deg"] = float(np.degrees(np.abs(phi).max()))
     flight.measured["last_bank_deg"] = float(np.degrees(np.abs(phi[-1])))
