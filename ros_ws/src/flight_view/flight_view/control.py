@@ -153,9 +153,8 @@ class Control:
             raise RefusedError(
                 HTTPStatus.BAD_REQUEST, f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}"
             )
-        if (
-            action not in {"state", "check", *AT_ONCE} and self._flight.state() in OVER
-        ):  # a later flight in this domain is another
+        # A later flight in this domain is another one.
+        if action not in {"state", "check", *AT_ONCE} and self._flight.state() in OVER:
             raise RefusedError(
                 HTTPStatus.CONFLICT, "the flight of this page is over: rise-di watch --control shows a later one"
             )
