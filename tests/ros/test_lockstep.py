@@ -109,7 +109,7 @@ LOG_SIZE = 1_000_000  # bytes; by then the liveliness monitor of every node is a
 
 
 @pytest.mark.parametrize("victim", ["aircraft", "controller", "recorder"])  # the next test kills the reference model
-def test_other_nodes_end_within_two_seconds_of_a_kill_and_name_the_lost_peer(victim: str, start: Start, tmp_path: Path) -> None:
+def test_other_nodes_end_within_three_seconds_of_a_kill_and_name_it(victim: str, start: Start, tmp_path: Path) -> None:
     processes = nodes(start, scenario_file(tmp_path, 1e6))
     processes["aircraft"].wait_for_log(tmp_path / "run", LOG_SIZE)
     processes[victim].popen.kill()
@@ -117,8 +117,8 @@ def test_other_nodes_end_within_two_seconds_of_a_kill_and_name_the_lost_peer(vic
     for role, process in processes.items():
         if role != victim:
             assert process.end(timeout=10.0) == 3, process.output
-            # The liveliness lease is one second; the other second is for a busy host.
-            assert time.monotonic() - killed < 2.0, role
+            # The liveliness lease is 1.8 s; the rest is for a busy host.
+            assert time.monotonic() - killed < 3.0, role
             assert f"lost contact with {victim}" in process.output, role
     assert len(read_run(tmp_path / "run").tape["y"].stamp_ns) > 100
 

@@ -27,7 +27,7 @@ POLL_PERIOD = 0.05  # s, of the progress bar
 NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # in a reason: "q is 0.30 s old"
 
 STALL_TIMEOUT = 40.0
-"""s. A lockstep flight without progress for so long ends; lost contact with a node ends it within two seconds."""
+"""s. A lockstep flight without progress for so long ends; lost contact with a node ends it within three seconds."""
 
 Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
 
