@@ -4,6 +4,7 @@
 
     make evidence                              # the missing measurements, then the page
     make evidence ARGS="--again faults"        # measure this one again; "speed" is all that begin so; repeatable
+    make evidence ARGS="--again long"          # those of an hour and more, which nothing else runs: "long-faults" is one
     make evidence ARGS=--quick                 # short versions; the page marks them
     make evidence ARGS=--render                # only the page, from the stored results
 
@@ -29,7 +30,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import psutil
-from benchmarks.evidence_page import SPEED, Measurement, Result, render
+from benchmarks.evidence_page import LONG_FLIGHTS, SPEED, Measurement, Result, render
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 RISE_DI = str(Path(sys.executable).parent / "rise-di")
@@ -53,6 +54,7 @@ FAULTS = (PYTHON, "-m", "benchmarks.faults", "--json", FILE, "--times")
 RANDOM_FAULTS = (PYTHON, "-m", "benchmarks.random_faults", "--json", FILE, "--count")
 CAMPAIGN = (PYTHON, "-m", "benchmarks.campaign", "--json", FILE)
 FUZZ, REPLAY = ((PYTHON, "-m", "benchmarks.evidence", "--do", task, "--json", FILE) for task in ("fuzz", "replay"))
+LONG_FLIGHT = (PYTHON, "-m", "benchmarks.long_flight", "--json", FILE)
 QUICK_CAMPAIGN = (*CAMPAIGN, "--aircraft", "2000", "--chunk", "200", "--exact", "1")
 CLUSTER = (PYTHON, "-m", "benchmarks.cluster", "--json", FILE)
 VIEW = (PYTHON, "-m", "benchmarks.view", "--json", FILE)
@@ -85,6 +87,28 @@ MEASUREMENTS = (
     Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), "other laws on the same aircraft and course", "5 min"),
     Measurement("view", VIEW, QUICK_VIEW, "the page beside a flight, and a log of one hour on it", "11 min", timed=True),
     Measurement("replay", REPLAY, (*REPLAY, "--seconds", "5"), "every scenario flown and replayed", "2 min"),
+    Measurement(
+        "long-faults",
+        (*RANDOM_FAULTS, "1000", "--lockstep", "100"),
+        (*RANDOM_FAULTS, "5", "--lockstep", "1"),
+        "a thousand random faults",
+        "75 min",
+        timed=True,
+        long=True,
+    ),
+    Measurement("long-fuzz", (*FUZZ, "--seconds", "600"), (*FUZZ, "--seconds", "5"), READERS, "55 min", long=True),
+    *(
+        Measurement(
+            f"long-{name}",
+            (*LONG_FLIGHT, *options),
+            (*LONG_FLIGHT, *options, "--minutes", "1"),
+            f"{what} of a guided flight",
+            takes,
+            timed=name == "real-time",
+            long=True,
+        )
+        for name, (what, options, takes) in LONG_FLIGHTS.items()
+    ),
 )
 
 
@@ -213,11 +237,14 @@ def write_page(results: Mapping[str, Result]) -> None:
 
 
 def wanted(names: Sequence[str], stored: Mapping[str, Result], *, quick: bool) -> list[Measurement]:
-    """Measurements to run: missing, failed, short (unless `quick`), and those whose names begin with one of `names`."""
+    """Measurements to run: missing, failed, short (unless `quick`), and those whose names begin with one of `names`.
+
+    Of the long ones, only those whose names do.
+    """
 
     def stale(one: Measurement) -> bool:
         result = stored.get(one.name)
-        return result is None or result["result"] is None or (result["quick"] and not quick)
+        return not one.long and (result is None or result["result"] is None or (result["quick"] and not quick))
 
     return [one for one in MEASUREMENTS if stale(one) or one.name.startswith(tuple(names))]
 

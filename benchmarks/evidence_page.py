@@ -33,6 +33,7 @@ class Measurement(NamedTuple):
     what: str  # in a line
     takes: str  # about, on two cores
     timed: bool = False  # whether a busy host spoils it
+    long: bool = False  # whether it is only measured by its name
 
 
 SPEED = {
@@ -46,6 +47,13 @@ SPEED = {
     "recorder": ("the recorder at 1 kHz on six topics", 30.0, "1 min"),
 }
 """What each group of benchmarks/speed.py measures, s a figure, and the time it takes."""
+
+LONG_FLIGHTS = {
+    "lockstep": ("six hours in lockstep", ("--observer", "--one-process", "--rate", "100", "--minutes", "360"), "60 min"),
+    "real-time": ("one hour in real time", ("--observer", "--real-time"), "65 min"),
+    "jsbsim": ("one hour of an aircraft of JSBSim in lockstep", ("--one-process",), "25 min"),
+}
+"""What each long flight is, the options of benchmarks/long_flight.py, and the time it takes."""
 
 
 def render(measurements: Sequence[Measurement], results: Mapping[str, Result], before: str = "") -> str:
@@ -204,7 +212,16 @@ TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-TEMPLATES.globals |= {"BUSY": BUSY, "SPEED": SPEED, "goal": goal, "ratio": ratio, "speed_goal": speed_goal, "zip": zip}
+TEMPLATES.globals |= {
+    "BUSY": BUSY,
+    "SPEED": SPEED,
+    "LONG_FLIGHTS": LONG_FLIGHTS,
+    "goal": goal,
+    "ratio": ratio,
+    "speed_goal": speed_goal,
+    "zip": zip,
+}
 TEMPLATES.globals |= {"UNMET": UNMET, "fastest_echo": fastest_echo, "marked_scores": marked_scores, "outcomes": outcomes}
+TEMPLATES.globals["speed_goal"] = speed_goal
 TEMPLATES.filters |= {"number": number, "milliseconds": milliseconds, "host": host, "counts": counts}
 TEMPLATES.tests["always_passed"] = lambda fault: fault["passed"] == fault["injected"]

@@ -16,6 +16,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,6 +26,8 @@ from benchmarks.evidence_page import milliseconds
 from benchmarks.sampling import new_table
 from rich.console import Console
 from rich.table import Table
+
+from flight_cli.output import COUNT_COLUMNS, progress_bar
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CAMPAIGN = REPOSITORY / "tests" / "ros" / "faults"
@@ -46,14 +49,23 @@ def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> list[Ro
     return run_campaign(options)[0]
 
 
-def run_campaign(options: Sequence[str]) -> tuple[list[Row], int]:
-    """Run the tests with options of pytest; their rows, and the exit status. Exits where no test matches."""
+def run_campaign(options: Sequence[str], total: int | None = None) -> tuple[list[Row], int]:
+    """Run the tests with options of pytest; their rows, and the exit status. Exits where no test matches.
+
+    `total` is the number of injections, for the progress bar; None where it is unknown.
+    """
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "rows.jsonl"
         command = [sys.executable, "-m", "pytest", "-q", str(CAMPAIGN), f"--faults-table={table}", *options]
-        status = subprocess.run(command, cwd=REPOSITORY, check=False, stdout=sys.stderr).returncode  # noqa: S603 - our own interpreter
+        with subprocess.Popen(command, cwd=REPOSITORY, stdout=sys.stderr) as tests, progress_bar(*COUNT_COLUMNS) as bar:  # noqa: S603
+            task = bar.add_task("faults", total=total)
+            while tests.poll() is None:
+                time.sleep(1.0)
+                if table.exists():
+                    bar.update(task, completed=table.read_text(encoding="utf-8").count("\n"))
         if not table.exists():
             sys.exit("error: no case matches")
+        status = tests.returncode
         return [json.loads(line) for line in table.read_text(encoding="utf-8").splitlines()], status
 
 

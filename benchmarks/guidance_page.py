@@ -4,7 +4,6 @@
 
 import json
 import re
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,14 +15,12 @@ from benchmarks.guidance_grid import Point
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "build" / "guidance"
 PAGE = REPOSITORY / "docs" / "evidence_guidance.md"
-REPORT = "At its end `rise-di fly` writes the report."
-OPEN_LIMIT = 3.0  # s, to open the report of a long flight
 INTRODUCTION = """\
 # Evidence: guidance
 
-`python -m benchmarks.guidance` and `python -m benchmarks.long_flight` fly guidance by rule and write this page; what they
-mean is in [guidance](guidance.md) and [experiments](experiments.md#guidance-by-rule). *Italics* miss their limit. In
-turbulence a figure is the worst of the seeds.
+`python -m benchmarks.guidance` flies guidance by rule and writes this page; what it means is in [guidance](guidance.md) and
+[experiments](experiments.md#guidance-by-rule). *Italics* miss their limit. In turbulence a figure is the worst of the seeds.
+[Long flights](evidence.md#long-flights) are with the other evidence.
 """
 
 
@@ -37,11 +34,11 @@ def store(name: str, result: Any) -> None:
 
 
 def page(results: Mapping[str, Mapping[str, Any]], before: str = "") -> str:
-    """The page from the stored results by name: "flights NAME", "grid NAME", "rates", "route", "long FLIGHT" and "opened".
+    """The page from the stored results by name: "flights NAME", "grid NAME", "rates" and "route".
 
     A section without a result stays as it is on the page `before`: another machine may have measured it.
     """
-    makers = {"flights": _flights, "grid": _grid, "rates": _rates, "route": _route, "long": _long, "opened": _opened}
+    makers = {"flights": _flights, "grid": _grid, "rates": _rates, "route": _route}
     sections = {one.partition("\n")[0]: one.strip() + "\n" for one in re.split(r"^## ", before, flags=re.MULTILINE)[1:]}
     for name, stored in results.items():
         kind, _, aircraft = name.partition(" ")
@@ -114,31 +111,3 @@ def _rates(_: str, rows: Any) -> tuple[str, str, list[str]]:
         *table(("aircraft", *rows[0][2], "limit"), cells),
     ]
     return "Errors of the rates", "python -m benchmarks.guidance --rates", lines
-
-
-def _long(flight: str, figures: Any) -> tuple[str, str, list[str]]:
-    """The figures of benchmarks/long_flight.py."""
-    shown = {name: value for name, value in figures.items() if name not in ("flight", "options")}
-    text = "; ".join(f"{name}: {_shown(value)}" for name, value in shown.items()) + "."
-    lines = textwrap.wrap(f"Round a triangle in turbulence of 1.5 m/s, over topics. {text} {REPORT}", 118)
-    return f"A long flight, {flight}", " ".join(["python -m benchmarks.long_flight", *figures["options"]]), lines
-
-
-def _opened(_: str, found: Any) -> tuple[str, str, list[str]]:
-    """Of the report of a run: the flight time, s, the size in bytes, and by repetition the times of `long_flight.opened`, s."""
-    times = {kind: [one[kind] for one in found["opened"]] for kind in found["opened"][0]}
-    drawn = (
-        f"{kind} after {', '.join(f'{one:.1f}' if one <= OPEN_LIMIT else f'*{one:.1f}*' for one in values)} s"
-        for kind, values in times.items()
-    )
-    text = f"A flight of {found['flight'] / 60.0:.0f} min, a report of {found['size'] / 1e6:.1f} MB"
-    lines = [f"{text}. Drawn: {', '.join(drawn)} (limit {OPEN_LIMIT:g})."]
-    return "The report of a long flight", "python -m benchmarks.long_flight --open RUN", lines
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{name} {_shown(one)}" for name, one in value.items())
-    if isinstance(value, list):
-        return ", ".join(map(_shown, value))
-    return f"{value:.3g}" if isinstance(value, float) and value < 10.0 else str(value)

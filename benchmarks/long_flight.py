@@ -5,16 +5,16 @@
     .venv/bin/python -m benchmarks.long_flight                                  # the c172p of JSBSim, 60 min in lockstep
     .venv/bin/python -m benchmarks.long_flight --observer                       # the osprey, with an observer beside the law
     .venv/bin/python -m benchmarks.long_flight --observer --real-time
-    .venv/bin/python -m benchmarks.long_flight --open RUN                       # only the report of a run, on an idle host
+    .venv/bin/python -m benchmarks.long_flight --observer --one-process --rate 100 --minutes 360
 
-Prints JSON and writes it to docs/evidence_guidance.md: the outcome, the samples that the log lacks, missed ticks, the largest
-cross-track error, the memory of each process in the middle and at the end of the flight, and the times to write and to open the
-report.
+Prints JSON: the outcome, the samples that the log lacks, missed ticks, the largest cross-track error, the memory of each
+process in the middle and at the end of the flight, and the times to write and to open the report.
 """
 
 import argparse
 import json
 import math
+import signal
 import subprocess
 import sys
 import tempfile
@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 import psutil
-from benchmarks import guidance_page
 from benchmarks.host_delays import Intervals
 from benchmarks.processes import delay_monitors, real_time
 from benchmarks.view import RISE_DI, Client, figures_of_ticks, watching
@@ -48,7 +47,6 @@ TURBULENCE = {  # of 1.5 m/s: at the altitude of the c172p; moderate at 100 m ab
     "osprey": {"altitude": 100.0, "wind": 15.4, "seed": 1},
 }
 PERIOD = 2.0  # s between samples of the memory
-MIB = 2**20
 IN_VIEW = """(() => {
   document.querySelector("figure")?.scrollIntoView();
   const place = ({node}) => node.getBoundingClientRect(), all = typeof figures === "undefined" ? [] : figures;
@@ -58,8 +56,8 @@ IN_VIEW = """(() => {
 MODES = {"in lockstep": ["--lockstep"], "in lockstep in one process": ["--one-process"], "in real time": []}
 
 
-def triangle(minutes: float, *, observer: bool) -> Scenario:
-    """The flight: laps round an equilateral triangle in turbulence, without wind."""
+def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Scenario:
+    """The flight: laps round an equilateral triangle in turbulence, without wind; the scenario's own rates without `rate`."""
     base = find_scenario("osprey_route" if observer else "jsbsim_c172p_route")
     if observer:
         base = replace(base, controller=find_scenario("osprey_observer").controller)
@@ -67,15 +65,17 @@ def triangle(minutes: float, *, observer: bool) -> Scenario:
     laps = math.ceil(60.0 * minutes * speed / (2.0 * SIDE))  # the fillets shorten a lap
     corners = [(0.0, 0.0), (SIDE, 0.0), (SIDE / 2.0, SIDE * math.sqrt(0.75))] * laps
     north, east = (list(values) for values in zip(*corners, strict=True))
+    rates = {} if rate is None else {"rate": rate}
     return base.vary(
         flight={"duration": 60.0 * minutes},
-        aircraft={"wind": [0.0, 0.0], "turbulence": TURBULENCE["osprey" if observer else "c172p"]},
+        aircraft={"wind": [0.0, 0.0], "turbulence": TURBULENCE["osprey" if observer else "c172p"], **rates},
+        reference_model=rates,
         guidance={"wind": 0.0, "route": {"north": north, "east": east, "altitude": [altitude] * len(north)}},
     )
 
 
 def fly(scenario: Path, runs: Path, mode: str) -> dict[str, list[int]]:
-    """Fly, with a client of the live page; the memory of each process by its command, bytes every PERIOD."""
+    """Fly, with a client of the page; the memory of each process by its command, until the nodes end, bytes every PERIOD."""
     command = [RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
     memory: dict[str, list[int]] = {}
     with ExitStack() as stack:
@@ -88,13 +88,14 @@ def fly(scenario: Path, runs: Path, mode: str) -> dict[str, list[int]]:
         client = Client(address)
         stack.callback(client.stop)
         client.start()
-        while flight.poll() is None:
-            for process in (flight, *flight.children(recursive=True), server):
+        while nodes := flight.children(recursive=True):
+            for process in (flight, *nodes, server):
                 with suppress(psutil.Error):
                     words = process.cmdline()
                     name = next((word for word in words if word.endswith(".main")), f"rise-di {words[2]}")
                     memory.setdefault(name, []).append(process.memory_info().rss)
             time.sleep(PERIOD)
+        flight.wait()  # it writes the report
     if flight.returncode != 0:
         sys.exit(f"the flight ended with status {flight.returncode}")
     return memory
@@ -139,7 +140,10 @@ def opened(report: Path) -> dict[str, float] | None:
 
 
 def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None) -> dict[str, Any]:
-    """The figures of a flight from its run. `delays` are those of the host, by the clock of the stamps; None where unknown."""
+    """The figures of a flight from its run, SI; memory in bytes in the middle and at the end, ticks as `figures_of_ticks`.
+
+    `delays` are those of the host, by the clock of the stamps; None where unknown.
+    """
     begin = time.monotonic()
     write_report(run)
     written = time.monotonic() - begin
@@ -148,24 +152,19 @@ def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None
     log = tape["guidance"]
     xtrack = log["xtrack"][tape.time("guidance") > 30.0]
     replay = replay_guidance(tape, scenario.guidance)
-    half = {name: values[len(values) // 2] for name, values in memory.items()}
     return {
         "outcome": json.loads((run / "summary.json").read_text(encoding="utf-8"))["outcome"],
-        "minutes": round((tape["y"].stamp_ns[-1] - tape.start_ns) / NANOSECONDS / 60.0, 3),
+        "minutes": (tape["y"].stamp_ns[-1] - tape.start_ns) / NANOSECONDS / 60.0,
         "legs": int(log["leg"].max()),
-        "samples missing": missing(tape, scenario),
-        "messages lost": sum(int(count) for count in read.metadata.get(LOST_MESSAGES, {}).values()),
-        **figures_of_ticks(tape["internals"], delays, period_ns(scenario.controller.rate, "rate")),
-        "steps of guidance that replay differently": [replay.differing, replay.steps],
-        "largest cross-track error (m)": round(float(np.abs(xtrack).max()), 1),
-        "largest bank (deg)": round(math.degrees(float(np.abs(log["pose.phi"]).max())), 1),
-        "V least (m/s)": round(float(log["y.V"].min()) + scenario.aircraft.channels().speed, 1),
-        "memory, middle and end (MiB)": {
-            name: [round(half[name] / MIB, 1), round(values[-1] / MIB, 1)] for name, values in memory.items()
-        },
-        "report (MB)": round((run / "report.html").stat().st_size / 1e6, 2),
-        "report written in (s)": round(written, 1),
-        "report opened in (s)": opened(run / "report.html"),
+        "missing": missing(tape, scenario),
+        "lost": sum(int(count) for count in read.metadata.get(LOST_MESSAGES, {}).values()),
+        "ticks": figures_of_ticks(tape["internals"], delays, period_ns(scenario.controller.rate, "rate")),
+        "guidance": {"steps": replay.steps, "differing": replay.differing},
+        "xtrack": float(np.abs(xtrack).max()),
+        "bank_deg": math.degrees(float(np.abs(log["pose.phi"]).max())),
+        "V": float(log["y.V"].min()) + scenario.aircraft.channels().speed,
+        "memory": {name: [values[len(values) // 2], values[-1]] for name, values in memory.items()},
+        "report": {"size": (run / "report.html").stat().st_size, "written": written, "opened": opened(run / "report.html")},
     }
 
 
@@ -178,29 +177,32 @@ def main() -> None:
     mode = parser.add_mutually_exclusive_group()
     for name, words in (("--one-process", "in lockstep in one process"), ("--real-time", "in real time")):
         mode.add_argument(name, dest="mode", action="store_const", const=words, default="in lockstep", help=words)
-    parser.add_argument("--open", type=Path, metavar="RUN", help="only time how long a browser takes to open its report")
+    parser.add_argument("--rate", type=float, help="of y and y_m, Hz; by default the scenario's")
+    parser.add_argument("--json", type=Path, help="JSON file to write")
     options = parser.parse_args()
-    if options.open is not None:
-        report, summary = options.open / "report.html", json.loads((options.open / "summary.json").read_text(encoding="utf-8"))
-        found = {"flight": summary["duration"], "size": report.stat().st_size, "opened": [opened(report) for _ in range(3)]}
-        guidance_page.store("opened", found)
-        print(json.dumps(found, indent=1))
-        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the flight ends too
     with tempfile.TemporaryDirectory() as folder, delay_monitors(bool(real_time())) as delays:
         runs = options.runs or Path(folder)
         runs.mkdir(parents=True, exist_ok=True)
         path = runs / "flown.yaml"
-        path.write_text(scenario_yaml(triangle(options.minutes, observer=options.observer)), encoding="utf-8")
+        path.write_text(
+            scenario_yaml(triangle(options.minutes, observer=options.observer, rate=options.rate)), encoding="utf-8"
+        )
         begin = time.monotonic()
         memory = fly(path, runs, options.mode)
         took = time.monotonic() - begin
         clock = time.time_ns() - time.monotonic_ns()
         host = [(since + clock, until + clock) for since, until in delays()] if delays else None
         aircraft = "osprey with an observer" if options.observer else "c172p"
-        found = {"flight": f"the {aircraft}, {options.mode}", "minutes it took": round(took / 60.0, 1)}
-        found |= figures((runs / "latest").resolve(), memory, host)
-        guidance_page.store(f"long {aircraft}, {options.mode}", found | {"options": sys.argv[1:]})
-        print(json.dumps(found, indent=1))
+        found = {
+            "flight": f"the {aircraft}, {options.mode}",
+            "took": took,
+            **figures((runs / "latest").resolve(), memory, host),
+        }
+        text = json.dumps(found, indent=1)
+        print(text)
+        if options.json is not None:
+            options.json.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

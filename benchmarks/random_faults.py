@@ -20,6 +20,7 @@ from typing import Annotated
 
 import typer
 from benchmarks.faults import Row, run_campaign
+from tests.ros.faults.draws import FOUND
 
 
 def main(
@@ -31,7 +32,7 @@ def main(
     """Inject random faults and print what failed; exit status 1 if any did."""
     options = [f"--faults-random={count}", f"--faults-lockstep={lockstep}", f"--faults-seed={seed}"]
     options += [f"--timeout={30 * (count + lockstep) + 300}", "-k", "random or log_holds"]
-    rows, status = run_campaign(options)
+    rows, status = run_campaign(options, len(FOUND) * bool(count) + count + lockstep)
     failed = [row for row in rows if not row["passed"]]
     two = sum("," in row["case"] for row in rows)
     cases = Counter(name for row in rows for name in row["case"].split(", "))

@@ -75,6 +75,16 @@ VIEW |= {
         "probability start included": dict.fromkeys(PAIRS, 0.5),
     }
 }
+LONG_FLIGHT: dict[str, Any] = {"flight": "the c172p, in lockstep", "took": 1500.0, "outcome": "completed", "minutes": 60.0}
+LONG_FLIGHT |= {"legs": 62, "missing": {"y": 0, "u": 1}, "lost": 0, "guidance": {"steps": 180_001, "differing": 0}}
+LONG_FLIGHT |= {
+    "xtrack": 6.5,
+    "bank_deg": 30.5,
+    "V": 40.5,
+    "memory": {"recorder.main": [100e6, 103e6], "rise-di fly": [90e6, 91e6]},
+}
+LONG_FLIGHT |= {"ticks": {"missed ticks": 3, "missed ticks, excluding host delays": 0}}
+LONG_FLIGHT |= {"report": {"size": 48.1e6, "written": 12.5, "opened": {"figures in view": 1.2, "all figures": 2.6}}}
 FLEET = {"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}
 RESULTS = {
     "speed-node": result("speed-node", {"seconds": 10.0, "rows": NODE}),
@@ -82,6 +92,8 @@ RESULTS = {
     "random-faults": result("random-faults", {"draws": 110, "two": 9, "lockstep": 10, "failed": []}),
     "security": result("security", [{"name": "test_an_attacker_receives_nothing", "outcome": "passed", "seconds": 1.0}]),
     "fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE}),
+    "long-fuzz": result("long-fuzz", {"mcap": COVERAGE}),
+    "long-jsbsim": result("long-jsbsim", LONG_FLIGHT),
     "campaign": result("campaign", CAMPAIGN),
     "campaign-fleet": result("campaign-fleet", {"cases": [FLEET]}),
     "cluster": result("cluster", {"faults": "worker killed", "workers": 4, "aircraft": 2000, "chunks": 40, "same": 39}),
@@ -104,7 +116,7 @@ def test_no_line_of_prose_is_longer_than_the_width_and_no_command_is_broken() ->
 
 def test_the_page_has_every_section() -> None:
     titles = re.findall(r"^## (.+)$", page(), re.MULTILINE)
-    assert titles == ["Faults", "Speed", "Security", "Campaign", "Other laws", "Live view", "Log"]
+    assert titles == ["Faults", "Speed", "Security", "Long flights", "Campaign", "Other laws", "Live view", "Log"]
 
 
 def test_without_results_the_page_holds_no_figure_but_the_command_for_each() -> None:
@@ -133,6 +145,24 @@ def changed_fault(worst: float) -> Result:
 def test_each_table_stands_below_its_command() -> None:
     for name in RESULTS:
         assert f"\n    measure {name}    # 2020-01-02 03:04 UTC, abc1234\n" in page()
+
+
+def test_long_measurements_run_only_by_their_name() -> None:
+    missing = {one.name for one in wanted((), {}, quick=False)}
+    assert not {name for name in missing if name.startswith("long-")}
+    assert [one.name for one in wanted(("long-f",), {}, quick=False) if one.name not in missing] == ["long-faults", "long-fuzz"]
+
+
+def test_a_long_flight_states_its_goals_and_those_that_it_misses() -> None:
+    for line in (
+        "- Goal: memory of recorder.main at most 2 % larger at the end than in the middle. Measured: 3 %, **not met**.",
+        "- Goal: memory of rise-di fly at most 2 % larger at the end than in the middle. Measured: 1.11 %, met.",
+        "- Goal: no sample is missing from the log. Measured: 1, **not met**.",
+        "- Goal: no missed tick, excluding host delays. Measured: 0, met.",
+        "- Goal: the report is written within 10 s. Measured: 12.5 s, **not met**.",
+        "- Goal: all figures of the report (48 MB) drawn within 3 s. Measured: 2.6 s, met.",
+    ):
+        assert line in page(), line
 
 
 def test_a_figure_that_depends_on_the_host_is_a_ratio_to_its_baseline_with_the_figure_in_parentheses() -> None:

@@ -9,15 +9,12 @@ from benchmarks.guidance_page import page
 def test_the_page_marks_what_misses_its_limit_and_names_what_was_lost() -> None:
     flights = [("heading", "calm", "V (m/s)", 1.25, 2.0, 0), ("heading", "turbulence", "V (m/s)", 7.6, 5.0, 5)]
     grid = [Point("c172p", 300.0, 30.0, "ok"), Point("c172p", 300.0, 36.0, "lost", "diverged at t = 3.00 s")]
-    opened = [{"figures in view": 1.44, "all figures": 2.44}, {"figures in view": 1.5, "all figures": 3.04}]
     dated = {
         name: {"date": "2026-01-01 00:00 UTC", "result": result}
         for name, result in {
             "flights c172p": flights,
             "grid c172p": grid,
             "rates": [("c172p", "calm", {"q": 0.9, "p": 1.6}, 1.5)],
-            "long c172p, in lockstep": {"minutes": 60.0, "legs": [1, 2], "options": ["--minutes", "60"]},
-            "opened": {"flight": 3600.0, "size": 54_530_000, "opened": opened},
         }.items()
     }
     lines = page(dated).splitlines()
@@ -27,9 +24,6 @@ def test_the_page_marks_what_misses_its_limit_and_names_what_was_lost() -> None:
     assert "| c172p, calm | 0.90 | *1.60* | 1.5 |" in lines
     assert "1 of 2 points flown, 1 lost." in lines
     assert "- lost at 36 m/s and 300 m: diverged at t = 3.00 s" in lines
-    drawn = "Drawn: figures in view after 1.4, 1.5 s, all figures after 2.4, *3.0* s (limit 3)."
-    assert f"A flight of 60 min, a report of 54.5 MB. {drawn}" in lines
-    assert any("minutes: 60.0; legs: 1, 2." in line for line in lines)
     again = page({"rates": dated["rates"] | {"result": [("737", "calm", {"q": 0.5}, 1.5)]}}, page(dated))
     assert "| 737, calm | 0.50 | 1.5 |" in again
     assert "| c172p, calm |" not in again
