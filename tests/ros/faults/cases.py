@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
+import pytest
 from mcap.records import Message
 from numpy.random import Generator
 from rcl_interfaces.srv import SetParameters
@@ -356,6 +357,7 @@ def stop(role: str) -> Injection:
 
 
 STORM_RATE, STORM_DURATION = 10_000.0, 2.0  # Hz, s
+STORM_ATTEMPTS = 3  # a host that other work delays may send too few once
 
 
 def storm(topic: str, reason: str = "conflicting publisher") -> Injection:
@@ -363,10 +365,13 @@ def storm(topic: str, reason: str = "conflicting publisher") -> Injection:
 
     def inject(flight: Flight, random: Generator) -> None:
         seed = int(random.integers(2**31))
-        until_refusal_logged_again(flight, topic, reason)
-        sent = disturb(flight, "storm", topic, str(STORM_RATE), str(STORM_DURATION), str(seed))
-        flight.measured["messages_per_second"] = sent / STORM_DURATION
-        assert sent >= 0.5 * STORM_RATE * STORM_DURATION, "the host is too busy for a storm"
+        for _ in range(STORM_ATTEMPTS):
+            until_refusal_logged_again(flight, topic, reason)
+            sent = disturb(flight, "storm", topic, str(STORM_RATE), str(STORM_DURATION), str(seed))
+            flight.measured["messages_per_second"] = sent / STORM_DURATION
+            if sent >= 0.5 * STORM_RATE * STORM_DURATION:
+                return
+        pytest.fail("the host is too busy for a storm")
 
     return inject
 
