@@ -16,6 +16,12 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
 
 Row = dict[str, str | int | float | bool | None]
+LINES = 12  # of an error in a row: what failed, and the first output of a process that did not answer
+
+
+def described(error: BaseException) -> str:
+    """An error in a line."""
+    return f"{type(error).__name__}: {' | '.join(str(error).splitlines()[:LINES])}"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

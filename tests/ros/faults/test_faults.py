@@ -14,7 +14,7 @@ from rcl_interfaces.msg import Log
 from rclpy.serialization import deserialize_message
 from tests.ros.conftest import logged
 from tests.ros.faults.cases import CASES, LEVEL, RESTART, SLACK, Case, Response
-from tests.ros.faults.conftest import Flights, Row
+from tests.ros.faults.conftest import Flights, Row, described
 from tests.ros.faults.draws import Draw, inject
 from tests.ros.faults.flight import HOLD, MAX_AGE, RAMP, TICK, U_MAX_AGE, Flight
 from tests.ros.faults.foreign import JUMP
@@ -53,7 +53,7 @@ def test_fault_is_detected_contained_and_recovered_from(
             case.inject(flight, np.random.default_rng((seed, crc32(case.name.encode()))))
             reaction, recovery, host_delay = check(case, flight)
         except BaseException as error:
-            record(row | {"passed": False, "error": f"{type(error).__name__}: {str(error).splitlines()[:1]}"})
+            record(row | {"passed": False, "error": described(error)})
             flights.close()
             raise
         flight.expect_in_log(f"{case.name}, seed {seed}")
@@ -81,7 +81,7 @@ def test_random_faults_are_detected_contained_and_recovered_from(
                 view.expect_in_log(f"{draw.name}, seed {draw.seed}")
         except (AssertionError, pytest.fail.Exception) as error:
             failed.append(f"{draw.name}, seed {draw.seed}: {error}")
-            record(row | {"passed": False, "error": f"{type(error).__name__}: {str(error).splitlines()[:1]}"})
+            record(row | {"passed": False, "error": described(error)})
             flights.close()
         else:
             record(row | {"passed": True})

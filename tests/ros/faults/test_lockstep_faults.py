@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 import pytest
 from tests.ros.conftest import Start
-from tests.ros.faults.conftest import Row
+from tests.ros.faults.conftest import Row, described
 from tests.ros.test_lockstep import ROUGH, both_cores_busy, scenario_file
 
 from flight_analysis.closed_loop.scenario import load_scenario
@@ -53,7 +53,7 @@ def test_random_faults_of_lockstep_flights(
                 fly_with_a_fault(start, scenario, f"runs{seed}", str(role), random, expected, kills=kills)
         except (AssertionError, pytest.fail.Exception) as error:
             failed.append(f"{name}, seed {seed}: {error}")
-            record(row | {"passed": False, "error": f"{type(error).__name__}: {str(error).splitlines()[:1]}"})
+            record(row | {"passed": False, "error": described(error)})
         else:
             record(row | {"passed": True})
     assert not failed, "\n".join(failed)
