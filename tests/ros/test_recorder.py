@@ -117,6 +117,25 @@ def test_a_flight_of_which_a_part_is_recorded_is_no_silent_failure(recorder: Rec
     assert "waiting for /y:" not in process.output
 
 
+def test_a_flight_that_falls_silent_is_named_each_time(recorder: Recorder, peer_node: Peer) -> None:
+    process = recorder("run").wait_for("ready")
+
+    def silences() -> int:
+        return sum("no y, y_m or u for 3 s" in line for line in errors(process))
+
+    def send() -> None:
+        peer_node.publish("y", to_message(time.time_ns(), OUTPUTS, np.zeros(4), "/aircraft#1"))
+
+    def pause(count: int) -> None:
+        before = recorded(peer_node, "/y")
+        peer_node.until(lambda: recorded(peer_node, "/y") > before, each=send)
+        assert silences() == count - 1
+        peer_node.until(lambda: silences() == count)
+
+    pause(1)
+    pause(2)
+
+
 def test_a_topic_whose_type_is_not_installed_is_named(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     # The recorder runs in this folder. Its packages precede the installed ones, and its lifecycle_msgs has no messages.
     (tmp_path / "lifecycle_msgs").mkdir()

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recorder's node: records the topics of a flight, as serialised messages, to one MCAP bag."""
 
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -38,6 +39,7 @@ DISK_PERIOD_NS = NANOSECONDS
 MEGABYTE = 1e6
 
 LOOP = (Y, Y_M, U)  # each flight has all of them
+SILENCE_NS = 3 * NANOSECONDS  # a controller that is killed is back within one
 
 # Published by ROS 2 itself (rmw: rmw_qos_profile_rosout_default, rmw_qos_profile_parameter_events).
 ROSOUT = Topic("/rosout", Log, foreign=True)
@@ -83,6 +85,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
         self._ended = ""  # the reason why recording ended
         self._flushed_ns = self._drained_ns = self._disk_checked_ns = time.monotonic_ns()
         self._warn_missing_ns = time.monotonic_ns() + NO_PUBLISHER_WARNING_NS
+        self._heard, self._heard_ns = 0, time.monotonic_ns()  # messages of LOOP, and when the last of them arrived
         self.get_logger().info(f"recording to {self._bag.path}")
 
     def _full_name(self, name: str) -> str:
@@ -153,6 +156,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
             return
         self._subscribe_missing(now_ns)
         self._warn_of_a_part()
+        self._warn_of_silence(now_ns)
         self._check_publisher_counts()
         if now_ns - self._disk_checked_ns > DISK_PERIOD_NS:
             self._disk_checked_ns = now_ns
@@ -234,6 +238,21 @@ class RecorderNode(FlightNode[RecorderParameters]):
             for topic in loop:
                 if not topic.channel.messages:
                     self.warn_no_publisher(topic.subscription)
+
+    def _warn_of_silence(self, now_ns: int) -> None:
+        """Warn, once, when y, y_m and u have all stopped: their publishers have ended, or this process receives nothing.
+
+        Fast DDS can block the threads that receive while it removes a participant that leaves (eProsima/Fast-DDS, issue 6502).
+        """
+        heard = sum(topic.channel.messages for topic in self._topics if topic.subscription.topic in LOOP)
+        if heard != self._heard:
+            self._heard, self._heard_ns = heard, now_ns
+        elif heard and now_ns - self._heard_ns > SILENCE_NS:
+            self._heard_ns = sys.maxsize
+            self.get_logger().error(
+                f"no y, y_m or u for {SILENCE_NS / NANOSECONDS:g} s: if their nodes still publish, the middleware of this "
+                "process is blocked: start the recorder again"
+            )
 
     def _subscribe(self, name: str, message_type: str) -> None:
         package, _, kind = message_type.partition("/msg/")
