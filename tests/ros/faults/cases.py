@@ -557,15 +557,16 @@ def full_disk(flight: Flight, random: Generator) -> None:
         flight.until(lambda: flight.first_line("recorder", "recording ended", flight.begin), 5.0, "the end of the recording")
         flight.processes["recorder"].popen.terminate()
         assert flight.processes["recorder"].end() == 0
+        flight.runs.pop()
+        flight.start("recorder")  # before the log is read: publishers keep two seconds for it
         (file,) = (folder / "run").glob("*.mcap")
         scan = Scan(file)
         times = [record.log_time for record in scan.records() if isinstance(record, Message)]
         assert scan.complete, "the log on the full disk has its footer"
         assert flight.begin - seconds(max(times)) <= 0.3, "and all messages until the fault"
-        flight.runs.pop()
         flight.end_fault()
-    flight.start("recorder")
     flight.processes["recorder"].wait_for("ready")
+    flight.until(lambda: recorded_since(flight.runs[-1], time.time() - 1.0), 10.0, "the last two seconds in the new log")
 
 
 CHANGES, IN_FLIGHT = 300, 8  # requests; a service queues ten

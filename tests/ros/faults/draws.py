@@ -34,6 +34,8 @@ FOUND: tuple[tuple[int, tuple[str, ...]], ...] = (
     (35, ("reference model stopped",)),
     (106, ("future stamps on u", "recorder killed under a live page")),
     (141, ("wrong length on y_m",)),
+    (152, ("disk full",)),
+    (651, ("storm on target",)),
 )
 """Seeds and cases of failures that were mended. The campaign replays them too."""
 
