@@ -55,8 +55,11 @@ def main() -> None:
         publisher.publish(command)
         time.sleep(1.0 / RATE)
     rclpy.shutdown()
-    print(f"sent to {place.latitude:g}, {place.longitude:g}, {place.altitude:g} m above sea level")
+    print(f"sent to {place.latitude}, {place.longitude}, {place.altitude} m above sea level")
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit(130)
