@@ -121,7 +121,7 @@ def test_a_flight_that_falls_silent_is_named_each_time(recorder: Recorder, peer_
     process = recorder("run").wait_for("ready")
 
     def silences() -> int:
-        return sum("no y, y_m or u for 3 s" in line for line in errors(process))
+        return sum("no y, y_m or u for 3 s" in line for line in process.lines)
 
     def send() -> None:
         peer_node.publish("y", to_message(time.time_ns(), OUTPUTS, np.zeros(4), "/aircraft#1"))

@@ -249,7 +249,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
             self._heard, self._heard_ns = heard, now_ns
         elif heard and now_ns - self._heard_ns > SILENCE_NS:
             self._heard_ns = sys.maxsize
-            self.get_logger().error(
+            self.get_logger().warning(
                 f"no y, y_m or u for {SILENCE_NS / NANOSECONDS:g} s: if their nodes still publish, the middleware of this "
                 "process is blocked: start the recorder again"
             )
