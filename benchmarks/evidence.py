@@ -4,7 +4,7 @@
 
     make evidence                              # the missing measurements, then the page
     make evidence ARGS="--again faults"        # measure this one again; "speed" is all that begin so; repeatable
-    make evidence ARGS="--again long"          # those of an hour and more, which nothing else runs: "long-faults" is one
+    make evidence ARGS="--again long"          # those of up to 80 min each, which nothing else runs: "long-faults" is one
     make evidence ARGS=--quick                 # short versions; the page marks them
     make evidence ARGS=--render                # only the page, from the stored results
 
@@ -102,7 +102,7 @@ MEASUREMENTS = (
             f"long-{name}",
             (*LONG_FLIGHT, *options),
             (*LONG_FLIGHT, *options, "--minutes", "1"),
-            f"{what} of a guided flight",
+            f"a guided flight: {what}",
             takes,
             timed=name == "real-time",
             long=True,
