@@ -50,9 +50,16 @@ def u_message(stamp_ns: int, authenticator: MessageAuthenticator | None = None) 
     return Encoder(INPUTS, "/controller#1", authenticator).encode(stamp_ns, np.array([0.1, 0.2, 0.3, 0.4]))
 
 
+def take(decoder: Decoder, raw: bytes) -> None:
+    sample = decoder.decode(raw)
+    assert sample is not None
+    with decoder.once(sample.stamp_ns):
+        pass
+
+
 def rejection(decoder: Decoder, raw: bytes) -> str:
     with pytest.raises(ChannelError) as rejected:
-        decoder.decode(raw)
+        take(decoder, raw)
     return rejected.value.reason
 
 
@@ -92,11 +99,18 @@ def test_a_sample_without_the_key_or_for_another_topic_is_rejected(authenticator
 def test_replay_protection_accepts_a_sample_once_and_none_from_before_the_start() -> None:
     decoder = Decoder(INPUTS, make_authenticator(since_ns=100))
     assert rejection(decoder, u_message(100, make_authenticator())) == "order"
-    assert decoder.decode(u_message(101, make_authenticator())) is not None
+    take(decoder, u_message(101, make_authenticator()))
     for stamp_ns in (101, 90):
         assert rejection(decoder, u_message(stamp_ns, make_authenticator())) == "order"
     assert rejection(decoder, u_message(2**30, make_authenticator(key=OTHER_KEY))) == "mac"  # without effect on the last stamp
-    assert decoder.decode(u_message(102, make_authenticator())) is not None
+    take(decoder, u_message(102, make_authenticator()))
+
+
+def test_a_signed_sample_that_is_refused_for_another_reason_makes_no_earlier_one_stale() -> None:
+    decoder = Decoder(INPUTS, make_authenticator(since_ns=100))
+    with pytest.raises(ChannelError, match="conflicting publisher"), decoder.once(2**30):
+        raise ChannelError("sender", "conflicting publisher /controller#2 ignored")
+    take(decoder, u_message(101, make_authenticator()))
 
 
 def test_without_a_key_a_message_has_no_code() -> None:
@@ -180,6 +194,28 @@ def test_a_replayed_u_is_rejected_also_after_a_restart(start_node: Start, keys: 
     peer_node.until(partial(peer_node.counted, "refused u: order"), BUSY, each=lambda: publisher.publish(replayed))
     peer_node.until(partial(peer_node.counted, "refused u: mac"), BUSY, each=lambda: publisher.publish(u_message(before)))
     assert "receiving u from" not in second.output
+
+
+def test_a_second_controller_with_the_key_and_newer_stamps_does_not_take_over(
+    start_node: Start, keys: Keys, peer_node: Peer
+) -> None:
+    node = aircraft(start_node, "-p", f"key_file:={keys[0]}")
+    publisher = peer_node.node.create_publisher(U.type, U.name, 10)
+    first, second = (Encoder(INPUTS, f"/controller#{number}", make_authenticator()) for number in (1, 2))
+    late_ns = 20_000_000  # as with a y that is 20 ms late
+
+    def send() -> None:
+        publisher.publish(first.encode(time.time_ns() - late_ns, np.zeros(4)))
+
+    def send_both() -> None:
+        send()
+        publisher.publish(second.encode(time.time_ns(), np.zeros(4)))
+
+    peer_node.until(lambda: "receiving u from /controller#1" in node.output, BUSY, each=send)
+    # 100 of them last 0.5 s or more: the age limit of u is 0.2 s, after which the same node in another process takes over.
+    peer_node.until(partial(peer_node.counted, "refused u: sender", 100), BUSY, each=send_both)
+    assert not peer_node.counted("refused u: order")
+    assert "receiving u from /controller#2" not in node.output
 
 
 def test_a_keyed_flight_is_signed_and_replays_exactly(start: Start, osprey_gust: Scenario, keys: Keys, tmp_path: Path) -> None:

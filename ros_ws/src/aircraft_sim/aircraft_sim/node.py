@@ -120,17 +120,11 @@ class AircraftNode(FlightNode[AircraftParameters]):
         limit = 1 if self.parameters.lockstep else None  # in lockstep there is one u for each y
         for received in self._u_subscription.take(limit):
             try:
-                sample = self._decoder.decode(received.message)
-                if sample is not None and not self.parameters.lockstep:
-                    self._require_timely(sample, now_ns)
-                if sample is not None:
-                    self._publisher_lock.check(sample.sender, now_ns, self._max_age_ns, self._takeover_ns)
+                if (sample := self._decoder.decode(received.message)) is not None:
+                    self._accept(sample, now_ns)
+                received_any = True  # without a sample the controller has no output at this instant of a lockstep flight
             except ChannelError as error:
                 self.reject(self._u_subscription, error.reason, str(error))
-                continue
-            received_any = True
-            if sample is not None:  # else the controller has no output at this instant of a lockstep flight
-                self._accept(sample, now_ns)
         if self._timed_out(now_ns):
             self.warn_no_publisher(self._u_subscription)
             if self._publisher_lock.publisher is not None and not self._timeout_logged:
@@ -146,6 +140,11 @@ class AircraftNode(FlightNode[AircraftParameters]):
             raise ChannelError("order", f"stamp {seconds(behind_ns):g} s before the last one")
 
     def _accept(self, sample: StampedVector, now_ns: int) -> None:
+        """Take a u. Raises ChannelError where its stamp is bad or it is from a conflicting publisher."""
+        with self._decoder.once(sample.stamp_ns):
+            if not self.parameters.lockstep:
+                self._require_timely(sample, now_ns)
+            self._publisher_lock.check(sample.sender, now_ns, self._max_age_ns, self._takeover_ns)
         self._u, self._u_stamp_ns, self._timeout_logged = sample.value, sample.stamp_ns, False
         if self._publisher_lock.refresh(sample.sender, now_ns):
             self.get_logger().info(f"receiving u from {self._publisher_lock.publisher}")

@@ -13,6 +13,8 @@ import hmac
 import os
 import stat
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from flight_core.files import open_nonblocking
 from flight_core.parameters import ParameterError, require
@@ -58,7 +60,7 @@ def mac_slice(message: bytes | bytearray) -> slice:
 class MessageAuthenticator:
     """Computes and checks the message authentication codes of one topic, given by its full name.
 
-    Replay protection: a sample must be newer than `since_ns` and than the last sample that was accepted. None switches it off,
+    Replay protection: a sample must be newer than `since_ns` and than the last sample that was taken. None switches it off,
     for lockstep, where stamps begin at 0.
     """
 
@@ -81,8 +83,16 @@ class MessageAuthenticator:
         if not hmac.compare_digest(digits, self.mac(message[: place.start] + b"0" * DIGITS + message[place.stop :])):
             raise ChannelError("mac", "wrong message authentication code: another key, another topic or a changed message")
 
-    def accept(self, stamp_ns: int) -> None:
-        """Accept a stamp as the last one. Raises ChannelError, reason "order", for a stale or replayed message."""
-        if self._last_ns is not None:
-            require_newer(stamp_ns, self._last_ns, "stale or replayed message")
-            self._last_ns = stamp_ns
+    @contextmanager
+    def once(self, stamp_ns: int) -> Iterator[None]:
+        """Within it a sample is taken. Raises ChannelError, reason "order", for a stale or replayed message.
+
+        Its stamp counts only where the block ends without an exception: a sample that is refused, as that of a second
+        publisher, must not make those of the first one stale.
+        """
+        if self._last_ns is None:
+            yield
+            return
+        require_newer(stamp_ns, self._last_ns, "stale or replayed message")
+        yield
+        self._last_ns = stamp_ns

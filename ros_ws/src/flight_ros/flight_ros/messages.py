@@ -10,6 +10,7 @@ middleware leaves uninitialised memory between two strings.
 import math
 import struct
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ STAMP = struct.Struct("<iI")  # seconds and nanoseconds; they follow the encapsu
 STAMP_PLACE = len(ENCAPSULATION)
 COUNT = struct.Struct("<I")  # length of a sequence or a string, before its elements
 NO_CHANNELS: FloatArray = np.zeros(0)
+NO_CONTEXT = nullcontext()
 
 
 def to_message(stamp_ns: int, names: Sequence[str], values: FloatArray, frame_id: str) -> JointState:
@@ -91,12 +93,27 @@ class Encoder:
         return message[: self._mac.start] + self._authenticator.mac(message) + message[self._mac.stop :]
 
 
-class Decoder:
-    """Decodes the wanted channels of the messages of one topic. An `authenticator` accepts only authentic, new ones."""
+class _AuthenticatingDecoder:
+    """Decodes messages of one topic. An `authenticator` passes only authentic ones, and `once` each of them once."""
+
+    def __init__(self, authenticator: MessageAuthenticator | None) -> None:
+        self._authenticator = authenticator
+
+    def _check(self, raw: bytes) -> None:
+        if self._authenticator is not None:
+            self._authenticator.check(raw)
+
+    def once(self, stamp_ns: int) -> AbstractContextManager[None]:
+        """Take a decoded sample within it: `MessageAuthenticator.once`."""
+        return NO_CONTEXT if self._authenticator is None else self._authenticator.once(stamp_ns)
+
+
+class Decoder(_AuthenticatingDecoder):
+    """Decodes the wanted channels of the messages of one topic."""
 
     def __init__(self, wanted: Sequence[str], authenticator: MessageAuthenticator | None = None) -> None:
+        super().__init__(authenticator)
         self._wanted = list(wanted)
-        self._authenticator = authenticator
         self._fixed = b""  # the constant bytes of the last publisher's messages
         self._names: list[str] = []
         self._order: list[int] = []
@@ -106,14 +123,7 @@ class Decoder:
 
     def decode(self, raw: bytes) -> StampedVector | None:
         """The sample; None for a vector without channels. Raises ChannelError for an invalid message."""
-        if self._authenticator is None:
-            return self._decode(raw)
-        self._authenticator.check(raw)
-        if (sample := self._decode(raw)) is not None:
-            self._authenticator.accept(sample.stamp_ns)
-        return sample
-
-    def _decode(self, raw: bytes) -> StampedVector | None:
+        self._check(raw)
         if not self._fixed or self._fixed_part(raw) != self._fixed:
             message = _message(raw)
             if not message.name and not message.position:
@@ -150,22 +160,19 @@ class NamedSample(NamedTuple):
     sender: str
 
 
-class NamedDecoder:
+class NamedDecoder(_AuthenticatingDecoder):
     """Decodes all channels of the messages of a topic whose channels vary; several times slower than Decoder."""
 
     def __init__(self, authenticator: MessageAuthenticator | None = None) -> None:
-        self._authenticator = authenticator
+        super().__init__(authenticator)
 
     def decode(self, raw: bytes) -> NamedSample:
         """The sample. Raises ChannelError for an invalid message."""
-        if self._authenticator is not None:
-            self._authenticator.check(raw)
+        self._check(raw)
         message = _message(raw)
         sample, names = from_message(message, message.name), list(message.name)
         if len(set(names)) < len(names):
             raise ChannelError("name", f"each channel expected once among {', '.join(names)}")
-        if self._authenticator is not None:
-            self._authenticator.accept(sample.stamp_ns)
         return NamedSample(sample.stamp_ns, dict(zip(names, sample.value.tolist(), strict=True)), sample.sender)
 
 

@@ -19,7 +19,7 @@ from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError, StampedVector, require_not_future, select
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
-from flight_ros.messages import NO_CHANNELS
+from flight_ros.messages import NO_CHANNELS, Decoder, NamedDecoder
 from flight_ros.publisher_lock import PublisherLock
 from flight_ros.rclpy_private import DeserializationError
 from flight_ros.subscriptions import PolledSubscription
@@ -111,9 +111,9 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         self._follow_controller()
         for sample in self._received_y():
             if sample is not None:
-                self._accept(self._y_subscription, self._y_lock, self._guidance.take_y, sample, now_ns)
+                self._accept_y(sample, now_ns)
         for sample in self._received_poses():
-            self._accept(self._pose_subscription, self._pose_lock, self._guidance.take_pose, sample, now_ns)
+            self._accept_pose(sample, now_ns)
         if (output := self._step(now_ns, tick.number * self.period_ns())) is not None:
             self._publish(output, now_ns)
 
@@ -121,9 +121,9 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         advanced = False
         for now_ns, due, y, poses in self._inputs.complete():
             if y is not None:
-                self._accept(self._y_subscription, self._y_lock, self._guidance.take_y, y, now_ns)
+                self._accept_y(y, now_ns)
             for pose in poses:
-                self._accept(self._pose_subscription, self._pose_lock, self._guidance.take_pose, pose, now_ns)
+                self._accept_pose(pose, now_ns)
             if due and (output := self._step(now_ns, now_ns)) is not None:
                 self._publish(output, now_ns)
             elif due:
@@ -182,9 +182,16 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
                 self.reject(self._pose_subscription, error.reason, str(error))
         return samples
 
+    def _accept_y(self, sample: StampedVector, now_ns: int) -> None:
+        self._accept(self._y_subscription, self._y_decoder, self._y_lock, self._guidance.take_y, sample, now_ns)
+
+    def _accept_pose(self, sample: StampedVector, now_ns: int) -> None:
+        self._accept(self._pose_subscription, self._pose_decoder, self._pose_lock, self._guidance.take_pose, sample, now_ns)
+
     def _accept(
         self,
         subscription: PolledSubscription,
+        decoder: Decoder | NamedDecoder,
         lock: PublisherLock,
         take: Callable[[StampedVector, int], None],
         sample: StampedVector,
@@ -193,8 +200,9 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         """Give a sample to guidance, unless its stamp is bad or it is from a conflicting publisher."""
         max_age_ns = nanoseconds(self.parameters.max_age)
         try:
-            lock.check(sample.sender, now_ns, max_age_ns, max_age_ns + nanoseconds(self.parameters.hold))
-            take(sample, now_ns)
+            with decoder.once(sample.stamp_ns):
+                lock.check(sample.sender, now_ns, max_age_ns, max_age_ns + nanoseconds(self.parameters.hold))
+                take(sample, now_ns)
             lock.refresh(sample.sender, now_ns)
         except ChannelError as error:
             self.reject(subscription, error.reason, str(error))
@@ -203,9 +211,10 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         for received in self._target_subscription.take(MAX_TARGETS):
             try:
                 sample = self._target_decoder.decode(received.message)
-                if not self.parameters.lockstep:  # an operator has the system clock, not the flight time of lockstep
-                    require_not_future(sample.stamp_ns, now_ns, nanoseconds(self.parameters.max_age))
-                self._guidance.take_target(sample.channels)
+                with self._target_decoder.once(sample.stamp_ns):
+                    if not self.parameters.lockstep:  # an operator has the system clock, not the flight time of lockstep
+                        require_not_future(sample.stamp_ns, now_ns, nanoseconds(self.parameters.max_age))
+                    self._guidance.take_target(sample.channels)
             except ChannelError as error:
                 self.reject(self._target_subscription, error.reason, str(error))
 
@@ -230,8 +239,10 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         """Fly while the controller is ENGAGED. After it was INACTIVE, hold what is measured; after a failsafe, go on."""
         for received in self._internals.take()[-1:]:
             try:
-                sample = self._internals_decoder.decode(received.message)
-                mode = self._controller_mode if sample is None else ControllerMode(int(sample.value[0]))
+                if (sample := self._internals_decoder.decode(received.message)) is None:
+                    continue
+                with self._internals_decoder.once(sample.stamp_ns):
+                    mode = ControllerMode(int(sample.value[0]))
             except ValueError as error:  # of the decoder, and of a number that is no mode
                 self.reject(self._internals, "mode", str(error))
                 continue

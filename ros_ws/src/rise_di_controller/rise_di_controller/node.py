@@ -94,7 +94,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         ):
             for sample in self._received(subscription, decoder):
                 if sample is not None:
-                    self._accept(subscription, take, sample, now_ns, lock)
+                    self._accept(subscription, decoder, take, sample, now_ns, lock)
         self._step(now_ns, tick.late_ns)
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._warn_stale_inputs(now_ns)
@@ -126,6 +126,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
     def _accept(
         self,
         subscription: PolledSubscription,
+        decoder: Decoder,
         take: Callable[[StampedVector, int], None],
         sample: StampedVector,
         now_ns: int,
@@ -136,10 +137,11 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         Another node may take over as publisher once the failsafe has brought u to trim.
         """
         try:
-            if lock is not None:
-                failsafe_ns = nanoseconds(self.parameters.hold + self.parameters.ramp)
-                lock.check(sample.sender, now_ns, self._max_age_ns, self._max_age_ns + failsafe_ns)
-            take(sample, now_ns)
+            with decoder.once(sample.stamp_ns):
+                if lock is not None:
+                    failsafe_ns = nanoseconds(self.parameters.hold + self.parameters.ramp)
+                    lock.check(sample.sender, now_ns, self._max_age_ns, self._max_age_ns + failsafe_ns)
+                take(sample, now_ns)
             if lock is not None:
                 lock.refresh(sample.sender, now_ns)
         except ChannelError as error:
@@ -164,9 +166,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         advanced = False
         for now_ns, due, y, y_m in self._inputs.complete():
             if y is not None:
-                self._accept(self._y_subscription, self._controller.take_y, y, now_ns)
+                self._accept(self._y_subscription, self._y_decoder, self._controller.take_y, y, now_ns)
             for sample in y_m:
-                self._accept(self._y_m_subscription, self._controller.take_y_m, sample, now_ns)
+                self._accept(self._y_m_subscription, self._y_m_decoder, self._controller.take_y_m, sample, now_ns)
             if due and not self._step(now_ns, late_ns=0):
                 self._publish_u(self._empty_encoder.encode(now_ns, NO_CHANNELS))
             advanced = True
