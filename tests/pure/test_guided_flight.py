@@ -179,6 +179,49 @@ def test_a_route_replaces_an_altitude_and_an_airspeed_that_were_commanded_before
     assert (signal["target.altitude"][0], signal["target.V"][0]) == (110.0, 26.0)
 
 
+@pytest.mark.parametrize("leg", [2.0, 0.5, -1.0, 99.0])
+def test_a_leg_that_the_route_does_not_have_is_refused(leg: float) -> None:
+    made, section = flying(), GuidanceParameters.validate_mapping(SECTION, "guidance")
+    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))  # a line and the orbit
+    with pytest.raises(ChannelError, match=f"target.leg: found {leg:g}, expected a whole number from 0 to 1"):
+        made.take_target({"leg": leg})
+    assert run(made, 1, 2)["leg"][0] == 0.0
+
+
+def test_a_new_route_voids_the_legs_of_the_program() -> None:
+    route = {"north": [0.0, 900.0, 1800.0], "east": [0.0] * 3, "altitude": [100.0] * 3}
+    steps = {"leg": {"start": [0.05], "value": [2.0]}, "V": {"start": [0.07], "value": [26.0]}}
+    made, section = flying(route=route, program=steps), GuidanceParameters.validate_mapping(SECTION, "guidance")
+    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))  # a line and the orbit
+    signal = run(made, 1, 5)
+    assert signal["leg"].tolist() == [0.0] * 4
+    assert signal["target.V"][-1] == 26.0
+
+
+@pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
+def test_commands_of_the_time_in_which_another_flew_are_not_flown(by: str) -> None:
+    made = flying(program={"heading": {"start": [0.05], "value": [2.0]}})
+    made.take_target({"altitude": 300.0})
+    if by == "guidance/engage":
+        made.engage(engaged=False)
+    else:
+        made.pause(paused=True, forget=True)
+    for k in range(1, 5):
+        made.take_y(StampedVector(20 * MS * k, np.zeros(4)), 20 * MS * k)
+        assert made.step(20 * MS * k, 20 * MS * k) is None
+    made.take_target({"V": 27.0})
+    if by == "guidance/engage":
+        made.engage(engaged=True)
+    else:
+        made.pause(paused=False, forget=False)
+    made.take_target({"climb": 1.0})  # from now on
+    made.take_pose(pose(100 * MS), 100 * MS)
+    signal = run(made, 5, 6, np.zeros(4))
+    assert signal["target.heading"][0] == pytest.approx(0.3)  # that of the pose
+    assert signal["target.V"][0] == 25.0
+    assert (signal["mode.vertical"][0], signal["target.climb"][0]) == (Vertical.CLIMB, 1.0)
+
+
 def test_a_skip_on_the_last_leg_is_refused_and_leaves_the_commands() -> None:
     made, section = flying(), GuidanceParameters.validate_mapping(SECTION, "guidance")
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
@@ -260,7 +303,7 @@ def test_a_command_that_cannot_be_flown_is_refused_and_changes_nothing(values: d
         ({"stall_speed": 24.0}, r"guidance.stall_speed: found 24.0 m/s, expected a floor of 1.15 V_s below 25 m/s"),
         ({"program": program(bank=0.1)}, r"guidance.program.bank: found a channel, expected one of phi"),
         ({"program": program(phi=0.9)}, r"guidance.program at 1 s.phi: found 0.9, expected -0.5"),
-        ({"program": program(leg=1.0)}, "guidance.program.leg: found no route, expected a section route beside it"),
+        ({"program": program(leg=1.0)}, "guidance.program at 1 s.leg: found no route, expected one"),
         ({"program": {"phi": {"start": [1.0, 1.0], "value": [0.1, 0.2]}}}, "expected times in rising order"),
         ({"route": {"north": [0.0], "east": [0.0, 1.0], "altitude": [0.0]}}, "guidance.route.east: found 2 values, expected 1"),
         ({"pitch": [0.2, 0.1]}, "guidance.pitch: found .* expected the least before the largest"),
@@ -297,6 +340,10 @@ def test_the_numbers_that_are_left_out_follow_from_the_other_sections() -> None:
         (
             {"guidance": {"speed": 30.0, "route": None}},
             "guidance.speed: found 30.0, expected 25.0, as the other sections have it",
+        ),
+        (
+            {"guidance": {"rate": 4.0}},
+            "guidance.rate: found 4 Hz, expected at least 5 Hz: the reference model ends",
         ),
         ({"guidance": {"rate": 40.0}}, r"guidance.rate: found 40 Hz, expected a whole fraction of the rate of pose \(50 Hz\)"),
     ],

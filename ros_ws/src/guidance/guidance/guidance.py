@@ -170,9 +170,7 @@ class Guidance:
 
     def take_target(self, values: Mapping[str, float]) -> None:
         """Take commands by channel of `modes.Target`; those of one instant are taken together. Raises ChannelError."""
-        modes.read_target(values, self._params)
-        if "leg" in values and self.route is None:
-            raise ChannelError("bounds", "target.leg: found no route, expected one")
+        modes.read_target(values, self._params, self.route)
         # A lateral or vertical command replaces that of another mode.
         for table in (modes.LATERAL, modes.VERTICAL):
             if any(name in table for name in values):
@@ -180,8 +178,12 @@ class Guidance:
         self._given |= values
 
     def take_route(self, route: Route) -> None:
-        """Fly a route from its first leg on. Commands given before it and not taken by a step yet are void."""
+        """Fly a route from its first leg on.
+
+        Commands given before it and not taken by a step yet are void, and so are those of the program for legs.
+        """
         self.route, self._digest, self._given = route, digest(route), {}
+        self._program = deque(step for step in self._program if "leg" not in step[1])
         self.take_target({"leg": 0.0})
 
     def hold(self) -> bool:
@@ -206,13 +208,21 @@ class Guidance:
         """Engage, with the heading, the altitude and the airspeed of then; or command nothing."""
         if engaged and not self._engaged:
             self._begin = Begin.HOLD
+            self._forget_commands()
         self._engaged = engaged
 
     def pause(self, *, paused: bool, forget: bool) -> None:
         """Command nothing while the controller does not fly. `forget`: then hold what is measured, else go on as before."""
-        self._paused = paused
         if forget:
             self._begin = Begin.HOLD
+        if self._paused and not paused and self._begin is Begin.HOLD:
+            self._forget_commands()
+        self._paused = paused
+
+    def _forget_commands(self) -> None:
+        """Forget what was commanded while another flew. Before the first step commands wait for it, as a route does."""
+        if self._state is not None:
+            self._given = {}
 
     def pose(self) -> dict[str, float]:
         """The last pose by channel; empty before the first one."""

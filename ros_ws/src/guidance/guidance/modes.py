@@ -167,8 +167,8 @@ class Commands(NamedTuple):
     slew_limited: bool = False
 
 
-def read_target(values: Mapping[str, float], params: GuidanceParams, what: str = "target") -> None:
-    """Raise ChannelError for commands that name no mode or two, or that are beyond the limits."""
+def read_target(values: Mapping[str, float], params: GuidanceParams, route: Route | None, what: str = "target") -> None:
+    """Raise ChannelError for commands that name no mode or two, or no leg of the route, or that are beyond the limits."""
     modes = [{table[name] for name in values if name in table} for table in (LATERAL, VERTICAL)]
     unknown = [name for name in values if name not in TARGETS]
     if unknown or not values:
@@ -186,13 +186,17 @@ def read_target(values: Mapping[str, float], params: GuidanceParams, what: str =
         ("theta", limits.least_pitch, limits.largest_pitch),
         ("climb", -vertical.sink, vertical.climb),
         ("V", limits.floor, math.inf),
-        ("leg", 0.0, math.inf),
     ):
         if name in values and not least <= values[name] <= largest:
             raise ChannelError("bounds", f"{what}.{name}: found {values[name]:g}, expected {least:.6g} to {largest:.6g}")
     if "radius" in values and abs(values["radius"]) < limits.radius:
         expected = f"at least {math.ceil(limits.radius)} m either way"
         raise ChannelError("bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}")
+    if "leg" in values and route is None:
+        raise ChannelError("bounds", f"{what}.leg: found no route, expected one")
+    if "leg" in values and route is not None and values["leg"] not in range(len(route.legs)):
+        expected = f"a whole number from 0 to {len(route.legs) - 1}"
+        raise ChannelError("bounds", f"{what}.leg: found {values['leg']:g}, expected {expected}")
 
 
 def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> dict[str, Scalar]:

@@ -147,12 +147,9 @@ class GuidanceParameters(KeyedParameters):
         fits = self.period is None or self.period >= least
         rule = f"at least {least:g} s: max(14 s, 1.5 V0 / (g tan(bank)), 11 bank / roll_rate)"
         require(fits, "period", f"{self.period} s", rule)
-        params = self.params()
+        params, route = self.params(), None if self.route is None else self.plan(self.waypoints())
         for start, target in self.program_steps():
-            read_target(target, params, f"program at {start:g} s")
-        if self.route is not None:
-            self.plan(self.waypoints())
-        require(self.route is not None or "leg" not in self.program, "program.leg", "no route", "a section route beside it")
+            read_target(target, params, route, f"program at {start:g} s")
 
     def by_rule(self) -> list[tuple[str, Any]]:
         """Parameters that follow from the other sections of a scenario, in which they may be left out."""
