@@ -140,3 +140,15 @@ def test_a_diverged_aircraft_ends_the_flight_with_the_reason_and_a_log(start: St
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
     assert re.fullmatch(r"aircraft ended with status 3: diverged at t = [\d.]+ s", summary["outcome"])
     assert summary["duration"] > 1.0
+
+
+def test_a_flight_that_waits_for_a_refused_sample_ends_with_the_reason(start: Start, tmp_path: Path) -> None:
+    key = tmp_path / "flight.key"
+    key.write_bytes(bytes(32))
+    key.chmod(0o600)
+    scenario = scenario_file(tmp_path, 60.0, aircraft={"key_file": str(key)})  # the controller has none
+    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", "runs")
+    assert command.end() == 3, command.output  # after PEER_TIMEOUT_NS, 30 s
+    summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
+    reason = "timed out waiting for /u: a sample was refused: no message authentication code"
+    assert summary["outcome"] == f"aircraft ended with status 3: {reason}"

@@ -30,7 +30,7 @@ BAD_PARAMETERS, ENDED_EARLY = 2, 3  # exit statuses
 
 MAX_START_AGE_NS = 10 * NANOSECONDS  # a late node catches up with its missed ticks, but not with hours
 
-PEER_TIMEOUT_NS = 30 * NANOSECONDS  # of a lockstep flight that never begins
+PEER_TIMEOUT_NS = 30 * NANOSECONDS  # of a lockstep flight that never begins, or that waits after a refused sample
 
 SERVICE_POLL_PERIOD = 0.1  # s, between two checks of liveliness and service calls in lockstep
 
@@ -128,12 +128,12 @@ def _start(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
 def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     executor = _start(nodes)
     wait_set = WaitSet([subscription.entity for node in nodes for subscription in node.polled_subscriptions], nodes[0].context)
-    begin_ns = serve_ns = report_ns = time.monotonic_ns()
+    now_ns = advance_ns = serve_ns = report_ns = time.monotonic_ns()
     began = False
     while not stop.requested:
         advanced = [node.advance() for node in nodes]  # each of them, without a short circuit
         if any(advanced):
-            began = True
+            began, advance_ns = True, now_ns
         elif not wait_set.wait(nanoseconds(IDLE_POLL_PERIOD)):
             serve_ns = 0  # no message: check the liveliness of the peers now
         now_ns = time.monotonic_ns()
@@ -147,9 +147,23 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
             for node in nodes:
                 node.publish_diagnostics()
                 node.check_graph()
-            if not began and now_ns - begin_ns > PEER_TIMEOUT_NS:
-                awaited = nodes[0].awaited_topic()
-                raise FlightEnded(f"timed out waiting for {awaited}: no message in {seconds(PEER_TIMEOUT_NS):g} s")
+            if now_ns - advance_ns > PEER_TIMEOUT_NS:
+                _require_input(nodes, advance_ns, began)
+
+
+def _require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: bool) -> None:
+    """Raise FlightEnded where a lockstep flight waits for ever: for a sample that was refused, or for its first one.
+
+    `advance_ns`: when it last advanced. A flight that began waits for a peer that is stopped, for instance in a debugger.
+    """
+    for node in nodes:
+        awaited = node.awaited_topic()
+        refused_ns, sentence = node.refusals.get(awaited, (0, ""))
+        if refused_ns >= advance_ns:
+            raise FlightEnded(f"timed out waiting for {awaited}: a sample was refused: {sentence}")
+    if not began:
+        awaited = nodes[0].awaited_topic()
+        raise FlightEnded(f"timed out waiting for {awaited}: no message in {seconds(PEER_TIMEOUT_NS):g} s")
 
 
 def _run_real_time(node: FlightNode[Any], stop: _Stop) -> None:

@@ -66,6 +66,7 @@ class FlightNode(Node, Generic[P]):
         if self._key is not None:
             self.get_logger().info(f"message authentication with the key in {key_file}")
         self.rejected: Counter[str] = Counter()
+        self.refusals: dict[str, tuple[int, str]] = {}  # the last one by topic: when on the monotonic clock, and why
         self._logged_ns: dict[str, int] = {}  # by message: when it was logged last
         self._conflict = ""  # the last sample of a conflicting publisher since the last report
         self.polled_subscriptions: list[PolledSubscription] = []
@@ -152,6 +153,7 @@ class FlightNode(Node, Generic[P]):
         """
         what = f"{subscription.topic.name}: {reason}"
         self.rejected[what] += 1
+        self.refusals[subscription.name] = time.monotonic_ns(), sentence
         if reason == SENDER:
             self._conflict = f"{subscription.name}: {sentence}"
         if not self._log_due(what, LOG_THROTTLE_NS):
