@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import numpy as np
 
@@ -78,21 +79,24 @@ def simulate(  # noqa: PLR0912 - one a node
                     controller.take_y(StampedVector(sample.stamp_ns, select(outputs, aircraft.outputs, sample.value)), t_ns)
                     if guidance is not None:
                         y = select(scenario.reference_model.outputs, aircraft.outputs, sample.value)
-                        guidance.take_y(StampedVector(sample.stamp_ns, y), t_ns)
+                        with suppress(ChannelError):  # refused, as by the node
+                            guidance.take_y(StampedVector(sample.stamp_ns, y), t_ns)
                 if t_ns % (aircraft.pose_every * aircraft.period_ns) == 0:
                     signals["pose"].add(t_ns, aircraft.pose())
                     if guidance is not None:
-                        guidance.take_pose(StampedVector(t_ns, signals["pose"].rows[-1]), t_ns)
+                        with suppress(ChannelError):
+                            guidance.take_pose(StampedVector(t_ns, signals["pose"].rows[-1]), t_ns)
                 signals["truth"].add(t_ns, aircraft.truth())
             if t_ns % reference.period_ns == 0:
                 y_m = reference.sample(t_ns // reference.period_ns)
                 signals["y_m"].add(t_ns, y_m)
                 controller.take_y_m(StampedVector(t_ns, select(outputs, scenario.reference_model.outputs, y_m)), t_ns)
             if guidance is not None and t_ns % guidance.period_ns == 0 and (guided := guidance.step(t_ns, t_ns)) is not None:
-                m = len(scenario.reference_model.outputs)
-                reference.take(t_ns, guided.u_m[:m], guided.u_m[m:])  # acts from the next step on: y_m of t is given
                 signals["u_m"].add(t_ns, guided.u_m)
                 signals["guidance"].add(t_ns, guided.log)
+                m = len(scenario.reference_model.outputs)
+                with suppress(ChannelError):
+                    reference.take(t_ns, guided.u_m[:m], guided.u_m[m:])  # acts from the next step on: y_m of t is given
             if t_ns % controller.period_ns == 0 and (output := controller.tick(t_ns)) is not None:
                 u = select(aircraft.inputs, inputs, output.u)
                 signals["u"].add(output.stamp_ns, output.u)
