@@ -40,3 +40,12 @@ def test_limits_of_u_beyond_those_of_the_map_are_refused_before_a_flight_that_se
     ):
         require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=False), wide)
     require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=True), wide)
+
+
+def test_a_controller_that_holds_u_while_it_is_inactive_is_refused_before_a_flight_that_sends() -> None:
+    """The bridge deactivates it before an engagement, which needs a u near trim."""
+    shipped = find_scenario(str(REPOSITORY / "examples" / "px4_airplane" / "scenario.yaml"))
+    scenario = shipped.vary(controller={"on_deactivate": "hold"})
+    with pytest.raises(ParameterError, match=r"controller\.on_deactivate: found 'hold', expected 'trim' with a bridge"):
+        require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=False), scenario)
+    require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=True), scenario)

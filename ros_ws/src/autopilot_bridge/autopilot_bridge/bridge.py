@@ -57,7 +57,7 @@ class Bridge:
         self._last_y_ns = -1  # stamp of the last y
         self._last_pose_ns = -1  # stamp of the last pose
         self._u: FloatArray = np.zeros(len(self.inputs))
-        self._u_sender: str | None = None
+        self.u_sender: str | None = None
         self._u_ns = 0  # when u was received
         self._conditions: dict[str, Reading] = {}
         self._overrides: dict[str, Reading] = {}
@@ -88,9 +88,9 @@ class Bridge:
 
     def take_u(self, u: FloatArray, sender: str, now_ns: int) -> None:
         """Take u, shape (m,) in the map's order. Raises ChannelError, reason "sender", for a conflicting publisher."""
-        if sender != self._u_sender and not self.u_timed_out(now_ns):
-            raise ChannelError("sender", f"conflicting publisher {sender} ignored: already receiving from {self._u_sender}")
-        self._u, self._u_sender, self._u_ns = u, sender, now_ns
+        if sender != self.u_sender and not self.u_timed_out(now_ns):
+            raise ChannelError("sender", f"conflicting publisher {sender} ignored: already receiving from {self.u_sender}")
+        self._u, self.u_sender, self._u_ns = u, sender, now_ns
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a condition. A condition that is lost ends an engagement at the next step."""
@@ -149,11 +149,11 @@ class Bridge:
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
-        return self._u_sender is None or now_ns - self._u_ns > self._max_age_ns
+        return self.u_sender is None or now_ns - self._u_ns > self._max_age_ns
 
     def _u_timeout(self, now_ns: int) -> str:
         """The reason why u has timed out, as a sentence; empty where u is fresh."""
-        if self._u_sender is None:
+        if self.u_sender is None:
             return "u not received yet"
         return f"u is {seconds(now_ns - self._u_ns):.2f} s old" if self.u_timed_out(now_ns) else ""
 

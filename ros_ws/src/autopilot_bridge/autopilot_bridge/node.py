@@ -86,6 +86,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
         self._report_ns = 0  # of the last report on the engagement
         self._controller = self.create_client(ChangeState, "controller/change_state")
         self._controller_ready = False
+        self._u_sender: str | None = None
         self._activation: Any = None  # the pending activation of the controller
         self._activation_ns = 0
         self.get_logger().info(
@@ -223,8 +224,9 @@ class BridgeNode(FlightNode[BridgeParameters]):
         refusal = "" if bridge.phase in {Phase.ENGAGED, Phase.ENGAGING} else bridge.refusal(now_ns)
         sentence = "; would refuse: ".join(filter(None, (bridge.reason, refusal)))
         self._engagement.publish(KeyValue(key=bridge.phase.name, value=sentence))
-        ready = self._controller.service_is_ready()
-        if ready and not self._controller_ready and bridge.phase is not Phase.ENGAGED:
+        ready, before, self._u_sender = self._controller.service_is_ready(), self._u_sender, bridge.u_sender
+        restarted = bool(before) and bridge.u_sender != before  # it can take less time than the loss of the service
+        if ready and (restarted or not self._controller_ready) and bridge.phase is not Phase.ENGAGED:
             self._activate(active=False)
         self._controller_ready = ready
 

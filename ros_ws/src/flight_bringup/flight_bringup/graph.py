@@ -80,12 +80,15 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
     """Raise ParameterError where the controller may command more than the map sends; a dry run sends nothing.
 
     The bridge would clip u, and the anti-windup of the law would not know. The limits of the scenario are not narrowed here:
-    the log holds the parameters that flew.
+    the log holds the parameters that flew. A controller that holds u while it is inactive is refused, too: the bridge engages
+    only from a u near trim.
     """
     if autopilot.dry_run:
         return
     channel_map = autopilot.channel_map
     controller, key = scenario.controller, f"scenario {scenario.name}: controller"
+    found = controller.on_deactivate
+    require(found == "trim", f"{key}.on_deactivate", repr(found), "'trim' with a bridge, which engages only from a u near trim")
     lowest, highest = ([sign * float("inf")] * len(controller.inputs) for sign in (-1.0, 1.0))
     lower, upper = controller.lower or lowest, controller.upper or highest
     for name, low, high in zip(controller.inputs, lower, upper, strict=True):
