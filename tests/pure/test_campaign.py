@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from tests.closed_loop import error
+from tests.other_laws import SECTIONS
 from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
@@ -34,6 +36,7 @@ from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_u
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
+from rise_di_controller.params import ControllerParameters
 
 SHORT = find_scenario("osprey_servo").vary(flight={"duration": 5.0})
 VALUES = arrays(np.float64, st.integers(1, 60), elements=st.floats(1e-6, 1e4))
@@ -264,6 +267,12 @@ def test_a_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
 def test_an_invalid_sweep_is_refused(sweep: Sweep, sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"^{sentence}"):
         definition(20, 20, sweep)
+
+
+def test_a_sweep_of_a_law_without_that_parameter_is_refused() -> None:
+    pi = replace(SHORT, controller=ControllerParameters.validate_mapping(SECTIONS["pi"], "controller"))
+    with pytest.raises(ParameterError, match=r"^--sweep: found beta, expected a parameter .*: Lambda, input_scale$"):
+        define(pi, 20, 0.3, 77, 20, sweep=Sweep(parameter="beta", factors=(1.0,)))
 
 
 @pytest.mark.parametrize("text", ["beta=inf", "beta=1,nan", "beta="])

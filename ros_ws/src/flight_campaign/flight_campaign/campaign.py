@@ -100,8 +100,9 @@ def define(
     Raises ParameterError if a campaign cannot fly it.
     """
     if sweep is not None:
-        names = ", ".join(SWEPT)
-        require(sweep.parameter in SWEPT, "--sweep", sweep.parameter, f"a parameter of the controller: {names}")
+        swept = [name for name in SWEPT if hasattr(scenario.controller, name)]
+        names = ", ".join(swept) or f"a law with one of {', '.join(SWEPT)}"
+        require(sweep.parameter in swept, "--sweep", sweep.parameter, f"a parameter of the controller: {names}")
         require(all(factor > 0.0 for factor in sweep.factors), "--sweep", sweep.factors, "factors above 0")
     if scenario.guidance is not None:
         from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights

@@ -71,6 +71,8 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                     client = stack.enter_context(Client(scheduler or cluster, timeout=f"{patience:g}s"))
                     ahead = AHEAD * max(count, len(client.scheduler_info()["workers"]))
                 except (OSError, ValueError) as error:  # ValueError: no address at all
+                    if scheduler is None:
+                        raise ParameterError(f"--engine dask: its workers did not start on this host ({error})") from None
                     where = f"found {scheduler}, expected a reachable dask scheduler"
                     raise ParameterError(f"--scheduler: {where} ({error})") from None
                 try:
