@@ -123,6 +123,11 @@ def test_close_live_commands_are_one_transient() -> None:
     ]
 
 
+def test_the_attitude_beside_live_commands_is_no_command() -> None:
+    u_m = signal([0.0, 500.0, 1000.0], q=[0.0, 0.1, 0.1], phi=[0.1, 0.2, 0.3], theta=0.1)
+    assert metrics.live_commands(tape(u_m=u_m, y_m=signal([0.0], q=[0.0]))) == [Transient("command", "q", 0.5, 0.5)]
+
+
 def test_settling_time_ends_where_the_error_begins_to_stay_in_the_band() -> None:
     t = np.arange(6.0) + 10.0
     for e, settling in (

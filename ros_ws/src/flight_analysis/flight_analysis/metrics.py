@@ -171,7 +171,8 @@ def live_commands(tape: Tape) -> list[Transient]:
         return []
     t, u_m = tape.time("u_m"), tape["u_m"]
     commands: list[Transient] = []
-    for name in u_m.names:
+    others = () if "y_m" not in tape else set(u_m.names) - set(tape["y_m"].names)  # the attitude, which never rests
+    for name in [one for one in u_m.names if one not in others]:
         moved = np.concatenate([u_m[name][:1] != 0.0, np.diff(u_m[name]) != 0.0])
         instants = t[moved]
         groups = np.split(instants, np.flatnonzero(np.diff(instants) > SETTLING_DWELL) + 1)
