@@ -60,6 +60,19 @@ def test_a_log_on_a_full_disk_is_finished_without_loss(disk: Path) -> None:
     assert read_run(disk / "run").tape.notes == ()
 
 
+def test_a_log_whose_chunks_fill_up_between_two_flushes_is_finished_too(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flight_log.bag.CHUNK_BYTES", 4000)  # three messages, so that a thousand index entries exceed END_BYTES
+    bag = BagWriter(disk / "run")
+    channel = bag.add_topic("/y", JOINT_STATE, "")
+    while not bag.full:
+        stamp_ns = 1_000_000 * (channel.messages + 1)
+        message = vector(stamp_ns, NAMES, RANDOM.normal(size=40).tolist())
+        bag.write(channel, stamp_ns, stamp_ns, channel.messages + 1, message)
+    bag.close()
+    with AnyReader([disk / "run"]) as reader:
+        assert reader.message_count == channel.messages > 1000
+
+
 def test_the_end_of_the_file_has_a_reserve_until_it_is_closed(disk: Path) -> None:
     with BagWriter(disk / "run"):
         assert SIZE - free_bytes(disk) >= END_BYTES

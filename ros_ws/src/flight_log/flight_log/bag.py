@@ -3,7 +3,7 @@
 """Writes a bag in the layout of rosbag2: one MCAP file of CDR messages, and metadata.yaml beside it. Needs no ROS."""
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -86,15 +86,20 @@ class _ChunkBuilder(ChunkBuilder):
 
 
 class _ChunkIndexes:
-    """In place of mcap's list, which grows by 1 kB with each chunk, 36 MB an hour: records on disk, written as one."""
+    """In place of mcap's list, which grows by 1 kB with each chunk, 36 MB an hour: records on disk, written as one.
 
-    def __init__(self, file: ReservedFile) -> None:
-        self._file = file
+    With each of them the reserve for the end of the file grows.
+    """
+
+    def __init__(self, file: ReservedFile, channels: Sequence[BagChannel]) -> None:
+        self._file, self._channels, self._count = file, channels, 0
 
     def append(self, index: ChunkIndex) -> None:
         record = RecordBuilder()
         index.write(record)
         self._file.keep(record.end())
+        self._count += 1
+        self._file.reserve(END_BYTES + self._count * (INDEX_BYTES + INDEX_BYTES_BY_TOPIC * len(self._channels)))
 
     def __iter__(self) -> Iterator["_ChunkIndexes"]:
         yield self
@@ -119,13 +124,12 @@ class BagWriter:
         self._file.reserve(END_BYTES)
         self._writer = Writer(cast(Any, self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         setattr(self._writer, CHUNK_BUILDER, _ChunkBuilder())
-        setattr(self._writer, CHUNK_INDEXES, _ChunkIndexes(self._file))
+        setattr(self._writer, CHUNK_INDEXES, _ChunkIndexes(self._file, self.channels))
         try:
             self._writer.start(profile="ros2", library="rise-di flight_recorder")
         except OSError:
             self._file.close()
             raise
-        self._chunks = 0
         self._first_ns: int | None = None
         self._last_ns = 0
 
@@ -178,8 +182,6 @@ class BagWriter:
     def flush(self) -> None:
         """Close the chunk in progress and pass it to the operating system."""
         self._writer.flush()
-        self._chunks += 1
-        self._file.reserve(END_BYTES + self._chunks * (INDEX_BYTES + INDEX_BYTES_BY_TOPIC * len(self.channels)))
 
     def contents(self) -> FileContents:
         """What the file holds so far."""

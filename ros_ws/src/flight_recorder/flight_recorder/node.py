@@ -145,9 +145,7 @@ class RecorderNode(FlightNode[RecorderParameters]):
     def _write(self) -> None:
         """Drain the subscriptions. Every FLUSH_PERIOD_NS also flush, and check the graph and the disk."""
         now_ns = self._drained_ns = time.monotonic_ns()
-        recorded_ns = self._drain_subscriptions()
-        if self._publish_recorded is not None and recorded_ns is not None:
-            self._publish_recorded(instant(recorded_ns))
+        self._drain_subscriptions()
         if now_ns - self._flushed_ns < FLUSH_PERIOD_NS or self._ended:
             return
         self._flushed_ns = now_ns
@@ -166,16 +164,17 @@ class RecorderNode(FlightNode[RecorderParameters]):
         if sentence := self._space_shortage(self._bag.directory):
             self._end(f"min_free: {sentence}")
 
-    def _drain_subscriptions(self) -> int | None:
-        """Write all received messages. Return the stamp of the newest sample of `truth` in ns, None without one."""
-        newest_ns = None
+    def _drain_subscriptions(self) -> None:
+        """Write all received messages. In lockstep publish the stamp of the newest sample of `truth`, for which it waits."""
+        recorded = b""
         for topic in self._topics:
             received = topic.subscription.take()
             if received and topic.subscription.topic is TRUTH:
-                newest_ns = stamp_of(received[-1].message)
+                recorded = instant(stamp_of(received[-1].message))
             if not self._ended:
                 self._write_or_end(partial(self._append, topic, received))
-        return newest_ns
+        if recorded and self._publish_recorded is not None:
+            self._publish_recorded(recorded)
 
     def _append(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
         write, channel = self._bag.write, topic.channel
