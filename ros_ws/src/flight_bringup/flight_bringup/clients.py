@@ -17,6 +17,7 @@ from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Path
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.duration import Duration
+from rclpy.exceptions import NameValidationException
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.publisher import Publisher
 from rclpy.serialization import deserialize_message
@@ -74,7 +75,11 @@ class _Client:
             transport.prepare()
             # The command handles SIGINT, not rclpy.
             rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-            node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False)
+            try:
+                node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False)
+            except NameValidationException as error:
+                rclpy.try_shutdown()
+                raise ParameterError(f"--namespace: {' '.join(str(error).split())}") from None
             self._node, self._cancelled = node, threading.Event()
         else:
             self._node, self._cancelled = parent._node, parent._cancelled

@@ -3,6 +3,7 @@
 """`rise-di target`: what a guided flight holds from now on."""
 
 import math
+import sys
 from typing import Annotated
 
 import typer
@@ -37,7 +38,7 @@ def target(
     with TargetClient(namespace, key_file=key_file) as client:
         refusal = client.send(values)
     if refusal:
-        print(f"error: not in force: {refusal}")
+        print(f"error: not in force: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)
     print(f"in force: {', '.join(commands)}")
 

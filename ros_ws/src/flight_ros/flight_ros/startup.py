@@ -29,7 +29,6 @@ def start_nodes(*nodes: str, early: bool = True) -> None:
     gc.disable()  # `run` enables it; collections during the imports find nothing and take a tenth of the time
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _exit)
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # no search for plugins in all installed packages
     early_participant = _create_early_participant() if early else None
     run = resolve_name("flight_ros.event_loop:run")
     make_nodes = [resolve_name(node) for node in nodes]

@@ -30,7 +30,9 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
     follower = Follower(run, lambda topic, type_name: math.inf)
-    before = list(follower.read())
+    before = {
+        one.topic: one._replace(data=[]) for one in follower.read() if isinstance(one, Messages)
+    }  # what defines a channel
     require(
         not follower.complete,
         f"--foxglove: {run}",
@@ -47,8 +49,8 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
         raise ParameterError(f"--port: {port} cannot be used, expected a free port of this host") from None
     announce(f"ws://{ADDRESS}:{server.port} for Foxglove, Lichtblick and PlotJuggler")
     try:
-        for one in before:
-            _channel(one, follower, channels, context)
+        for first in before.values():
+            _channel(first, follower, channels, context)
         while not ended.wait(POLL_PERIOD) and not follower.complete:
             for one in follower.read():
                 if (channel := _channel(one, follower, channels, context)) is not None and isinstance(one, Messages):
