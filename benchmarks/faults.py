@@ -45,7 +45,9 @@ Row = dict[str, Any]
 def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> list[Row]:
     """Inject every case `times` times in a row; one row for each injection."""
     options = [f"--faults-times={times}", f"--faults-seed={seed}", f"--timeout={120 * times}"]
-    options += [f"--faults-scenario={scenario}", f"--faults-guided={guided}", "-k", f"not random and ({only or 'test'})"]
+    words = only.split() or ["test"]
+    expression = only if {"and", "or", "not"} & set(words) else " and ".join(words)  # the name of a case has blanks
+    options += [f"--faults-scenario={scenario}", f"--faults-guided={guided}", "-k", f"not random and ({expression})"]
     return run_campaign(options)[0]
 
 
@@ -109,7 +111,7 @@ def main(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first injection; the others count up.")] = 1,
     scenario: Annotated[str, typer.Option(help="Scenario of the flight without guidance.")] = "osprey_gust",
     guided: Annotated[str, typer.Option(help="Scenario of the flight under guidance.")] = "osprey_route",
-    only: Annotated[str, typer.Option(help="Cases by parts of their names, as pytest's -k takes them.")] = "",
+    only: Annotated[str, typer.Option(help="Cases by words of their names, or an expression of pytest's -k.")] = "",
     file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
 ) -> None:
     """Run the fault campaign and print its table; exit status 1 if a case did not pass each time."""

@@ -43,7 +43,7 @@ FAULT = {
     "ready_to_caught_up": {"median": 0.4, "worst": 0.62},
     "longest_pause": None,
 }
-UNCERTAIN = {"mean": 1.75, "worst": 2.48, "worst_number": 3, "lost": 0.0}
+UNCERTAIN = {"mean": 1.75, "worst": 2.48, "lost": 0.0}
 LEVEL = {"uncertainty": 0.3, "gust": UNCERTAIN, "turbulence": UNCERTAIN | {"mean": 2.75, "worst": 3.48}}
 LAW: dict[str, Any] = {"law": "rise", "sees": "y", "knows": "Omega", "tuned_on": "gust"}
 LAW |= {"score": {"gust": 1.61, "turbulence": 2.61}}
@@ -199,7 +199,7 @@ def test_the_controller_is_also_compared_with_the_fastest_echo() -> None:
 
 def test_the_page_depends_on_every_figure_of_every_result() -> None:
     """Except those that the page omits."""
-    before, hidden = page(), {"seconds", "deviation", "status", "quiet", "worst_number"}
+    before, hidden = page(), {"seconds", "deviation", "status", "quiet"}
     for name, whole in RESULTS.items():
         for path in leaves(whole["result"]):
             if path[-1] in hidden or path[-2:] == ("turbulence", "lost"):

@@ -26,7 +26,6 @@ class Scores(NamedTuple):
 
     mean: float  # infinite if one diverged
     worst: float
-    worst_number: int  # index of that aircraft, from 0
     lost: float  # fraction with loss of track, a score above LOSS_OF_TRACK_SCORE; includes diverged ones
 
 
@@ -119,8 +118,7 @@ def score_cells(result: LawResult) -> list[str]:
 
 
 def _scores(scores: FloatArray) -> Scores:
-    worst = int(np.argmax(scores))
-    return Scores(float(np.mean(scores)), float(scores[worst]), worst, _lost(scores))
+    return Scores(float(np.mean(scores)), float(np.max(scores)), _lost(scores))
 
 
 def _lost(scores: FloatArray) -> float:
