@@ -128,6 +128,14 @@ def test_a_service_starts_its_node_with_parameters_that_it_has(name: str) -> Non
     assert {option for option, _ in options} <= {"--params-file", "-p"}
 
 
+def test_each_documented_container_starts_a_program_that_the_image_has() -> None:
+    texts = [path.read_text(encoding="utf-8") for path in (DOCKER / "README.md", ROOT / ".github" / "workflows" / "test.yml")]
+    commands = [match[1] for text in texts for match in re.finditer(r"docker run .*?(?<=\s)rise-di ([\w-]+)", text)]
+    assert len(commands) > 3
+    for command in commands:
+        assert command == "rise-di" or list(INSTALLED.glob(f"*/lib/*/{command}")), command
+
+
 def test_the_services_are_the_nodes_of_a_flight() -> None:
     assert SERVICES.keys() == {"aircraft", "reference_model", "controller", "recorder"}
     timed = {name for name, service in SERVICES.items() if any("start_time:=" in word for word in service["command"])}
