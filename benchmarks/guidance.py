@@ -450,7 +450,7 @@ def trim_pitch(scenario: Scenario) -> float:
 EXEMPT = {("f16", "heading", "altitude (m)"): 40.0, ("f16", "orbit", "rms (s)"): 0.05}
 """Limits of an aircraft whose rudder is at its stop in turns: its own yaw damper feeds r back without a washout."""
 AT_STOP = ("f16", "r")
-"""Its rudder is at the stop in turns, so that r is not compared."""
+"""Its rudder is at the stop in turns, so that r misses its limit."""
 LATE = 8.0
 """Limit of the bank beyond its limit with a poor pose, deg: 0.2 s at p_max = 0.35 rad/s are 4 deg, and so are 5 Hz."""
 

@@ -106,8 +106,8 @@ def _rates(_: str, rows: Any) -> tuple[str, str, list[str]]:
     ]
     lines = [
         "The rms of e with guidance over that without. In calm air: a turn of 90 deg over the commands of the scenario's own.",
-        "In turbulence of 1.5 m/s: straight flight over straight flight without commands. r of the f16 has no limit: its",
-        "rudder is at its stop in turns.\n",
+        "In turbulence of 1.5 m/s: straight flight over straight flight without commands. r of the f16 misses its limit:",
+        "its rudder is at its stop in turns.\n",
         *table(("aircraft", *rows[0][2], "limit"), cells),
     ]
     return "Errors of the rates", "python -m benchmarks.guidance --rates", lines
