@@ -36,6 +36,7 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import tracking_error
 from flight_bringup.scenarios import find_scenario
+from flight_core.channels import POSE
 from flight_core.outcome import COMPLETED
 from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Tape
@@ -43,7 +44,7 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from guidance.guidance import Guidance
 from guidance.lateral import least_radius
-from guidance.modes import POSE, Lateral, Mode
+from guidance.modes import Lateral, Mode
 from guidance.params import GuidanceParameters
 from guidance.protection import FLOOR
 

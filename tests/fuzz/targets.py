@@ -34,6 +34,7 @@ from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.replay import recorded_parameters, replay
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_bringup.scenarios import find_scenario, share
+from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError, StampedVector
 from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
@@ -47,7 +48,6 @@ from flight_view.control import Control, RefusedError
 from flight_view.flight import Flight
 from flight_view.server import ADDRESS, Server, answer
 from guidance.guidance import Guidance
-from guidance.modes import POSE
 from guidance.modes import TARGETS as MODE_TARGETS
 from guidance.params import GuidanceParameters
 from guidance.route_file import READERS, Origin, read_route

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from benchmarks import guidance as benchmark
 
+from flight_core.channels import POSE
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import StampedVector
-from guidance.modes import POSE
 
 
 def test_a_step_of_the_bank_is_flown_within_its_limits() -> None:

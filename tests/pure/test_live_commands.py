@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aircraft_sim import pose
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
+from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
@@ -107,7 +107,7 @@ def flight(scenario: Scenario, bank_deg: float, lost: float, duration: float) ->
     speed = scenario.aircraft.channels().speed
     varied = scenario.vary(reference_model={"live": {"speed": speed}, "pulses": {}, "coordinated_turn": None})
     aircraft, model, controller = Simulator(varied.aircraft), Reference(varied.reference_model), Controller(varied.controller)
-    names, u, attitude = varied.reference_model.outputs, np.zeros(4), np.zeros(len(pose.CHANNELS))
+    names, u, attitude = varied.reference_model.outputs, np.zeros(4), np.zeros(len(POSE))
     level, history = 0.0, []
     for t_ns in range(0, int(duration * 1e9) + 1, min(aircraft.period_ns, model.period_ns)):
         t = t_ns / 1e9

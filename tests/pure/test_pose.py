@@ -16,6 +16,7 @@ from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
+from flight_core.channels import POSE
 from flight_core.kinematics import heading_rate
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal
@@ -111,7 +112,7 @@ def test_the_pose_of_an_airframe_agrees_with_another_integrator() -> None:
     exact = solve_ivp(derivative, (0.0, 5.0), np.zeros(12), rtol=1e-10, atol=1e-12).y[:, -1]
     for number in range(int(5.0 * RATE) + 1):
         simulator.sample(number, u if number else np.zeros(4))
-    found = dict(zip(pose.CHANNELS, simulator.pose().tolist(), strict=True))
+    found = dict(zip(POSE, simulator.pose().tolist(), strict=True))
     expected = {"phi": exact[states.index("phi")], "psi": exact[8], "north": exact[9], "east": exact[10], "altitude": exact[11]}
     assert abs(exact[states.index("phi")]) > 0.05  # it has rolled
     for name, value in expected.items():
@@ -165,7 +166,7 @@ def test_the_place_of_jsbsim_is_that_of_its_own_latitude_and_longitude() -> None
     for number in range(int(60.0 * aircraft.rate) + 1):
         pulse = 2.0 < number / aircraft.rate < 3.0
         simulator.sample(number, np.array([0.0, 0.0, 0.05 if pulse else 0.0, 0.0]))
-    found = dict(zip(pose.CHANNELS, simulator.pose().tolist(), strict=True))
+    found = dict(zip(POSE, simulator.pose().tolist(), strict=True))
     radius = 0.3048 * model._fdm["position/radius-to-vehicle-ft"]
     north, east = (radius * (model._fdm[path] - before) for path, before in zip(angles, start, strict=True))
     assert abs(start[0]) < 1e-12  # it flies from the equator: no cosine of the latitude

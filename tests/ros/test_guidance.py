@@ -23,10 +23,11 @@ from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.clients import ControlClient
 from flight_bringup.scenarios import find_scenario
+from flight_core.channels import POSE
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
-from guidance.modes import POSE, Lateral, Vertical
+from guidance.modes import Lateral, Vertical
 from rise_di_controller.guard import Mode as ControllerMode
 
 PEER_TOPICS = ("u_m", "guidance", "pose", "/diagnostics")

@@ -15,11 +15,11 @@ from tests.ros.peer import OUTPUTS, Peer, peer
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_bringup.scenarios import find_scenario
+from flight_core.channels import ATTITUDE
 from flight_core.rates import NANOSECONDS
 from flight_core.units import GRAVITY
 from flight_ros.messages import instant, to_message
 from flight_ros.topics import LOCKSTEP
-from reference_model.live import ATTITUDE
 from reference_model.reference import Reference
 
 PEER_TOPICS = ("pose", "y_m", "/diagnostics")

@@ -8,9 +8,9 @@ A watchdog measures the age of u. A u that times out gets the failsafe: hold the
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from aircraft_sim import pose
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
+from flight_core import channels
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_not_future
 from flight_ros.flight_node import FlightNode
@@ -39,7 +39,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         self._timeout_logged = False
         self._u_subscription, self._decoder = self.subscribe(U), self.decoder(U, self._simulator.inputs)
         self._publish_y, self._publish_truth = self.advertise(Y), self.advertise(TRUTH)
-        self._publish_pose, self._pose_encoder = self.advertise(POSE), self.encoder(POSE, pose.CHANNELS)
+        self._publish_pose, self._pose_encoder = self.advertise(POSE), self.encoder(POSE, channels.POSE)
         self._y_encoder = self.encoder(Y, self._simulator.outputs)
         self._truth_encoder = self.encoder(TRUTH, self._simulator.truth_names)
         if self.parameters.lockstep:

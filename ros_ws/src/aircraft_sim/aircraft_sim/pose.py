@@ -11,10 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flight_core.channels import POSE
 from flight_core.vectors import FloatArray, Scalar, array_namespace
-
-CHANNELS = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
-"""rad (body FRD in NED, psi from true north in (-pi, pi]), m, m/s over ground, and the sideslip in rad."""
 
 RATE = 50.0
 """Hz, the highest rate of pose: the aircraft publishes it at every k-th of its instants, with the least such k."""
@@ -52,6 +50,6 @@ def over_ground(pose: FloatArray, t: float, wind: Sequence[float]) -> FloatArray
     """A pose relative to the air mass as that over ground after t s of a steady wind (m/s to the north, to the east)."""
     moved = pose.copy()
     for i, speed in enumerate(wind):
-        moved[CHANNELS.index("north") + i] += speed * t
-        moved[CHANNELS.index("v_north") + i] += speed
+        moved[POSE.index("north") + i] += speed * t
+        moved[POSE.index("v_north") + i] += speed
     return np.asarray(moved)

@@ -42,7 +42,7 @@ class FlightDynamicsModel(Protocol):
         """Values in the order of `truth_names`."""
 
     def pose(self) -> FloatArray:
-        """The pose relative to the air mass, in the order of `pose.CHANNELS`, absolute values, SI."""
+        """The pose relative to the air mass, in the order of `channels.POSE`, absolute values, SI."""
 
     def diverged(self) -> bool:
         """Whether the state is not finite or too large for a flight."""
@@ -187,7 +187,7 @@ class Simulator:
         return arrived
 
     def pose(self) -> FloatArray:
-        """The true pose at the instant of the last sample, in the order of `pose.CHANNELS`."""
+        """The true pose at the instant of the last sample, in the order of `channels.POSE`."""
         return pose.over_ground(self._model.pose(), seconds(self._number * self.period_ns), self._wind)
 
     def truth(self) -> FloatArray:

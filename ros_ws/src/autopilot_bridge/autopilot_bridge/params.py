@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args
 
 from autopilot_bridge.channel_map import PATH, Line, to_raw
+from flight_core.channels import POSE
 from flight_core.fields import Field
 from flight_core.files import is_file, read_yaml
 from flight_core.parameters import KeyedParameters, NonNegative, Numbers, Parameters, Positive, require
@@ -42,10 +43,6 @@ Raw = Annotated[float, Field(allow_inf_nan=True)]
 Range = tuple[Raw, Raw]
 Limits = tuple[float, float]
 Value = bool | int | Raw | str | tuple[int, ...] | tuple[Raw, ...]
-
-
-POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb")
-"""Channels of a pose: attitude, rad (body FRD in NED); position, m, and velocity over ground, m/s, north, east and up."""
 
 
 class Row(Parameters):

@@ -20,6 +20,7 @@ from aircraft_sim.simulator import POSE_STATES
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import CAPTURE_TIME
 from flight_campaign.benchmark_course import ENGAGE, HOLD, STEP, Course, Segments
+from flight_core.channels import POSE
 from flight_core.kinematics import heading_rate
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import divide, period_ns, seconds
@@ -283,7 +284,7 @@ def _states(x: Array, mission: Mission) -> list[Array]:
 
 
 def _pose(state: MissionState, x: Array, t: Array, mission: Mission) -> dict[str, Array]:
-    """The pose over ground by channel of `guidance.modes.POSE`, (N,) each; psi is not wrapped."""
+    """The pose over ground by channel of `channels.POSE`, (N,) each; psi is not wrapped."""
     _, _, beta, phi, theta, *_ = _states(x, mission)
     north, east, altitude = state.position
     v_north, v_east, climb = state.velocity
@@ -291,7 +292,7 @@ def _pose(state: MissionState, x: Array, t: Array, mission: Mission) -> dict[str
         *(phi, theta, state.psi, north + mission.wind[0] * t, east + mission.wind[1] * t, altitude),
         *(v_north + mission.wind[0], v_east + mission.wind[1], climb, beta),
     )
-    return dict(zip(modes.POSE, values, strict=True))
+    return dict(zip(POSE, values, strict=True))
 
 
 def figures(state: MissionState, mission: Mission) -> dict[str, Array]:

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from flight_core.channels import POSE
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer, require_not_future
 from guidance import modes
 from guidance.modes import (
-    POSE,
     TARGETS,
     Begin,
     Commands,
@@ -30,9 +30,6 @@ from guidance.modes import (
 )
 from guidance.params import GuidanceParameters
 from guidance.path import Route
-
-ATTITUDE = ("phi", "theta")
-"""Channels of u_m beside the commands, for its ending: bank, and pitch above that of level flight, rad."""
 
 LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip")
@@ -146,7 +143,7 @@ class Guidance:
         return self._state
 
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
-        """Take a pose in the order of `modes.POSE`.
+        """Take a pose in the order of `channels.POSE`.
 
         Raises ChannelError for a stamp that is not newer or in the future, for a value beyond `modes.LARGEST`, and for values
         that are all those of the last pose.

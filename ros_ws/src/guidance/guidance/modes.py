@@ -14,6 +14,7 @@ from functools import partial, reduce
 from operator import or_
 from typing import Any, NamedTuple
 
+from flight_core.channels import POSE
 from flight_core.kinematics import clip, euler_rates, heading_rate, tilt
 from flight_core.rates import seconds
 from flight_core.units import GRAVITY
@@ -23,9 +24,6 @@ from guidance.attitude import AttitudeParams, BodyRates, body_rates
 from guidance.lateral import PathError, PathParams, bank_for, course_acceleration, path_acceleration, slip_estimate
 from guidance.path import Arc, Leg, Point, Route
 from guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
-
-POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
-"""Channels of `pose`: rad, m, m/s; beta is 0 where it is not measured."""
 
 LARGEST = 1e9
 """Largest value of pose, y and target, SI. The squares of larger ones overflow; the orbit of the moon is 4e8 m away."""

@@ -14,6 +14,7 @@ from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
+from flight_core import channels
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError, StampedVector, require_not_future, select
@@ -39,8 +40,8 @@ from flight_ros.topics import (
     Y,
     publisher_qos,
 )
-from guidance import modes, path
-from guidance.guidance import ATTITUDE, Guidance, GuidanceOutput
+from guidance import path
+from guidance.guidance import Guidance, GuidanceOutput
 from guidance.modes import Mode
 from guidance.odometry import body_velocity, quaternion
 from guidance.params import GuidanceParameters
@@ -77,7 +78,7 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         self._target_subscription, self._target_decoder = self.subscribe(TARGET, NEWEST_SAMPLES), self.named_decoder(TARGET)
         self._route_subscription = self.subscribe(ROUTE, PUBLISH)
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
-        self._u_m_encoder = self.encoder(U_M, (*outputs, *ATTITUDE))
+        self._u_m_encoder = self.encoder(U_M, (*outputs, *channels.ATTITUDE))
         self._log_encoder = self.encoder(GUIDANCE, self._guidance.names)
         self._y_lock, self._pose_lock = PublisherLock(), PublisherLock()
         self._allowed, self._mode = True, Mode.OFF
@@ -170,13 +171,13 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         return samples
 
     def _received_poses(self) -> list[StampedVector]:
-        """The poses in the order of `modes.POSE`, without sideslip where there is none."""
+        """The poses in the order of `channels.POSE`, without sideslip where there is none."""
         samples = []
         for received in self._pose_subscription.take():
             try:
                 sample = self._pose_decoder.decode(received.message)
-                channels = {"beta": 0.0} | sample.channels
-                pose = select(modes.POSE, [*channels], [*channels.values()])
+                values = {"beta": 0.0} | sample.channels
+                pose = select(channels.POSE, [*values], [*values.values()])
                 samples.append(StampedVector(sample.stamp_ns, pose, sample.sender))
             except ChannelError as error:
                 self.reject(self._pose_subscription, error.reason, str(error))

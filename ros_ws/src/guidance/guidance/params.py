@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from itertools import repeat, starmap
 from typing import Annotated, Any
 
+from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
 from flight_core.parameters import (
     KeyedParameters,
@@ -30,7 +31,6 @@ from guidance.path import Route, leads
 from guidance.route_file import Waypoint
 from guidance.vertical import VerticalParams, path_lag
 
-OUTPUTS = ("q", "V", "p", "r")
 BY_RULE = ("outputs", "natural_frequency", "speed", "throttle_authority", "roll_authority")
 FLOOR_FRACTION = 0.8
 """Speed floor over the trim speed where no stall speed is known."""
@@ -81,7 +81,7 @@ class GuidanceParameters(KeyedParameters):
         default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
     )
     y_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the rate of y, Hz")
-    outputs: Names = Field(default=OUTPUTS, description="the names of the commands u_m: q, V, p, r in any order")
+    outputs: Names = Field(default=RATES_AND_SPEED, description="the names of the commands u_m: q, V, p, r in any order")
     natural_frequency: Positives = Field(description="those of the reference model, one per output, rad/s")
     speed: Positive = Field(description="the trim speed V0, m/s: airspeed is speed + V")
     throttle_authority: tuple[Positive, ...] = Field(
@@ -132,7 +132,7 @@ class GuidanceParameters(KeyedParameters):
 
     def _check(self) -> None:
         period_ns(self.rate, "rate")
-        require(sorted(self.outputs) == sorted(OUTPUTS), "outputs", ", ".join(self.outputs), ", ".join(OUTPUTS))
+        require(sorted(self.outputs) == sorted(RATES_AND_SPEED), "outputs", ", ".join(self.outputs), ", ".join(RATES_AND_SPEED))
         require_length("natural_frequency", self.natural_frequency, self.outputs)
         if self.throttle_authority:
             require(len(self.throttle_authority) == 2, "throttle_authority", self.throttle_authority, "two: down and up")

@@ -14,9 +14,6 @@ from flight_core.kinematics import body_rates, euler_rates, tilt, turn_rate
 from flight_core.rates import seconds
 from flight_core.vectors import ChannelError, FloatArray
 
-ATTITUDE = ("phi", "theta")
-"""Channels of u_m beside the commands: bank, and pitch above that of level flight, rad. They serve the ending alone."""
-
 
 class LiveParams(NamedTuple):
     """Limits of u_m and the gains of its ending."""

@@ -6,6 +6,7 @@ from collections import deque
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from flight_core.channels import ATTITUDE
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, FloatArray, require_not_future
 from flight_ros.flight_node import FlightNode
@@ -13,7 +14,6 @@ from flight_ros.messages import Decoder, stamp_of
 from flight_ros.publisher_lock import PublisherLock
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, U_M, Y_M
-from reference_model.live import ATTITUDE
 from reference_model.params import ReferenceModelParameters
 from reference_model.reference import Reference
 

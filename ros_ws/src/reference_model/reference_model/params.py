@@ -7,6 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from flight_core import parameters
+from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
 from flight_core.parameters import (
     KeyedParameters,
@@ -23,9 +24,6 @@ from flight_core.units import GRAVITY
 from reference_model.command import Profile
 from reference_model.live import LiveParams
 from reference_model.model import Model, second_order, stepper
-
-RATES_AND_SPEED = ("q", "V", "p", "r")
-"""Channels by which the ending of u_m levels the wings."""
 
 
 class Pulses(Parameters):

@@ -30,8 +30,8 @@ class Reference:
     def take(self, t_ns: int, u_m: FloatArray, attitude: FloatArray | None = None) -> None:
         """Take a live u_m, shape (m,), of flight time t; it acts from the next step on.
 
-        `attitude` is [phi, theta] as in `live.ATTITUDE`, None where it is not known. Raises ChannelError for an old u_m or one
-        beyond its bounds.
+        `attitude` has `channels.ATTITUDE`, None where it is not known. Raises ChannelError for an old u_m or one beyond its
+        bounds.
         """
         if self._live is not None:
             require_newer(t_ns, self._live.t_ns, "u_m")

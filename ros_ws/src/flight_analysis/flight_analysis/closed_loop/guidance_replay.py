@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flight_analysis.closed_loop.replay import Difference
+from flight_core.channels import ATTITUDE
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Tape
 from guidance import guidance, modes
@@ -75,7 +76,7 @@ def replay_guidance(tape: Tape, parameters: GuidanceParameters | None) -> Guidan
             if len(columns):
                 differing += 1
                 column = int(columns[0])
-                channel = (*names, *(f"published.{name}" for name in (*outputs, *guidance.ATTITUDE)))[column]
+                channel = (*names, *(f"published.{name}" for name in (*outputs, *ATTITUDE)))[column]
                 first = first or Difference(k + 1, float(t[k]), channel, float(both[0][column]), float(both[1][column]))
         previous = recorded
     missing = len(t) - checked

@@ -11,12 +11,13 @@ import yaml
 
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.pose import every
+from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
 from flight_core.parameters import ParameterError, Parameters, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario import Sections, read_sections
 from flight_recorder.params import RecorderParameters
-from guidance.params import OUTPUTS, GuidanceParameters
+from guidance.params import GuidanceParameters
 from reference_model.params import ReferenceModelParameters
 from rise_di_controller.params import ControllerParameters
 from rise_di_controller.rise_di import RiseDiParameters
@@ -120,8 +121,8 @@ def guidance_by_rule(
     key, channels = "reference_model.second_order", aircraft.channels()
     if reference.second_order is None:
         raise ParameterError(f"{key}: found linear, expected second_order: guidance needs its bounds on y_m_ddot")
-    missing = [name for name in OUTPUTS if name not in reference.outputs]
-    require(not missing, "guidance", f"an aircraft without {', '.join(missing)}", f"one with {', '.join(OUTPUTS)}")
+    missing = [name for name in RATES_AND_SPEED if name not in reference.outputs]
+    require(not missing, "guidance", f"an aircraft without {', '.join(missing)}", f"one with {', '.join(RATES_AND_SPEED)}")
     values = {
         "outputs": reference.outputs,
         "natural_frequency": reference.second_order.natural_frequency,

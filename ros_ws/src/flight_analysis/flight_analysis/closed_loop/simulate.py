@@ -8,14 +8,14 @@ from contextlib import suppress
 
 import numpy as np
 
-from aircraft_sim import pose
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario, require_euler
+from flight_core.channels import ATTITUDE, POSE
 from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
 from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
-from guidance.guidance import ATTITUDE, Guidance
+from guidance.guidance import Guidance
 from guidance.params import GuidanceParameters
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
@@ -69,7 +69,7 @@ def simulate(  # noqa: PLR0912 - one a node
     outcome, t_ns = COMPLETED, 0
     try:
         aircraft = Simulator(scenario.aircraft)
-        signals["truth"], signals["pose"] = _SignalBuilder(aircraft.truth_names), _SignalBuilder(pose.CHANNELS)
+        signals["truth"], signals["pose"] = _SignalBuilder(aircraft.truth_names), _SignalBuilder(POSE)
         base_ns = math.gcd(aircraft.period_ns, reference.period_ns)
         u = np.zeros(len(inputs))
         for t_ns in range(0, nanoseconds(scenario.flight.duration) + 1, base_ns):
