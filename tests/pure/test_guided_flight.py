@@ -353,6 +353,14 @@ def test_sections_that_do_not_fit_guidance_are_refused(changes: dict[str, Any], 
         ROUTE.vary(**changes)
 
 
+def test_commands_beyond_the_bounds_of_the_reference_model_are_refused_and_the_flight_goes_on() -> None:
+    turn = calm(6.0, program=program(heading=2.0)).vary(reference_model={"live": {"speed": 25.0, "bounds": {"p": 0.1}}})
+    tape = simulate(turn)
+    assert tape.outcome == "completed"
+    assert np.abs(tape["u_m"]["p"]).max() > 0.1
+    assert np.abs(tape["y_m"]["p"]).max() < 0.15  # with the overshoot of the reference model
+
+
 def test_a_linear_reference_is_refused() -> None:
     names = ["q", "V", "p", "r"]
     linear = {"states": names, "A_m": (-np.eye(4)).ravel().tolist(), "B_m": np.eye(4).ravel().tolist()}
