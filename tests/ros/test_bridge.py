@@ -366,7 +366,7 @@ def test_the_controller_is_active_only_while_engaged_and_the_summary_says_when_a
     setup: BridgeSetup, start: Start, tmp_path: Path
 ) -> None:
     setup.autopilot()
-    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send", "--duration", "120", "--json")
+    flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send", "--duration", "10000", "--json")
     # A busy host may start the bridge later than the 10 s for which the command waits for one.
     setup.peer.until(lambda: setup.peer.node.count_publishers("bridge/engagement"))
     engaged = start("flight_cli.cli", "engage")  # before all nodes run: it waits for the first u
