@@ -691,6 +691,7 @@ def test_a_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
     for words, expected in (
         (("--wait",), "error: --wait: found no RUN, expected the folder of a run that will be recorded\n"),
         ((recorded, recorded, "--text"), "error: --text: found two runs, expected one run\n"),
+        ((recorded, "--key-file", "k"), "error: --namespace, --key-file: found no --control, expected --control beside them\n"),
     ):
         ended = subprocess.run(command("watch", *words), capture_output=True, text=True, check=False, cwd=recorded)
         assert (ended.returncode, ended.stderr) == (2, expected)

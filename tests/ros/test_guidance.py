@@ -67,7 +67,8 @@ def test_a_keyed_guidance_takes_targets_with_the_key_alone_and_no_route(start: S
     assert "not in force" in forged.output
     peer_node.until(partial(peer_node.counted, "refused target: mac"))
     assert "in force: altitude=60" in start("flight_cli.cli", "target", "altitude=60", "--key-file", str(key)).succeed().output
-    with ControlClient("") as client:
+    with ControlClient("", key.read_bytes()) as client:
+        assert client.send_target({"altitude": 61.0}) == ""
         client.send_route([[0.0, 0.0, 50.0], [900.0, 0.0, 55.0]])
         peer_node.until(partial(peer_node.counted, "refused route: mac"))
 

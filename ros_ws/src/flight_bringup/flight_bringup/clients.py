@@ -24,7 +24,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
-from flight_core.authentication import MessageAuthenticator, read_key
+from flight_core.authentication import MessageAuthenticator
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
 from flight_core.vectors import ChannelError, FloatArray
@@ -223,10 +223,10 @@ class EngagementClient(_Client):
 class TargetClient(_Client):
     """Commands the guidance of a running flight."""
 
-    def __init__(self, namespace: str = "", parent: _Client | None = None, key_file: str = "") -> None:
-        """`key_file` is that of guidance, empty for a flight without keys. Raises ParameterError for an invalid one."""
-        self._key = read_key(key_file, "--key-file") if key_file else None
+    def __init__(self, namespace: str = "", parent: _Client | None = None, key: bytes | None = None) -> None:
+        """`key`: that of guidance, None for a flight without keys."""
         super().__init__("operator", namespace, parent)
+        self._key = key
         self._guidance, self._decoder = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True), NamedDecoder()
         self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
         self._sent = -TARGET_PERIOD  # monotonic time of the last target, s
@@ -273,8 +273,10 @@ class ControlClient(_Client):
 
     NODES = ("aircraft", "bridge", "controller", "guidance")
 
-    def __init__(self, namespace: str) -> None:
+    def __init__(self, namespace: str, key: bytes | None = None) -> None:
+        """`key`: that of guidance, None for a flight without keys."""
         super().__init__("control", namespace)
+        self._key = key
         self._targets: TargetClient | None = None
         self._engagement: EngagementClient | None = None
 
@@ -307,7 +309,7 @@ class ControlClient(_Client):
 
     def send_target(self, values: Mapping[str, float]) -> str:
         """Command guidance, as `rise-di target`."""
-        self._targets = self._targets or TargetClient(parent=self)
+        self._targets = self._targets or TargetClient(parent=self, key=self._key)
         return self._targets.send(values)
 
     def send_route(self, points: Sequence[Sequence[float]]) -> str:

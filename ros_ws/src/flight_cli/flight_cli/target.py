@@ -8,9 +8,13 @@ from typing import Annotated
 
 import typer
 
+from flight_core.authentication import read_key
 from flight_core.parameters import ParameterError, require
 from guidance.modes import TARGETS
 
+KeyFile = Annotated[
+    str, typer.Option(metavar="FILE", help="The `key_file` of guidance, where it has one: targets are refused without it.")
+]
 ANGLES = ("phi", "theta", "heading", "course")
 REFUSED = 1
 
@@ -25,7 +29,7 @@ def target(
         ),
     ],
     namespace: Annotated[str, typer.Option(help="Namespace of the aircraft.")] = "",
-    key_file: Annotated[str, typer.Option(metavar="FILE", help="The `key_file` of guidance, where it has one.")] = "",
+    key_file: KeyFile = "",
 ) -> None:
     """Command a running guided flight, as in: rise-di target heading=90 altitude=1300. What is not named stays.
 
@@ -33,14 +37,20 @@ def target(
     """
     values = dict(map(_parse, commands))
     require(len(values) == len(commands), "target", "a command twice", "each once")
+    key = operator_key(key_file)
     from flight_bringup.clients import TargetClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
-    with TargetClient(namespace, key_file=key_file) as client:
+    with TargetClient(namespace, key=key) as client:
         refusal = client.send(values)
     if refusal:
         print(f"error: not in force: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)
     print(f"in force: {', '.join(commands)}")
+
+
+def operator_key(key_file: str) -> bytes | None:
+    """The key of guidance; None where no file is named. Raises ParameterError for an invalid one."""
+    return read_key(key_file, "--key-file") if key_file else None
 
 
 def _parse(text: str) -> tuple[str, float]:
