@@ -73,6 +73,20 @@ def test_a_log_whose_chunks_fill_up_between_two_flushes_is_finished_too(disk: Pa
         assert reader.message_count == channel.messages > 1000
 
 
+@pytest.mark.parametrize("chunks", range(1, 5))
+def test_a_log_closes_where_its_last_chunk_would_need_a_larger_reserve(
+    chunks: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flight_log.disk.RESERVE_STEP", 0)  # each chunk needs more
+    with BagWriter(tmp_path / "run") as bag:
+        channel = bag.add_topic("/y", JOINT_STATE, "")
+        for k in range(chunks):
+            bag.write(channel, k, k, k + 1, vector(k, NAMES, [0.0] * 40))
+            if k + 1 < chunks:
+                bag.flush()
+    assert len(read_run(tmp_path / "run").tape["y"].stamp_ns) == chunks
+
+
 def test_the_end_of_the_file_has_a_reserve_until_it_is_closed(disk: Path) -> None:
     with BagWriter(disk / "run"):
         assert SIZE - free_bytes(disk) >= END_BYTES

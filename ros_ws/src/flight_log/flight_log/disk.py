@@ -71,8 +71,11 @@ class ReservedFile:
         self.full = False  # the reserve was needed
 
     def reserve(self, size: int) -> None:
-        """Reserve this many bytes in total. Without space for them `full` is set and the earlier reserve stays."""
-        if self.full or size <= self._reserved_bytes:
+        """Reserve this many bytes in total. Without space for them `full` is set and the earlier reserve stays.
+
+        After `release` it does nothing: the last chunk is written then.
+        """
+        if self.full or self._reserve.closed or size <= self._reserved_bytes:
             return
         self._reserved_bytes = size + RESERVE_STEP
         try:
