@@ -45,7 +45,7 @@ Row = dict[str, Any]
 def fly(times: int, seed: int, only: str, scenario: str, guided: str) -> list[Row]:
     """Inject every case `times` times in a row; one row for each injection."""
     options = [f"--faults-times={times}", f"--faults-seed={seed}", f"--timeout={120 * times}"]
-    words = only.split() or ["test"]
+    words = only.replace(",", " ").split() or ["test"]
     expression = only if {"and", "or", "not"} & set(words) else " and ".join(words)  # the name of a case has blanks
     options += [f"--faults-scenario={scenario}", f"--faults-guided={guided}", "-k", f"not random and ({expression})"]
     return run_campaign(options)[0]

@@ -27,7 +27,7 @@ from sensor_msgs.msg import FluidPressure, Imu, Joy
 from std_srvs.srv import SetBool
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, Start, settable_clock
-from tests.ros.peer import Peer, peer
+from tests.ros.peer import HANG, Peer, peer
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
@@ -180,7 +180,8 @@ def test_the_unchanged_controller_tracks_through_the_map_and_when_killed_release
     setup.joys.clear()
     controller.popen.kill()
     killed = time.time()
-    setup.node("rise_di_controller.main")  # at once: the middleware takes 2 s to see that its service was gone
+    setup.until_logged(bridge, "ENGAGED -> RELEASE: u is")
+    restarted = setup.node("rise_di_controller.main")  # the middleware takes 2 s to see that its service was gone
     setup.until_logged(bridge, "RELEASE -> DISENGAGED: u is")
     setup.peer.spin(0.3)
     finite, released = setup.after(killed)
@@ -188,8 +189,7 @@ def test_the_unchanged_controller_tracks_through_the_map_and_when_killed_release
     assert MAX_AGE - 0.05 < min(released) < MAX_AGE + LATE  # the last u may be a period of 20 ms older than the kill
     assert RELEASE - LATE < max(released) - min(released) < RELEASE + LATE
     assert len(released) > 10  # 25 at 50 Hz
-    setup.peer.received["internals"].clear()
-    setup.peer.until(lambda: Mode.INACTIVE in setup.peer.modes())  # the restarted one, so that its integrals do not wind up
+    setup.until_logged(restarted, "-> INACTIVE", HANG)  # so that its integrals do not wind up
 
 
 def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the_channels(setup: BridgeSetup) -> None:
