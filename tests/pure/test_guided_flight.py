@@ -198,6 +198,40 @@ def test_a_new_route_voids_the_legs_of_the_program() -> None:
     assert signal["target.V"][-1] == 26.0
 
 
+def test_a_new_route_leaves_the_airspeed_of_a_program_step_with_a_leg() -> None:
+    route = {"north": [0.0, 900.0, 1800.0], "east": [0.0] * 3, "altitude": [100.0] * 3}
+    steps = {"leg": {"start": [0.05], "value": [2.0]}, "V": {"start": [0.05], "value": [26.0]}}
+    made, section = flying(route=route, program=steps), GuidanceParameters.validate_mapping(SECTION, "guidance")
+    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
+    signal = run(made, 1, 5)
+    assert signal["leg"].tolist() == [0.0] * 4
+    assert signal["target.V"][-1] == 26.0
+
+
+@pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
+def test_a_route_that_is_sent_while_guidance_is_off_is_flown_from_its_engagement(by: str) -> None:
+    made, section = flying(), GuidanceParameters.validate_mapping(SECTION, "guidance")
+
+    def switch(*, on: bool) -> None:
+        if by == "guidance/engage":
+            made.engage(engaged=on)
+        else:
+            made.pause(paused=not on, forget=not on)
+
+    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
+    assert run(made, 1, 2)["mode.lateral"][0] == modes.Lateral.ROUTE
+    switch(on=False)
+    switch(on=True)  # the route that was flown before is not flown on
+    assert run(made, 2, 3)["mode.lateral"][0] != modes.Lateral.ROUTE
+    switch(on=False)
+    made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 130.0)]))
+    made.take_target({"V": 27.0})
+    switch(on=True)
+    signal = run(made, 3, 4)
+    assert (signal["mode.lateral"][0], signal["leg"][0]) == (modes.Lateral.ROUTE, 0.0)
+    assert (signal["target.altitude"][0], signal["target.V"][0]) == (130.0, 25.0)
+
+
 @pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
 def test_commands_of_the_time_in_which_another_flew_are_not_flown(by: str) -> None:
     made = flying(program={"heading": {"start": [0.05], "value": [2.0]}})
@@ -342,8 +376,8 @@ def test_the_numbers_that_are_left_out_follow_from_the_other_sections() -> None:
             "guidance.speed: found 30.0, expected 25.0, as the other sections have it",
         ),
         (
-            {"guidance": {"rate": 4.0}},
-            "guidance.rate: found 4 Hz, expected at least 5 Hz: the reference model ends",
+            {"guidance": {"rate": 5.0}},
+            "guidance.rate: found 5 Hz, expected more than 5 Hz: the reference model ends",
         ),
         ({"guidance": {"rate": 40.0}}, r"guidance.rate: found 40 Hz, expected a whole fraction of the rate of pose \(50 Hz\)"),
     ],

@@ -129,6 +129,7 @@ class Guidance:
         self._pose: StampedVector | None = None
         self._y: StampedVector | None = None
         self._given: dict[str, float] = {} if self.route is None else {"leg": 0.0}
+        self._route_waits = self.route is not None  # no step has flown it yet
         self._state: GuidanceState | None = None
         self._engaged, self._paused, self._begin = True, False, Begin.HOLD
 
@@ -177,10 +178,12 @@ class Guidance:
     def take_route(self, route: Route) -> None:
         """Fly a route from its first leg on.
 
-        Commands given before it and not taken by a step yet are void, and so are those of the program for legs.
+        While guidance is off, the route waits for the engagement. Commands given before it and not taken by a step yet are
+        void, and so are the legs of the program.
         """
-        self.route, self._digest, self._given = route, digest(route), {}
-        self._program = deque(step for step in self._program if "leg" not in step[1])
+        self.route, self._digest, self._given, self._route_waits = route, digest(route), {}, True
+        without = ((start, {name: one for name, one in step.items() if name != "leg"}) for start, step in self._program)
+        self._program = deque((start, step) for start, step in without if step)
         self.take_target({"leg": 0.0})
 
     def hold(self) -> bool:
@@ -217,9 +220,9 @@ class Guidance:
         self._paused = paused
 
     def _forget_commands(self) -> None:
-        """Forget what was commanded while another flew. Before the first step commands wait for it, as a route does."""
+        """Forget what was commanded while another flew, but a route. Before the first step all commands wait for it."""
         if self._state is not None:
-            self._given = {}
+            self._given = {name: one for name, one in self._given.items() if name == "leg" and self._route_waits}
 
     def pose(self) -> dict[str, float]:
         """The last pose by channel; empty before the first one."""
@@ -251,6 +254,6 @@ class Guidance:
             return None
         y_values, pose_values = tuple(y.value.tolist()), tuple(pose.value.tolist())
         inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given)
-        self._begin, self._given = Begin.NO, {}
+        self._begin, self._given, self._route_waits = Begin.NO, {}, False
         self._state, commands = modes.step(self._state, inputs, self.route, self._params)
         return GuidanceOutput(u_m(self._state), row(inputs, self._state, commands, self._digest))
