@@ -24,7 +24,7 @@ from tests.ros.peer import INPUTS, Peer
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.authentication import MessageAuthenticator
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, require_not_future
 from flight_ros.messages import Decoder, Encoder
 from flight_ros.topics import U
 from flight_ros.transport import LOOPBACK_PROFILE, open_to_network
@@ -111,6 +111,15 @@ def test_a_signed_sample_that_is_refused_for_another_reason_makes_no_earlier_one
     with pytest.raises(ChannelError, match="conflicting publisher"), decoder.once(2**30):
         raise ChannelError("sender", "conflicting publisher /controller#2 ignored")
     take(decoder, u_message(101, make_authenticator()))
+
+
+def test_a_signed_sample_that_was_ahead_of_the_clock_cannot_be_replayed_when_its_time_comes() -> None:
+    decoder = Decoder(INPUTS, make_authenticator(since_ns=100))
+    with pytest.raises(ChannelError, match="ahead of the clock"), decoder.once(10**9):
+        require_not_future(10**9, 200, 100)
+    take(decoder, u_message(101, make_authenticator()))
+    assert rejection(decoder, u_message(10**9, make_authenticator())) == "order"
+    take(decoder, u_message(10**9 + 1, make_authenticator()))
 
 
 def test_without_a_key_a_message_has_no_code() -> None:
@@ -204,16 +213,17 @@ def test_a_second_controller_with_the_key_and_newer_stamps_does_not_take_over(
     first, second = (Encoder(INPUTS, f"/controller#{number}", make_authenticator()) for number in (1, 2))
     late_ns = 20_000_000  # as with a y that is 20 ms late
 
-    def send() -> None:
-        publisher.publish(first.encode(time.time_ns() - late_ns, np.zeros(4)))
-
-    def send_both() -> None:
-        send()
-        publisher.publish(second.encode(time.time_ns(), np.zeros(4)))
+    def send(*others: Encoder) -> None:
+        stamp_ns = time.time_ns() - late_ns
+        publisher.publish(first.encode(stamp_ns, np.zeros(4)))
+        for other in others:
+            publisher.publish(other.encode(stamp_ns, np.zeros(4)))  # of the same y
+            publisher.publish(other.encode(time.time_ns(), np.zeros(4)))
 
     peer_node.until(lambda: "receiving u from /controller#1" in node.output, BUSY, each=send)
-    # 100 of them last 0.5 s or more: the age limit of u is 0.2 s, after which the same node in another process takes over.
-    peer_node.until(partial(peer_node.counted, "refused u: sender", 100), BUSY, each=send_both)
+    # 200 of them, two at a time, last 0.5 s or more. The age limit of u, after which the same node in another process takes
+    # over, is 0.2 s.
+    peer_node.until(partial(peer_node.counted, "refused u: sender", 200), BUSY, each=lambda: send(second))
     assert not peer_node.counted("refused u: order")
     assert "receiving u from /controller#2" not in node.output
 

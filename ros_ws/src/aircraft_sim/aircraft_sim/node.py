@@ -141,10 +141,10 @@ class AircraftNode(FlightNode[AircraftParameters]):
 
     def _accept(self, sample: StampedVector, now_ns: int) -> None:
         """Take a u. Raises ChannelError where its stamp is bad or it is from a conflicting publisher."""
+        self._publisher_lock.check(sample.sender, now_ns, self._max_age_ns, self._takeover_ns)
         with self._decoder.once(sample.stamp_ns):
             if not self.parameters.lockstep:
                 self._require_timely(sample, now_ns)
-            self._publisher_lock.check(sample.sender, now_ns, self._max_age_ns, self._takeover_ns)
         self._u, self._u_stamp_ns, self._timeout_logged = sample.value, sample.stamp_ns, False
         if self._publisher_lock.refresh(sample.sender, now_ns):
             self.get_logger().info(f"receiving u from {self._publisher_lock.publisher}")

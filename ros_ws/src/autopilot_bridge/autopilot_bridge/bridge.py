@@ -86,10 +86,14 @@ class Bridge:
                 value = last.value - math.expm1(-seconds(stamp_ns - last.stamp_ns) / row.low_pass) * (value - last.value)
         self._readings[name] = Reading(stamp_ns, value)
 
-    def take_u(self, u: FloatArray, sender: str, now_ns: int) -> None:
-        """Take u, shape (m,) in the map's order. Raises ChannelError, reason "sender", for a conflicting publisher."""
+    def require_sender(self, sender: str, now_ns: int) -> None:
+        """Raise ChannelError, reason "sender", for a u of a conflicting publisher."""
         if sender != self.u_sender and not self.u_timed_out(now_ns):
             raise ChannelError("sender", f"conflicting publisher {sender} ignored: already receiving from {self.u_sender}")
+
+    def take_u(self, u: FloatArray, sender: str, now_ns: int) -> None:
+        """Take u, shape (m,) in the map's order. Raises ChannelError as `require_sender` does."""
+        self.require_sender(sender, now_ns)
         self._u, self.u_sender, self._u_ns = u, sender, now_ns
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:

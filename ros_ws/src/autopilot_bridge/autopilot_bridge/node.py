@@ -171,6 +171,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
             try:
                 sample = self._decoder.decode(received.message)
                 if sample is not None:
+                    self._bridge.require_sender(sample.sender, now_ns)
                     with self._decoder.once(sample.stamp_ns):
                         self._bridge.take_u(sample.value, sample.sender, now_ns)
                     accepted = True

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 
 from flight_core.files import open_nonblocking
 from flight_core.parameters import ParameterError, require
-from flight_core.vectors import ChannelError, require_newer
+from flight_core.vectors import FUTURE, ChannelError, require_newer
 
 KEY_BYTES = 32
 MARK = ";mac="
@@ -27,6 +27,7 @@ BLANK = MARK + "0" * DIGITS
 LENGTH = struct.Struct("<I")
 LENGTH_PLACE = 12  # of header.frame_id: it follows the encapsulation (4 bytes) and the stamp (8)
 TEXT_PLACE = LENGTH_PLACE + LENGTH.size
+MOST_AHEAD = 10_000  # refused stamps that are remembered for each topic: 1 MB
 EXPECTED = f"a file of {KEY_BYTES} bytes that its owner alone can read (chmod 600)"
 
 
@@ -67,6 +68,7 @@ class MessageAuthenticator:
     def __init__(self, key: bytes, topic: str, since_ns: int | None) -> None:
         self._topic_hmac = hmac.new(key, topic.encode() + b"\x00", "sha256")
         self._last_ns = since_ns
+        self._ahead: dict[int, None] = {}  # stamps of samples that were refused as ahead of the clock, the oldest first
 
     def mac(self, blank: bytes) -> bytes:
         """The digits of the code of a message, in which they are still "0"."""
@@ -88,11 +90,21 @@ class MessageAuthenticator:
         """Within it a sample is taken. Raises ChannelError, reason "order", for a stale or replayed message.
 
         Its stamp counts only where the block ends without an exception: a sample that is refused, as that of a second
-        publisher, must not make those of the first one stale.
+        publisher, must not make those of the first one stale. One that is refused as "future" stays refused when its time
+        comes: the last MOST_AHEAD stamps are remembered.
         """
         if self._last_ns is None:
             yield
             return
         require_newer(stamp_ns, self._last_ns, "stale or replayed message")
-        yield
+        if stamp_ns in self._ahead:
+            raise ChannelError("order", "replayed message: refused before as ahead of the clock")
+        try:
+            yield
+        except ChannelError as error:
+            if error.reason == FUTURE:
+                self._ahead[stamp_ns] = None
+                if len(self._ahead) > MOST_AHEAD:
+                    del self._ahead[next(iter(self._ahead))]
+            raise
         self._last_ns = stamp_ns

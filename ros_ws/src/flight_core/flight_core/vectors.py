@@ -15,6 +15,7 @@ from flight_core.rates import seconds
 FloatArray = NDArray[np.float64]
 Array = Any  # an array of NumPy or of JAX
 Scalar = Any  # a Python float, or an array with a value for each aircraft of a fleet
+FUTURE = "future"  # the reason of a ChannelError for a stamp ahead of the clock
 
 
 class _NumPy1:
@@ -76,7 +77,7 @@ def require_newer(stamp_ns: int, last_ns: int, what: str = "sample") -> None:
 def require_not_future(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
     """Raise ChannelError, reason "future", for a stamp ahead of the clock by more than the age limit."""
     if stamp_ns > now_ns + max_age_ns:
-        raise ChannelError("future", f"stamp {seconds(stamp_ns - now_ns):g} s ahead of the clock")
+        raise ChannelError(FUTURE, f"stamp {seconds(stamp_ns - now_ns):g} s ahead of the clock")
 
 
 def select(wanted: Sequence[str], names: Sequence[str], values: Sequence[float] | FloatArray) -> FloatArray:

@@ -201,8 +201,8 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         """Give a sample to guidance, unless its stamp is bad or it is from a conflicting publisher."""
         max_age_ns = nanoseconds(self.parameters.max_age)
         try:
+            lock.check(sample.sender, now_ns, max_age_ns, max_age_ns + nanoseconds(self.parameters.hold))
             with decoder.once(sample.stamp_ns):
-                lock.check(sample.sender, now_ns, max_age_ns, max_age_ns + nanoseconds(self.parameters.hold))
                 take(sample, now_ns)
             lock.refresh(sample.sender, now_ns)
         except ChannelError as error:

@@ -65,11 +65,11 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
             sample = self._decoder.decode(message)
             if sample is None:
                 return
+            self._publisher_lock.check(sample.sender, now_ns, max_age_ns, takeover_ns)
             with self._decoder.once(sample.stamp_ns):
                 require_not_future(sample.stamp_ns, now_ns, max_age_ns)
                 if now_ns - sample.stamp_ns > max_age_ns:
                     raise ChannelError("old", f"stamp {seconds(now_ns - sample.stamp_ns):g} s old")
-                self._publisher_lock.check(sample.sender, now_ns, max_age_ns, takeover_ns)
                 self._reference.take(sample.stamp_ns - start_ns, sample.value, self._attitude(message))
             self._publisher_lock.refresh(sample.sender, now_ns)
         except ChannelError as error:

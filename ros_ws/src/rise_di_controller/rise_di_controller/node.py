@@ -137,10 +137,10 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         Another node may take over as publisher once the failsafe has brought u to trim.
         """
         try:
+            if lock is not None:
+                failsafe_ns = nanoseconds(self.parameters.hold + self.parameters.ramp)
+                lock.check(sample.sender, now_ns, self._max_age_ns, self._max_age_ns + failsafe_ns)
             with decoder.once(sample.stamp_ns):
-                if lock is not None:
-                    failsafe_ns = nanoseconds(self.parameters.hold + self.parameters.ramp)
-                    lock.check(sample.sender, now_ns, self._max_age_ns, self._max_age_ns + failsafe_ns)
                 take(sample, now_ns)
             if lock is not None:
                 lock.refresh(sample.sender, now_ns)

@@ -207,8 +207,8 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceParameters) -> None:
     require(reference.live.speed is not None, "reference_model.live.speed", "none beside guidance", levels)
     pose_ns = every(aircraft.rate) * period_ns(aircraft.rate, "aircraft.rate")
     period = period_ns(guidance.rate, "guidance.rate")
-    slowest = f"at least {1.0 / reference.live.max_age:g} Hz: the reference model ends a u_m older than live.max_age"
-    require(period <= nanoseconds(reference.live.max_age), "guidance.rate", f"{guidance.rate:g} Hz", slowest)
+    slowest = f"more than {1.0 / reference.live.max_age:g} Hz: the reference model ends a u_m older than live.max_age"
+    require(period < nanoseconds(reference.live.max_age), "guidance.rate", f"{guidance.rate:g} Hz", slowest)
     for what, part_ns in (("pose", pose_ns), ("y_m", period_ns(reference.rate, "reference_model.rate"))):
         rate = f"a whole fraction of the rate of {what} ({NANOSECONDS / part_ns:g} Hz)"
         require(period % part_ns == 0, "guidance.rate", f"{guidance.rate:g} Hz", rate)
