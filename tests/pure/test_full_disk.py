@@ -61,7 +61,10 @@ def test_a_log_on_a_full_disk_is_finished_without_loss(disk: Path) -> None:
 
 
 def test_a_log_whose_chunks_fill_up_between_two_flushes_is_finished_too(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flight_log.bag.CHUNK_BYTES", 4000)  # three messages, so that a thousand index entries exceed END_BYTES
+    # Three messages a chunk: a reserve that did not grow with each of them would be too small for the index of a thousand.
+    monkeypatch.setattr("flight_log.bag.CHUNK_BYTES", 4000)
+    monkeypatch.setattr("flight_log.bag.END_BYTES", 8000)
+    monkeypatch.setattr("flight_log.disk.RESERVE_STEP", 4096)
     bag = BagWriter(disk / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
     while not bag.full:
