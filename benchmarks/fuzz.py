@@ -15,6 +15,7 @@ import resource
 import signal
 import sys
 import tempfile
+from multiprocessing import get_context
 from pathlib import Path
 from types import FrameType
 
@@ -42,7 +43,7 @@ def main() -> None:
     if arguments.replay is not None:
         replay(arguments.target, arguments.replay)
     else:
-        fuzz(arguments.target, arguments.seconds, keep=arguments.keep)
+        sys.exit(fuzz(arguments.target, arguments.seconds, keep=arguments.keep))
 
 
 def replay(target: str, files: list[Path]) -> None:
@@ -66,21 +67,33 @@ def replay(target: str, files: list[Path]) -> None:
     print(f"{target}: {len(files)} inputs read or refused")
 
 
-def fuzz(target: str, seconds: int, *, keep: bool) -> None:
-    """Fuzz for `seconds`; never returns."""
+def fuzz(target: str, seconds: int, *, keep: bool) -> int:
+    """Fuzz for `seconds` in another process, whose files are removed afterwards. Returns its exit status."""
+    memory = Path("/dev/shm")  # noqa: S108 - for speed
+    with tempfile.TemporaryDirectory(prefix=f"fuzz-{target}-", dir=memory if memory.is_dir() else None) as folder:
+        process = get_context("fork").Process(target=_fuzz, args=(target, seconds, Path(folder)), kwargs={"keep": keep})
+        process.start()
+        process.join()
+    return process.exitcode or 0
+
+
+def _fuzz(target: str, seconds: int, scratch: Path, *, keep: bool) -> None:
+    """Fuzz with files in a folder; never returns."""
     import atheris  # noqa: PLC0415 - a replay does not need it
 
     with atheris.instrument_imports(include=[*STACK, "mcap", "rosbags"]):
         from tests.fuzz.targets import SEEDS, TARGETS  # noqa: PLC0415 - as above
 
+    tempfile.tempdir = str(scratch)
     findings = FINDINGS / target
     findings.mkdir(parents=True, exist_ok=True)
-    inputs = findings / "inputs" if keep else Path(tempfile.mkdtemp(prefix=f"fuzz-{target}-"))
+    inputs = findings / "inputs" if keep else scratch / "inputs"
     inputs.mkdir(parents=True, exist_ok=True)
     for k, seed in enumerate(SEEDS[target]()):
         (inputs / f"seed-{k}").write_bytes(seed)
     corpora = [str(path) for path in (inputs, CORPUS / target) if path.is_dir()]
-    folder = Path(tempfile.mkdtemp(prefix="fuzz", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))  # noqa: S108 - for speed
+    folder = scratch / "read"
+    folder.mkdir()
     limits = {"max_total_time": seconds, "timeout": TIMEOUT, "rss_limit_mb": MEMORY_MB, "max_len": MAX_LENGTH}
     options = limits | {"artifact_prefix": f"{findings}/", "print_final_stats": 1}
     arguments = [sys.argv[0], *(f"-{name}={value}" for name, value in options.items()), *corpora]

@@ -7,9 +7,11 @@ inputs of each target, made by the writers of the stack; tests/corpus/<target>/ 
 """
 
 import asyncio
+import atexit
 import json
 import logging
 import math
+import shutil
 import struct
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -234,7 +236,9 @@ def _guided() -> GuidanceParameters:
 @lru_cache(maxsize=1)
 def _page() -> tuple[asyncio.AbstractEventLoop, Server, Control, list[str]]:
     """A server with control of nodes in memory, its event loop, and the exceptions that it has logged."""
-    run = write_run(Path(tempfile.mkdtemp(prefix="fuzz")), log(_flight()))
+    folder = Path(tempfile.mkdtemp(prefix="fuzz"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    run = write_run(folder, log(_flight()))
     scenario, loop, times = find_scenario("osprey_servo"), asyncio.new_event_loop(), count()
     flight = Flight(run)
     flight.update()
