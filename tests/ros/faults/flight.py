@@ -33,7 +33,7 @@ from tests.ros.peer import peer
 
 from autopilot_bridge.params import LIBRARY
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
-from flight_core.rates import NANOSECONDS, nanoseconds, seconds
+from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray, StampedVector
 from flight_ros import transport
 from flight_ros.messages import Decoder, to_message
@@ -86,6 +86,7 @@ PUBLISHED = {
 
 TICK = 0.01  # s, the controller's, as in the default scenario
 MAX_AGE = 0.1  # s, of y and y_m, as in the default scenario
+RATE = 200.0  # Hz, of aircraft and reference model
 U_MAX_AGE = 0.2  # s, of u, the aircraft's default
 LEVEL = 0.01  # rad, of wings
 HOLD, RAMP = 0.2, 0.3  # s, of both failsafes: shorter than the defaults, so that a case sees all of them
@@ -246,8 +247,8 @@ def steady_scenario(source: Path, folder: Path) -> Path:
     for disturbance in ("gusts", "turbulence", "wind", "sensors", "actuators"):
         aircraft.pop(disturbance, None)
     reference.pop("coordinated_turn", None)
-    aircraft |= {"rate": 200.0, "step": 0.005}  # a lower load, for busy hosts
-    reference["rate"] = 200.0
+    aircraft |= {"rate": RATE, "step": 1.0 / RATE}  # a lower load, for busy hosts
+    reference["rate"] = RATE
     if (guidance := sections.get("guidance")) is None:
         reference["second_order"]["natural_frequency"] = [4.0, 4.0, 5.0, 4.0]  # V settles sooner
         reference["pulses"] = {"V": {"start": [0.0], "stop": [1e5], "value": [0.1]}}
@@ -432,6 +433,12 @@ class Flight:
         """The controller's ticks."""
         return _ticks(*self._values("internals", self._tick_channels, begin, end))
 
+    def foreign_y(self, begin: float, end: float) -> list[StampedVector]:
+        """The engaged ticks with the y of another publisher: their stamp, that of y, is none of the aircraft's instants."""
+        (instant, *_) = (sample.stamp_ns for _, sample in self._samples("truth", (), begin, end))
+        ticks = [tick for _, tick in self._samples("internals", ("mode",), begin, end) if tick.value[0] == Mode.ENGAGED]
+        return [tick for tick in ticks if (tick.stamp_ns - instant) % period_ns(RATE, "rate")]
+
     def engaged_ticks(self, begin: float, until: float) -> Ticks | None:
         """The engaged ticks with samples from `begin` on, from the log, which is complete; None before it reaches `until`."""
         decoder, found = Decoder(self._tick_channels), []
@@ -454,12 +461,15 @@ class Flight:
         return t, phi[:, 0]
 
     def _values(self, topic: str, names: tuple[str, ...], begin: float, end: float) -> tuple[FloatArray, FloatArray]:
-        decoder, found = Decoder(names), []
-        for one in self.probe.since(topic, begin, end):
-            sample = self._decode(decoder, one.message)
-            if sample is not None:
-                found.append((one.at, sample.value))
+        found = [(at, sample.value) for at, sample in self._samples(topic, names, begin, end)]
         return np.array([at for at, _ in found]), np.array([value for _, value in found]).reshape(-1, len(names))
+
+    def _samples(self, topic: str, names: tuple[str, ...], begin: float, end: float) -> Iterator[tuple[float, StampedVector]]:
+        """The samples of the flight's own nodes, and when they were received."""
+        decoder = Decoder(names)
+        for one in self.probe.since(topic, begin, end):
+            if (sample := self._decode(decoder, one.message)) is not None:
+                yield one.at, sample
 
     def _decode(self, decoder: Decoder, data: bytes) -> StampedVector | None:
         """A message of the flight's own nodes; None for any other."""

@@ -179,11 +179,13 @@ def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
     until = flight.end + SETTLING
     ticks, (_, applied) = flight.ticks(flight.begin, until), flight.actuator_positions(flight.begin, until)
     before = flight.ticks(flight.begin - 0.5, until)
-    if window.host_delay < MAX_AGE + HOLD + RAMP:  # else the failsafe was over, and the publisher lock free
-        assert np.abs(ticks.y).max() <= USUAL
+    if Mode.TRIM not in ticks.modes:  # else the failsafe was over, and the publisher lock free
+        assert not flight.foreign_y(flight.begin, until)
         assert np.abs(ticks.y_m).max() <= USUAL
-    if window.host_delay < U_MAX_AGE:  # else the publisher lock of u was free
-        assert np.abs(applied).max() <= USUAL
+    starved = window.host_delay > MAX_AGE  # by a storm that uses up the processors: the failsafe may act
+    assert starved or np.abs(ticks.y).max() <= USUAL
+    if flight.first_line("aircraft", "failsafe", flight.begin - 0.1) is None:  # else the publisher lock of u was free
+        assert np.abs(applied).max() <= max(USUAL, np.abs(ticks.u).max())
     quiet = window.host_delay <= QUIET
     if quiet:  # else the failsafe of the aircraft may have moved u
         low, high = before.u.min(axis=0), before.u.max(axis=0)
@@ -192,18 +194,20 @@ def check_unchanged(case: Case, flight: Flight, window: Window) -> None:
     # The probe subscribes with best effort: in a storm its socket drops samples that the flight's nodes receive again.
     flooded = case.name.removeprefix("storm on ")
     topics = tuple(topic for topic in CONTINUING if topic != flooded)
-    pauses = check_pauses(flight, topics, until, window)
+    pauses = check_pauses(flight, topics, until, window, limited=not starved)
     if quiet:
         assert ticks.modes == [Mode.ENGAGED], pauses
         # without the thrust, which may still settle after an earlier fault
         assert np.abs((ticks.u - before.u[0])[:, :-1]).max() <= MOVES
 
 
-def check_pauses(flight: Flight, topics: tuple[str, ...], end: float, window: Window) -> dict[str, float]:
-    """No topic paused for longer than its age limit; the pauses, s."""
+def check_pauses(
+    flight: Flight, topics: tuple[str, ...], end: float, window: Window, *, limited: bool = True
+) -> dict[str, float]:
+    """No topic paused for longer than its age limit, where it is `limited`; the pauses, s."""
     pauses = {topic: flight.pause(topic, flight.begin, end) for topic in topics}
     limits = {topic: (U_MAX_AGE if topic == "u" else MAX_AGE) + 2.0 * window.host_delay for topic in topics}
-    assert all(pause <= limits[topic] for topic, pause in pauses.items()), (pauses, window)
+    assert not limited or all(pause <= limits[topic] for topic, pause in pauses.items()), (pauses, window)
     flight.measured["longest_pause"] = max(pauses.values())
     return pauses
 
