@@ -54,6 +54,15 @@ def test_a_lockstep_flight_takes_a_target_and_ends_with_the_name_of_a_lost_guida
     assert summary["outcome"] == "guidance was killed by SIGKILL"
 
 
+def test_guidance_alone_starts_from_the_parameters_of_a_run(start: Start, tmp_path: Path) -> None:
+    refused = start("guidance.main", "--ros-args", "--params-file", str(find_scenario("osprey_route").path))
+    assert refused.end() == 2
+    assert "`parameters.yaml` of a run has them" in refused.output
+    start("flight_cli.cli", "fly", "osprey_route", "--in-process", "--duration", "1", "--runs", "runs").succeed()
+    parameters = tmp_path / "runs" / "latest" / "parameters.yaml"
+    start("guidance.main", "--ros-args", "--params-file", str(parameters)).wait_for("ready")
+
+
 def test_a_keyed_guidance_takes_targets_with_the_key_alone_and_no_route(start: Start, peer_node: Peer, tmp_path: Path) -> None:
     key = tmp_path / "flight.key"
     key.write_bytes(bytes(range(32)))

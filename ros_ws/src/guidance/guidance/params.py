@@ -82,7 +82,9 @@ class GuidanceParameters(KeyedParameters):
     )
     y_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the rate of y, Hz")
     outputs: Names = Field(default=RATES_AND_SPEED, description="the names of the commands u_m: q, V, p, r in any order")
-    natural_frequency: Positives = Field(description="those of the reference model, one per output, rad/s")
+    natural_frequency: Positives = Field(
+        description="those of the reference model, one per output, rad/s; `parameters.yaml` of a run has them"
+    )
     speed: Positive = Field(description="the trim speed V0, m/s: airspeed is speed + V")
     throttle_authority: tuple[Positive, ...] = Field(
         default=(), description="deceleration and acceleration of full throttle down and up from trim, m/s^2"
