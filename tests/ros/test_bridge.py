@@ -200,19 +200,22 @@ def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the
     setup.peer.until(lambda: setup.peer.received["u"])
 
     gamepad = setup.peer.node.create_publisher(Joy, "/joy", 10)
+
+    def press() -> None:  # again and again: an old override does not block an engagement
+        gamepad.publish(Joy(buttons=[1]))
+
     setup.peer.until(lambda: gamepad.get_subscription_count() == 1)
-    gamepad.publish(Joy(buttons=[1]))
-    setup.peer.until(lambda: setup.engage() == "pilot override active: gamepad")
+    setup.peer.until(lambda: setup.engage(each=press) == "pilot override active: gamepad")
     gamepad.publish(Joy(buttons=[0]))
     setup.engage_from_trim()
     pressed = time.time()
-    gamepad.publish(Joy(buttons=[1]))
+    press()
     setup.until_logged(bridge, "ENGAGED -> RELEASE: pilot override by gamepad", timeout=2.0)
     setup.peer.spin(RELEASE + LATE)
     finite, released = setup.after(pressed)
     assert max(finite, default=0.0) < LATE  # at once
     assert min(released) < LATE
-    assert setup.engage() == "pilot override active: gamepad"
+    assert setup.engage(each=press) == "pilot override active: gamepad"
     gamepad.publish(Joy(buttons=[0]))
 
     setup.engage_from_trim()
@@ -386,11 +389,14 @@ def test_the_controller_is_active_only_while_engaged_and_the_summary_says_when_a
     assert engagement["reason"] == "disengaged by request"
     tape = read_run(run).tape
     mode, t = tape["internals"]["mode"], tape.time("internals")
-    flies = t[mode == Mode.ENGAGED]
+    engaged_ticks = np.flatnonzero(mode == Mode.ENGAGED)
+    *early, flies = np.split(t[engaged_ticks], np.flatnonzero(np.diff(engaged_ticks) > 1) + 1)
+    assert len(early) <= 1  # on a busy host the law may begin before the bridge finds the controller; none of it is sent
     assert abs(engagement["start"] - flies[0]) < 1.0  # the timeout of an activation, which is reported when it has answered
     assert engagement["stop"] - 0.1 < flies[-1] < engagement["stop"] + LATE
     u, t_u = tape["u"].values, tape.time("u")
-    assert not u[t_u < flies[0]].any()  # no integral before the engagement, none 2 s after it
+    rests = max((spell[-1] + 2.0 for spell in early), default=0.0)
+    assert not u[(t_u > rests) & (t_u < flies[0])].any()  # no integral before the engagement, none 2 s after it
     assert (t_u > engagement["stop"] + 2.0).any()
     assert not u[t_u > engagement["stop"] + 2.0].any()
     assert (
