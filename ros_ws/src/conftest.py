@@ -10,9 +10,9 @@ SOURCES = Path(__file__).resolve().parent
 TESTS = SOURCES.parents[1] / "tests"
 
 MODULES = {
-    "flight_core": "pure: authentication fields parameters vectors",
+    "flight_core": "pure: authentication fields parameters publisher_lock vectors",
     "flight_log": "pure: bag follow full_disk log_contents playback recorded_before repair",
-    "flight_ros": "pure: lockstep_inputs publisher_lock ticker; ros: fuzz_messages health messages rclpy_private security",
+    "flight_ros": "pure: lockstep_inputs ticker; ros: fuzz_messages health messages rclpy_private security",
     "reference_model": "pure: live_commands reference_model; ros: live_commands",
     "guidance": "pure: feasibility guidance guided_flight route_file; ros: guidance",
     "rise_di_controller": "pure: any_plant decomposition engagement feedforward guard law paper_identities saturation schedule"

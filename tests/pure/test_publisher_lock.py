@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError, StampedVector
-from flight_ros.publisher_lock import PublisherLock
 from rise_di_controller.controller import Controller
 from rise_di_controller.guard import Mode
 
@@ -42,6 +42,18 @@ def test_a_restarted_node_takes_over_after_the_age_limit_and_another_node_later(
     lock.check("/foreign", TAKEOVER + 1, MAX_AGE, TAKEOVER)
     assert lock.timed_out(MAX_AGE + 1, MAX_AGE)
     assert not lock.timed_out(MAX_AGE, MAX_AGE)
+
+
+def test_an_overrun_of_the_receiver_is_no_silence_of_the_publisher() -> None:
+    lock = locked(("/aircraft#1", 0))
+    lock.overran(5000)
+    now_ns = 5000 + TAKEOVER
+    with pytest.raises(ChannelError, match="already receiving from /aircraft#1"):
+        lock.check("/foreign", now_ns, MAX_AGE, TAKEOVER)
+    lock.check("/foreign", now_ns + 1, MAX_AGE, TAKEOVER)
+    assert lock.timed_out(now_ns, MAX_AGE)  # its sample is old, whatever the reason
+    lock.refresh("/aircraft#1", now_ns)
+    lock.check("/foreign", now_ns + TAKEOVER + 1, MAX_AGE, TAKEOVER)  # an overrun counts once
 
 
 def test_a_change_of_publisher_is_returned_once() -> None:

@@ -189,6 +189,25 @@ def test_stopped_controller_publishes_no_stale_u_and_re_engages_from_trim(start_
     assert (peer_node.u()[before] == 0.0).all()
 
 
+def test_an_overrun_of_the_controller_does_not_free_its_publisher_lock(start_node: Start, peer_node: Peer) -> None:
+    process = start_node("rise_di_controller", "-p", "hold:=0.1", "-p", "ramp:=0.2")
+    engage(peer_node)
+
+    def conflict() -> None:
+        peer_node.publish("y", to_message(time.time_ns(), OUTPUTS, np.ones(4), "/foreign"))
+
+    def send_both() -> None:
+        conflict()
+        peer_node.send(0.01)
+
+    peer_node.spin(0.05)  # the controller takes all samples
+    with process.stopped():
+        peer_node.spin(0.6)  # beyond age limit, hold and ramp
+        conflict()  # the first sample that the controller takes
+    peer_node.until(lambda: peer_node.counted("refused y: sender"), each=send_both)
+    assert {channel(message, "y.q") for message in peer_node.received["internals"]} == {0.01}
+
+
 @pytest.mark.parametrize(
     ("name", "message", "reason"),
     [

@@ -11,11 +11,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from aircraft_sim.params import AircraftParameters
 from aircraft_sim.simulator import Simulator
 from flight_core import channels
+from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_not_future
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import NO_CHANNELS, instant, stamp_of
-from flight_ros.publisher_lock import PublisherLock
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, POSE, RECORDED, TRUTH, NodeState, U, Y
 
@@ -34,7 +34,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         super().__init__("aircraft", AircraftParameters)
         self._simulator = Simulator(self.parameters)
         self._u = np.zeros(len(self._simulator.inputs))
-        self._publisher_lock = PublisherLock()
+        (self._publisher_lock,) = self.publisher_locks = (PublisherLock(),)
         self._u_stamp_ns = 0  # of the last u
         self._timeout_logged = False
         self._u_subscription, self._decoder = self.subscribe(U), self.decoder(U, self._simulator.inputs)

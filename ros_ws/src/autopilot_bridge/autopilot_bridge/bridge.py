@@ -14,6 +14,7 @@ import numpy as np
 
 from autopilot_bridge.channel_map import to_channel, to_raw
 from autopilot_bridge.params import ROUNDING, ChannelMap, ConditionRow, InputRow, MeasuredRow, OutputRow
+from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer
 
@@ -57,8 +58,7 @@ class Bridge:
         self._last_y_ns = -1  # stamp of the last y
         self._last_pose_ns = -1  # stamp of the last pose
         self._u: FloatArray = np.zeros(len(self.inputs))
-        self.u_sender: str | None = None
-        self._u_ns = 0  # when u was received
+        self.u_lock = PublisherLock()
         self._conditions: dict[str, Reading] = {}
         self._overrides: dict[str, Reading] = {}
         self._overrides_at_engagement: dict[str, float] = {}
@@ -88,13 +88,13 @@ class Bridge:
 
     def require_sender(self, sender: str, now_ns: int) -> None:
         """Raise ChannelError, reason "sender", for a u of a conflicting publisher."""
-        if sender != self.u_sender and not self.u_timed_out(now_ns):
-            raise ChannelError("sender", f"conflicting publisher {sender} ignored: already receiving from {self.u_sender}")
+        self.u_lock.check(sender, now_ns, self._max_age_ns, self._max_age_ns)
 
     def take_u(self, u: FloatArray, sender: str, now_ns: int) -> None:
         """Take u, shape (m,) in the map's order. Raises ChannelError as `require_sender` does."""
         self.require_sender(sender, now_ns)
-        self._u, self.u_sender, self._u_ns = u, sender, now_ns
+        self._u = u
+        self.u_lock.refresh(sender, now_ns)
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a condition. A condition that is lost ends an engagement at the next step."""
@@ -153,13 +153,13 @@ class Bridge:
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
-        return self.u_sender is None or now_ns - self._u_ns > self._max_age_ns
+        return self.u_lock.timed_out(now_ns, self._max_age_ns)
 
     def _u_timeout(self, now_ns: int) -> str:
         """The reason why u has timed out, as a sentence; empty where u is fresh."""
-        if self.u_sender is None:
+        if self.u_lock.publisher is None:
             return "u not received yet"
-        return f"u is {seconds(now_ns - self._u_ns):.2f} s old" if self.u_timed_out(now_ns) else ""
+        return f"u is {seconds(self.u_lock.age_ns(now_ns)):.2f} s old" if self.u_timed_out(now_ns) else ""
 
     def refusal(self, now_ns: int) -> str:
         """Why `engage` would be refused now; empty where it would not. Awaited conditions do not count.

@@ -55,6 +55,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
         self._map = load_map(self.parameters.map)
         dry_run = self._map.dry_run if self.parameters.dry_run is None else self.parameters.dry_run
         self._bridge = Bridge(self._map, dry_run=dry_run)
+        self.publisher_locks = (self._bridge.u_lock,)
         self._logged_phase = self._bridge.phase
         named: list[NamedRow] = [
             *self._map.outputs.items(),
@@ -225,8 +226,8 @@ class BridgeNode(FlightNode[BridgeParameters]):
         refusal = "" if bridge.phase in {Phase.ENGAGED, Phase.ENGAGING} else bridge.refusal(now_ns)
         sentence = "; would refuse: ".join(filter(None, (bridge.reason, refusal)))
         self._engagement.publish(KeyValue(key=bridge.phase.name, value=sentence))
-        ready, before, self._u_sender = self._controller.service_is_ready(), self._u_sender, bridge.u_sender
-        restarted = bool(before) and bridge.u_sender != before  # it can take less time than the loss of the service
+        ready, before, self._u_sender = self._controller.service_is_ready(), self._u_sender, bridge.u_lock.publisher
+        restarted = bool(before) and self._u_sender != before  # it can take less time than the loss of the service
         if ready and (restarted or not self._controller_ready) and bridge.phase is not Phase.ENGAGED:
             self._activate(active=False)
         self._controller_ready = ready

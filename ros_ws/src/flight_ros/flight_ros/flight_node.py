@@ -22,12 +22,12 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from flight_core.authentication import MessageAuthenticator, read_key
 from flight_core.outcome import LOST_CONTACT, FlightEnded
 from flight_core.parameters import KeyedParameters, NodeParameters, ParameterError
+from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS, seconds
 from flight_ros.endpoints import mismatch, type_name
 from flight_ros.liveliness import LivelinessMonitor
 from flight_ros.messages import Decoder, Encoder, NamedDecoder
 from flight_ros.parameters import changed, read_parameters
-from flight_ros.publisher_lock import SENDER
 from flight_ros.rclpy_private import raw_publish
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
@@ -77,6 +77,7 @@ class FlightNode(Node, Generic[P]):
         self._periods: list[int] = []
         self._compute: list[int] = []
         self._missed = 0
+        self.publisher_locks: tuple[PublisherLock, ...] = ()  # of a node's topics
         self._last_tick_ns: int | None = None
         self.time_offset_ns = 0  # of the time of the ticks from the monotonic clock
         self._clock_step_ns = 0  # of the system clock since the start
@@ -215,6 +216,8 @@ class FlightNode(Node, Generic[P]):
             self._periods.append(begin_ns - self._last_tick_ns)
         self._last_tick_ns = begin_ns
         self._missed += tick.missed
+        for lock in self.publisher_locks:
+            lock.overran(tick.missed * self.period_ns())
         self.tick(tick, now_ns)
         self._compute.append(time.monotonic_ns() - begin_ns)
 

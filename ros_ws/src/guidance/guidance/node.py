@@ -16,12 +16,12 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from flight_core import channels
 from flight_core.parameters import ParameterError, require
+from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError, StampedVector, require_not_future, select
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS, Decoder, NamedDecoder
-from flight_ros.publisher_lock import PublisherLock
 from flight_ros.rclpy_private import DeserializationError
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
@@ -80,7 +80,7 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
         self._u_m_encoder = self.encoder(U_M, (*outputs, *channels.ATTITUDE))
         self._log_encoder = self.encoder(GUIDANCE, self._guidance.names)
-        self._y_lock, self._pose_lock = PublisherLock(), PublisherLock()
+        self._y_lock, self._pose_lock = self.publisher_locks = PublisherLock(), PublisherLock()
         self._allowed, self._mode = True, Mode.OFF
         if self.parameters.lockstep:
             y_period_ns = period_ns(self.parameters.y_rate, "y_rate")

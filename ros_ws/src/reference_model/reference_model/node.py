@@ -7,11 +7,11 @@ from collections import deque
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from flight_core.channels import ATTITUDE
+from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, FloatArray, require_not_future
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, stamp_of
-from flight_ros.publisher_lock import PublisherLock
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, U_M, Y_M
 from reference_model.params import ReferenceModelParameters
@@ -30,7 +30,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
         self._reference = Reference(self.parameters)
         self._publish_y_m = self.advertise(Y_M)
         self._encoder = self.encoder(Y_M, self.parameters.outputs)
-        self._publisher_lock = PublisherLock()
+        (self._publisher_lock,) = self.publisher_locks = (PublisherLock(),)
         self._decoder = self.decoder(U_M, self.parameters.outputs)
         self._attitude_decoder = Decoder(ATTITUDE)
         rate = self.parameters.u_m_rate

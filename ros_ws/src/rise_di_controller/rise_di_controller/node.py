@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterator
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
+from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS, Decoder
-from flight_ros.publisher_lock import PublisherLock
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
@@ -50,7 +50,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
                 lambda: self._received(self._y_subscription, self._y_decoder),
                 lambda: self._received(self._y_m_subscription, self._y_m_decoder),
             )
-        self._y_publisher_lock, self._y_m_publisher_lock = PublisherLock(), PublisherLock()
+        self._y_publisher_lock, self._y_m_publisher_lock = self.publisher_locks = PublisherLock(), PublisherLock()
         self._last_ns = 0  # of the last tick
         if self.parameters.autostart:
             self.trigger_configure()

@@ -13,12 +13,14 @@ SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting 
 class PublisherLock:
     """Locks to the first publisher of a topic, until its samples time out; then to the next one.
 
-    A restarted node, which has the same name, may take over earlier than another node.
+    A restarted node, which has the same name, may take over earlier than another node. Overruns of the node that receives do
+    not count: after one, a sample of another publisher may be the first that it takes.
     """
 
     def __init__(self) -> None:
         self.publisher: str | None = None
         self._received_ns = 0
+        self._overrun_ns = 0  # since the last sample
 
     def age_ns(self, now_ns: int) -> int:
         """Time since the last sample of the locked publisher."""
@@ -28,6 +30,10 @@ class PublisherLock:
         """Whether there is no publisher, or its last sample is older than the age limit."""
         return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
+    def overran(self, duration_ns: int) -> None:
+        """Leave a time out of the publisher's silence: the node itself did not run."""
+        self._overrun_ns += duration_ns
+
     def check(self, sender: str, now_ns: int, max_age_ns: int, takeover_ns: int) -> None:
         """Raise ChannelError, reason "sender", for a sample of another publisher while the locked one has not timed out.
 
@@ -36,10 +42,11 @@ class PublisherLock:
         if sender == self.publisher:
             return
         restarted = self.publisher is not None and sender.partition("#")[0] == self.publisher.partition("#")[0]
-        if not self.timed_out(now_ns, max_age_ns if restarted else takeover_ns):
+        if not self.timed_out(now_ns - self._overrun_ns, max_age_ns if restarted else takeover_ns):
             raise ChannelError(SENDER, f"conflicting publisher {sender} ignored: already receiving from {self.publisher}")
 
     def refresh(self, sender: str, now_ns: int) -> bool:
         """Lock to the publisher of a valid sample. Returns whether it is another one than before."""
         changed, self.publisher, self._received_ns = sender != self.publisher, sender, now_ns
+        self._overrun_ns = 0
         return changed
