@@ -68,9 +68,10 @@ def test_no_line_of_a_page_is_longer_than_200_characters(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
-def test_each_row_of_a_table_has_a_cell_for_each_column(page: Path) -> None:
+def test_each_table_has_a_heading_and_each_of_its_rows_a_cell_for_each_column(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)  # a | in a formula would begin a cell, on GitHub and on the site
+    assert [table for table in tables if not re.match(r".*\n\|( ?:?-+:? ?\|)+\n", table)] == []
     assert [table for table in tables if len({len(re.split(r"(?<!\\)\|", row)) for row in table.splitlines()}) != 1] == []
 
 
