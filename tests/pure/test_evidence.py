@@ -247,6 +247,13 @@ def test_the_page_of_a_flight_has_the_limit_of_its_fault(case: str, limit: str) 
     assert f"- Goal: {case}: the page answers, and says so, within {limit} s. Measured: 1.6 s at worst, " in text
 
 
+def test_the_page_says_that_nothing_was_measured_on_a_screen_without_a_browser() -> None:
+    without = {name: part for name, part in VIEW.items() if name not in {"live with a browser", "frozen"}}
+    sentence = "not measured, this host has no Chromium."
+    assert sentence in page(view=result("view", without))
+    assert sentence not in page(view=result("view", VIEW))
+
+
 @pytest.mark.parametrize(("probability", "verdict"), [(0.05, "0.05, met."), (0.04, "0.04, **not met**.")])
 def test_missed_ticks_of_a_watched_flight_are_told_from_chance(probability: float, verdict: str) -> None:
     flights = VIEW["flights"] | {"probability with": dict.fromkeys(PAIRS, probability)}
