@@ -10,7 +10,6 @@ The kit is that of `make test-sitl`: docs/autopilots.md. build/autopilots/ has t
 """
 
 import argparse
-import fcntl
 import json
 import math
 import os
@@ -19,7 +18,7 @@ import sys
 import time
 from bisect import bisect
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -55,7 +54,6 @@ FOLDER = REPOSITORY / "build" / "autopilots"
 PAGE = REPOSITORY / "docs" / "evidence_autopilots.md"
 EXAMPLE = REPOSITORY / "examples" / "arduplane" / "scenario.yaml"
 PX4_MAP = REPOSITORY / "examples" / "px4_airplane" / "map.yaml"
-LOCK: Path | None = None  # --lock
 ENGAGEMENTS, LARGEST_STEP = 20, 0.02  # of the range of a setpoint
 WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
 PERIODS = {"elevator": 12.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}
@@ -94,16 +92,13 @@ def px4() -> Iterator["Px4"]:
 
 @contextmanager
 def _flying(autopilot: Any, **parameters: float) -> Iterator[Any]:
-    """In flight, and while --lock is held: a host flies one autopilot at a time."""
-    with nullcontext() if LOCK is None else LOCK.open("w", encoding="utf-8") as lock:
-        if lock is not None:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        try:
-            autopilot.up(**parameters)
-            autopilot.take_off()
-            yield autopilot
-        finally:
-            autopilot.down()
+    """In flight."""
+    try:
+        autopilot.up(**parameters)
+        autopilot.take_off()
+        yield autopilot
+    finally:
+        autopilot.down()
 
 
 # Measurements
@@ -395,11 +390,8 @@ def pose() -> dict[str, Any]:
 def releases() -> dict[str, Any]:
     """`make test-sitl`: what failed, and the times until the pilot or PX4's own law flies again, s."""
     report, python = FOLDER / "releases.xml", sys.executable
-    with nullcontext() if LOCK is None else LOCK.open("w", encoding="utf-8") as lock:
-        if lock is not None:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        command = [python, "-m", "pytest", "tests/sitl", "-m", "not long", f"--junitxml={report}"]
-        subprocess.run(command, cwd=REPOSITORY, check=False)  # noqa: S603 - our own arguments; a failure is in the report
+    command = [python, "-m", "pytest", "tests/sitl", "-m", "not long", f"--junitxml={report}"]
+    subprocess.run(command, cwd=REPOSITORY, check=False)  # noqa: S603 - our own arguments; a failure is in the report
     suite = next(ElementTree.parse(report).getroot().iter("testsuite"))  # noqa: S314 - written by pytest just now
     times = {one.attrib["name"]: float(one.attrib["value"]) for one in suite.iter("property")}
     counts = {name: int(suite.attrib[name]) for name in ("tests", "failures", "errors", "skipped")}
@@ -467,7 +459,8 @@ def page() -> str:
             result = results[name]["result"]
             parts.append(f"    python -m benchmarks.autopilots --only {name}    # {results[name]['date']}\n")
             parts.append(table(result))
-            parts.append("\n".join(goals(name, result)) + "\n")
+            refused = ["- Goal: all of it. Refused, **not met**."]
+            parts.append("\n".join(refused if "refused" in result else goals(name, result)) + "\n")
         else:
             parts.append("- Goal: all of it. Not measured yet, **not met**.\n")
     return finished("\n".join(parts))
@@ -668,11 +661,8 @@ def main() -> None:
     parser.add_argument("--only", action="append", choices=MEASUREMENTS, help="repeatable")
     parser.add_argument("--experiments", type=int, default=25, help="number of further ones on signs, a minute each")
     parser.add_argument("--log", type=Path, action="append", help="with --only: a flown experiment in place of a new one")
-    parser.add_argument("--lock", type=Path, help="file that is locked while an autopilot flies, for a shared host")
     parser.add_argument("--render", action="store_true", help="no flight")
     arguments = parser.parse_args()
-    global LOCK  # noqa: PLW0603 - of the whole command
-    LOCK = arguments.lock
     FOLDER.mkdir(parents=True, exist_ok=True)
     if not arguments.render:
         if arguments.sitl is not None:

@@ -110,7 +110,7 @@ def main(
         table.add_row(*row)
     Console().print(table)
     if json_file is not None:
-        figures = {**many._asdict(), "aircraft": aircraft, "plain": single_speed, "integration": shares}
+        figures = {**many._asdict(), "aircraft": aircraft, "plain": single_speed, "exact": exact, "integration": shares}
         json_file.write_text(json.dumps(figures, indent=1), encoding="utf-8")
 
 

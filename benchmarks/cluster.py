@@ -80,7 +80,8 @@ class Cluster:
 
 
 def main(
-    aircraft: Annotated[int, typer.Option(min=200, help="Aircraft of the campaign, in chunks of 50.")] = 2000,
+    # the last fault comes after the 14th chunk
+    aircraft: Annotated[int, typer.Option(min=800, help="Aircraft of the campaign, in chunks of 50.")] = 2000,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the results to a file.")] = None,
 ) -> None:
     """Fly a campaign in threads, then on the cluster with one fault after another, and compare the chunks."""

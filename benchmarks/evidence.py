@@ -31,9 +31,9 @@ from xml.etree import ElementTree
 
 import psutil
 from benchmarks.evidence_page import LONG_FLIGHTS, SPEED, Measurement, Result, render
+from benchmarks.processes import RISE_DI
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-RISE_DI = str(Path(sys.executable).parent / "rise-di")
 RESULTS = REPOSITORY / "build" / "evidence"
 PAGE = REPOSITORY / "docs" / "evidence.md"
 
@@ -120,6 +120,7 @@ def measure(one: Measurement, *, quick: bool) -> Result:
     parts = one.quick if quick else one.command
     busy = psutil.cpu_percent(interval=LOAD_INTERVAL) / 100.0
     begin, date = time.monotonic(), datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    measured = revision()  # before it: a commit meanwhile is not what runs
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / ("result.xml" if "--junitxml=FILE" in parts else "result.json")
         programs = {PYTHON: sys.executable, "rise-di": RISE_DI}
@@ -135,7 +136,7 @@ def measure(one: Measurement, *, quick: bool) -> Result:
         "command": " ".join(parts),
         "quick": quick,
         "date": date,
-        "revision": revision(),
+        "revision": measured,
         "machine": host_details(),
         "busy": busy,
         "seconds": time.monotonic() - begin,

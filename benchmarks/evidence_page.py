@@ -21,7 +21,8 @@ BUSY = 0.1  # share of the processors in use just before a measurement; the page
 ECHOES = ("bare echo, single", "bare echo, multi", "bare echo, events")  # rows of the group "node"
 MEASURED = re.compile(r"^    .+    # \d{4}-\d\d-\d\d ", re.MULTILINE)  # a command with its date
 GOAL, NOT_MET, UNMET = "- Goal: ", "**not met**", "UNMET"
-WITHOUT_RATIO = ("missed", "missed excluding host delays", "lost", "ticks", "max (us)")  # counts and single outliers
+WITHOUT_RATIO = ("missed", "missed excluding host delays", "lost", "ticks", "max (us)", "answered (%)")
+"""Counts, single outliers, and shares."""
 
 
 class Measurement(NamedTuple):
@@ -222,6 +223,5 @@ TEMPLATES.globals |= {
     "zip": zip,
 }
 TEMPLATES.globals |= {"UNMET": UNMET, "fastest_echo": fastest_echo, "marked_scores": marked_scores, "outcomes": outcomes}
-TEMPLATES.globals["speed_goal"] = speed_goal
-TEMPLATES.filters |= {"number": number, "milliseconds": milliseconds, "host": host, "counts": counts}
+TEMPLATES.filters |= {"number": number, "milliseconds": milliseconds, "counts": counts}
 TEMPLATES.tests["always_passed"] = lambda fault: fault["passed"] == fault["injected"]

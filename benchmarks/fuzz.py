@@ -38,12 +38,11 @@ def main() -> None:
     parser.add_argument("target", help="mcap, metadata, scenario, airframe, map, message, route, targets, control or page")
     parser.add_argument("--seconds", type=int, default=60, help="how long to fuzz")
     parser.add_argument("--replay", type=Path, nargs="*", help="read each of these inputs once instead of fuzzing")
-    parser.add_argument("--keep", action="store_true", help="keep new inputs in runs/fuzz/<target>/inputs for the next run")
     arguments = parser.parse_args()
     if arguments.replay is not None:
         replay(arguments.target, arguments.replay)
     else:
-        sys.exit(fuzz(arguments.target, arguments.seconds, keep=arguments.keep))
+        sys.exit(fuzz(arguments.target, arguments.seconds))
 
 
 def replay(target: str, files: list[Path]) -> None:
@@ -67,17 +66,17 @@ def replay(target: str, files: list[Path]) -> None:
     print(f"{target}: {len(files)} inputs read or refused")
 
 
-def fuzz(target: str, seconds: int, *, keep: bool) -> int:
+def fuzz(target: str, seconds: int) -> int:
     """Fuzz for `seconds` in another process, whose files are removed afterwards. Returns its exit status."""
     memory = Path("/dev/shm")  # noqa: S108 - for speed
     with tempfile.TemporaryDirectory(prefix=f"fuzz-{target}-", dir=memory if memory.is_dir() else None) as folder:
-        process = get_context("fork").Process(target=_fuzz, args=(target, seconds, Path(folder)), kwargs={"keep": keep})
+        process = get_context("fork").Process(target=_fuzz, args=(target, seconds, Path(folder)))
         process.start()
         process.join()
     return process.exitcode or 0
 
 
-def _fuzz(target: str, seconds: int, scratch: Path, *, keep: bool) -> None:
+def _fuzz(target: str, seconds: int, scratch: Path) -> None:
     """Fuzz with files in a folder; never returns."""
     import atheris  # noqa: PLC0415 - a replay does not need it
 
@@ -87,8 +86,8 @@ def _fuzz(target: str, seconds: int, scratch: Path, *, keep: bool) -> None:
     tempfile.tempdir = str(scratch)
     findings = FINDINGS / target
     findings.mkdir(parents=True, exist_ok=True)
-    inputs = findings / "inputs" if keep else scratch / "inputs"
-    inputs.mkdir(parents=True, exist_ok=True)
+    inputs = scratch / "inputs"
+    inputs.mkdir()
     for k, seed in enumerate(SEEDS[target]()):
         (inputs / f"seed-{k}").write_bytes(seed)
     corpora = [str(path) for path in (inputs, CORPUS / target) if path.is_dir()]

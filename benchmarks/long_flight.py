@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 import psutil
 from benchmarks.host_delays import Intervals
-from benchmarks.processes import delay_monitors, real_time
-from benchmarks.view import RISE_DI, Client, figures_of_ticks, watching
+from benchmarks.processes import RISE_DI, delay_monitors, real_time
+from benchmarks.view import Client, figures_of_ticks, watching
 from tests.browser import CHROMIUM, Browser
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
@@ -46,7 +46,7 @@ TURBULENCE = {  # of 1.5 m/s: at the altitude of the c172p; moderate at 100 m ab
     "c172p": {"altitude": 1219.2, "sigma": 1.5, "seed": 1},
     "osprey": {"altitude": 100.0, "wind": 15.4, "seed": 1},
 }
-PERIOD = 2.0  # s between samples of the memory
+PERIOD, REPORT_PERIOD = 2.0, 0.1  # s between samples of the memory, in flight and while the report is written
 IN_VIEW = """(() => {
   document.querySelector("figure")?.scrollIntoView();
   const place = ({node}) => node.getBoundingClientRect(), all = typeof figures === "undefined" ? [] : figures;
@@ -74,8 +74,11 @@ def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Sc
     )
 
 
-def fly(scenario: Path, runs: Path, mode: str) -> dict[str, list[int]]:
-    """Fly, with a client of the page; the memory of each process by its command, until the nodes end, bytes every PERIOD."""
+def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], int]:
+    """Fly, with a client of the page; the memory of each process by its command, until the nodes end, bytes every PERIOD.
+
+    The second result is the most memory of `rise-di fly` after that, while it writes the report, bytes.
+    """
     command = [RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
     memory: dict[str, list[int]] = {}
     with ExitStack() as stack:
@@ -90,15 +93,19 @@ def fly(scenario: Path, runs: Path, mode: str) -> dict[str, list[int]]:
         client.start()
         while nodes := flight.children(recursive=True):
             for process in (flight, *nodes, server):
-                with suppress(psutil.Error):
+                with suppress(psutil.Error, IndexError):  # of one that ends just now
                     words = process.cmdline()
                     name = next((word for word in words if word.endswith(".main")), f"rise-di {words[2]}")
                     memory.setdefault(name, []).append(process.memory_info().rss)
             time.sleep(PERIOD)
-        flight.wait()  # it writes the report
+        most = memory["rise-di fly"][-1]
+        while flight.poll() is None:
+            with suppress(psutil.Error):
+                most = max(most, flight.memory_info().rss)
+            time.sleep(REPORT_PERIOD)
     if flight.returncode != 0:
         sys.exit(f"the flight ended with status {flight.returncode}")
-    return memory
+    return memory, most
 
 
 def end(flight: psutil.Popen) -> None:
@@ -139,10 +146,11 @@ def opened(report: Path) -> dict[str, float] | None:
         return {"figures in view": in_view, "all figures": time.monotonic() - begin}
 
 
-def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None) -> dict[str, Any]:
+def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None, *, real_time: bool) -> dict[str, Any]:
     """The figures of a flight from its run, SI; memory in bytes in the middle and at the end, ticks as `figures_of_ticks`.
 
-    `delays` are those of the host, by the clock of the stamps; None where unknown.
+    `delays` are those of the host, by the clock of the stamps; None where unknown. Ticks are of flights in real time alone: in
+    lockstep they wait for their inputs.
     """
     begin = time.monotonic()
     write_report(run)
@@ -158,7 +166,7 @@ def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None
         "legs": int(log["leg"].max()),
         "missing": missing(tape, scenario),
         "lost": sum(int(count) for count in read.metadata.get(LOST_MESSAGES, {}).values()),
-        "ticks": figures_of_ticks(tape["internals"], delays, period_ns(scenario.controller.rate, "rate")),
+        "ticks": figures_of_ticks(tape["internals"], delays, period_ns(scenario.controller.rate, "rate")) if real_time else {},
         "guidance": {"steps": replay.steps, "differing": replay.differing},
         "xtrack": float(np.abs(xtrack).max()),
         "bank_deg": math.degrees(float(np.abs(log["pose.phi"]).max())),
@@ -172,7 +180,6 @@ def main() -> None:
     """Fly and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=60.0, help="of flight time")
-    parser.add_argument("--runs", type=Path, help="folder for the run; by default it is removed")
     parser.add_argument("--observer", action="store_true", help="the osprey with its observer, in place of the c172p")
     mode = parser.add_mutually_exclusive_group()
     for name, words in (("--one-process", "in lockstep in one process"), ("--real-time", "in real time")):
@@ -181,15 +188,15 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="JSON file to write")
     options = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # the flight ends too
-    with tempfile.TemporaryDirectory() as folder, delay_monitors(bool(real_time())) as delays:
-        runs = options.runs or Path(folder)
-        runs.mkdir(parents=True, exist_ok=True)
+    timed = options.mode == "in real time"
+    with tempfile.TemporaryDirectory() as folder, delay_monitors(timed and bool(real_time())) as delays:
+        runs = Path(folder)
         path = runs / "flown.yaml"
         path.write_text(
             scenario_yaml(triangle(options.minutes, observer=options.observer, rate=options.rate)), encoding="utf-8"
         )
         begin = time.monotonic()
-        memory = fly(path, runs, options.mode)
+        memory, report_memory = fly(path, runs, options.mode)
         took = time.monotonic() - begin
         clock = time.time_ns() - time.monotonic_ns()
         host = [(since + clock, until + clock) for since, until in delays()] if delays else None
@@ -197,8 +204,9 @@ def main() -> None:
         found = {
             "flight": f"the {aircraft}, {options.mode}",
             "took": took,
-            **figures((runs / "latest").resolve(), memory, host),
+            **figures((runs / "latest").resolve(), memory, host, real_time=timed),
         }
+        found["report"]["memory"] = report_memory
         text = json.dumps(found, indent=1)
         print(text)
         if options.json is not None:

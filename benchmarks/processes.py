@@ -15,6 +15,7 @@ from typing import Any
 import psutil
 from benchmarks.host_delays import Intervals
 
+RISE_DI = str(Path(sys.executable).parent / "rise-di")
 ENDS_WITHIN = 30.0  # s
 PRIORITY = 50  # SCHED_FIFO, as that of ros2_control
 

@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 import psutil
-from benchmarks import campaign, law, lockstep, recorder
+from benchmarks import law, lockstep, recorder
 from benchmarks.host_delays import Intervals, missed_excluding_delays
 from benchmarks.nodes import open_node, ticks
-from benchmarks.processes import PRIORITY, Child, delay_monitors, real_time, threads_ns
+from benchmarks.processes import PRIORITY, RISE_DI, Child, delay_monitors, real_time, threads_ns
 from benchmarks.sampling import new_table
 from rclpy.node import Node
 from rich.console import Console
@@ -108,8 +108,9 @@ class Peer:
             now_ns = time.time_ns()
             self._y_m.publish(self._y_m_encoder.encode(now_ns, zero))
             self._y.publish(self._y_encoder.encode(now_ns, self._values[tick.number % len(self._values)]))
+            driven.sent += 1
             for received in self._u.take():
-                if (stamp_ns := stamp_of(received.message)) >= since_ns:  # else it answers an earlier process
+                if (stamp_ns := stamp_of(received.message)) >= since_ns:  # else of an earlier process, or warm-up
                     driven.start = driven.start or received.received_ns / NANOSECONDS
                     driven.received[stamp_ns] = received.received_ns
             for received in self._internals.take():
@@ -118,7 +119,7 @@ class Peer:
                     driven.age[sample.stamp_ns], driven.late[sample.stamp_ns] = sample.value.tolist()
             if not first and driven.received and time.time() > driven.start + WARM_UP:
                 first = time.monotonic() - WARM_UP
-                driven, cpu_ns = Driven(driven.start), child.cpu_ns()
+                driven, cpu_ns, since_ns = Driven(driven.start), child.cpu_ns(), time.time_ns()
             if not driven.received and not first and time.monotonic() > begin + MATCHED_WITHIN:
                 raise RuntimeError(f"no answer within {MATCHED_WITHIN:g} s")
         driven.cpu_ns = child.cpu_ns() - cpu_ns
@@ -130,6 +131,7 @@ class Driven:
     """Answers of a process, by stamp of the y."""
 
     start: float = 0.0  # system time of the first u, s
+    sent: int = 0  # y
     received: dict[int, int] = field(default_factory=dict)  # when u was received, ns
     age: dict[int, float] = field(default_factory=dict)  # of y at the tick, s
     late: dict[int, float] = field(default_factory=dict)  # lateness of the tick, s
@@ -223,7 +225,7 @@ def latency_rows(seconds: float, folder: Path) -> Iterator[Row]:
 
 
 def _latency(driven: Driven, values: Sequence[float]) -> dict[str, float]:
-    return us(values) | {"CPU (us each)": driven.cpu_each}
+    return us(values) | {"CPU (us each)": driven.cpu_each, "answered (%)": 100.0 * len(driven.received) / driven.sent}
 
 
 def tick_rows(seconds: float) -> Iterator[Row]:
@@ -326,7 +328,7 @@ def start_rows(folder: Path) -> Iterator[Row]:
             with controller_at(100.0, folder, CONTROLLER.module) as child:
                 waits.append(peer.drive(100.0, 0.1, child).start - begin)
         yield Row("controller, to its first u", {"seconds": float(np.median(waits))}, floor)
-    yield Row("rise-di fly, to its first u", {"seconds": seconds_to_first_u()}, floor)
+    yield Row("rise-di fly, to its first u", {"seconds": float(np.median([seconds_to_first_u() for _ in range(5)]))}, floor)
 
 
 def seconds_to_first_u() -> float:
@@ -334,7 +336,7 @@ def seconds_to_first_u() -> float:
     with open_node("subscriber") as node, tempfile.TemporaryDirectory() as runs:
         subscription = PolledSubscription(node, U, RECORD, raw=True)
         begin = time.time()
-        command = [str(Path(sys.executable).parent / "rise-di"), "fly", SCENARIO, "--duration", "30", "--runs", runs]
+        command = [RISE_DI, "fly", SCENARIO, "--duration", "30", "--runs", runs]
         flight = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)  # noqa: S603 - this stack
         try:
             while not (received := subscription.take()) and flight.poll() is None:
@@ -365,18 +367,6 @@ def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
     yield Row("recorder, from topics to disk", figures | {"lost": sent["sent"] - count}, floor, (Goal("lost", 0),))
 
 
-def campaign_rows(seconds: float) -> Iterator[Row]:
-    """Flights of uncertain aircraft a second, many at once, compared with one after the other in the loop."""
-    scenario = find_scenario("osprey_servo")
-    floor, workers = "one flight in the loop", psutil.cpu_count() or 1
-    aircraft = 4000 if seconds >= 10.0 else 1000
-    yield Row(floor, {"aircraft-s/s": max(campaign.alone(scenario)[0] for _ in range(2))}, floor)
-    many = campaign.speed(scenario, aircraft, aircraft // (5 * workers), workers)
-    what = f"campaign of {aircraft} aircraft, {workers} threads"
-    yield Row(f"{what}, with compiling", {"aircraft-s/s": many.whole}, floor)
-    yield Row(what, {"aircraft-s/s": many.flown}, floor)
-
-
 Group = Callable[[float, Path], Iterator[Row]]
 GROUPS: dict[str, Group] = {
     "law": lambda seconds, folder: law_rows(),
@@ -387,7 +377,6 @@ GROUPS: dict[str, Group] = {
     "start": lambda seconds, folder: start_rows(folder),
     "lockstep": lockstep_rows,
     "recorder": recorder_rows,
-    "campaign": lambda seconds, folder: campaign_rows(seconds),
 }
 
 

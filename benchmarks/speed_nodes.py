@@ -190,7 +190,7 @@ def delay_monitor(core: int) -> dict[str, Any]:
         time.sleep(MONITOR_PERIOD)
         now_ns = time.monotonic_ns()
         if now_ns - last_ns > 1.5e9 * MONITOR_PERIOD:  # a wake-up takes a twentieth to a fifth of a period
-            delays.append((last_ns, now_ns))
+            delays.append((last_ns + round(MONITOR_PERIOD * NANOSECONDS), now_ns))  # it was to sleep until then
         last_ns = now_ns
     return {"delays": delays}
 

@@ -15,7 +15,6 @@ import itertools
 import json
 import os
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -29,7 +28,8 @@ from typing import Any
 import numpy as np
 import psutil
 from benchmarks.host_delays import Intervals, excluding_delays, missed_excluding_delays
-from benchmarks.processes import delay_monitors, real_time, threads_ns
+from benchmarks.processes import RISE_DI, delay_monitors, real_time, threads_ns
+from numpy.typing import NDArray
 from scipy.stats import quantile_test
 from tests.browser import CHROMIUM, Browser
 from tornado.httpclient import HTTPRequest
@@ -55,9 +55,8 @@ POLLS = 60.0  # Hz: the page asks again once an answer is drawn, a frame later
 FREEZE, RECOVERED = 10.0, 0.3  # s: a page stops for so long, and is back when it is less behind than that
 BEGUN = 3.0  # s, until a flight has begun
 FLIGHT_SECONDS = 60.0  # of each of the flights whose ticks are compared
-TURN = 2.5  # s, with a client and without one in turns: above the second from which a pause is no missed tick
+TURN = 2.5  # s, with a client and without one in turns
 STARTED = 7.0  # s, for the start of the server, until its client has the flight so far
-RISE_DI = str(Path(sys.executable).parent / "rise-di")
 
 
 # A long log
@@ -114,7 +113,7 @@ def open_log(hours: float) -> dict[str, Any]:
 
 
 class Client(threading.Thread):
-    """Asks for news as the page does, until stopped; the delays from a sample's stamp to its arrival."""
+    """Asks for news as the page does, until stopped."""
 
     def __init__(self, address: str) -> None:
         super().__init__(daemon=True)
@@ -129,7 +128,6 @@ class Client(threading.Thread):
         self.asks = True
         self._head: dict[str, Any] = {}
         self._rows: dict[str, int] = {}
-        self.delays: list[float] = []
         self.bytes = 0
 
     async def _connect(self, netloc: str) -> WebSocketClientConnection:
@@ -150,19 +148,11 @@ class Client(threading.Thread):
         """The head of an answer with what the client lacks, which it knows then. Raises EOFError where the server has ended."""
         known = {name: self._head.get(name, "") for name in ("epoch", "state", "described")} | self._rows
         content = self.ask(urllib.parse.urlencode(known))
-        now = time.time()
         self.bytes += len(content)
         size = int.from_bytes(content[:4], "little")
         head: dict[str, Any] = json.loads(content[4 : 4 + size])
-        place = 4 + size
         self._rows["events"] = head["first_event"] + len(head["events"])
-        for topic in head["topics"]:
-            count = topic["count"]
-            if topic["name"] == "internals" and head["state"] == "recording":
-                start = int(head["epoch"].partition(".")[0]) / NANOSECONDS
-                self.delays.append(now - start - float(np.frombuffer(content, "<f8", count, place)[-1]))
-            self._rows[topic["name"]] = topic["first"] + count
-            place += 8 * count + -(-4 * count * len(topic["channels"]) // 8) * 8
+        self._rows |= {topic["name"]: topic["first"] + topic["count"] for topic in head["topics"]}
         self._head = head
         return head
 
@@ -212,10 +202,10 @@ def watching(*runs: Path) -> Iterator[tuple[psutil.Popen, str]]:
 
 
 MEASURE = """(start => {
-    const delays = window.delays = [], time = document.getElementById('time'), state = document.getElementById('state');
+    const delays = window.delays = [], time = document.getElementById('time');
     let before = '';
     (function look() {
-        if (time.textContent !== before && state.textContent === 'LIVE') {
+        if (time.textContent !== before) {
             before = time.textContent;
             delays.push(Date.now() / 1e3 - start - parseFloat(before.slice(4)));
             (window.instants ??= []).push(Date.now() / 1e3);
@@ -226,7 +216,7 @@ MEASURE = """(start => {
 
 
 def live(seconds: float, *, browser: bool) -> dict[str, Any]:
-    """Processor share and memory (MB) of the server beside a flight, traffic, and delays to the client and to the screen."""
+    """Processor share and memory (MB) of the server beside a flight, traffic, and delays to the screen."""
     with (
         tempfile.TemporaryDirectory() as folder,
         flying(Path(folder), seconds) as (flight, run),
@@ -251,12 +241,11 @@ def live(seconds: float, *, browser: bool) -> dict[str, Any]:
         client.stop()
         traffic = client.bytes / seconds
     shown: dict[str, Any] = {"flight": seconds, "processor": share, "memory": memory, "traffic": traffic}
-    shown |= {"to the client": percentiles(client.delays)}
-    return shown | ({"to the screen": percentiles(drawn[len(drawn) // 5 :])} if browser else {})
+    return shown | ({"to the screen": {f"p{k}": float(np.percentile(drawn, k)) for k in (50, 99)}} if browser else {})
 
 
 def frozen(seconds: float = FREEZE) -> dict[str, Any]:
-    """A page whose process stops for so long: the delay when it goes on, and the time until it is below RECOVERED again, s."""
+    """A page whose process stops for so long: the time from its going on until its delay is below RECOVERED again, s."""
     with (
         tempfile.TemporaryDirectory() as folder,
         flying(Path(folder), seconds + 60.0) as (flight, run),
@@ -275,17 +264,11 @@ def frozen(seconds: float = FREEZE) -> dict[str, Any]:
         for one in renderers:
             one.resume()
         page.wait_for(f"window.delays.length > 0 && delays.at(-1) < {RECOVERED} && instants.at(-1) > {resumed}")
-        time.sleep(4.0)
         instants, delays = page.run("[instants, delays]")
         flight.terminate()
         flight.communicate()
-    after = [(instant - resumed, delay) for instant, delay in zip(instants, delays, strict=True) if instant > resumed]
-    return {
-        "frozen": seconds,
-        "delay at first": after[0][1],
-        "recovered after": next((since for since, delay in after if delay < RECOVERED), None),
-        "afterwards": percentiles([delay for since, delay in after if since > 1.0]),
-    }
+    back = (at - resumed for at, delay in zip(instants, delays, strict=True) if at > resumed and delay < RECOVERED)
+    return {"frozen": seconds, "recovered after": next(back)}
 
 
 def start_of(address: str) -> float:
@@ -293,11 +276,6 @@ def start_of(address: str) -> float:
     content = Client(address).ask()
     size = int.from_bytes(content[:4], "little")
     return int(json.loads(content[4 : 4 + size])["epoch"].partition(".")[0]) / NANOSECONDS
-
-
-def percentiles(delays: list[float]) -> dict[str, float]:
-    """Median, 90th and 99th percentile, s, and their number."""
-    return {f"p{k}": float(np.percentile(delays, k)) for k in (50, 90, 99)} | {"count": len(delays)} if delays else {}
 
 
 def flights(count: int, seconds: float) -> dict[str, Any]:
@@ -344,7 +322,7 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
             "with": turns[True],
             "start included": [(starts, joins), *turns[True]],
         }.items():
-            found[kind].append(figures_of_ticks(internals.within(windows), host_delays, period_ns))
+            found[kind].append(figures_of_ticks(internals, host_delays, period_ns, windows))
         starting.append((joins - starts) / NANOSECONDS)
     names = found["with"][0]
     shown: dict[str, Any] = {kind: {name: [one[name] for one in figures] for name in names} for kind, figures in found.items()}
@@ -356,17 +334,25 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
     return shown | {"starting": starting}
 
 
-def figures_of_ticks(internals: Signal, delays: Intervals | None, period_ns: int) -> dict[str, float]:
-    """Missed ticks and late p99, also excluding host delays where they are known. A pause of a second is no miss."""
+def figures_of_ticks(
+    internals: Signal, delays: Intervals | None, period_ns: int, windows: Intervals = ((0, 2**63 - 1),)
+) -> dict[str, float]:
+    """Missed ticks and late p99 of the deadlines inside windows, also excluding host delays where they are known."""
     at = internals.stamp_ns + np.rint(internals["age"] * NANOSECONDS).astype(np.int64)
     due = at - np.rint(internals["late"] * NANOSECONDS).astype(np.int64)
-    gaps = np.diff(due)
-    skipped = np.column_stack((due[:-1] + period_ns, at[1:]))[(gaps > 1.5 * period_ns) & (gaps < NANOSECONDS)]
+
+    def inside(instants: NDArray[np.int64]) -> NDArray[np.bool_]:
+        found: NDArray[np.bool_] = np.any([(instants >= first) & (instants <= last) for first, last in windows], axis=0)
+        return found
+
+    missed = due[:-1] + period_ns  # unless the next tick has this deadline
+    skipped = np.column_stack((missed, at[1:]))[(np.diff(due) > 1.5 * period_ns) & inside(missed)]
+    ticks = np.column_stack((due, at))[inside(due)]
     figures: dict[str, float] = {}
     for words, known in (("", ()), (", excluding host delays", delays)):
         if known is not None:
             figures["missed ticks" + words] = missed_excluding_delays(skipped, known, period_ns)
-            late = excluding_delays(np.column_stack((due, at)), known)
+            late = excluding_delays(ticks, known)
             figures["late p99 (ms)" + words] = float(np.percentile(late, 99)) / 1e6
     return figures
 

@@ -34,7 +34,8 @@ TIMES = {"median": 0.1234, "worst": 0.2341}
 FAULT = {
     "case": "controller killed",
     "u": "held, then ramped",
-    **dict.fromkeys(("injected", "detected", "passed"), 10),
+    **dict.fromkeys(("injected", "passed"), 10),
+    "any_delay": 3,
     **dict.fromkeys(("reaction", "recovery", "ready_to_traffic", "held_back"), TIMES),
     "exec_to_traffic": {"median": 0.4, "worst": 0.51},
     "exec_to_ready": {"median": 0.38, "worst": 0.47},
@@ -53,7 +54,7 @@ PI = LAW | {"law": "pi", "score": {"gust": 1.72, "turbulence": 2.51}}
 FIGURE = {"mean": 1.31, "q50": 1.21, "q95": 2.31, "q99": 2.71, "worst": 3.01, "deviation": 0.1}
 COVERAGE = {"status": 0, "covered": 1234, "number_of_executed_units": 98765, "peak_rss_mb": 321}
 CAMPAIGN: dict[str, Any] = {"whole": 120_000.0, "flown": 150_000.0, "memory_early": 900.0, "memory": 905.0, "aircraft": 10_000}
-CAMPAIGN |= {"plain": 50.0, "integration": {"q": 0.0021, "V": 0.0005}}
+CAMPAIGN |= {"plain": 50.0, "exact": 4, "integration": {"q": 0.0021, "V": 0.0005}}
 SHARE = {"count": 3, "share": 3e-4, "low": 1e-4, "high": 9e-4}
 DELAYS = {"p50": 0.052, "p99": 0.26}
 BESIDE = {"processor": 0.027, "memory": 76.0, "traffic": 22_000.0, "flight": 30.0}
@@ -84,12 +85,14 @@ LONG_FLIGHT |= {
     "memory": {"recorder.main": [100e6, 103e6], "rise-di fly": [90e6, 91e6]},
 }
 LONG_FLIGHT |= {"ticks": {"missed ticks": 3, "missed ticks, excluding host delays": 0}}
-LONG_FLIGHT |= {"report": {"size": 48.1e6, "written": 12.5, "opened": {"figures in view": 1.2, "all figures": 2.6}}}
+LONG_FLIGHT |= {
+    "report": {"size": 48.1e6, "memory": 900e6, "written": 12.5, "opened": {"figures in view": 1.2, "all figures": 2.6}}
+}
 FLEET = {"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}
 RESULTS = {
     "speed-node": result("speed-node", {"seconds": 10.0, "rows": NODE}),
     "faults": result("faults", [FAULT]),
-    "random-faults": result("random-faults", {"draws": 110, "two": 9, "lockstep": 10, "failed": []}),
+    "random-faults": result("random-faults", {"draws": 110, "two": 9, "lockstep": 10, "passed": 110, "failed": []}),
     "security": result("security", [{"name": "test_an_attacker_receives_nothing", "outcome": "passed", "seconds": 1.0}]),
     "fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE}),
     "long-fuzz": result("long-fuzz", {"mcap": COVERAGE}),
@@ -155,14 +158,20 @@ def test_long_measurements_run_only_by_their_name() -> None:
 
 def test_a_long_flight_states_its_goals_and_those_that_it_misses() -> None:
     for line in (
-        "- Goal: memory of recorder.main at most 2 % larger at the end than in the middle. Measured: 3 %, **not met**.",
-        "- Goal: memory of rise-di fly at most 2 % larger at the end than in the middle. Measured: 1.11 %, met.",
+        "memory of recorder.main at most 2 % larger at the end of the flight than in the middle. Measured: 3 %, **not met**.",
+        "- Goal: memory of rise-di fly at most 2 % larger at the end of the flight than in the middle. Measured: 1.11 %, met.",
         "- Goal: no sample is missing from the log. Measured: 1, **not met**.",
         "- Goal: no missed tick, excluding host delays. Measured: 0, met.",
         "- Goal: the report is written within 10 s. Measured: 12.5 s, **not met**.",
         "- Goal: all figures of the report (48 MB) drawn within 3 s. Measured: 2.6 s, met.",
     ):
         assert line in page(), line
+
+
+def test_a_lockstep_flight_has_no_late_ticks_to_state() -> None:
+    text = page(**{"long-jsbsim": result("long-jsbsim", LONG_FLIGHT | {"ticks": {}})})
+    assert "- In lockstep a tick waits for its inputs: none is missed or late." in text
+    assert "Goal: no missed tick" not in text
 
 
 def test_a_figure_that_depends_on_the_host_is_a_ratio_to_its_baseline_with_the_figure_in_parentheses() -> None:
@@ -225,13 +234,15 @@ def leaves(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     [
         ({"quick": True}, "**A short version**, not to be quoted"),
         ({"busy": BUSY + 0.4}, "**The host was busy** at the start, 50 % of its processors in use"),
-        ({"result": None, "status": 2}, "**Failed**, with exit status 2"),
-        ({"status": 1}, "**Exit status 1.**"),
+        ({"result": None, "status": 2}, "**Failed**, with exit status 2: its goals are **not met**"),
+        ({"status": 1}, "- Goal: the measurement ends with exit status 0. Measured: 1, **not met**."),
     ],
 )
 def test_a_measurement_with_reduced_validity_is_marked(changes: dict[str, Any], expected: str) -> None:
     assert expected not in page()
-    assert expected in page(faults=RESULTS["faults"] | changes)
+    marked = page(faults=RESULTS["faults"] | changes)
+    assert expected in marked
+    assert ("- Faults: " + expected.removeprefix("- Goal: ") in marked.partition("## ")[0]) == ("status" in changes)
 
 
 def test_a_killed_node_is_timed_from_its_start_and_from_its_being_ready() -> None:
@@ -272,28 +283,40 @@ def test_a_busy_host_is_marked_only_for_timed_measurements() -> None:
 
 def test_a_random_fault_that_failed_is_named_with_its_seed() -> None:
     failed = {"seed": 417, "case": "storm on y, recorder killed", "error": "not within 3 s: detected"}
-    text = page(**{"random-faults": result("random-faults", {"draws": 9, "two": 1, "lockstep": 0, "failed": [failed]})})
+    drawn = {"draws": 9, "two": 1, "lockstep": 0, "passed": 7, "failed": [failed]}  # and one that was not injected
+    text = page(**{"random-faults": result("random-faults", drawn)})
     assert "- Seed 417, storm on y, recorder killed: not within 3 s: detected" in text
-    assert "no draw fails. Measured: 1 of 9, **not met**" in text
+    assert "no draw fails. Measured: 2 of 9, **not met**" in text
 
 
 def test_a_fault_that_did_not_pass_each_time_is_bold() -> None:
-    assert "1 of 1 cases passed every time; 10 of 10 faults" in page()
+    assert "1 of 1 cases passed every time." in page()
     text = page(faults=result("faults", [FAULT | {"passed": 9}], status=1))
-    assert "0 of 1 cases passed every time; 9 of 10 faults" in text
+    assert "0 of 1 cases passed every time." in text
+    assert "- Goal: every fault ends as expected. Measured: 1 of 10 do not, **not met**." in text
     assert "| **9** |" in text
+
+
+def test_an_input_that_fuzzing_found_is_a_goal_that_is_not_met() -> None:
+    text = page(**{"fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE | {"status": 77}})})
+    assert "- Goal: no input is a finding. Measured: 1 of 1 readers, **not met**." in text
+    assert "| **an input, status 77** |" in text
 
 
 def test_a_failed_test_is_bold() -> None:
     failed = [{"name": "test_an_attacker_receives_nothing[far]", "outcome": "failed", "seconds": 1.0}]
     assert "| an attacker receives nothing | passed |" in page()
-    assert "| an attacker receives nothing | **failed** |" in page(security=result("security", failed, status=1))
+    text = page(security=result("security", failed, status=1))
+    assert "| an attacker receives nothing | **failed** |" in text
+    assert "- Goal: no test fails. Measured: 1 of 1, **not met**." in text
 
 
 def test_a_scenario_that_replays_differently_is_bold() -> None:
     differing = {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": False, "differing": 17}
-    assert "**17 ticks differ**" in page(replay=result("replay", {"osprey_gust": differing}))
-    assert "**no flight**" in page(replay=result("replay", {"osprey_gust": {"outcome": ["error: no aircraft"]}}))
+    for replay, cell in ((differing, "**17 ticks differ**"), ({"outcome": ["error: no aircraft"]}, "**no flight**")):
+        text = page(replay=result("replay", {"osprey_gust": replay}))
+        assert cell in text
+        assert "- Goal: every scenario replays to the bit. Measured: 1 of 1 do not, **not met**." in text
 
 
 def test_the_lowest_score_among_laws_with_the_same_measurements_and_knowledge_is_bold() -> None:

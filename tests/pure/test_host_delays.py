@@ -2,7 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Missed ticks of a loop, excluding host delays."""
 
+import math
+
+import numpy as np
 from benchmarks.host_delays import missed_excluding_delays
+from benchmarks.view import figures_of_ticks
+
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal
 
 PERIOD_NS = 2_000_000
 
@@ -25,3 +32,15 @@ def test_the_rest_of_a_skip_counts_in_whole_periods() -> None:
 def test_a_delay_of_two_cores_at_once_is_subtracted_once() -> None:
     delays = [(0, 2 * PERIOD_NS), (PERIOD_NS, 3 * PERIOD_NS), (PERIOD_NS, 2 * PERIOD_NS)]
     assert missed_excluding_delays([(0, 5 * PERIOD_NS)], delays[::-1], PERIOD_NS) == 2
+
+
+def test_a_pause_of_a_second_counts_inside_a_window_and_not_outside_of_it() -> None:
+    deadlines = np.delete(np.arange(0, 4 * NANOSECONDS, PERIOD_NS), slice(501, 1001))  # none from 1.002 s to 2.000 s
+    internals = Signal(deadlines, ("age", "late"), np.tile((1e-3, 1e-3), (len(deadlines), 1)))  # a tick 1 ms after its deadline
+    inside, outside = (NANOSECONDS // 2, 3 * NANOSECONDS), (3 * NANOSECONDS, 4 * NANOSECONDS)
+    for windows, missed in (([inside], 500), ([outside], 0), ([outside, inside], 500)):
+        figures = figures_of_ticks(internals, None, PERIOD_NS, windows)
+        assert figures["missed ticks"] == missed
+        assert math.isclose(figures["late p99 (ms)"], 1.0)
+    delay = [(1_002_000_000, 1_502_000_000)]  # of the host, half of the pause
+    assert figures_of_ticks(internals, delay, PERIOD_NS)["missed ticks, excluding host delays"] == 250
