@@ -18,12 +18,18 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
+from flight_core.rates import NANOSECONDS
 from flight_ros import transport
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
 
 HANG = 150.0  # s, until a test ends that makes no progress: a guard and no limit, which a busy host must not reach
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
+
+
+def stamp_ns(message: Any) -> int:
+    """The stamp of a message with a header."""
+    return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
 
 
 class Peer:

@@ -4,7 +4,9 @@
 
 import numpy as np
 from tests.ros.conftest import Start
-from tests.ros.peer import Peer
+from tests.ros.peer import Peer, stamp_ns
+
+from flight_core.rates import NANOSECONDS
 
 PEER_TOPICS = ("truth", "/diagnostics")
 
@@ -25,7 +27,7 @@ def test_u_that_times_out_is_held_then_ramped_to_trim_and_may_return(start_node:
     positions, messages = aileron(peer_node), peer_node.received["truth"]
     assert (np.diff(positions) <= 0).all()
     # A ramp of 0.01 in 0.2 s. The host may skip ticks, which the stamps show, and delay one by 18 ms.
-    stamps = np.array([message.header.stamp.sec + message.header.stamp.nanosec * 1e-9 for message in messages])
+    stamps = np.array([stamp_ns(message) for message in messages]) / NANOSECONDS
     assert (np.abs(np.diff(positions)) <= 0.01 / 0.2 * (np.diff(stamps) + 0.018)).all()
     process.wait_for("waiting for /u")
     peer_node.until(lambda: aileron(peer_node)[-1:] == [0.02], each=lambda: command(peer_node, "second", 0.02))

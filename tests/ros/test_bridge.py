@@ -27,7 +27,7 @@ from sensor_msgs.msg import FluidPressure, Imu, Joy
 from std_srvs.srv import SetBool
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, Start, settable_clock
-from tests.ros.peer import HANG, Peer, peer
+from tests.ros.peer import HANG, Peer, peer, stamp_ns
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
@@ -134,7 +134,7 @@ class BridgeSetup:
 
 
 def stamp(message: Any) -> float:
-    return float(message.header.stamp.sec + message.header.stamp.nanosec / NANOSECONDS)
+    return stamp_ns(message) / NANOSECONDS
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from tests.ros.conftest import Process, Start
-from tests.ros.peer import OUTPUTS, Peer, peer
+from tests.ros.peer import OUTPUTS, Peer, peer, stamp_ns
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.rates import NANOSECONDS, nanoseconds
@@ -76,10 +76,6 @@ def ticks(peer_node: Peer) -> Ticks:
 
 def channel(message: JointState, name: str) -> float:
     return float(message.position[message.name.index(name)])
-
-
-def stamp_ns(message: Any) -> int:
-    return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
 
 
 class HostDelay:

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from rosgraph_msgs.msg import Clock
 from tests.ros.conftest import Start
-from tests.ros.peer import OUTPUTS, Peer, peer
+from tests.ros.peer import OUTPUTS, Peer, peer, stamp_ns
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_bringup.scenarios import find_scenario
 from flight_core.channels import ATTITUDE
-from flight_core.rates import NANOSECONDS
 from flight_core.units import GRAVITY
 from flight_ros.messages import instant, to_message
 from flight_ros.topics import LOCKSTEP
@@ -105,6 +104,5 @@ def test_in_lockstep_the_reference_waits_for_u_m_and_repeats_the_bytes_of_one_pr
             values = np.array([0.0, 0.0, 0.02 * (number + 1), 0.0, 0.0, 0.0])
             u_m.publish(to_message(number * 2 * MS, (*OUTPUTS, *ATTITUDE), values, "/guidance"))
         lockstep_peer.until(partial(arrived, 31))
-    stamps = [message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec for message in received]
-    assert stamps == [number * 2 * MS for number in range(31)]
+    assert [stamp_ns(message) for message in received] == [number * 2 * MS for number in range(31)]
     assert np.array([message.position for message in received]).tobytes() == np.array(expected).tobytes()

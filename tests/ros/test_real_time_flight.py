@@ -55,13 +55,14 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
     # The bounds are for the loop, not for the host. Such a flight is repeated, at most three times. Host delays count that made
     # the controller late by more than a quarter of its period, or the aircraft or the reference model by more than a sample.
     # Those of u on its way to the aircraft are in no topic, so that one flight beyond the bounds proves nothing.
+    delays = []
     for _ in range(4):
         start("flight_cli.cli", "fly", str(short_scenario)).succeed()
         run = (tmp_path / "runs" / "latest").resolve()
         tape = read_run(run).tape
         ticks = json.loads((run / "summary.json").read_text(encoding="utf-8"))["ticks"]
         gap = max(np.diff(tape[topic].stamp_ns).max() for topic in ("y", "y_m"))
-        delayed = bool(ticks["late_max"] >= 0.0025 or ticks["without_new_y"] > 1 or gap > 4_000_000)
+        delays.append(bool(ticks["late_max"] >= 0.0025 or ticks["without_new_y"] > 1 or gap > 4_000_000))
         errors = rms(tracking_error(tape).values)
         accurate = bool((errors <= bound).all())
         with AnyReader([run]) as reader:
@@ -77,11 +78,11 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
     assert internals.name[:2] == ["mode", "dt"]
     assert internals.header.frame_id.startswith("/controller#")
     assert tape["y"].stamp_ns[0] == tape.start_ns  # the log begins with the first sample
-    assert delayed or np.diff(tape["y"].stamp_ns).max() <= 20_000_000
+    assert delays[-1] or np.diff(tape["y"].stamp_ns).max() <= 20_000_000
     # u carries the stamp of the y from which it was computed; one that is held on a busy host, that of its tick
     held = tape["internals"].stamp_ns[tape["internals"]["mode"] != Mode.ENGAGED]
     assert set(tape["u"].stamp_ns.tolist()) - set(held.tolist()) <= set(tape["y"].stamp_ns.tolist())
-    if delayed and (missing or not accurate):
+    if all(delays) and (missing or not accurate):
         pytest.skip("host scheduling delayed a node in four flights of four")
     assert not missing, counts
     assert accurate, f"{errors} over topics, at most {bound}"
