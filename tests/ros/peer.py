@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
-from flight_core.rates import NANOSECONDS
+from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_ros import transport
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
@@ -65,9 +65,9 @@ class Peer:
         for name, value in (("y_m", y_m), ("y", y)):
             self.publish(name, to_message(now_ns, OUTPUTS, np.full(4, value), "peer"))
 
-    def command(self, *u: float, sender: str = "peer") -> None:
-        """Publish u, stamped now."""
-        self.publish("u", to_message(time.time_ns(), INPUTS, np.array(u), sender))
+    def command(self, *u: float, sender: str = "peer", age: float = 0.0) -> None:
+        """Publish u, stamped `age` s ago."""
+        self.publish("u", to_message(time.time_ns() - nanoseconds(age), INPUTS, np.array(u), sender))
 
     def publish(self, topic: str, message: JointState) -> None:
         """Publish a named vector on a topic."""

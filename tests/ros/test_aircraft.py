@@ -34,6 +34,18 @@ def test_u_that_times_out_is_held_then_ramped_to_trim_and_may_return(start_node:
     process.wait_for("receiving u from second")
 
 
+def test_a_u_older_than_the_age_limit_does_not_end_the_failsafe(start_node: Start, peer_node: Peer) -> None:
+    process = start_node("aircraft_sim", "-p", "max_age:=0.1", "-p", "hold:=0.0", "-p", "ramp:=0.0")
+    peer_node.until(lambda: aileron(peer_node)[-1:] == [0.01], each=lambda: command(peer_node, "first", 0.01))
+    peer_node.until(lambda: aileron(peer_node)[-1:] == [0.0])
+    peer_node.received["truth"].clear()
+    # As of a controller that was stopped while its middleware sent: longer than the age limit, newer than the last u.
+    peer_node.until(lambda: peer_node.counted("refused u: old"), each=lambda: peer_node.command(0.0, 0.0, 0.02, 0.0, age=0.15))
+    assert not any(aileron(peer_node))
+    process.wait_for("/u: sample refused: stamp 0.1")
+    peer_node.until(lambda: aileron(peer_node)[-1:] == [0.02], each=lambda: command(peer_node, "first", 0.02))
+
+
 def test_a_second_controller_is_ignored_while_the_first_one_publishes(start_node: Start, peer_node: Peer) -> None:
     process = start_node("aircraft_sim")
     peer_node.until(lambda: aileron(peer_node)[-1:] == [0.01], each=lambda: command(peer_node, "first", 0.01))

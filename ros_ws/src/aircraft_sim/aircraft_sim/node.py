@@ -13,7 +13,7 @@ from aircraft_sim.simulator import Simulator
 from flight_core import channels
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
-from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_not_future
+from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_not_future, require_not_old
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import NO_CHANNELS, instant, stamp_of
 from flight_ros.ticker import Tick
@@ -133,10 +133,15 @@ class AircraftNode(FlightNode[AircraftParameters]):
         return received_any
 
     def _require_timely(self, sample: StampedVector, now_ns: int) -> None:
-        """Raise ChannelError where a u is stamped in the future, or before the last u, by more than the age limit."""
+        """Raise ChannelError where a u is stamped in the future, or before the last u, by more than the age limit.
+
+        After a timeout, where it is older than that: the middleware of a controller that was stopped sends its last u when the
+        process continues.
+        """
         require_not_future(sample.stamp_ns, now_ns, self._max_age_ns)
-        behind_ns = self._u_stamp_ns - sample.stamp_ns
-        if behind_ns > self._max_age_ns and not self._timed_out(now_ns):
+        if self._timed_out(now_ns):
+            require_not_old(sample.stamp_ns, now_ns, self._max_age_ns)
+        elif (behind_ns := self._u_stamp_ns - sample.stamp_ns) > self._max_age_ns:
             raise ChannelError("order", f"stamp {seconds(behind_ns):g} s before the last one")
 
     def _accept(self, sample: StampedVector, now_ns: int) -> None:

@@ -80,6 +80,12 @@ def require_not_future(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
         raise ChannelError(FUTURE, f"stamp {seconds(stamp_ns - now_ns):g} s ahead of the clock")
 
 
+def require_not_old(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
+    """Raise ChannelError, reason "old", for a stamp behind the clock by more than the age limit."""
+    if now_ns - stamp_ns > max_age_ns:
+        raise ChannelError("old", f"stamp {seconds(now_ns - stamp_ns):g} s old")
+
+
 def select(wanted: Sequence[str], names: Sequence[str], values: Sequence[float] | FloatArray) -> FloatArray:
     """Values of the wanted channels, in the wanted order: v_i = values[names.index(wanted_i)], shape (len(wanted),).
 

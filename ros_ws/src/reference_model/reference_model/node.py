@@ -8,8 +8,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from flight_core.channels import ATTITUDE
 from flight_core.publisher_lock import PublisherLock
-from flight_core.rates import nanoseconds, period_ns, seconds
-from flight_core.vectors import ChannelError, FloatArray, require_not_future
+from flight_core.rates import nanoseconds, period_ns
+from flight_core.vectors import ChannelError, FloatArray, require_not_future, require_not_old
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, stamp_of
 from flight_ros.ticker import Tick
@@ -68,8 +68,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
             self._publisher_lock.check(sample.sender, now_ns, max_age_ns, takeover_ns)
             with self._decoder.once(sample.stamp_ns):
                 require_not_future(sample.stamp_ns, now_ns, max_age_ns)
-                if now_ns - sample.stamp_ns > max_age_ns:
-                    raise ChannelError("old", f"stamp {seconds(now_ns - sample.stamp_ns):g} s old")
+                require_not_old(sample.stamp_ns, now_ns, max_age_ns)
                 self._reference.take(sample.stamp_ns - start_ns, sample.value, self._attitude(message))
             self._publisher_lock.refresh(sample.sender, now_ns)
         except ChannelError as error:
