@@ -31,6 +31,7 @@ FOUND: tuple[tuple[int, tuple[str, ...]], ...] = (
     (2, ("guidance stopped",)),
     (7, ("pose stale",)),
     (10, ("storm on the live page",)),
+    (11, ("controller stopped",)),
     (35, ("reference model stopped",)),
     (106, ("future stamps on u", "recorder killed under a live page")),
     (141, ("wrong length on y_m",)),
