@@ -18,6 +18,7 @@ import json
 import os
 import platform
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,7 +27,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from xml.etree import ElementTree
 
 import psutil
@@ -128,9 +129,9 @@ def measure(one: Measurement, *, quick: bool) -> Result:
         if parts[:2] == FLEET[:2]:
             command += ["--runs", folder]
         with (RESULTS / f"{one.name}.log").open("w", encoding="utf-8") as log:
-            ran = subprocess.run(command, cwd=REPOSITORY, check=False, stdout=subprocess.PIPE, stderr=log, text=True)  # noqa: S603
-            log.write(ran.stdout)
-        result = read(file, ran.stdout)
+            status, output = run_to_its_end(command, log)
+            log.write(output)
+        result = read(file, output)
     return {
         "name": one.name,
         "command": " ".join(parts),
@@ -140,9 +141,22 @@ def measure(one: Measurement, *, quick: bool) -> Result:
         "machine": host_details(),
         "busy": busy,
         "seconds": time.monotonic() - begin,
-        "status": ran.returncode,
+        "status": status,
         "result": result,
     }
+
+
+def run_to_its_end(command: Sequence[str], log: IO[str]) -> tuple[int, str]:
+    """Exit status and output of a program. Where this one is ended, the program ends first, with the flights it started."""
+    with subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=log, text=True) as running:  # noqa: S603
+        try:
+            output, _ = running.communicate()
+        except (KeyboardInterrupt, SystemExit) as ending:
+            if isinstance(ending, SystemExit):  # SIGTERM; a Ctrl-C has reached the program too
+                running.send_signal(signal.SIGINT)
+            running.wait()
+            raise
+    return running.returncode, output
 
 
 def read(file: Path, output: str) -> Any:
@@ -225,6 +239,11 @@ def fuzz(seconds: float) -> dict[str, Any]:
 # The command
 
 
+def exit_on_sigterm() -> None:
+    """Raise SystemExit at SIGTERM."""
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+
+
 def load() -> dict[str, Result]:
     """The stored results, by name."""
     paths = {one.name: RESULTS / f"{one.name}.json" for one in MEASUREMENTS}
@@ -267,6 +286,7 @@ def main() -> int:
     if unknown := [name for name in options.again if not any(one.name.startswith(name) for one in MEASUREMENTS)]:
         parser.error(f"--again: found {unknown[0]!r}, expected one of {', '.join(one.name for one in MEASUREMENTS)}")
     RESULTS.mkdir(parents=True, exist_ok=True)
+    exit_on_sigterm()
     results = load()
     chosen = tuple(options.again) or ("",)
     todo = [] if options.render else wanted(options.again, results, quick=options.quick)

@@ -4,12 +4,16 @@
 
 import json
 import re
+import signal
+import subprocess
+import sys
+import time
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import pytest
-from benchmarks.evidence import MEASUREMENTS, cases, read, wanted
+from benchmarks.evidence import MEASUREMENTS, REPOSITORY, cases, read, wanted
 from benchmarks.evidence_page import BUSY, SPEED, WIDTH, Result, render
 
 MACHINE = {"processor": "a processor", "cores": 2, "memory": 8, "system": "Linux 6", "python": "3.11.7"}
@@ -340,6 +344,21 @@ def test_the_score_of_a_diverged_law_is_a_word() -> None:
 def test_each_table_has_as_many_cells_as_headings() -> None:
     for table in re.findall(r"(?:^\|.*\n)+", page(), re.MULTILINE):
         assert len({line.replace("\\|", "").count("|") for line in table.splitlines()}) == 1, table
+
+
+def test_a_program_that_measures_ends_before_the_terminated_evidence(tmp_path: Path) -> None:
+    begun, ended = tmp_path / "begun", tmp_path / "ended"
+    child = f"import pathlib, time\ntry:\n pathlib.Path({str(begun)!r}).touch()\n time.sleep(60)\n"
+    child += f"except KeyboardInterrupt:\n pathlib.Path({str(ended)!r}).touch()"
+    program = (
+        f"from benchmarks import evidence\nevidence.RESULTS = evidence.Path({str(tmp_path)!r})\nevidence.exit_on_sigterm()\n"
+    )
+    program += f"evidence.measure(evidence.Measurement('one', ('python', '-c', {child!r}), (), '', ''), quick=False)"
+    with subprocess.Popen([sys.executable, "-c", program], cwd=REPOSITORY) as running:
+        while running.poll() is None and not begun.exists():
+            time.sleep(0.01)
+        running.terminate()
+    assert (running.returncode, ended.exists()) == (128 + signal.SIGTERM, True)
 
 
 def test_exactly_the_missing_failed_and_short_measurements_run() -> None:
