@@ -5,7 +5,6 @@
 The folder of a campaign holds its definition, a file for each completed chunk, and at the end its figures and its report.
 """
 
-import os
 from collections.abc import Iterator
 from functools import lru_cache, partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
-from flight_core.files import writing
+from flight_core.files import replace_text, writing
 from flight_core.parameters import ParameterError, Parameters, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import TunedLaw
@@ -245,8 +244,5 @@ class Campaign:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file atomically."""
-    part = path.with_suffix(".part")
     with writing("", path, "a folder and a disk that can"):
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)  # noqa: PTH105 - atomic, replaces a file
+        replace_text(path, text)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Input files and output files: existence checks, YAML, and one-sentence errors for files that cannot be read or written."""
+"""Input and output files: existence checks, YAML, atomic replacement, sentences for files that cannot be read or written."""
 
 import math
 import os
@@ -122,3 +122,13 @@ def parse_yaml(content: bytes | str, key: str, expected: str) -> Any:
     except NOT_YAML as error:
         what = " ".join(str(error).split()) or type(error).__name__
         raise ParameterError(f"{key}: not valid YAML ({what}), expected {expected}") from None
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file atomically: after a crash the file has either its new or its old content."""
+    fresh = path.with_name(f"{path.name}.new")
+    with fresh.open("w", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+    fresh.replace(path)

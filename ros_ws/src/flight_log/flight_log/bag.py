@@ -15,9 +15,9 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Message, MessageIndex
 from mcap.writer import CompressionType, Writer
 
-from flight_core.files import read_yaml
+from flight_core.files import read_yaml, replace_text
 from flight_core.parameters import require
-from flight_log.disk import ReservedFile, replace_text
+from flight_log.disk import ReservedFile
 from flight_log.message_definitions import Definition, definition
 from flight_log.rosbag2_metadata import METADATA, FileContents, TopicCount, bag_metadata_yaml
 from flight_log.scan import RECORD

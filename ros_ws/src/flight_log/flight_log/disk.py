@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files on a disk that may be full: free space, a file with reserved space, atomic replacement of a text file."""
+"""Files on a disk that may be full: free space, a file with reserved space."""
 
 import errno
 import fcntl
@@ -17,16 +17,6 @@ def free_bytes(folder: Path) -> int:
     """Bytes that an unprivileged user may still write to the disk of a folder."""
     disk = os.statvfs(folder)
     return disk.f_bavail * disk.f_frsize
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a text file atomically: after a crash the file has either its new or its old content."""
-    fresh = path.with_name(f"{path.name}.new")
-    with fresh.open("w", encoding="utf-8") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    fresh.replace(path)
 
 
 def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:

@@ -14,10 +14,10 @@ from typing import NamedTuple
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from flight_core.files import is_file
+from flight_core.files import is_file, replace_text
 from flight_core.parameters import ParameterError, require
 from flight_log.bag import CHUNK_BYTES
-from flight_log.disk import replace_text, try_lock
+from flight_log.disk import try_lock
 from flight_log.rosbag2_metadata import METADATA, FileContents, TopicCount, bag_files, bag_metadata_yaml, read_bag_metadata
 from flight_log.scan import Scan
 
