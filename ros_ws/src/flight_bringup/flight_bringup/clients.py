@@ -50,6 +50,7 @@ from flight_ros.topics import (
     Y,
 )
 from guidance.modes import TARGETS
+from guidance.odometry import MAP
 from rise_di_controller.guard import Mode
 
 __all__ = ["ControlClient", "EngagementClient", "FlightMonitor", "Player", "TargetClient"]
@@ -316,7 +317,7 @@ class ControlClient(_Client):
         """Publish a route of waypoints, each north, east and altitude in m."""
         places = [Point(x=float(east), y=float(north), z=float(altitude)) for north, east, altitude in points]
         route = Path(poses=[PoseStamped(pose=Pose(position=place)) for place in places])
-        route.header.frame_id = "map"
+        route.header.frame_id = MAP
         publisher = self._node.create_publisher(ROUTE.type, ROUTE.name, PUBLISH)
         try:
             subscribed = f"{publisher.topic_name}: no subscriber, expected a flight with guidance in this domain"

@@ -30,6 +30,7 @@ from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, fli
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_view.series import Series
 from guidance import modes as guidance
+from guidance.odometry import ROUTE_FRAMES
 from guidance.path import route_outline
 from guidance.route_file import Waypoint
 from rise_di_controller.guard import Mode
@@ -52,7 +53,6 @@ CONTROL = "control"  # name of the node that carries out the requests of a page
 SHARED = (LOG, PARAMETER_EVENTS)  # topics of all aircraft
 POSE = "pose"
 ROUTE, ROUTE_TYPE = "route", "nav_msgs/msg/Path"
-FRAMES = ("map", "")  # of a route that guidance takes
 LIVE_BACKLOG = 200_000  # bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading"
 MAX_EVENTS, MAX_NOTES, MAX_CHANNELS = 5000, 50, 200
 BATCH = 2000  # messages that are decoded together
@@ -304,7 +304,7 @@ class Flight:
                 if text and self._shows(namespace):
                     self._add_event(Event(sent_ns, "parameter", f"{node}: {text}"))
             elif messages.type_name == ROUTE_TYPE:
-                if message.header.frame_id not in FRAMES:
+                if message.header.frame_id not in ROUTE_FRAMES:
                     continue
                 places = [one.pose.position for one in message.poses]
                 self._take_route(sent_ns, [Waypoint(one.y, one.x, one.z) for one in places])

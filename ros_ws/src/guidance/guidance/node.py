@@ -43,12 +43,11 @@ from flight_ros.topics import (
 from guidance import path
 from guidance.guidance import Guidance, GuidanceOutput
 from guidance.modes import Mode
-from guidance.odometry import body_velocity, quaternion
+from guidance.odometry import BODY, MAP, ROUTE_FRAMES, body_velocity, quaternion
 from guidance.params import GuidanceParameters
 from guidance.route_file import Waypoint
 from rise_di_controller.guard import Mode as ControllerMode
 
-MAP, BODY = "map", "base_link"  # frames of REP 105: east, north, up; forward, left, up
 MAX_TARGETS = 16  # messages of target a tick; later ones wait, so that a storm delays no u_m
 ODOMETRY_PERIOD_NS, PATH_PERIOD_NS = NANOSECONDS // 10, NANOSECONDS
 PATH_LENGTH = 120  # poses of the flown path, one a second
@@ -227,7 +226,7 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
             try:
                 message = deserialize_message(received.message, Path)
                 frame = message.header.frame_id
-                require(frame in {MAP, ""}, "route", f"the frame {frame!r}", f"{MAP!r}, or none named")
+                require(frame in ROUTE_FRAMES, "route", f"the frame {frame!r}", f"{MAP!r}, or none named")
                 points = [one.pose.position for one in message.poses]
                 route = self.parameters.plan([Waypoint(one.y, one.x, one.z) for one in points])
             except (ParameterError, DeserializationError) as error:

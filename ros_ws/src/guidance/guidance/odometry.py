@@ -5,6 +5,9 @@
 import math
 from collections.abc import Mapping
 
+MAP, BODY = "map", "base_link"  # frames of REP 105: east, north, up; forward, left, up
+ROUTE_FRAMES = (MAP, "")  # of a route that guidance takes
+
 
 def quaternion(phi: float, theta: float, psi: float) -> tuple[float, float, float, float]:
     """Orientation x, y, z, w of forward-left-up in east-north-up: R_z(pi/2 - psi) R_y(-theta) R_x(phi); angles in rad."""
