@@ -86,15 +86,17 @@ def test_an_altitude_beyond_the_climb_to_the_next_point_is_refused(altitude: flo
     )
 
 
-def test_the_route_of_the_tutorial_is_flown_and_its_refusal_is_the_one_shown(tmp_path: Path) -> None:
+def test_of_the_routes_of_the_tutorial_one_is_flown_and_one_is_refused_with_the_sentence_shown(tmp_path: Path) -> None:
     page = (REPOSITORY / "docs" / "fly-a-route.md").read_text(encoding="utf-8")
     guidance = find_scenario("osprey_route").guidance
     assert guidance is not None
-    (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    (tmp_path / "triangle.yaml").write_text(block, encoding="utf-8")
-    assert len(guidance.plan(read_route(tmp_path / "triangle.yaml")).legs) == 6  # three lines, two fillets, an orbit
+    blocks = re.findall(r"^```yaml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    triangle, short = tmp_path / "triangle.yaml", tmp_path / "short.yaml"
+    for path, block in zip((triangle, short), blocks, strict=True):
+        path.write_text(block, encoding="utf-8")
+    assert len(guidance.plan(read_route(triangle)).legs) == 6  # three lines, two fillets, an orbit
     with pytest.raises(ParameterError) as refused:
-        guidance.plan([Waypoint(0, 0, 0), Waypoint(500, 0, 0), Waypoint(500, 200, 0), Waypoint(0, 200, 0)])
+        guidance.plan(read_route(short))
     assert f"error: guidance.{refused.value}\n" in page
 
 
