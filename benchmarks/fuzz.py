@@ -15,6 +15,7 @@ import resource
 import signal
 import sys
 import tempfile
+from contextlib import suppress
 from multiprocessing import get_context
 from pathlib import Path
 from types import FrameType
@@ -72,6 +73,8 @@ def fuzz(target: str, seconds: int) -> int:
     with tempfile.TemporaryDirectory(prefix=f"fuzz-{target}-", dir=memory if memory.is_dir() else None) as folder:
         process = get_context("fork").Process(target=_fuzz, args=(target, seconds, Path(folder)))
         process.start()
+        with suppress(KeyboardInterrupt):  # Ctrl-C has reached the fuzzer too, which ends with its statistics
+            process.join()
         process.join()
     return process.exitcode or 0
 
