@@ -43,6 +43,7 @@ LOAD_INTERVAL = 2.0  # s before a measurement, over which the load of the host i
 FILE, PYTHON = "FILE", "python"  # placeholders in commands
 PYTEST = (PYTHON, "-m", "pytest", "-q", f"--junitxml={FILE}")
 QUICK_SECONDS = 2.0
+FUZZ_LOG = 10_000  # characters of the output of a fuzzer that ended early
 
 
 def _speed(group: str) -> Measurement:
@@ -226,6 +227,8 @@ def fuzz(seconds: float) -> dict[str, Any]:
 
     def ran(target: str) -> dict[str, int | None]:
         found = _run(sys.executable, "-m", "benchmarks.fuzz", target, "--seconds", f"{seconds:.0f}")
+        if found.returncode:  # the log of the measurement then says why
+            print(found.stderr[-FUZZ_LOG:], file=sys.stderr)
         covered = re.findall(r"cov: (\d+)", found.stderr)
         stats = re.findall(r"^stat::(\w+):\s+(\d+)", found.stderr, re.MULTILINE)
         return {"status": found.returncode, "covered": int(covered[-1]) if covered else None} | {

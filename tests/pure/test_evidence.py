@@ -303,8 +303,8 @@ def test_a_fault_that_did_not_pass_each_time_is_bold() -> None:
 
 def test_an_input_that_fuzzing_found_is_a_goal_that_is_not_met() -> None:
     text = page(**{"fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE | {"status": 77}})})
-    assert "- Goal: no input is a finding. Measured: 1 of 1 readers, **not met**." in text
-    assert "| **an input, status 77** |" in text
+    assert "- Goal: no fuzzer ends with a finding or an error. Measured: 1 of 1 readers, **not met**." in text
+    assert "| **ended with status 77** |" in text
 
 
 def test_a_failed_test_is_bold() -> None:
