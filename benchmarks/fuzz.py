@@ -11,6 +11,7 @@ input to the corpus.
 """
 
 import argparse
+import hashlib
 import resource
 import signal
 import sys
@@ -99,7 +100,15 @@ def _fuzz(target: str, seconds: int, scratch: Path) -> None:
     limits = {"max_total_time": seconds, "timeout": TIMEOUT, "rss_limit_mb": MEMORY_MB, "max_len": MAX_LENGTH}
     options = limits | {"artifact_prefix": f"{findings}/", "print_final_stats": 1}
     arguments = [sys.argv[0], *(f"-{name}={value}" for name, value in options.items()), *corpora]
-    atheris.Setup(arguments, lambda data: TARGETS[target](data, folder))
+
+    def read(data: bytes) -> None:
+        try:
+            TARGETS[target](data, folder)
+        except Exception:  # the fuzzer itself does not always keep the input
+            (findings / f"raised-{hashlib.sha256(data).hexdigest()[:16]}").write_bytes(data)
+            raise
+
+    atheris.Setup(arguments, read)
     atheris.Fuzz()
 
 
