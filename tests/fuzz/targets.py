@@ -167,8 +167,11 @@ def route(data: bytes, folder: Path) -> None:
 
 
 def targets(data: bytes, folder: Path) -> None:
-    """Poses, y and targets of guidance, as 64 bit numbers. What a step commands is finite and inside its slew limits."""
-    guidance, params, now_ns, before = Guidance(_guided()), _guided().params(), 0, None
+    """Poses, y and targets of guidance, as 64 bit numbers. What a step commands is finite and inside its slew limits.
+
+    After a time without steps beyond the age limit of u_m, guidance starts again at what is measured: no limit holds across it.
+    """
+    guidance, params, now_ns, before, before_ns = Guidance(_guided()), _guided().params(), 0, None, 0
     values = [value for (value,) in struct.iter_unpack("<d", data[: len(data) // 8 * 8]) if math.isfinite(value)]
     while len(values) > GUIDED_NUMBERS:
         part, values = values[:GUIDED_NUMBERS], values[GUIDED_NUMBERS:]
@@ -181,11 +184,11 @@ def targets(data: bytes, folder: Path) -> None:
         if (output := guidance.step(now_ns, now_ns)) is None:
             continue
         assert np.isfinite(output.u_m).all(), output.u_m
-        if before is not None:
+        if before is not None and now_ns - before_ns <= params.max_age_ns:
             V = params.outputs.index("V")
             moved = np.delete(np.abs(output.u_m - before)[:4], V)
-            assert (moved <= np.delete(params.slew, V) * params.period_ns / 1e9 * (1.0 + 1e-9) + 1e-12).all(), moved
-        before = output.u_m
+            assert (moved <= np.delete(params.slew, V) * (now_ns - before_ns) / 1e9 * (1.0 + 1e-9) + 1e-12).all(), moved
+        before, before_ns = output.u_m, now_ns
 
 
 def control(data: bytes, folder: Path) -> None:
