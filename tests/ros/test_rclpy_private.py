@@ -18,8 +18,6 @@ from tests.ros.peer import Peer
 from flight_ros import rclpy_private
 
 SOURCES = REPOSITORY / "ros_ws" / "src"
-
-
 FILES = sorted(path for path in SOURCES.glob("*/**/*.py") if path.name != "rclpy_private.py")
 
 
