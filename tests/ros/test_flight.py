@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The end of a flight over topics: by Ctrl-C, with its command, with one of its nodes."""
 
+import os
+import pty
 import signal
 import subprocess
 import sys
@@ -13,6 +15,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, Start
+from tests.ros.peer import HANG
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_log.tape_reader import read_run
@@ -26,9 +29,13 @@ Engaged = tuple[Process, list[psutil.Process]]
 def engaged(start: Start, tmp_path: Path) -> Engaged:
     """A flight whose controller has engaged, and its four processes."""
     flight = start("flight_cli.cli", "fly", "osprey_gust")
-    logs = tmp_path / "runs"
-    flight.until(lambda: any("ENGAGED" in log.read_text(encoding="utf-8") for log in logs.glob("*/log/controller.log")))
+    flight.until(lambda: is_engaged(tmp_path))
     return flight, flight.children()
+
+
+def is_engaged(folder: Path) -> bool:
+    """Whether the controller of a flight below a folder has engaged."""
+    return any("ENGAGED" in log.read_text(encoding="utf-8") for log in folder.glob("runs/*/log/controller.log"))
 
 
 def test_interrupt_ends_all_processes_and_keeps_the_log(engaged: Engaged, tmp_path: Path) -> None:
@@ -59,6 +66,26 @@ def test_a_second_interrupt_does_not_interrupt_the_shutdown(engaged: Engaged, tm
     flight.end()
     assert "Traceback" not in flight.output
     assert read_run(next((tmp_path / "runs").glob("*-osprey_gust"))).tape.notes == ()  # the recorder closed its file
+
+
+def test_a_lost_terminal_ends_the_flight_with_its_log_and_report(tmp_path: Path) -> None:
+    terminal, of_flight = pty.openpty()
+    words = ["setsid", "--ctty", sys.executable, "-m", "flight_cli.cli", "fly", "osprey_gust"]
+    flight = subprocess.Popen(words, cwd=tmp_path, stdin=of_flight, stdout=of_flight, stderr=of_flight)
+    os.close(of_flight)
+    try:
+        deadline = time.monotonic() + HANG
+        while not is_engaged(tmp_path):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        os.close(terminal)
+        assert flight.wait(HANG) == 130
+    finally:
+        flight.kill()
+        flight.wait()
+    run = (tmp_path / "runs" / "latest").resolve()
+    assert read_run(run).tape.notes == ()
+    assert (run / "report.html").is_file()
 
 
 @pytest.mark.parametrize("seconds", [0.3, 0.6])  # of processor time; an earlier interrupt stops the interpreter itself

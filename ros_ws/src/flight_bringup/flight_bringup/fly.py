@@ -3,8 +3,10 @@
 """Fly a scenario: over topics in real time or in lockstep, or in one process."""
 
 import math
+import os
 import re
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +20,7 @@ from flight_analysis.report.summary import display_units
 from flight_bringup.graph import Autopilot
 from flight_bringup.processes import FlightProcesses, handle_signals
 from flight_core.outcome import COMPLETED, INTERRUPTED
+from flight_core.signals import handle_shutdown
 from flight_log.tape_writer import write_run
 
 if TYPE_CHECKING:
@@ -34,8 +37,11 @@ Progress = Callable[[float, str], None]  # flight time in s, and the text beside
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """End the flight. A second signal would interrupt the clean-up, in which `subprocess` releases a lock of each process."""
-    for handled in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(handled, signal.SIG_IGN)
+    handle_shutdown(signal.SIG_IGN)
+    if number == signal.SIGHUP:  # the terminal is lost: writing to it is an error
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(nowhere, stream.fileno())
     raise KeyboardInterrupt
 
 
@@ -56,7 +62,7 @@ def fly_over_topics(
     `autopilot` flies in the aircraft's place, in real time only. `announce` gets a line for each change of engagement and of
     reason, but not for a changed number. With `engaged_for`, s, the flight ends so long after its first engagement, or with
     it, or without one when too little time is left.
-    Outcomes: "completed", "interrupted" (Ctrl-C or SIGTERM), or a sentence that names the process that ended early.
+    Outcomes: "completed", "interrupted" (Ctrl-C, SIGTERM or SIGHUP), or a sentence that names the process that ended early.
     """
     from flight_bringup.clients import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
 

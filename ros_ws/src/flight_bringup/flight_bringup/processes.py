@@ -31,6 +31,7 @@ from flight_bringup.graph import (
 )
 from flight_core.outcome import LOST_CONTACT
 from flight_core.parameters import ParameterError
+from flight_core.signals import handle_shutdown
 
 if TYPE_CHECKING:
     from flight_bringup.clients import FlightMonitor
@@ -51,8 +52,8 @@ def end_with_parent() -> list[str]:
 
 @contextmanager
 def handle_signals(handler: Any) -> Iterator[None]:
-    """Handle SIGINT and SIGTERM in the block. Python leaves SIGINT ignored, as a shell starts background commands."""
-    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    """Handle the signals of `handle_shutdown` in the block."""
+    before = handle_shutdown(handler)
     try:
         yield
     finally:

@@ -3,7 +3,6 @@
 """Event loop of a node: ticks on the monotonic clock or lockstep steps, services in between, clean shutdown."""
 
 import gc
-import signal
 import sys
 import time
 import traceback
@@ -19,6 +18,7 @@ from rclpy.signals import SignalHandlerOptions
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
+from flight_core.signals import handle_shutdown
 from flight_ros import transport
 from flight_ros.flight_node import FlightNode
 from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, destroy_participant, ready_callback
@@ -53,7 +53,7 @@ class _Stop:
 
 
 def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participant | None = None) -> None:
-    """Run a node, or several in lockstep, until SIGINT or SIGTERM. The exit status is then 0.
+    """Run a node, or several in lockstep, until SIGINT, SIGTERM or SIGHUP. The exit status is then 0.
 
     Other exit statuses: 2 for invalid parameters, 3 for a flight that cannot continue, 1 for an unexpected exception. The
     `early_participant` of flight_ros.startup is destroyed once the nodes exist.
@@ -62,8 +62,7 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
     advances when its input has arrived. The executor serves parameters and services after a tick and never blocks.
     """
     stop = _Stop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop.request)
+    handle_shutdown(stop.request)
     try:
         transport.prepare()
         if not rclpy.ok():

@@ -8,7 +8,6 @@ sooner. For this reason this module imports rclpy and little else.
 
 import gc
 import os
-import signal
 from contextlib import suppress
 from pkgutil import resolve_name
 from types import FrameType
@@ -17,6 +16,7 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_default_context
 
+from flight_core.signals import handle_shutdown
 from flight_ros import transport
 from flight_ros.rclpy_private import Participant, create_participant
 
@@ -27,8 +27,7 @@ def start_nodes(*nodes: str, early: bool = True) -> None:
     `early`: create a DDS participant before the imports.
     """
     gc.disable()  # `run` enables it; collections during the imports find nothing and take a tenth of the time
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _exit)
+    handle_shutdown(_exit)
     early_participant = _create_early_participant() if early else None
     run = resolve_name("flight_ros.event_loop:run")
     make_nodes = [resolve_name(node) for node in nodes]
