@@ -189,6 +189,40 @@ def test_a_conflicting_publisher_of_u_is_refused_until_the_first_one_times_out()
     receive_u(bridge, 0.3, sender="second")
 
 
+def test_while_engaged_no_other_publisher_of_u_takes_over_and_the_timeout_releases() -> None:
+    # A hot standby: its u may be anywhere, and would move all surfaces at once.
+    bridge = engaged_bridge()
+    receive_outputs(bridge, 0.21)
+    for sender in ("standby", "controller#2"):
+        with pytest.raises(ChannelError, match="conflicting publisher"):
+            receive_u(bridge, 0.21, 0.2, sender=sender)
+    assert bridge.step(at(0.21)) is Phase.RELEASE
+    assert bridge.reason == "u is 0.21 s old"
+    receive_u(bridge, 0.22, sender="standby")
+
+
+def test_a_second_publisher_of_a_topic_of_the_autopilot_ends_the_engagement_and_blocks_another() -> None:
+    bridge = engaged_bridge()
+    bridge.conflict = "/ap/twist/filtered has 2 publishers"
+    assert bridge.step(at(0.01)) is Phase.RELEASE
+    assert bridge.reason == bridge.engage(at(0.02)) == "/ap/twist/filtered has 2 publishers"
+    bridge.conflict = ""
+    assert bridge.engage(at(0.03)) == ""
+
+
+def test_an_engagement_says_which_pilot_override_has_no_effect() -> None:
+    bridge = engaged_bridge()
+    silent = "a pilot override has no effect: no message on /joy for 1 s"
+    assert bridge.reason == silent
+    for t, reason in ((0.1, ""), (1.2, silent)):
+        if not reason:
+            bridge.take_override("gamepad", 0.0, at(t))
+        receive_outputs(bridge, t)
+        receive_u(bridge, t)
+        assert bridge.step(at(t)) is Phase.ENGAGED
+        assert bridge.reason == reason
+
+
 def test_y_is_returned_once_per_rate_sample_and_only_while_all_channels_are_fresh() -> None:
     bridge = new_bridge()
     bridge.take_output("q", 0.5, at(0.0), at(0.01))

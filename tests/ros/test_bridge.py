@@ -8,6 +8,7 @@ the map, not that the map agrees with ArduPilot.
 
 import json
 import math
+import signal
 import struct
 import time
 from collections import Counter
@@ -24,6 +25,7 @@ from geometry_msgs.msg import Twist, TwistStamped, Vector3, Vector3Stamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import FluidPressure, Imu, Joy
+from std_msgs.msg import UInt8
 from std_srvs.srv import SetBool
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, Start, settable_clock
@@ -270,6 +272,65 @@ def test_a_step_of_the_system_clock_leaves_the_engagement_and_its_release_as_the
     bridge.interrupt().succeed()
     setup.peer.spin(0.1)
     assert all(map(math.isnan, setup.joys[-1].axes))
+
+
+def test_a_stopped_bridge_a_second_autopilot_and_a_lost_terminal_each_release_the_channels(setup: BridgeSetup) -> None:
+    command = partial(setup.peer.command, 0.0, 0.0, 0.0, 0.0)
+    autopilot = setup.autopilot()
+    bridge = setup.bridge("-p", "dry_run:=false")
+
+    def until_released(*reason: str) -> None:
+        words = ("ENGAGED -> RELEASE: ", *reason)
+        setup.peer.until(lambda: any(all(word in line for word in words) for line in bridge.lines), each=command)
+
+    def engage() -> None:
+        setup.peer.until(lambda: setup.engage(each=command) == "", each=command)
+
+    engage()
+    with bridge.stopped():  # until the autopilot flies on its own law
+        setup.peer.until(lambda: "timeout" in autopilot.lines, each=command)
+    until_released("the bridge did not run for ")
+    engage()
+    second = setup.autopilot()
+    until_released("/ap/", " has 2 publishers, expected the autopilot alone")
+    assert "has 2 publishers" in setup.engage(each=command)
+    second.popen.kill()
+    engage()
+    setup.joys.clear()
+    bridge.popen.send_signal(signal.SIGHUP)
+    bridge.succeed()
+    setup.peer.spin(0.1)
+    assert all(map(math.isnan, setup.joys[-1].axes))
+
+
+def test_an_engagement_that_is_not_waited_for_any_more_is_withdrawn(setup: BridgeSetup, start: Start) -> None:
+    condition = {
+        "topic": "/ap/mode",
+        "type": "std_msgs/msg/UInt8",
+        "field": "data",
+        "one_of": [15],
+        "sentence": "the mode is not guided",
+        "max_age": 1e3,
+        "awaited": True,
+        "source": "a test",
+    }
+    setup.change_map(conditions={"guided": condition}, engage_timeout=1e3)
+    setup.change_map("topics", **{"/ap/mode": {"reliability": "reliable", "durability": "volatile", "depth": 1}})
+    setup.autopilot()
+    bridge = setup.bridge("-p", "dry_run:=false")
+    mode = setup.peer.node.create_publisher(UInt8, "/ap/mode", 1)
+
+    def command() -> None:
+        setup.peer.command(0.0, 0.0, 0.0, 0.0)
+        mode.publish(UInt8(data=10))
+
+    client = start("flight_cli.cli", "engage")
+    waiting = "waiting: the mode is not guided (data is 10)"
+    setup.peer.until(lambda: any(waiting in line for line in client.lines), each=command)
+    client.interrupt()
+    setup.peer.until(lambda: client.popen.poll() is not None, each=command)
+    assert client.end() == 130
+    assert any("ENGAGING -> RELEASE: disengaged by request" in line for line in bridge.lines)
 
 
 def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(setup: BridgeSetup) -> None:

@@ -6,6 +6,7 @@ It reads no clock: every instant is an argument, in ns of one clock. The watchdo
 """
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from enum import IntEnum
 from typing import NamedTuple
@@ -49,7 +50,8 @@ class Bridge:
         self.dry_run = dry_run
         self.outputs, self.inputs = tuple(channel_map.outputs), tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
-        self.reason = "not engaged yet"  # why the bridge is not engaged, or what an engagement waits for
+        self.reason = "not engaged yet"  # why the bridge is not engaged, what an engagement waits for, or lacks
+        self.conflict = ""  # the topics of the autopilot that have another publisher, as a sentence; set by the node
         sources = {trim_key(name): row for name, row in channel_map.trims.items()}
         self._rows: dict[str, MeasuredRow] = {**channel_map.pose, **channel_map.outputs, **sources}
         self._readings: dict[str, Reading] = {}
@@ -87,8 +89,12 @@ class Bridge:
         self._readings[name] = Reading(stamp_ns, value)
 
     def require_sender(self, sender: str, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a u of a conflicting publisher."""
-        self.u_lock.check(sender, now_ns, self._max_age_ns, self._max_age_ns)
+        """Raise ChannelError, reason "sender", for a u of a conflicting publisher.
+
+        While engaged every other publisher conflicts, also after a timeout: its u would jump. The timeout ends the engagement.
+        """
+        takeover_ns = sys.maxsize if self.phase is Phase.ENGAGED else self._max_age_ns
+        self.u_lock.check(sender, now_ns, takeover_ns, takeover_ns)
 
     def take_u(self, u: FloatArray, sender: str, now_ns: int) -> None:
         """Take u, shape (m,) in the map's order. Raises ChannelError as `require_sender` does."""
@@ -142,14 +148,21 @@ class Bridge:
     def _is_active(self, name: str, now_ns: int) -> bool:
         """Whether a pilot override is active. It ends with its topic: an old one does not block an engagement."""
         row, reading = self.channel_map.overrides[name], self._overrides.get(name)
-        if reading is None or self._override_is_old(name, now_ns):
+        if reading is None or self._is_silent(name, now_ns):
             return False
         engaged = self.phase in {Phase.ENGAGED, Phase.NEUTRAL}
         at_engagement = self._overrides_at_engagement.setdefault(name, reading.value) if engaged else None
         return row.is_active(reading.value, at_engagement)
 
-    def _override_is_old(self, name: str, now_ns: int) -> bool:
-        return now_ns - self._overrides[name].stamp_ns > nanoseconds(self.channel_map.overrides[name].max_age)
+    def _is_silent(self, name: str, now_ns: int) -> bool:
+        """Whether a pilot override could not act now: its topic was not received, or has ended."""
+        row = self.channel_map.overrides[name]
+        return bool(_staleness(row.topic, self._overrides.get(name), row.max_age, now_ns))
+
+    def _silent_overrides(self, now_ns: int) -> str:
+        rows = self.channel_map.overrides.items()
+        silent = [f"no message on {row.topic} for {row.max_age:g} s" for name, row in rows if self._is_silent(name, now_ns)]
+        return f"a pilot override has no effect: {'; '.join(silent)}" if silent else ""
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
@@ -167,6 +180,7 @@ class Bridge:
         A dry run states the reason that there would be with `dry_run: false` too.
         """
         checks: tuple[Callable[[int], str], ...] = (
+            lambda _: self.conflict,
             self._active_overrides,
             lambda now_ns: self._unmet(now_ns, awaited=False),
             self._missing,
@@ -223,7 +237,7 @@ class Bridge:
             self._trim = {name: self.trim(name) for name in self.channel_map.trims}
             self._zero = {name: self._readings[name].value for name, row in self.channel_map.outputs.items() if row.captured}
             self._overrides_at_engagement = {
-                name: reading.value for name, reading in self._overrides.items() if not self._override_is_old(name, now_ns)
+                name: reading.value for name, reading in self._overrides.items() if not self._is_silent(name, now_ns)
             }
             self._enter(Phase.ENGAGED, now_ns)
 
@@ -236,18 +250,20 @@ class Bridge:
     def step(self, now_ns: int) -> Phase:
         """Phase at an instant.
 
-        A stale y or u, a value outside the envelope or a lost condition ends an engagement. The phases ENGAGING, NEUTRAL and
-        RELEASE end after their times.
+        A stale y or u, a value outside the envelope, a lost condition or a conflicting publisher ends an engagement. The phases
+        ENGAGING, NEUTRAL and RELEASE end after their times.
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)
         elif self.phase is Phase.ENGAGED:
-            lost = filter(None, (self._unmet(now_ns, awaited=awaited) for awaited in (False, True)))
+            lost = filter(None, (self.conflict, *(self._unmet(now_ns, awaited=awaited) for awaited in (False, True))))
             if ended := "; ".join(filter(None, (*lost, _sentence(self.stale(now_ns))))) or self._outside():
                 self.disengage(ended, now_ns)
             elif timeout := self._u_timeout(now_ns):
                 self.reason = timeout
                 self._enter(Phase.NEUTRAL, now_ns)
+            else:
+                self.reason = self._silent_overrides(now_ns)
         times = self.channel_map.silence
         if self.phase is Phase.NEUTRAL and now_ns - self._phase_ns >= nanoseconds(times.neutral):
             self._enter(Phase.RELEASE, now_ns)
@@ -336,7 +352,7 @@ class Bridge:
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
         if phase is Phase.ENGAGED:
-            self.reason = ""
+            self.reason = self._silent_overrides(now_ns)
         self.phase, self._phase_ns = phase, now_ns
 
 

@@ -22,13 +22,14 @@ from autopilot_bridge.params import (
     InputRow,
     MeasuredRow,
     MessageRow,
+    OverrideRow,
     QosRow,
     WatchedRow,
     load_map,
 )
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
-from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
+from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError
 from flight_ros import transport
 from flight_ros.endpoints import mismatch, type_name
@@ -56,7 +57,9 @@ class BridgeNode(FlightNode[BridgeParameters]):
         dry_run = self._map.dry_run if self.parameters.dry_run is None else self.parameters.dry_run
         self._bridge = Bridge(self._map, dry_run=dry_run)
         self.publisher_locks = (self._bridge.u_lock,)
-        self._logged_phase = self._bridge.phase
+        self._logged = self._bridge.phase, self._bridge.reason
+        self._longest_pause_ns = nanoseconds(self._map.silence.max_age)
+        self._began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         named: list[NamedRow] = [
             *self._map.outputs.items(),
             *self._map.pose.items(),
@@ -117,6 +120,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         now_ns += tick.late_ns
+        self._disengage_after_pause(now_ns)
         step_ns = self.clock_step_ns()
         for subscription, rows in self._readers:
             for received in subscription.take():
@@ -139,8 +143,20 @@ class BridgeNode(FlightNode[BridgeParameters]):
         self._log_phase()
         if now_ns - self._report_ns >= NANOSECONDS:
             self._report(now_ns)
-        self._send(now_ns, self.period_ns() // 2)
+        if self._pause_ns() <= self._longest_pause_ns:  # else the tick was stopped half-way, and its u is old
+            self._send(now_ns, self.period_ns() // 2)
         self._warn_stale_inputs(now_ns)
+
+    def _pause_ns(self) -> int:
+        """Time since the tick before began, also that of a suspended host, in which the clock of the ticks stands still."""
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - self._began_ns
+
+    def _disengage_after_pause(self, now_ns: int) -> None:
+        """Disengage where the bridge did not run: the autopilot, or its pilot, may fly on its own law since then."""
+        pause_ns = self._pause_ns()
+        self._began_ns += pause_ns
+        if pause_ns > self._longest_pause_ns:
+            self._bridge.disengage(f"the bridge did not run for {seconds(pause_ns):.2f} s", now_ns)
 
     def _read(
         self, subscription: PolledSubscription, rows: list[NamedRow], raw: bytes, arrived_ns: int, now_ns: int, step_ns: int
@@ -191,6 +207,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
     def _engage(self, request: Any, response: Any) -> Any:
         now_ns = self.now_ns()
         if request.data:
+            self._find_conflicts()
             response.message = self._bridge.engage(now_ns)
         else:
             self._bridge.disengage("disengaged by request", now_ns)
@@ -233,17 +250,19 @@ class BridgeNode(FlightNode[BridgeParameters]):
         self._controller_ready = ready
 
     def _log_phase(self) -> None:
-        phase = self._bridge.phase
-        if phase is not self._logged_phase:
-            sentence = f"{self._logged_phase.name} -> {phase.name}"
-            if phase is Phase.ENGAGED:
-                self.get_logger().info(sentence)
-            else:
-                self.get_logger().warning(f"{sentence}: {self._bridge.reason}")
-            if Phase.ENGAGED in (phase, self._logged_phase):
-                self._activate(active=phase is Phase.ENGAGED)
-            self._engagement.publish(KeyValue(key=phase.name, value=self._bridge.reason))
-            self._logged_phase = phase
+        phase, reason = self._bridge.phase, self._bridge.reason
+        before, lacked = self._logged
+        self._logged = phase, reason
+        if phase is before and (phase is not Phase.ENGAGED or reason == lacked):
+            return
+        sentence = phase.name if phase is before else f"{before.name} -> {phase.name}"
+        if reason:
+            self.get_logger().warning(f"{sentence}: {reason}")
+        else:
+            self.get_logger().info(sentence)
+        if phase is not before and Phase.ENGAGED in (phase, before):
+            self._activate(active=phase is Phase.ENGAGED)
+        self._engagement.publish(KeyValue(key=phase.name, value=reason))
 
     def _warn_stale_inputs(self, now_ns: int) -> None:
         stale = self._bridge.stale(now_ns)
@@ -279,16 +298,38 @@ class BridgeNode(FlightNode[BridgeParameters]):
         return next(filter(None, (*faults, *refused)), "its publisher sends no samples")
 
     def check_graph(self) -> None:
-        """Also report a topic to which the autopilot subscribes with another type or an incompatible quality of service."""
+        """Also report a topic to which the autopilot subscribes with another type or an incompatible quality of service.
+
+        A topic with another publisher ends the engagement.
+        """
         super().check_graph()
         for outgoing in self._outgoing.values():
             self.check_subscribers(outgoing.publisher)
+        self._find_conflicts()
+
+    def _find_conflicts(self) -> None:
+        """Tell the bridge which topics have two publishers: of two autopilots y would be mixed, and both would be flown.
+
+        Any number of transmitters may override.
+        """
+        read = {
+            subscription.name
+            for subscription, rows in self._readers
+            if not all(isinstance(row, OverrideRow) for _, row in rows)
+        }
+        sent = {outgoing.publisher.topic_name for outgoing in self._outgoing.values()}
+        counts = {topic: self.count_publishers(topic) for topic in sorted(read | sent)}
+        self._bridge.conflict = "; ".join(
+            f"{topic} has {count} publishers, expected {'this bridge' if topic in sent else 'the autopilot'} alone"
+            for topic, count in counts.items()
+            if count > 1
+        )
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         bridge, now_ns = self._bridge, self.now_ns()
         refusal = "" if bridge.phase is Phase.ENGAGED else bridge.refusal(now_ns)
-        level = DiagnosticStatus.OK if bridge.phase is Phase.ENGAGED else DiagnosticStatus.WARN
-        sentence = "ENGAGED" if bridge.phase is Phase.ENGAGED else f"{bridge.phase.name}: {bridge.reason}"
+        level = DiagnosticStatus.OK if bridge.phase is Phase.ENGAGED and not bridge.reason else DiagnosticStatus.WARN
+        sentence = ": ".join(filter(None, (bridge.phase.name, bridge.reason)))
         return level, sentence, {"phase": bridge.phase.name, "map": self._map.name, "would refuse": refusal or "nothing"}
 
     def close(self) -> None:

@@ -57,9 +57,11 @@ __all__ = ["ControlClient", "EngagementClient", "FlightMonitor", "Player", "Targ
 
 MODES = {float(mode): mode.name for mode in Mode}
 
-SERVICE_TIMEOUT = 10.0  # s
+ENGAGE = "bridge/engage"  # the service of a bridge
+SERVICE_TIMEOUT, WITHDRAW_TIMEOUT = 10.0, 1.0  # s
 TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at its ticks
 ROUTE_TIMEOUT = 3.0  # s, in which the middleware of guidance confirms a route
+ROUTE_POLL_PERIOD = Duration(seconds=0.05)
 TARGET_PERIOD = 0.2  # s, between two equal targets
 FIRST_U = 30.0  # s: the nodes of a flight start, and the autopilot may send its first messages late
 AT_REST = 20  # so many equal samples of u in a row: it has reached trim
@@ -111,6 +113,9 @@ class _Client:
             return future.result()
         finally:
             self._node.destroy_client(client)
+
+    def _set_engaged(self, *, engaged: bool) -> str:
+        return str(self._call(SetBool, ENGAGE, SetBool.Request(data=engaged), "a flight with a bridge").message)
 
 
 class FlightMonitor(_Client):
@@ -177,24 +182,39 @@ class EngagementClient(_Client):
     def engage(self, progress: Callable[[str], None]) -> str:
         """Wait for u at trim and engage the bridge, which activates the controller. Returns the reason of a refusal, or "".
 
-        `progress` is called with the phase and the reason while the bridge waits for the autopilot.
+        `progress` is called with what the bridge waits for, and with what it lacks once it is engaged. An engagement that is
+        not waited for any more, as after Ctrl-C, is withdrawn: the autopilot must not change its mode later.
         """
         self._spin_until(lambda: bool(self._received_phases()), "bridge/engagement: not received, expected a running bridge")
         self._spin_until(lambda: bool(self._received_u()), "u: not received, expected a controller with y and y_m", FIRST_U)
         self._spin_until(self._at_rest, f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim")
         self._received_phases().clear()
-        if refusal := self._set_engaged(engaged=True):
-            return refusal
-        self._spin_until(lambda: self._settled(progress), "bridge/engagement: no change, expected ENGAGED or a reason", FIRST_U)
+        try:
+            if refusal := self._set_engaged(engaged=True):
+                return refusal
+            silent = "bridge/engagement: no change, expected ENGAGED or a reason"
+            self._spin_until(lambda: self._settled(progress), silent, FIRST_U)
+        except BaseException:
+            self._withdraw()
+            raise
         phase, reason = self._phases[-1]
-        return "" if phase == "ENGAGED" else reason
+        if phase != "ENGAGED":
+            return reason
+        if reason:
+            progress(f"warning: {reason}")
+        return ""
 
     def disengage(self) -> str:
         """Disengage the bridge. Returns its reason to refuse, or ""."""
         return self._set_engaged(engaged=False)
 
-    def _set_engaged(self, *, engaged: bool) -> str:
-        return str(self._call(SetBool, "bridge/engage", SetBool.Request(data=engaged), "a flight with a bridge").message)
+    def _withdraw(self) -> None:
+        """Request to disengage, and wait for an answer at most WITHDRAW_TIMEOUT: a bridge that is stopped answers later."""
+        client = self._node.create_client(SetBool, ENGAGE)
+        if client.wait_for_service(WITHDRAW_TIMEOUT):
+            future = client.call_async(SetBool.Request(data=False))
+            rclpy.spin_until_future_complete(self._node, future, timeout_sec=WITHDRAW_TIMEOUT)
+        self._node.destroy_client(client)
 
     def _received_u(self) -> list[tuple[float, ...]]:
         for received in self._u_subscription.take():
@@ -213,7 +233,7 @@ class EngagementClient(_Client):
             del phases[0], self._phases[0]
         if phases and phases[-1] == "ENGAGING" and self._phases[-1][1] != self._waits_for:
             self._waits_for = self._phases[-1][1]
-            progress(self._waits_for)
+            progress(f"waiting: {self._waits_for}")
         return bool(phases) and phases[-1] != "ENGAGING"
 
     def _at_rest(self) -> bool:
@@ -323,10 +343,11 @@ class ControlClient(_Client):
             subscribed = f"{publisher.topic_name}: no subscriber, expected a flight with guidance in this domain"
             self._spin_until(lambda: self._reaches_guidance(publisher), subscribed)
             publisher.publish(route)
-            received = publisher.wait_for_all_acked(Duration(seconds=ROUTE_TIMEOUT))
+            unconfirmed = f"guidance did not confirm its reception in {ROUTE_TIMEOUT:g} s"
+            self._spin_until(lambda: publisher.wait_for_all_acked(ROUTE_POLL_PERIOD), unconfirmed, ROUTE_TIMEOUT)
         finally:
             self._node.destroy_publisher(publisher)  # else guidance that starts later would receive the route, and fly it
-        return "" if received else f"guidance did not confirm its reception in {ROUTE_TIMEOUT:g} s"
+        return ""
 
     def _reaches_guidance(self, publisher: Publisher) -> bool:
         """Whether guidance is among the subscribers in the graph, and each of them has been matched."""
@@ -348,7 +369,7 @@ class ControlClient(_Client):
 
     def disengage(self) -> str:
         """Disengage the bridge."""
-        return str(self._call(SetBool, "bridge/engage", SetBool.Request(data=False), "a flight with a bridge").message)
+        return self._set_engaged(engaged=False)
 
     def cancel(self) -> None:
         """End the wait of the method that runs, from another thread."""

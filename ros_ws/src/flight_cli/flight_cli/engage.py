@@ -23,7 +23,7 @@ def engage(
     from flight_bringup.clients import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     with EngagementClient(namespace) as client:
-        refusal = client.disengage() if off else client.engage(lambda reason: print(f"waiting: {reason}", file=sys.stderr))
+        refusal = client.disengage() if off else client.engage(lambda line: print(line, file=sys.stderr))
     if refusal:
         print(f"error: not {'disengaged' if off else 'engaged'}: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)
