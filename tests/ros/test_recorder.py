@@ -189,6 +189,20 @@ def test_lost_messages_are_counted_and_reported(recorder: Recorder, peer_node: P
     assert f"/truth: the recorder lost {lost} messages" in run.tape.notes
 
 
+def test_a_second_publisher_of_a_topic_is_no_loss(recorder: Recorder, peer_node: Peer) -> None:
+    process = recorder("run")
+    process.wait_for("ready")
+    publishers = [peer_node.node.create_publisher(JointState, "y", PUBLISH) for _ in range(2)]
+    peer_node.until(lambda: all(publisher.get_subscription_count() == 1 for publisher in publishers))
+    for number in range(50):  # their sequences begin apart
+        publishers[0].publish(to_message(number, OUTPUTS, np.zeros(4), "/aircraft#0"))
+    for number in range(50, 100):
+        for sender, publisher in enumerate(publishers):
+            publisher.publish(to_message(number, OUTPUTS, np.zeros(4), f"/aircraft#{sender}"))
+    peer_node.until(lambda: recorded(peer_node, "/y") == 150)
+    assert "lost /y" not in diagnostics(peer_node)[2]
+
+
 # A full disk
 
 

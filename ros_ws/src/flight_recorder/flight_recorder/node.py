@@ -19,6 +19,7 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_topic_name import validate_topic_name
 
+from flight_core.authentication import LENGTH_PLACE, mac_slice
 from flight_core.files import is_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
@@ -53,6 +54,7 @@ class _RecordedTopic:
     subscription: PolledSubscription
     channel: BagChannel
     next_sequence: int = 0  # 0 before the first message
+    publisher: bytes = b""  # of the last message, with its length
     publishers: int = 0  # number of publishers at the last check
 
     @property
@@ -178,16 +180,18 @@ class RecorderNode(FlightNode[RecorderParameters]):
 
     def _append(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
         write, channel = self._bag.write, topic.channel
-        # A foreign topic may have several publishers. Their sequences interleave, so that a gap is no loss.
+        # The sequences of several publishers interleave: a gap between two of them is no loss. Foreign topics name none.
         counted = not topic.foreign
         for message, sent_ns, received_ns, sequence in received:
             write(channel, received_ns, sent_ns, sequence, message)
-            if counted:
-                if sequence > topic.next_sequence > 0:
+            if counted and sequence != topic.next_sequence:
+                publisher = message[LENGTH_PLACE : mac_slice(message).start]
+                if publisher == topic.publisher and sequence > topic.next_sequence:
                     count = sequence - topic.next_sequence
                     self.lost[topic.name] += count
                     self.get_logger().warning(f"{topic.name}: {count} messages lost", throttle_duration_sec=2.0)
-                topic.next_sequence = sequence + 1
+                topic.publisher = publisher
+            topic.next_sequence = sequence + 1
 
     def _write_or_end(self, write: Callable[[], None]) -> None:
         """Write to the bag. On an error or a full disk end the bag; the node goes on, because a flight waits for it."""
