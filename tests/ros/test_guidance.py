@@ -24,6 +24,8 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.clients import ControlClient
 from flight_bringup.scenarios import find_scenario
 from flight_core.channels import POSE
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
@@ -160,6 +162,28 @@ def test_targets_select_the_modes_and_bad_ones_are_refused(flight: Flight) -> No
     for reason, values in {"bounds": {"phi": 2.0}, "name": {"bank": 0.1}, "finite": {"heading": math.nan}}.items():
         flight.until(partial(flight.peer.counted, f"refused target: {reason}"), partial(flight.target, **values))
     assert flight.last("target.heading") == 1.0
+    late = to_message(time.time_ns() - NANOSECONDS, ["heading"], np.array([0.5]), "/operator#1")
+    flight.until(partial(flight.peer.counted, "refused target: old"), partial(flight.peer.publish, "target", late))
+    assert flight.last("target.heading") == 1.0
+
+
+def test_the_modes_of_a_second_controller_are_refused(flight: Flight) -> None:
+    def second() -> None:
+        inactive = np.array([float(ControllerMode.INACTIVE)])
+        flight.peer.publish("internals", to_message(time.time_ns(), ["mode"], inactive, "/standby#2"))
+
+    flight.until(lambda: flight.last("target.heading") == 1.0, lambda: flight.target(heading=1.0))
+    flight.until(partial(flight.peer.counted, "refused internals: sender"), second)
+    assert flight.last("target.heading") == 1.0  # that of an INACTIVE controller is forgotten
+
+
+def test_a_route_to_a_stopped_guidance_ends_at_once_when_it_is_cancelled(flight: Flight) -> None:
+    with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker, flight.process.stopped():
+        sent = worker.submit(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0]])
+        flight.until(lambda: flight.peer.node.count_publishers("route") == 1)
+        client.cancel()
+        with pytest.raises(ParameterError, match="cancelled by a later request"):
+            sent.result()
 
 
 def test_the_command_target_says_what_is_in_force_and_what_is_refused(flight: Flight, start: Start) -> None:

@@ -24,6 +24,7 @@ from flight_core.outcome import LOST_CONTACT, FlightEnded
 from flight_core.parameters import KeyedParameters, NodeParameters, ParameterError
 from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS, seconds
+from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.endpoints import mismatch, type_name
 from flight_ros.liveliness import LivelinessMonitor
 from flight_ros.messages import Decoder, Encoder, NamedDecoder
@@ -146,6 +147,42 @@ class FlightNode(Node, Generic[P]):
         return (
             None if self._key is None else MessageAuthenticator(self._key, self.resolve_topic_name(topic.name), self._since_ns)
         )
+
+    def received(self, subscription: PolledSubscription, decoder: Decoder) -> list[StampedVector | None]:
+        """The samples that were received since the last call; None for one without channels or with an error."""
+        samples: list[StampedVector | None] = []
+        for one in subscription.take():
+            try:
+                samples.append(decoder.decode(one.message))
+            except ChannelError as error:
+                self.reject(subscription, error.reason, str(error))
+                samples.append(None)
+        return samples
+
+    def accept(
+        self,
+        subscription: PolledSubscription,
+        decoder: Decoder | NamedDecoder,
+        take: Callable[[StampedVector, int], None],
+        sample: StampedVector,
+        now_ns: int,
+        lock: PublisherLock | None = None,
+        max_age_ns: int = 0,
+        takeover_ns: int = 0,
+    ) -> None:
+        """Give a sample to `take`, unless its stamp is bad or it is from a conflicting publisher.
+
+        The lock has the timeouts of `PublisherLock.check`. Without one, in lockstep, every publisher is accepted.
+        """
+        try:
+            if lock is not None:
+                lock.check(sample.sender, now_ns, max_age_ns, takeover_ns)
+            with decoder.once(sample.stamp_ns):
+                take(sample, now_ns)
+            if lock is not None:
+                lock.refresh(sample.sender, now_ns)
+        except ChannelError as error:
+            self.reject(subscription, error.reason, str(error))
 
     def reject(self, subscription: PolledSubscription, reason: str, sentence: str) -> None:
         """Count an invalid sample, and log it at most once in 2 s for each topic and reason.

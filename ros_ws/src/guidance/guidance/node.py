@@ -4,6 +4,7 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -18,12 +19,11 @@ from flight_core import channels
 from flight_core.parameters import ParameterError, require
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
-from flight_core.vectors import ChannelError, StampedVector, require_not_future, select
+from flight_core.vectors import ChannelError, StampedVector, require_not_future, require_not_old, select
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
-from flight_ros.messages import NO_CHANNELS, Decoder, NamedDecoder
+from flight_ros.messages import NO_CHANNELS
 from flight_ros.rclpy_private import DeserializationError
-from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import (
     GUIDANCE,
@@ -79,11 +79,16 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
         self._u_m_encoder = self.encoder(U_M, (*outputs, *channels.ATTITUDE))
         self._log_encoder = self.encoder(GUIDANCE, self._guidance.names)
-        self._y_lock, self._pose_lock = self.publisher_locks = PublisherLock(), PublisherLock()
+        self._y_lock, self._pose_lock, self._mode_lock = self.publisher_locks = (
+            PublisherLock(),
+            PublisherLock(),
+            PublisherLock(),
+        )
         self._allowed, self._mode = True, Mode.OFF
         if self.parameters.lockstep:
             y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
-            self._inputs = LockstepInputs(y_period_ns, self.period_ns(), self._received_y, self._received_poses)
+            receive_y = partial(self.received, self._y_subscription, self._y_decoder)
+            self._inputs = LockstepInputs(y_period_ns, self.period_ns(), receive_y, self._received_poses)
             self._empty_encoder = self.encoder(U_M, ())
         else:
             self._controller_mode = ControllerMode.WAITING
@@ -108,8 +113,8 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         return nanoseconds(self.parameters.start_time)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        self._follow_controller()
-        for sample in self._received_y():
+        self._follow_controller(now_ns)
+        for sample in self.received(self._y_subscription, self._y_decoder):
             if sample is not None:
                 self._accept_y(sample, now_ns)
         for sample in self._received_poses():
@@ -159,16 +164,6 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
 
     # Received messages
 
-    def _received_y(self) -> list[StampedVector | None]:
-        samples: list[StampedVector | None] = []
-        for received in self._y_subscription.take():
-            try:
-                samples.append(self._y_decoder.decode(received.message))
-            except ChannelError as error:
-                self.reject(self._y_subscription, error.reason, str(error))
-                samples.append(None)
-        return samples
-
     def _received_poses(self) -> list[StampedVector]:
         """The poses in the order of `channels.POSE`, without sideslip where there is none."""
         samples = []
@@ -183,29 +178,17 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         return samples
 
     def _accept_y(self, sample: StampedVector, now_ns: int) -> None:
-        self._accept(self._y_subscription, self._y_decoder, self._y_lock, self._guidance.take_y, sample, now_ns)
+        y = self._y_subscription, self._y_decoder, self._guidance.take_y
+        self.accept(*y, sample, now_ns, self._y_lock, *self._ages_ns())
 
     def _accept_pose(self, sample: StampedVector, now_ns: int) -> None:
-        self._accept(self._pose_subscription, self._pose_decoder, self._pose_lock, self._guidance.take_pose, sample, now_ns)
+        pose = self._pose_subscription, self._pose_decoder, self._guidance.take_pose
+        self.accept(*pose, sample, now_ns, self._pose_lock, *self._ages_ns())
 
-    def _accept(
-        self,
-        subscription: PolledSubscription,
-        decoder: Decoder | NamedDecoder,
-        lock: PublisherLock,
-        take: Callable[[StampedVector, int], None],
-        sample: StampedVector,
-        now_ns: int,
-    ) -> None:
-        """Give a sample to guidance, unless its stamp is bad or it is from a conflicting publisher."""
+    def _ages_ns(self) -> tuple[int, int]:
+        """Ages above which a publisher has timed out: for the same node in another process, and for another node."""
         max_age_ns = nanoseconds(self.parameters.max_age)
-        try:
-            lock.check(sample.sender, now_ns, max_age_ns, max_age_ns + nanoseconds(self.parameters.hold))
-            with decoder.once(sample.stamp_ns):
-                take(sample, now_ns)
-            lock.refresh(sample.sender, now_ns)
-        except ChannelError as error:
-            self.reject(subscription, error.reason, str(error))
+        return max_age_ns, max_age_ns + nanoseconds(self.parameters.hold)
 
     def _take_targets(self, now_ns: int) -> None:
         for received in self._target_subscription.take(MAX_TARGETS):
@@ -213,7 +196,10 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
                 sample = self._target_decoder.decode(received.message)
                 with self._target_decoder.once(sample.stamp_ns):
                     if not self.parameters.lockstep:  # an operator has the system clock, not the flight time of lockstep
-                        require_not_future(sample.stamp_ns, now_ns, nanoseconds(self.parameters.max_age))
+                        max_age_ns = nanoseconds(self.parameters.max_age)
+                        require_not_future(sample.stamp_ns, now_ns, max_age_ns)
+                        # One that waited while guidance was stopped is not wanted any more: its operator knows that it failed.
+                        require_not_old(sample.stamp_ns, now_ns, max_age_ns)
                     self._guidance.take_target(sample.channels)
             except ChannelError as error:
                 self.reject(self._target_subscription, error.reason, str(error))
@@ -235,23 +221,21 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
                 self.get_logger().info(f"route of {len(points)} waypoints")
                 self._guidance.take_route(route)
 
-    def _follow_controller(self) -> None:
+    def _follow_controller(self, now_ns: int) -> None:
         """Fly while the controller is ENGAGED. After it was INACTIVE, hold what is measured; after a failsafe, go on."""
-        for received in self._internals.take()[-1:]:
-            try:
-                if (sample := self._internals_decoder.decode(received.message)) is None:
-                    continue
-                with self._internals_decoder.once(sample.stamp_ns):
-                    mode = ControllerMode(int(sample.value[0]))
-            except ValueError as error:  # of the decoder, and of a number that is no mode
-                self.reject(self._internals, "mode", str(error))
-                continue
-            if mode is not self._controller_mode:
-                self._controller_mode = mode
-                engaged, inactive = (
-                    self._controller_mode is mode for mode in (ControllerMode.ENGAGED, ControllerMode.INACTIVE)
-                )
-                self._guidance.pause(paused=not engaged, forget=inactive)
+        for sample in self.received(self._internals, self._internals_decoder):
+            if sample is not None:
+                internals = self._internals, self._internals_decoder, self._take_mode
+                self.accept(*internals, sample, now_ns, self._mode_lock, *self._ages_ns())
+
+    def _take_mode(self, sample: StampedVector, now_ns: int) -> None:
+        try:
+            mode = ControllerMode(int(sample.value[0]))
+        except ValueError as error:
+            raise ChannelError("mode", str(error)) from None
+        if mode is not self._controller_mode:
+            self._controller_mode = mode
+            self._guidance.pause(paused=mode is not ControllerMode.ENGAGED, forget=mode is ControllerMode.INACTIVE)
 
     def _engage(self, request: Any) -> bool | str:
         if request.data and not self.parameters.lockstep and self._controller_mode is not ControllerMode.ENGAGED:

@@ -5,18 +5,16 @@
 It subscribes to y and y_m and publishes u and internals. It handles overruns, conflicting publishers and stale inputs.
 """
 
-from collections.abc import Callable, Iterator
+from functools import partial
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
-from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
-from flight_ros.messages import NO_CHANNELS, Decoder
-from flight_ros.subscriptions import PolledSubscription
+from flight_ros.messages import NO_CHANNELS
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
@@ -47,8 +45,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
             self._inputs = LockstepInputs(
                 period_ns(self.parameters.y_rate, "y_rate"),
                 self.period_ns(),
-                lambda: self._received(self._y_subscription, self._y_decoder),
-                lambda: self._received(self._y_m_subscription, self._y_m_decoder),
+                partial(self.received, self._y_subscription, self._y_decoder),
+                partial(self.received, self._y_m_subscription, self._y_m_decoder),
             )
         self._y_publisher_lock, self._y_m_publisher_lock = self.publisher_locks = PublisherLock(), PublisherLock()
         self._last_ns = 0  # of the last tick
@@ -92,9 +90,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
             (self._y_subscription, self._y_decoder, self._controller.take_y, self._y_publisher_lock),
             (self._y_m_subscription, self._y_m_decoder, self._controller.take_y_m, self._y_m_publisher_lock),
         ):
-            for sample in self._received(subscription, decoder):
+            for sample in self.received(subscription, decoder):
                 if sample is not None:
-                    self._accept(subscription, decoder, take, sample, now_ns, lock)
+                    self.accept(subscription, decoder, take, sample, now_ns, lock, *self._ages_ns())
         self._step(now_ns, tick.late_ns)
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._warn_stale_inputs(now_ns)
@@ -113,39 +111,12 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         self._step(self._last_ns + self._max_age_ns + self.period_ns(), 0)
         self._step(now_ns, 0)
 
-    def _received(self, subscription: PolledSubscription, decoder: Decoder) -> Iterator[StampedVector | None]:
-        """The samples that were received since the last call; None for one without channels or with an error."""
-        for received in subscription.take():
-            try:
-                sample = decoder.decode(received.message)
-            except ChannelError as error:
-                self.reject(subscription, error.reason, str(error))
-                sample = None
-            yield sample
+    def _ages_ns(self) -> tuple[int, int]:
+        """Ages above which a publisher has timed out: for the same node in another process, and for another node.
 
-    def _accept(
-        self,
-        subscription: PolledSubscription,
-        decoder: Decoder,
-        take: Callable[[StampedVector, int], None],
-        sample: StampedVector,
-        now_ns: int,
-        lock: PublisherLock | None = None,
-    ) -> None:
-        """Give a sample to the controller, unless its stamp is bad or it is from a conflicting publisher.
-
-        Another node may take over as publisher once the failsafe has brought u to trim.
+        Another one may take over once the failsafe has brought u to trim.
         """
-        try:
-            if lock is not None:
-                failsafe_ns = nanoseconds(self.parameters.hold + self.parameters.ramp)
-                lock.check(sample.sender, now_ns, self._max_age_ns, self._max_age_ns + failsafe_ns)
-            with decoder.once(sample.stamp_ns):
-                take(sample, now_ns)
-            if lock is not None:
-                lock.refresh(sample.sender, now_ns)
-        except ChannelError as error:
-            self.reject(subscription, error.reason, str(error))
+        return self._max_age_ns, self._max_age_ns + nanoseconds(self.parameters.hold + self.parameters.ramp)
 
     def _step(self, now_ns: int, late_ns: int) -> bool:
         """One tick of the controller; whether it had an output to publish."""
@@ -166,9 +137,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         advanced = False
         for now_ns, due, y, y_m in self._inputs.complete():
             if y is not None:
-                self._accept(self._y_subscription, self._y_decoder, self._controller.take_y, y, now_ns)
+                self.accept(self._y_subscription, self._y_decoder, self._controller.take_y, y, now_ns)
             for sample in y_m:
-                self._accept(self._y_m_subscription, self._y_m_decoder, self._controller.take_y_m, sample, now_ns)
+                self.accept(self._y_m_subscription, self._y_m_decoder, self._controller.take_y_m, sample, now_ns)
             if due and not self._step(now_ns, late_ns=0):
                 self._publish_u(self._empty_encoder.encode(now_ns, NO_CHANNELS))
             advanced = True
