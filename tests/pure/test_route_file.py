@@ -123,6 +123,11 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ("r.yaml", "{route: [], speed: 5}", "found another content, expected the key route alone"),
         ("r.geojson", "{", r"r\.geojson: not valid JSON .* expected a route file"),
         ("r.geojson", line([[8.5, 47.4]]), r"route\[0\]: found \[8\.5, 47\.4\], expected longitude, latitude, altitude"),
+        (
+            "r.geojson",
+            line([[-171.5, -47.4, 500.0]]),
+            r"route\[0\]: found a position on the other half of the Earth, expected one near",
+        ),
         ("r.geojson", line([[47.4, 8.5, 500.0]]), r"route\[0\]: found 49\d\d km from the origin"),
         ("r.geojson", line([[8.5, 147.4, 1.0]]), r"route\[0\]\.latitude: found 147\.4, expected .* from -90 to 90"),
         ("r.geojson", {"features": [line(), line()]}, "found 2 LineStrings, expected one, or Points alone"),

@@ -66,6 +66,13 @@ def local(latitude: float, longitude: float, origin: Origin) -> Point:
     return (up - up_0) * math.cos(lat) - outward * math.sin(lat), out * math.sin(turn)
 
 
+def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
+    """Whether a position is on the half of the Earth around the origin; one on the other half has the same north and east."""
+    lat, turn = math.radians(origin.latitude), math.radians(longitude - origin.longitude)
+    out, up = _meridian(math.radians(latitude))
+    return out * math.cos(turn) * math.cos(lat) + up * math.sin(lat) > 0.0
+
+
 def _meridian(latitude: float) -> tuple[float, float]:
     """Distance of a position on the ellipsoid from the Earth's axis, and from the plane of the equator, m."""
     e_squared = FLATTENING * (2.0 - FLATTENING)
@@ -190,6 +197,7 @@ def _placed(place: Place, origin: Origin | None) -> Waypoint:
     if origin is None:
         raise ParameterError(f"{key}: found a latitude and a longitude, expected an origin, where north and east are 0")
     degrees = (_number(key, latitude, "latitude", 90.0), _number(key, longitude, "longitude", 180.0))
+    require(_is_above(*degrees, origin), key, "a position on the other half of the Earth", "one near the origin")
     return _waypoint(key, *local(*degrees, origin), altitude, speed)
 
 
