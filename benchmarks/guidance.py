@@ -15,7 +15,6 @@ minutes.
 import argparse
 import math
 import sys
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -32,7 +31,7 @@ from benchmarks.guidance_grid import GRIDS, places, point
 from benchmarks.sampling import new_table
 from rich.console import Console
 
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import tracking_error
 from flight_bringup.scenarios import find_scenario
@@ -366,10 +365,7 @@ def original_of(name: str) -> Scenario:
         return find_scenario(f"jsbsim_{name}")
     from flight_analysis.design.identification import identify  # noqa: PLC0415 - for this aircraft alone
 
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"jsbsim_{name}.yaml"
-        path.write_text(identify(name, *CONDITIONS[name]).text, encoding="utf-8")
-        return load_scenario(path)
+    return parse_scenario(identify(name, *CONDITIONS[name]).text.encode(), Path(f"jsbsim_{name}.yaml"))
 
 
 AIRCRAFT = ("osprey_servo", "c172p", "737", "f16")

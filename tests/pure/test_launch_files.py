@@ -22,7 +22,7 @@ from tests.conftest import REPOSITORY
 from tests.launch_stand_in import ExecuteProcess, LaunchContext, Node, OpaqueFunction, ProcessExited, TimerAction
 
 from autopilot_bridge.params import LIBRARY, BridgeParameters, load_map
-from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, read_scenario_sections
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, parse_scenario_sections
 from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError, Parameters
@@ -180,7 +180,7 @@ def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None
         assert node.namespace == stand_in.LaunchConfiguration("namespace")
         assert node.exec_name == executable
         file, given_to_node = node.parameters
-        section = {} if executable == "bridge" else read_scenario_sections(Path(file))[executable]
+        section = {} if executable == "bridge" else parse_scenario_sections(Path(file).read_bytes(), Path(file))[executable]
         NODES[executable].validate_mapping(section | given_to_node, executable)
 
 

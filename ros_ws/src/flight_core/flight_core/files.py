@@ -102,6 +102,11 @@ def read_file(path: Path, key: str, expected: str) -> bytes:
             content = stream.read(MAX_FILE_BYTES + 1)
     except (OSError, ValueError) as error:
         raise ParameterError(f"{key}: cannot be read ({error}), expected {expected}") from None
+    return limited(content, key, expected)
+
+
+def limited(content: bytes, key: str, expected: str) -> bytes:
+    """The content, of at most MAX_FILE_BYTES. Raises ParameterError for more."""
     require(len(content) <= MAX_FILE_BYTES, key, f"more than {MAX_FILE_BYTES} bytes", expected)
     return content
 

@@ -10,28 +10,30 @@
 from pathlib import Path
 from typing import Any
 
-from flight_core.files import read_yaml
+from flight_core.files import limited, parse_yaml
 from flight_core.parameters import require
 
 Sections = dict[str, dict[str, Any]]
 
+A_SCENARIO = "a scenario file"
 
-def read_sections(path: Path, expected: tuple[str, ...], optional: tuple[str, ...] = ()) -> Sections:
-    """Sections of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
 
-    Raises ParameterError for a file that cannot be read, is no scenario file, has a duplicate key, or lacks or adds a section;
-    those in `optional` may be absent, or an empty mapping: every parameter by default.
+def parse_sections(content: bytes, path: Path, expected: tuple[str, ...], optional: tuple[str, ...] = ()) -> Sections:
+    """Sections of the content of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
+
+    Raises ParameterError, which names the path, for content that is no scenario file or too long, has a duplicate key, or lacks
+    or adds a section; those in `optional` may be absent, or an empty mapping: every parameter by default.
     """
-    tree = read_yaml(path, str(path), "a scenario file")
+    tree = parse_yaml(limited(content, str(path), A_SCENARIO), str(path), A_SCENARIO)
     require(isinstance(tree, dict), str(path), f"{type(tree).__name__}", f"a mapping with {', '.join(expected)}")
     sections: Sections = {}
-    for key, content in tree.items():
+    for key, section in tree.items():
         name = str(key).removeprefix("/**/").removeprefix("/")
         known = (*expected, *optional)
         require(name in known, f"{path.name}: {name}", "a section", f"only {', '.join(known)}")
-        values = content.get("ros__parameters") if isinstance(content, dict) else None
+        values = section.get("ros__parameters") if isinstance(section, dict) else None
         require(
-            isinstance(values, dict) and (bool(values) or name in optional) and set(content) == {"ros__parameters"},
+            isinstance(values, dict) and (bool(values) or name in optional) and set(section) == {"ros__parameters"},
             f"{path.name}: {name}",
             "no parameters under ros__parameters",
             "a mapping of them there, as in every ROS parameter file",

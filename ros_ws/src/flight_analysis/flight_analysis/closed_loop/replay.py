@@ -4,13 +4,12 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario, read_scenario_sections
+from flight_analysis.closed_loop.scenario import Scenario, parse_scenario, parse_scenario_sections
 from flight_core.parameters import flatten, nest, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
@@ -86,19 +85,13 @@ class ReplayResult(NamedTuple):
 
 def recorded_parameters(scenario: StoredFile) -> ControllerParameters:
     """The controller's section of the scenario in a log; other sections are not validated. Raises ParameterError."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / scenario.name
-        path.write_bytes(scenario.content)
-        sections = read_scenario_sections(path)
+    sections = parse_scenario_sections(scenario.content, Path(scenario.name))
     return ControllerParameters.validate_mapping(sections["controller"], "controller")
 
 
 def recorded_scenario(stored: StoredFile) -> Scenario:
     """The scenario in a log, every section validated. Raises ParameterError."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / stored.name
-        path.write_bytes(stored.content)
-        return load_scenario(path)
+    return parse_scenario(stored.content, Path(stored.name))
 
 
 def vary(parameters: ControllerParameters, changes: Mapping[str, Any]) -> ControllerParameters:

@@ -13,9 +13,10 @@ from aircraft_sim.params import AircraftParameters
 from aircraft_sim.pose import every
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
+from flight_core.files import read_file
 from flight_core.parameters import ParameterError, Parameters, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
-from flight_core.scenario import Sections, read_sections
+from flight_core.scenario import A_SCENARIO, Sections, parse_sections
 from flight_recorder.params import RecorderParameters
 from guidance.params import GuidanceParameters
 from reference_model.params import ReferenceModelParameters
@@ -91,7 +92,12 @@ OPTIONAL = ("guidance",)
 
 def load_scenario(path: Path) -> Scenario:
     """Read a scenario file and validate it. Raises ParameterError with one sentence."""
-    return scenario_of(path.stem, path, read_scenario_sections(path))
+    return parse_scenario(read_file(path, str(path), A_SCENARIO), path)
+
+
+def parse_scenario(content: bytes, path: Path) -> Scenario:
+    """The scenario in the content of a file, validated. Raises ParameterError."""
+    return scenario_of(path.stem, path, parse_scenario_sections(content, path))
 
 
 def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]) -> Scenario:
@@ -104,9 +110,9 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
     return scenario.vary(**{key: sections[key] for key in OPTIONAL if key in sections})
 
 
-def read_scenario_sections(path: Path) -> Sections:
-    """The sections of a scenario file, not validated yet. Raises ParameterError."""
-    return read_sections(path, tuple(name for name in SCHEMAS if name not in OPTIONAL), OPTIONAL)
+def parse_scenario_sections(content: bytes, path: Path) -> Sections:
+    """The sections in the content of a scenario file, not validated yet. Raises ParameterError."""
+    return parse_sections(content, path, tuple(name for name in SCHEMAS if name not in OPTIONAL), OPTIONAL)
 
 
 def guidance_by_rule(

@@ -8,7 +8,6 @@ inputs measured in flight. No number in this module is specific to an aircraft.
 """
 
 import math
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, FlightCondition, Trim,
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import sideslip_zero, trim_solution
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre, Selection, Study
@@ -419,10 +418,7 @@ def _slew(tape: Tape, lag: FloatArray) -> FloatArray:
 
 
 def _load(text: str) -> Scenario:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "identified.yaml"
-        path.write_text(text, encoding="utf-8")
-        return load_scenario(path)
+    return parse_scenario(text.encode(), Path("identified.yaml"))
 
 
 SCENARIO_YAML = gain_selection.yaml_template("""\
