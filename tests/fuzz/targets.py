@@ -149,7 +149,7 @@ def channel_map(data: bytes, folder: Path) -> None:
 def message(data: bytes, folder: Path) -> None:
     """The payload of a message for the readers of a log: alone, and between valid ones."""
     for messages in ([data], [_SAMPLE, data, _SAMPLE]):
-        decode = decoder("/y", JOINT_STATE)
+        decode = decoder(JOINT_STATE)
         assert decode is not None
         decode(messages)
     run = write_run(folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)]))

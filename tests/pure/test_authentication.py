@@ -60,7 +60,7 @@ def test_the_slice_of_the_code_is_empty_or_whole_for_any_bytes(message: bytes) -
 
 def test_signed_samples_of_a_log_are_decoded_as_one_group() -> None:
     authenticator = MessageAuthenticator(KEY, "/y", None)
-    decode = decoder("/y", JOINT_STATE)
+    decode = decoder(JOINT_STATE)
     assert decode is not None
     decoded = decode([signed(k, (0.1 * k, -k), authenticator) for k in range(5)])
     assert len(decoded.samples) == 1  # one layout, although the codes differ

@@ -25,11 +25,12 @@ from flight_core.tape import Tape
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.message_definitions import definition
-from flight_log.named_vectors import JOINT_STATE_TYPES, decoder, joint_state_types
+from flight_log.named_vectors import JOINT_STATE_TYPES, Samples, decoder, encoded, joint_state_types, stamp_of
 from flight_log.playback import read_playback
 from flight_log.scan import Scan
 from flight_log.tape_reader import ROSBAG2, read_run
 from flight_log.tape_writer import write_run
+from flight_view.flight import Flight
 
 
 def test_a_written_tape_is_read_back_bit_by_bit(tape: Tape, recorded: Path) -> None:
@@ -358,7 +359,7 @@ MIXTURES = {
 
 @pytest.mark.parametrize("messages", MIXTURES.values(), ids=MIXTURES)
 def test_messages_decoded_together_equal_those_decoded_one_by_one(messages: list[bytes]) -> None:
-    decode = decoder("/y", JOINT_STATE)
+    decode = decoder(JOINT_STATE)
     assert decode is not None
     decoded = [
         (samples.names, int(stamp), values.tobytes())
@@ -375,8 +376,8 @@ def test_the_types_of_a_joint_state_are_those_of_ros_2() -> None:
 
 
 def test_other_types_have_no_decoder_and_malformed_messages_are_counted() -> None:
-    assert decoder("/rosout", "rcl_interfaces/msg/Log") is None
-    decode = decoder("/y", JOINT_STATE)
+    assert decoder("rcl_interfaces/msg/Log") is None
+    decode = decoder(JOINT_STATE)
     assert decode is not None
     decoded = decode([SAMPLES[0][:20], SAMPLES[1], b""])
     assert decoded.unreadable == 2
@@ -388,7 +389,7 @@ def test_the_engagements_of_a_log_begin_with_the_phase_engaged_and_end_with_thei
     kind = "diagnostic_msgs/msg/KeyValue"
     bag = BagWriter(tmp_path / "run")
     other = bag.add_topic("/y", JOINT_STATE, "")
-    bag.write(other, 1, 1, 1, SAMPLES[0])
+    bag.write(other, 1, stamp_of(SAMPLES[0]), 1, SAMPLES[0])
     bag.flush()
     assert read_run(tmp_path / "run").engagements is None
     channel, of_another = (bag.add_topic(f"{name}/bridge/engagement", kind, "") for name in ("", "/plane"))
@@ -403,3 +404,56 @@ def test_the_engagements_of_a_log_begin_with_the_phase_engaged_and_end_with_thei
         Engagement(10, 30, "lost"),
         Engagement(60, None, ""),
     ]  # when they were sent
+
+
+def test_engagements_after_a_step_of_the_clock_have_the_time_of_the_stamps(tmp_path: Path) -> None:
+    kind, step_ns = "diagnostic_msgs/msg/KeyValue", 5 * NANOSECONDS
+    bag = BagWriter(tmp_path / "run")
+    y, report = bag.add_topic("/y", JOINT_STATE, ""), bag.add_topic("/bridge/engagement", kind, "")
+    stamps = np.arange(10, 20) * NANOSECONDS
+    samples = encoded(Samples(("q",), stamps, np.zeros((10, 1)), "/bridge#1"))
+    for number, (stamp_ns, data) in enumerate(zip(stamps.tolist(), samples, strict=True)):
+        sent_ns = stamp_ns + 30_000_000 + (step_ns if number >= 5 else 0)
+        bag.write(y, number, sent_ns, number, data.tobytes())
+        if number in (2, 7):
+            key = "ENGAGED" if number == 2 else "RELEASE"
+            message = bytes(STORE.serialize_cdr(STORE.types[kind](key=key, value=""), kind))
+            bag.write(report, number, sent_ns + 1, number, message)
+    bag.close()
+    (engagement,) = read_run(tmp_path / "run").engagements or []
+    assert engagement.start_ns == pytest.approx(12 * NANOSECONDS, abs=40_000_000)  # its y is 30 ms old
+    assert engagement.stop_ns == pytest.approx(17 * NANOSECONDS, abs=40_000_000)
+
+
+def test_samples_of_two_publishers_at_the_same_time_are_noted(tmp_path: Path) -> None:
+    bag = BagWriter(tmp_path / "run")
+    spans = {
+        "/y": ("/aircraft#1", "/aircraft#2"),
+        "/y_m": ("/reference_model#3", "/reference_model#9"),
+    }  # a second one, a restarted one
+    for topic, (first, second) in spans.items():
+        channel = bag.add_topic(topic, JOINT_STATE, "")
+        later = 4 if topic == "/y" else 10
+        for sender, stamps in ((first, np.arange(0, 10)), (second, np.arange(later, later + 3))):
+            for data in encoded(Samples(("q",), stamps * NANOSECONDS + 1, np.zeros((len(stamps), 1)), sender)):
+                bag.write(channel, 1, 1, 1, data.tobytes())
+    bag.close()
+    both = "y: samples of /aircraft#1, /aircraft#2: the figures are of all, the nodes refuse all but one"
+    assert read_run(tmp_path / "run").tape.notes == (both,)
+
+
+def test_without_truth_flight_time_counts_from_the_first_y_m(tmp_path: Path) -> None:
+    """A bridge publishes y before the reference model starts, and commands count from its start."""
+    bag = BagWriter(tmp_path / "run")
+    for name, first in (("y", 3), ("y_m", 5)):
+        channel, stamps = bag.add_topic(f"/{name}", JOINT_STATE, ""), np.arange(first, 9) * NANOSECONDS
+        samples = encoded(Samples(("q",), stamps, np.zeros((len(stamps), 1)), "/node#1"))
+        for stamp_ns, data in zip(stamps.tolist(), samples, strict=True):
+            bag.write(channel, stamp_ns, stamp_ns, 1, data.tobytes())
+    bag.close()
+    assert read_run(tmp_path / "run").tape.start_ns == 5 * NANOSECONDS
+    assert read_playback(tmp_path / "run").start_ns == 5 * NANOSECONDS
+    flight = Flight(tmp_path / "run")
+    while flight.update(1.0):
+        pass
+    assert flight.start_ns == 5 * NANOSECONDS

@@ -33,7 +33,7 @@ def all_of(topic: str, type_name: str) -> float:
 
 def vectors(found: list[Messages], topic: str) -> tuple[NDArray[np.int64], FloatArray]:
     """Stamps and values of a topic."""
-    decode = decoder(topic, JOINT_STATE)
+    decode = decoder(JOINT_STATE)
     assert decode is not None
     parts = [part for one in found if one.topic == topic for part in decode(one.data).samples]
     return np.concatenate([one.stamp_ns for one in parts]), np.concatenate([one.values for one in parts])

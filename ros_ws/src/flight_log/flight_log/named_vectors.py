@@ -16,7 +16,7 @@ from rosbags.serde.errors import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from flight_core.authentication import mac_slice
+from flight_core.authentication import MARK, mac_slice
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.vectors import FloatArray
 
@@ -41,6 +41,7 @@ class Samples(NamedTuple):
     names: tuple[str, ...]
     stamp_ns: NDArray[np.int64]  # (N,), the instant of each sample
     values: FloatArray  # (N, k)
+    sender: str = ""  # the publisher's instance
 
 
 class Decoded(NamedTuple):
@@ -68,8 +69,8 @@ def joint_state_types() -> Typestore:
     return store
 
 
-def decoder(topic: str, type_name: str) -> Decoder | None:
-    """Decoder from messages to named vectors, for a topic by its full name; None for a type without named vectors.
+def decoder(type_name: str) -> Decoder | None:
+    """Decoder from messages of a type to named vectors; None for a type without named vectors.
 
     A decoder serves one topic. It takes the messages in their order, several at a time.
     """
@@ -81,12 +82,17 @@ def stamp_of(data: bytes) -> int:
     return int.from_bytes(data[STAMP][:4], "little", signed=True) * NANOSECONDS + int.from_bytes(data[STAMP][4:], "little")
 
 
+def _instance(frame_id: str) -> str:
+    """The instance of the publisher, without the message authentication code."""
+    return frame_id.partition(MARK)[0]
+
+
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
     """Stamp of flight time 0, from a sample of `truth` and its t in s: stamp - t. None when t is not a flight time."""
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 
 
-def encoded(frame_id: str, samples: Samples) -> NDArray[np.uint8]:
+def encoded(samples: Samples) -> NDArray[np.uint8]:
     """The samples as serialised sensor_msgs/JointState, one in each row, with empty velocity and effort.
 
     The first is serialised by its definition. The others differ from it in stamp and values only.
@@ -95,7 +101,7 @@ def encoded(frame_id: str, samples: Samples) -> NDArray[np.uint8]:
     types: dict[str, Any] = store.types
     header, time = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
     empty, marks = np.zeros(0), _marks(len(samples.names))
-    message = types[JOINT_STATE](header(time(sec=0, nanosec=0), frame_id), list(samples.names), marks, empty, empty)
+    message = types[JOINT_STATE](header(time(sec=0, nanosec=0), samples.sender), list(samples.names), marks, empty, empty)
     template = bytes(store.serialize_cdr(message, JOINT_STATE))
     rows = np.tile(np.frombuffer(template, dtype=np.uint8), (len(samples.stamp_ns), 1))
     seconds, nanoseconds = np.divmod(samples.stamp_ns, NANOSECONDS)
@@ -137,6 +143,7 @@ class _JointStateDecoder:
     def __init__(self) -> None:
         self._store = joint_state_types()
         self._names: tuple[str, ...] = ()
+        self._sender = ""
         self._template = np.zeros(0, dtype=np.uint8)  # the bytes of the message that the layout was learnt from
         self._constant = np.zeros(0, dtype=np.uint8)  # 255 for the bytes that are equal in all messages of the layout, else 0
         self._values = slice(0, 0)
@@ -156,7 +163,7 @@ class _JointStateDecoder:
                 continue
             stamp = one.header.stamp
             stamps = np.array([stamp.sec * NANOSECONDS + stamp.nanosec])
-            samples.append(Samples(tuple(one.name), stamps, one.position[None]))
+            samples.append(Samples(tuple(one.name), stamps, one.position[None], _instance(one.header.frame_id)))
         if rest:
             self._learn(rest[-1])
         return Decoded(samples, unreadable)
@@ -175,7 +182,7 @@ class _JointStateDecoder:
         stamps = np.ascontiguousarray(table[:, STAMP])
         stamp_ns = stamps.view("<i4")[:, 0].astype(np.int64) * NANOSECONDS + stamps.view("<u4")[:, 1]
         values = np.ascontiguousarray(table[:, self._values]).view("<f8")
-        return [Samples(self._names, stamp_ns, values)] if len(table) else [], rest
+        return [Samples(self._names, stamp_ns, values, self._sender)] if len(table) else [], rest
 
     def _learn(self, message: bytes) -> None:
         """Learn the layout: serialise marked values with the same strings, and find the position of the marks."""
@@ -191,7 +198,7 @@ class _JointStateDecoder:
         values = _position(marked, marks)
         if len(marked) != len(message) or message[values] != one.position.tobytes():
             return
-        self._names, self._values = tuple(one.name), values
+        self._names, self._values, self._sender = tuple(one.name), values, _instance(one.header.frame_id)
         self._template = np.frombuffer(message, dtype=np.uint8)
         self._constant = np.full(len(message), 255, dtype=np.uint8)
         self._constant[STAMP] = self._constant[self._values] = self._constant[mac_slice(message)] = 0

@@ -106,12 +106,13 @@ def _is_flight_time(stored: StoredMessage) -> bool:
 
 
 def _start_ns(stored: Sequence[StoredMessage], otherwise: int) -> int:
-    """Stamp of flight time 0 by the topic `truth`; `otherwise` without one."""
-    truth = next((one for one in stored if one.topic.rpartition("/")[2] == "truth"), None)
-    decode = None if truth is None else decoder(truth.topic, truth.type_name)
+    """Stamp of flight time 0, by the first `truth` or else the first `y_m`; `otherwise` without both."""
+    truth, y_m = (next((one for one in stored if one.topic.rpartition("/")[2] == name), None) for name in ("truth", "y_m"))
+    otherwise = otherwise if y_m is None else stamp_of(y_m.data)
+    decode = None if truth is None else decoder(truth.type_name)
     if truth is None or decode is None:
         return otherwise
-    for names, stamp_ns, values in decode([truth.data]).samples:
+    for names, stamp_ns, values, _ in decode([truth.data]).samples:
         if "t" in names and (start_ns := flight_start_ns(int(stamp_ns[0]), float(values[0, names.index("t")]))) is not None:
             return start_ns
     return otherwise

@@ -5,6 +5,7 @@
 import re
 import shlex
 from collections.abc import Callable, Collection, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from flight_core.files import is_file, is_folder
 from flight_core.parameters import ParameterError, printable, require
-from flight_core.rates import seconds
+from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
@@ -27,6 +28,7 @@ from flight_log.scan import Scan
 
 ROUTE = "route"
 BATCH = 4096  # messages that are decoded together
+LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by the age of its sample
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace with one of these topics is that of an aircraft
 
 ROSBAG2 = "rosbag2"
@@ -75,7 +77,9 @@ def read_run(run: Path, namespace: str | None = None) -> RecordedRun:
     signals = {name: filled[topic] for topic, name in names.items()}
     start_ns = _start_ns(signals)
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
-    notes = [*log.notes_at(end), *(note for topic, name in names.items() if (note := log.topics[topic].note(name)))]
+    told = [log.topics[topic].note(name) for topic, name in names.items()]
+    told += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
+    notes = [*log.notes_at(end), *filter(None, told)]
     tape = Tape(signals, start_ns, tuple(map(printable, notes)))
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
     delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
@@ -116,6 +120,7 @@ class _TopicSamples:
         self._decode = decode
         self._batch: list[bytes] = []
         self._samples: dict[tuple[str, ...], list[tuple[NDArray[np.int64], FloatArray]]] = {}  # by names: stamps, values
+        self._spans: dict[str, tuple[int, int]] = {}  # by publisher: its first and its last stamp
         self._refused = 0
 
     def add(self, message: bytes) -> None:
@@ -127,8 +132,11 @@ class _TopicSamples:
         decoded = self._decode(self._batch)
         self._batch = []
         self._refused += decoded.unreadable
-        for names, stamp_ns, values in decoded.samples:
+        for names, stamp_ns, values, sender in decoded.samples:
             if values.shape[1] == len(names):
+                first, last = int(stamp_ns.min()), int(stamp_ns.max())
+                before, after = self._spans.get(sender, (first, last))
+                self._spans[sender] = min(first, before), max(last, after)
                 self._samples.setdefault(names, []).append((stamp_ns, values))
             else:
                 self._refused += len(stamp_ns)
@@ -152,6 +160,13 @@ class _TopicSamples:
     def _count(self, names: tuple[str, ...]) -> int:
         return sum(len(stamp_ns) for stamp_ns, _ in self._samples[names])
 
+    def conflict(self, name: str) -> str:
+        """The note on publishers at the same time, of which the nodes refuse all but one; empty for one after the other."""
+        spans = sorted(self._spans.items(), key=lambda one: one[1])
+        if all(before[1][1] < after[1][0] for before, after in pairwise(spans)):
+            return ""
+        return f"{name}: samples of {', '.join(sorted(self._spans))}: the figures are of all, the nodes refuse all but one"
+
     def note(self, name: str) -> str:
         """The note on refused samples; empty without any."""
         refused = self._refused + sum(map(self._count, self._samples)) - (self._count(self._names()) if self._samples else 0)
@@ -172,6 +187,7 @@ class _Log:
         self.known_end_ns = 0  # the latest log time in any index or metadata
         self.sent: dict[str, dict[int, int]] = {}  # of y and u by full topic name: times of sending by stamp, ns
         self.reports: dict[str, list[tuple[int, bytes]]] = {}  # of bridges by full topic name: time of sending, ns, and message
+        self.clock_step_ns = 0  # how far the system clock was set, by the last y or u: the nodes keep the time of their stamps
 
     def reader_of(self, topic: str, type_name: str) -> Callable[[Message], None] | None:
         """What takes the messages of a topic; None for a topic that plays no part."""
@@ -181,20 +197,23 @@ class _Log:
             def take(message: Message) -> None:
                 samples.add(message.data)
                 if len(message.data) >= STAMP.stop:
-                    self.sent.setdefault(topic, {})[stamp_of(message.data)] = message.publish_time
+                    stamp_ns = stamp_of(message.data)
+                    self.sent.setdefault(topic, {})[stamp_ns] = message.publish_time
+                    offset_ns = message.publish_time - stamp_ns
+                    self.clock_step_ns = offset_ns if abs(offset_ns) > LEAST_CLOCK_STEP_NS else 0
 
             return take
         if samples is not None:
             return lambda message: samples.add(message.data)
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             reports = self.reports.setdefault(topic, [])
-            return lambda message: reports.append((message.publish_time, message.data))
+            return lambda message: reports.append((message.publish_time - self.clock_step_ns, message.data))
         return None
 
     def samples_of(self, topic: str, type_name: str) -> _TopicSamples | None:
         """The samples of a topic; None for a type without named vectors that is no route."""
         is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
-        if topic not in self.topics and (decode := decode_routes if is_route else decoder(topic, type_name)) is not None:
+        if topic not in self.topics and (decode := decode_routes if is_route else decoder(type_name)) is not None:
             self.topics[topic] = _TopicSamples(decode)
         return self.topics.get(topic)
 
@@ -290,11 +309,13 @@ def _read_other(run: Path, log: _Log) -> None:
 
 
 def _start_ns(signals: Mapping[str, Signal]) -> int:
-    """Stamp of flight time 0 by `truth`; without it, the earliest stamp."""
+    """Stamp of flight time 0: by `truth`, else the first y_m, since commands count from it; else the earliest stamp."""
     truth = signals.get("truth")
     if truth is not None and "t" in truth.names:
         start_ns = flight_start_ns(int(truth.stamp_ns[0]), float(truth["t"][0]))
         if start_ns is not None:
             return start_ns
+    if "y_m" in signals:
+        return int(signals["y_m"].stamp_ns[0])
     stamps = {name: int(signal.stamp_ns[0]) for name, signal in signals.items()}
     return min([stamp_ns for name, stamp_ns in stamps.items() if name != ROUTE] or stamps.values())  # a route may have no stamp

@@ -19,7 +19,7 @@ def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
     bag cannot be written.
     """
     signals = list(tape.signals.values())
-    messages = [encoded("in_process", Samples(one.names, one.stamp_ns, one.values)) for one in signals]
+    messages = [encoded(Samples(one.names, one.stamp_ns, one.values, "in_process")) for one in signals]
     stamps = np.concatenate([one.stamp_ns for one in signals])
     columns = np.repeat(np.arange(len(signals)), [len(one.stamp_ns) for one in signals])
     indexes = np.concatenate([np.arange(len(one.stamp_ns)) for one in signals])

@@ -3,7 +3,6 @@
 """Follows the log of a run, live or recorded: samples by topic, events, and the state of the recording."""
 
 import math
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -16,7 +15,7 @@ from mcap.records import Attachment, Metadata
 from numpy.typing import NDArray
 from rosbags.serde.errors import SerdeError
 
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.metrics import settling_bands
 from flight_analysis.report.summary import display_units, pulse_edges
 from flight_core.parameters import ParameterError, printable
@@ -101,6 +100,7 @@ class Flight:
         self._namespace: str | None = None
         self._unreadable = 0
         self._start_ns: int | None = None  # by `truth`
+        self._reference_ns: int | None = None  # of the first y_m
         self._first_ns: int | None = None
         self._mode = -1
         self._banded = 0  # rows of internals that the bands are of
@@ -110,8 +110,8 @@ class Flight:
 
     @property
     def start_ns(self) -> int:
-        """Stamp of flight time 0: by `truth`, else the earliest stamp."""
-        return self._start_ns if self._start_ns is not None else self._first_ns or 0
+        """Stamp of flight time 0: by `truth`, else the first y_m, since commands count from it; else the earliest stamp."""
+        return next((one for one in (self._start_ns, self._reference_ns, self._first_ns) if one is not None), 0)
 
     @property
     def end(self) -> float:
@@ -203,15 +203,12 @@ class Flight:
                 for topic, count in record.metadata.items():
                     self._note(f"{topic}: the recorder lost {count} messages")
         elif record.media_type == SCENARIO_MEDIA_TYPE and "units" not in self.description:
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder) / "scenario.yaml"
-                path.write_bytes(record.data)
-                try:
-                    self.scenario = load_scenario(path)
-                    self.described += 1
-                    self.description |= _described(self.scenario)  # reads the airframe, maybe a file of another machine
-                except ParameterError as error:
-                    self._note(f"units, limits and commands are unknown: {error}")
+            try:
+                self.scenario = parse_scenario(record.data, Path("scenario.yaml"))
+                self.described += 1
+                self.description |= _described(self.scenario)  # reads the airframe, maybe a file of another machine
+            except ParameterError as error:
+                self._note(f"units, limits and commands are unknown: {error}")
 
     def _take(self, messages: Messages) -> None:
         if messages.type_name != JOINT_STATE:
@@ -219,7 +216,7 @@ class Flight:
             return
         topic = self._topics.get(messages.topic)
         if topic is None:
-            if (decode := decoder(messages.topic, messages.type_name)) is None:
+            if (decode := decoder(messages.type_name)) is None:
                 return
             topic = self._topics[messages.topic] = _Topic(messages.topic.rpartition("/")[2], decode)
             if topic.name == "internals":
@@ -237,7 +234,7 @@ class Flight:
             self._take_samples(topic, samples)
 
     def _take_samples(self, topic: _Topic, decoded: Samples) -> None:
-        names, stamp_ns, values = decoded
+        names, stamp_ns, values, _ = decoded
         # A pose has the channels that a bridge has received so far: those with fewer than the widest one are left out.
         if topic.name == POSE and set(names) > set(topic.names):
             topic.columns = None
@@ -258,6 +255,8 @@ class Flight:
             return
         earliest = int(stamp_ns.min())
         self._first_ns = earliest if self._first_ns is None else min(self._first_ns, earliest)
+        if topic.name == "y_m" and self._reference_ns is None:
+            self._reference_ns = earliest
         if topic.name == "truth" and "t" in names and self._start_ns is None:
             self._start_ns = flight_start_ns(int(stamp_ns[0]), float(values[0, names.index("t")]))
         if topic.name == "internals" and "mode" in names:
