@@ -214,10 +214,10 @@ def mask_spans(t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0) 
 
 
 def in_spans(t: FloatArray, spans: Iterable[tuple[float, float]], settle: float = 0.0) -> NDArray[np.bool_]:
-    """Mask of the instants inside a span or up to `settle` seconds after it, shape (N,)."""
+    """Mask of the ascending instants t inside a span or up to `settle` seconds after it, shape (N,)."""
     inside = np.zeros(len(t), dtype=bool)
     for start, stop in spans:
-        inside |= (t >= start) & (t <= stop + settle)
+        inside[np.searchsorted(t, start) : np.searchsorted(t, stop + settle, side="right")] = True
     return inside
 
 
