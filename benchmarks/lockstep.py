@@ -25,10 +25,10 @@ from benchmarks.processes import Child
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
-from flight_bringup.scenarios import find_scenario
+from flight_bringup.scenarios import find_scenario, written
 from flight_ros.messages import Encoder
 from flight_ros.rclpy_private import WaitSet
 from flight_ros.subscriptions import PolledSubscription
@@ -37,12 +37,6 @@ from flight_ros.topics import LOCKSTEP, PUBLISH, U, Y
 ECHOES = 5000
 RATE = 100.0  # Hz, of the controller of osprey_gust
 FLOOR = "bare echo, to another process and back"
-
-
-def write_scenario(scenario: Scenario, path: Path) -> Scenario:
-    """The scenario, read from a file that it is written to, for other processes."""
-    path.write_text(scenario_yaml(scenario), encoding="utf-8")
-    return load_scenario(path)
 
 
 def flight_steps_per_second(scenario: Scenario, run: Path, *, one_process: bool) -> float:
@@ -88,7 +82,7 @@ def measure(folder: Path, duration: float, repeat: int) -> dict[str, float]:
     """Steps per second of the echo (FLOOR) and of each kind of flight: the median of `repeat` runs, interleaved."""
     aircraft, model = {"rate": RATE, "step": 1.0 / RATE}, {"rate": RATE}
     scenario = find_scenario("osprey_gust").vary(flight={"duration": duration}, aircraft=aircraft, reference_model=model)
-    scenario = write_scenario(scenario, folder / "at_100_hz.yaml")
+    scenario = written(scenario, folder / "at_100_hz.yaml")
     measurements: dict[str, Callable[[Path], float]] = {
         FLOOR: lambda run: echo_steps_per_second(),
         "lockstep, four processes": lambda run: flight_steps_per_second(scenario, run, one_process=False),

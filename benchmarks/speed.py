@@ -37,7 +37,7 @@ from rosbags.rosbag2 import CompressionMode
 from flight_bringup.clients import FlightMonitor
 from flight_bringup.graph import CONTROLLER
 from flight_bringup.processes import FlightProcesses
-from flight_bringup.scenarios import find_scenario
+from flight_bringup.scenarios import find_scenario, written
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 from flight_ros import transport
@@ -158,9 +158,7 @@ def controller_at(hz: float, folder: Path, role: str = "controller", scenario_na
     """The process of the controller of a scenario at a rate."""
     others = {"rate": max(hz, 500.0)}  # at least as fast as the controller, as a scenario demands; they do not run here
     rates = {"aircraft": others | {"step": 0.001}, "reference_model": others, "controller": {"rate": hz}}
-    scenario = lockstep.write_scenario(
-        find_scenario(scenario_name).vary(**rates), folder / f"{scenario_name}_at_{hz:g}_hz.yaml"
-    )
+    scenario = written(find_scenario(scenario_name).vary(**rates), folder / f"{scenario_name}_at_{hz:g}_hz.yaml")
     with Child(role, "--ros-args", "--params-file", str(scenario.path)) as child:
         yield child
 
@@ -290,7 +288,7 @@ def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
     with Child("idle") as child:
         time.sleep(WARM_UP + 1.0)
         yield Row("node that only spins", _use([child.popen.pid], 3.0)[0], "node that only spins")
-    scenario = lockstep.write_scenario(scenario, folder / "scenario.yaml")
+    scenario = written(scenario, folder / "scenario.yaml")
     with (
         FlightMonitor(scenario.controller.outputs, lockstep=True) as monitor,  # without a subscription to internals
         FlightProcesses(scenario, run, monitor, lockstep=False, one_process=False) as flight,

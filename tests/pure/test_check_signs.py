@@ -14,10 +14,9 @@ from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.params import LIBRARY, ChannelMap, load_map
-from autopilot_bridge.signs import through
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.response_identification import MIN_RATIO, Response, identify_response
-from flight_analysis.design.sign_check import SignCheck, check, recorded_response
+from flight_analysis.design.sign_check import SignCheck, check, recorded_response, through
 from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import COMMANDS, application

@@ -12,7 +12,7 @@ from tests.builders import rms
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import observer_selection
 from flight_analysis.design.observer_selection import (
@@ -154,8 +154,3 @@ def test_the_command_refuses_options_that_contradict_each_other(arguments: list[
     with pytest.raises(ParameterError) as refused:
         CliRunner().invoke(application(["gains"]), ["gains", "osprey", *arguments], catch_exceptions=False)
     assert f"error: {refused.value}".startswith(sentence)
-
-
-@pytest.mark.parametrize("name", SHIPPED)
-def test_a_shipped_scenario_loads_by_its_path_too(name: str) -> None:
-    assert load_scenario(find_scenario(name).path).controller.observer is not None

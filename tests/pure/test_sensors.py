@@ -285,20 +285,6 @@ def test_a_delay_inside_the_margin_costs_little_and_one_beyond_it_loses_track(se
 
 
 @pytest.mark.parametrize(
-    ("gyro", "expected", "activity"),
-    [(0.002, 2.1, 4.4), (0.010, 4.0, 22.0), (0.020, 7.2, 44.0)],
-    ids=lambda value: f"{value:g}",
-)
-def test_effect_of_gyro_noise_without_gusts(servo: Scenario, gyro: float, expected: float, activity: float) -> None:
-    # q in mrad/s and mean abs(u_dot) of the elevator in deg/s, within 10 % of the prototype.
-    # Measured 2.05, 3.85, 7.03 and 4.5, 22.3, 44.6.
-    tape = simulate(with_sensors(servo.vary(aircraft={"gusts": {}}), noise=[gyro, 0.0, gyro, gyro]))
-    elevator = tape["u"]["elevator"]
-    assert rms(tape)[0] == pytest.approx(expected, rel=0.1)
-    assert np.rad2deg(np.mean(np.abs(np.diff(elevator))) / 0.01) == pytest.approx(activity, rel=0.1)
-
-
-@pytest.mark.parametrize(
     ("dropout", "expected"), [(0.05, [7.6, 0.088, 9.9, 6.4]), (0.2, [7.6, 0.088, 9.8, 6.4])], ids=("5 %", "20 %")
 )
 def test_missed_ticks_cost_nothing_as_the_real_dt_is_integrated(servo: Scenario, dropout: float, expected: list[float]) -> None:

@@ -82,14 +82,6 @@ def test_literal_sign_halving_dt_halves_the_error(rms: Rms) -> None:
     assert (coarse[[0, 3]] > 20 * calm(rate=200.0, duration=30.0)[[0, 3]]).all()
 
 
-def test_two_flights_of_one_scenario_are_equal_to_the_last_bit(osprey_gust: Scenario) -> None:
-    scenario = osprey_gust.vary(flight={"duration": 3.0})
-    first, second = simulate(scenario), simulate(scenario)
-    for name, signal in first.signals.items():
-        assert (signal.stamp_ns == second[name].stamp_ns).all()
-        assert signal.values.tobytes() == second[name].values.tobytes()
-
-
 def test_progress_is_reported_once_per_second(osprey_gust: Scenario) -> None:
     reported: list[float] = []
     simulate(osprey_gust.vary(flight={"duration": 3.0}), reported.append)

@@ -244,17 +244,6 @@ def test_the_turbulence_does_not_depend_on_how_the_flight_is_divided() -> None:
         assert first.truth().tobytes() == second.truth().tobytes()
 
 
-def test_given_numbers_replace_those_of_the_seed() -> None:
-    # Campaigns on other array types need this: the seed takes NumPy.
-    params, u = aircraft_parameters(turbulence=TURBULENCE).plant(), np.zeros(4)
-    assert params.turbulence is not None
-    state = plant.initial_state(params)
-    own = plant.advance(0, state, u, 20 * MS, params)
-    given_numbers = plant.advance(0, state, u, 20 * MS, params, normals=turbulence.normals(0, 10, params.turbulence.seed))
-    assert own.x.tobytes() == given_numbers.x.tobytes()
-    assert (plant.advance(0, state, u, 20 * MS, params, normals=np.zeros((10, 5))).x != own.x).any()
-
-
 def test_truth_holds_the_wind_that_acts_from_now_on_and_f_includes_it() -> None:
     gusts = {"vertical": {"start": 0.0, "speed": 2.0, "length": 2.5}}
     parameters = aircraft_parameters(turbulence=TURBULENCE, gusts=gusts)

@@ -16,8 +16,6 @@ AXES = ("longitudinal", "lateral", "vertical")
 AIR_STATE = {"longitudinal": "V", "lateral": "beta", "vertical": "alpha"}
 """State that wind w along an axis changes relative to the air: V - w, beta - w / V0, alpha - w / V0, small angles."""
 
-REFERENCE_LENGTH = 106.68  # m, 350 ft: FAR/CS 25.341(a)(4)
-
 MIN_RISE = 1e-30  # s, used for rise 0, a step: t / 1e-30 saturates for every t > 0, in float32 too, without division by 0
 
 
@@ -55,15 +53,6 @@ def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
     # minimum and maximum are several times faster than clip, which checks the types of its limits first
     s = xp.minimum(xp.maximum(airspeed * (t - gusts.start) / gusts.length, 0.0), 2.0)
     return gusts.speed / 2.0 * (1.0 - xp.cos(xp.pi * s))
-
-
-def design_gust_speed(length: Array, reference: Array, alleviation: Array) -> Array:
-    """Design gust speed U_ds = U_ref F_g (H / 350 ft)^(1/6), equivalent airspeed in m/s.
-
-    Arguments: `length` H from 9.144 to 106.68 m (30 to 350 ft), `reference` U_ref in m/s (17.07 at sea level, 13.41 at
-    4572 m), `alleviation` F_g of the aircraft, up to 1. Source: FAR/CS 25.341(a)(4) to (6).
-    """
-    return reference * alleviation * (length / REFERENCE_LENGTH) ** (1.0 / 6.0)
 
 
 def bias(t: Array, params: Bias) -> Array:

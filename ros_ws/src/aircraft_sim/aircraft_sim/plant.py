@@ -52,7 +52,6 @@ def advance(
     duration_ns: int,
     plant: PlantParams,
     forced: Forcing | None = None,
-    normals: Array | None = None,
 ) -> AircraftState:
     """State at t + duration from that at t, with the command u held (zero-order hold).
 
@@ -67,14 +66,13 @@ def advance(
     during the whole step: sampled at the steps it has its spectrum exactly, in between it is held. Time is counted in ns, so
     that steps add up exactly.
 
-    `forced` is the `forcing` of these steps, if the caller has it. `normals` are the numbers n_k, shape (steps, 5); by default
-    they follow from the seed, which takes NumPy. Raises ParameterError where the step does not divide the duration.
+    n_k follow from the seed. `forced` is the `forcing` of these steps, if the caller has it. Raises ParameterError where the
+    step does not divide the duration.
     """
     x, position, z = state
     aircraft, filters = plant.aircraft, plant.turbulence
     steps, dt = divide(duration_ns, plant.step_ns, "step", "the duration"), seconds(plant.step_ns)
-    if normals is None:
-        normals = () if filters is None else turbulence.normals(t_ns // plant.step_ns, steps, filters.seed)
+    normals = () if filters is None else turbulence.normals(t_ns // plant.step_ns, steps, filters.seed)
 
     def x_dot(since: float, x: Array, forced: Array, params: Aircraft) -> Array:
         return dynamics.x_dot_forced(x, forced[round(2.0 * since / dt)], params)

@@ -24,6 +24,7 @@ from flight_core.vectors import FloatArray
 COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, 5 % wide
 WIND_EFFECTS: dict[WindEffect, str] = {"air_relative": "by each aircraft's own A", "published": "that of the airframe"}
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
+FIGURE_HEADINGS = ("mean", *SPREAD, "worst")
 
 
 def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cases: Sequence[Mapping[str, Any]]) -> None:
@@ -81,13 +82,18 @@ def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> Table:
-    columns = [Column("", head) for head in ("mean", *SPREAD, "worst")]
+    columns = [Column("", head) for head in FIGURE_HEADINGS]
+    return Table(label, columns, figure_rows(tally, units), "of flights that did not diverge; slew: mean abs(u_dot)")
+
+
+def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str]]:
+    """A row for each figure of a tally: its label with the unit, and what FIGURE_HEADINGS name."""
     rows = []
     for name, figure in tally.figures.items():
-        label_, factor = _label(name, units)
+        label, factor = _label(name, units)
         values = (figure.mean, *(figure.quantile(share) for share in SPREAD.values()), figure.largest)
-        rows.append([label_, *(f"{value * factor:.3g}" for value in values)])
-    return Table(label, columns, rows, "of flights that did not diverge; slew: mean abs(u_dot)")
+        rows.append([label, *(f"{value * factor:.3g}" for value in values)])
+    return rows
 
 
 def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:

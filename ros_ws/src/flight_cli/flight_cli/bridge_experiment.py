@@ -32,7 +32,7 @@ from flight_analysis.design.sign_check import OPEN_LOOP
 from flight_analysis.report.run_folder import link_latest, new_run
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
-from flight_cli.output import CLOCK_COLUMNS, display_path, new_table, print_json, progress_bar
+from flight_cli.output import display_path, flight_progress, new_table, print_json
 from flight_core.files import writing
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Tape
@@ -40,7 +40,7 @@ from flight_log.tape_reader import read_run
 
 
 def identify_behind_bridge(
-    map_name: str, speed: float, folder: Path, amplitude: float, log: Path | None, runs: Path, as_json: bool
+    map_name: str, speed: float, folder: Path, amplitude: float, log: Path | None, as_json: bool
 ) -> None:
     """Excite the aircraft behind a map, or read the log of such a flight, and write what flies it into `folder`."""
     channel_map = load_map(map_name)
@@ -49,7 +49,7 @@ def identify_behind_bridge(
     console = Console(quiet=as_json)
     if log is None:
         require_envelope(channel_map)
-    run = _excite(console, channel_map, map_name, speed, folder, amplitude, runs) if log is None else log
+    run = _excite(console, channel_map, map_name, speed, folder, amplitude) if log is None else log
     tape, spans = _engaged(run)
     pairing, _ = channel_pairs(channel_map)
     trims = measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
@@ -72,28 +72,21 @@ def identify_behind_bridge(
     console.print(f"to fly it: rise-di fly {scenario} --bridge {copied} --send", highlight=False, soft_wrap=True)
 
 
-def _excite(
-    console: Console, channel_map: ChannelMap, map_name: str, speed: float, folder: Path, amplitude: float, runs: Path
-) -> Path:
+def _excite(console: Console, channel_map: ChannelMap, map_name: str, speed: float, folder: Path, amplitude: float) -> Path:
     """Fly the experiment; the folder of its run."""
     airframe, scenario = folder / "experiment_airframe.yaml", folder / "experiment.yaml"
     planned = experiment(channel_map, speed, amplitude, str(airframe.resolve()))
     _write(folder, {airframe.stem: planned.airframe, scenario.stem: planned.scenario})
     chosen = load_scenario(scenario)
     _announce(console, planned, chosen.flight.duration)
-    run = new_run(chosen, runs)
-    with progress_bar(*CLOCK_COLUMNS, quiet=console.quiet) as bar:
-        task = bar.add_task("experiment", total=chosen.flight.duration, clock="", shown="")
-
-        def progress(t: float, shown: str) -> None:
-            bar.update(task, completed=t, clock=f"t = {t:5.1f} of {chosen.flight.duration:g} s", shown=shown)
-
+    run = new_run(chosen, Path("runs"))
+    with flight_progress(chosen.flight.duration, quiet=console.quiet) as (progress, announce):
         outcome = fly_over_topics(
             chosen,
             run,
             progress,
             autopilot=find_autopilot(map_name, dry_run=False),
-            announce=lambda line: bar.console.print(line, highlight=False, soft_wrap=True),
+            announce=announce,
             engaged_for=planned.controller.duration,
         )
     link_latest(run)

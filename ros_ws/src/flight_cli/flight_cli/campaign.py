@@ -20,7 +20,7 @@ from flight_analysis.report.summary import QUANTITY_UNITS, display_units
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import Campaign, Definition, Sweep, define
-from flight_campaign.campaign_report import WIND_EFFECTS, write_page
+from flight_campaign.campaign_report import FIGURE_HEADINGS, WIND_EFFECTS, figure_rows, write_page
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
 from flight_cli.output import (
     COUNT_COLUMNS,
@@ -180,14 +180,9 @@ def _show(console: Console, definition: Definition, case: int, tally: Tally, fig
     title += f", effect of wind {WIND_EFFECTS[definition.wind]}"
     if definition.sweep is not None:
         title += f", {definition.sweep.parameter} times {definition.factor(case):g}"
-    table = new_table(title, ("figure", "mean", "median", "95 %", "99 %", "worst"), left=("figure",))
-    for name, figure in tally.figures.items():
-        kind, _, channel = name.partition(".")
-        unit = units.get(channel)
-        per_second = "/s" * (kind == "slew")
-        factor, label = (1.0, name) if unit is None else (unit.factor, f"{kind} {channel}, {unit.unit}{per_second}")
-        values = (figure.mean, figure.quantile(0.5), figure.quantile(0.95), figure.quantile(0.99), figure.largest)
-        table.add_row(label, *(f"{value * factor:.3g}" for value in values))
+    table = new_table(title, ("figure", *FIGURE_HEADINGS), left=("figure",))
+    for row in figure_rows(tally, units):
+        table.add_row(*row)
     console.print(table)
     for word, count in (("diverged", tally.diverged), (f"lost track (score above {LOSS_OF_TRACK_SCORE:g})", tally.lost)):
         share, low, high = tally.share(count)

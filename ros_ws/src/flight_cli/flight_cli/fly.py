@@ -15,13 +15,12 @@ from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.output import (
-    CLOCK_COLUMNS,
     ENDED_EARLY,
     INTERRUPTED,
     display_path,
+    flight_progress,
     parse_numbers,
     print_json,
-    progress_bar,
     show_flight,
 )
 from flight_core import outcome as ends
@@ -90,12 +89,7 @@ def fly(
         from flight_view.watch import services_note  # noqa: PLC0415 - as above
 
         print(*context.with_resource(watched(run)), *services_note(chosen), sep="\n", file=sys.stderr)
-    with progress_bar(*CLOCK_COLUMNS, quiet=as_json) as bar:
-        task = bar.add_task("flight", total=chosen.flight.duration, clock="", shown="")
-
-        def progress(t: float, shown: str) -> None:
-            bar.update(task, completed=t, clock=f"t = {t:5.1f} of {chosen.flight.duration:g} s", shown=shown)
-
+    with flight_progress(chosen.flight.duration, quiet=as_json) as (progress, announce):
         if in_process:
             outcome = fly_in_process(chosen, run, progress)
         else:
@@ -106,7 +100,7 @@ def fly(
                 lockstep=stepping,
                 one_process=one_process,
                 autopilot=autopilot,
-                announce=lambda line: bar.console.print(line, highlight=False, soft_wrap=True),
+                announce=announce,
             )
         if outcome == "completed":
             progress(chosen.flight.duration, outcome)

@@ -30,7 +30,7 @@ from flight_analysis.metrics import mask_spans
 from flight_analysis.report.figures import ERROR, GUST, PLANT
 from flight_analysis.report.html import Line, Page, Section, page_html
 from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, time_series_figure
-from flight_analysis.report.summary import DisplayUnit
+from flight_analysis.report.summary import DisplayUnit, display_unit
 from flight_bringup.scenarios import find_scenario
 from flight_cli.bridge_experiment import identify_behind_bridge
 from flight_cli.gains import observed, speed_of_margin
@@ -46,8 +46,6 @@ from rise_di_controller.params import ControllerParameters
 CANNOT_FLY = 3
 REFLY_MARGIN, STEP_MARGIN = 0.03, 0.015  # s. Without A the model of the loop has no damping, and less margin than the aircraft.
 LINEAR = 0.8  # the ratio of smallest to largest slope below which an input is reported as not linear
-MILLI = 1e3
-DISPLAY_UNITS = {"rad/s": ("mrad/s", MILLI), "m/s": ("m/s", 1.0)}
 
 
 def identify(
@@ -116,7 +114,7 @@ def identify(
             raise ParameterError("identify: found too few arguments, expected --speed and --write beside --bridge")
         require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
         part = AMPLITUDE if amplitude is None else amplitude
-        identify_behind_bridge(bridge, speed, write, part, log, Path("runs"), as_json)
+        identify_behind_bridge(bridge, speed, write, part, log, as_json)
         return
     require(amplitude is None, "--amplitude", amplitude, "--bridge beside it")
     of_tests = {
@@ -283,7 +281,7 @@ def _show_model(console: Console, found: Identification) -> None:
 
 def _units(found: Identification) -> dict[str, DisplayUnit]:
     units = {name: found.airframe.states[name] for name in found.airframe.outputs}
-    return {name: DisplayUnit(*DISPLAY_UNITS.get(unit, (unit, 1.0 / SI_PER_UNIT[unit]))) for name, unit in units.items()}
+    return {name: display_unit(unit) for name, unit in units.items()}
 
 
 def _innovation_page(found: Identification, name: str) -> Page:
@@ -355,7 +353,7 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
         figures = (params.K[i] * response, params.Lambda[i], params.beta[i], controller.lag[i])
         table.add_row(f"{output} by {name}", *(f"{figure:.3g}" for figure in figures))
     console.print(table)
-    margin = "" if answer.delay_margin is None else f"; delay margin {MILLI * answer.delay_margin:.0f} ms"
+    margin = "" if answer.delay_margin is None else f"; delay margin {1e3 * answer.delay_margin:.0f} ms"
     if answer.delay_margin:
         margin += f", {speed_of_margin(found.selection.study, answer)}"
     if found.sideslip_zero > 0.0:
@@ -371,7 +369,7 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
 
 
 def _show_flights(console: Console, found: IdentifiedAircraft) -> None:
-    headings = [f"{name}\n{DISPLAY_UNITS[unit][0]}" for name, unit in OUTPUTS.items()]
+    headings = [f"{name}\n{display_unit(unit).unit}" for name, unit in OUTPUTS.items()]
     flights = new_table(
         "\nFlights of 60 s in one process: rms of the error",
         ["flight", *headings, "outcome"],
@@ -380,7 +378,7 @@ def _show_flights(console: Console, found: IdentifiedAircraft) -> None:
     )
     largest = new_table("\nLargest deviation of a command from trim", ["flight", *INPUTS], left=("flight",))
     for title, one in found.flights.items():
-        errors = [f"{one.rms[name] * DISPLAY_UNITS[unit][1]:.3g}" for name, unit in OUTPUTS.items()]
+        errors = [f"{one.rms[name] * display_unit(unit).factor:.3g}" for name, unit in OUTPUTS.items()]
         flights.add_row(title, *errors, one.outcome)
         largest.add_row(title, *(f"{one.largest[name]:.2g}" for name in INPUTS))
     console.print(flights)

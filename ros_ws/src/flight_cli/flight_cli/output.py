@@ -3,7 +3,8 @@
 """What the commands share: tables, JSON, paths, exit statuses."""
 
 import json
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -84,6 +85,18 @@ CLOCK_COLUMNS = (TextColumn("{task.fields[clock]}"), BarColumn(), SHOWN_COLUMN)
 def progress_bar(*columns: ProgressColumn, quiet: bool = False) -> Progress:
     """A progress bar on standard error."""
     return Progress(*columns, console=Console(stderr=True, quiet=quiet))
+
+
+@contextmanager
+def flight_progress(duration: float, *, quiet: bool) -> Iterator[tuple[Callable[[float, str], None], Callable[[str], None]]]:
+    """The progress bar of a flight, s: a function for the flight time and the text beside it, and one for a line above."""
+    with progress_bar(*CLOCK_COLUMNS, quiet=quiet) as bar:
+        task = bar.add_task("flight", total=duration, clock="", shown="")
+
+        def progress(t: float, shown: str) -> None:
+            bar.update(task, completed=t, clock=f"t = {t:5.1f} of {duration:g} s", shown=shown)
+
+        yield progress, lambda line: bar.console.print(line, highlight=False, soft_wrap=True)
 
 
 def grouped_table(title: str, first: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Table:

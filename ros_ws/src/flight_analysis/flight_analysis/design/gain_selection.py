@@ -422,7 +422,7 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
     channels = ChannelPairing(controller.outputs, controller.inputs)
     D = require_channels(study.Omega[np.ix_(rows, columns)], channels, controller.D)
     params = controller.law_params()
-    loop = _loop(controller)
+    loop = loop_of(controller)
     bounds, holds, counts = _bounds(study, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2)
     gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
     C, Bs = study.C[rows], study.B[:, :, columns]
@@ -469,7 +469,7 @@ def margins(scenario: Scenario, controller: ControllerParameters) -> dict[str, A
     airframe = load_airframe(scenario.aircraft.airframe)
     rows, columns = law_order(airframe, controller)
     A, B, C = airframe.matrix_a() + airframe.matrix_gravity(), airframe.matrix_b()[:, columns], airframe.matrix_c()[rows]
-    plant, loop = LinearPlant(A, B, C), _loop(controller)
+    plant, loop = LinearPlant(A, B, C), loop_of(controller)
     linear = linear_law(controller.tuned_law(), len(rows), loop.period)
     each = {name: delay_margin(plant, linear, loop, channel) for channel, name in enumerate(controller.outputs)}
     return {"delay_margin": delay_margin(plant, linear, loop), "channels": each, "least": loop.period}
@@ -482,7 +482,7 @@ def stable_speed_ratio(study: Study, controller: RiseDiParameters) -> float:
     SPEED_STEP, and infinite where the linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
     """
     rows, columns = law_order(study.airframe, controller)
-    loop, linear = _loop(controller), linear_law(controller.tuned_law(), len(rows), 1.0 / controller.rate)
+    loop, linear = loop_of(controller), linear_law(controller.tuned_law(), len(rows), 1.0 / controller.rate)
     surfaces, no_delay = np.array([name != "V" for name in controller.outputs]), np.zeros(len(rows))
     plant, steps = LinearPlant(study.A[0] + study.gravity, study.B[0][:, columns], study.C[rows]), round(1.0 / SPEED_STEP)
     for step in range(steps, round(MAX_SPEED_RATIO * steps) + 1):
@@ -492,7 +492,8 @@ def stable_speed_ratio(study: Study, controller: RiseDiParameters) -> float:
     return math.inf
 
 
-def _loop(controller: ControllerParameters) -> Loop:
+def loop_of(controller: ControllerParameters) -> Loop:
+    """The loop of a controller."""
     return Loop(np.array(controller.lag, dtype=np.float64), controller.delay, 1.0 / controller.rate)
 
 

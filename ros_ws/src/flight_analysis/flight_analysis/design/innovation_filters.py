@@ -48,8 +48,8 @@ class Actuation(NamedTuple):
     delay: float  # s
 
 
-def recording(tape: Tape, airframe: Airframe, rate: float | None = None) -> Recording:
-    """Y and u of a tape at the rate of u, from the first u on, or at `rate` in Hz.
+def recording(tape: Tape, airframe: Airframe) -> Recording:
+    """Y and u of a tape at the rate of u, from the first u on.
 
     y is the sample nearest to the instant, within half a period; u is the last one. Raises ParameterError for a log without
     the channels of the airframe, or one shorter than ten times the transient.
@@ -59,7 +59,7 @@ def recording(tape: Tape, airframe: Airframe, rate: float | None = None) -> Reco
         of = f"the channels of the airframe {airframe.name}: {', '.join(expected)}"
         require(sorted(found) == sorted(expected), f"topic {topic}", ", ".join(found), of)
     require(len(u.stamp_ns) > 1 and len(y.stamp_ns) > 1, "the log", f"{len(u.stamp_ns)} samples of u", "a flight")
-    period_ns = round(NANOSECONDS / rate) if rate else round(float(np.median(np.diff(u.stamp_ns))))
+    period_ns = round(float(np.median(np.diff(u.stamp_ns))))
     require(period_ns > 0, "topic u", "samples with equal stamps", "one a period")
     instants = np.arange(u.stamp_ns[0], min(u.stamp_ns[-1], y.stamp_ns[-1]) + 1, period_ns)
     seconds = len(instants) * period_ns / NANOSECONDS

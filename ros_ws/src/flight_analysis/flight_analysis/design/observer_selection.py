@@ -24,7 +24,7 @@ from control_laws.observer_design import (
     extended_state_observer,
 )
 from flight_analysis.design.gain_conditions import MIN_GAIN, MIN_K
-from flight_analysis.design.gain_selection import law_order, with_feedforward
+from flight_analysis.design.gain_selection import law_order, loop_of, with_feedforward
 from flight_analysis.design.nominal import nominal_model
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
@@ -86,11 +86,6 @@ def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> Observer
     if "beta" in values:
         return ObserverGains(K, Lambda, values["beta"], np.broadcast_to(values["softening"], K.shape), weights)
     return ObserverGains(K, SHARE * Lambda, K / T, 1.0 / ((1.0 - SHARE) * Lambda * T), weights)
-
-
-def loop_of(controller: ControllerParameters) -> Loop:
-    """The loop of a controller."""
-    return Loop(np.array(controller.lag), controller.delay, 1.0 / controller.rate)
 
 
 def model_for(airframe: Airframe, controller: ControllerParameters, noise: FloatArray) -> NominalModel:

@@ -58,14 +58,15 @@ def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
     return f"{name} ({unit})" if unit else name
 
 
+def display_unit(unit: str) -> DisplayUnit:
+    """The unit in which a channel of a unit of the airframe file is shown: mrad/s for rad/s, otherwise that unit."""
+    return DisplayUnit("mrad/s", 1e3) if unit == "rad/s" else DisplayUnit(unit, 1.0 / SI_PER_UNIT[unit])
+
+
 def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
-    """Units of tables and figures by channel of y and u: angular rates in mrad/s, inputs as in the airframe file."""
+    """Units of tables and figures by channel of y and u."""
     channels = scenario.aircraft.channels()
-    units = {
-        name: DisplayUnit("mrad/s", 1e3) if unit == "rad/s" else DisplayUnit(unit, 1.0 / SI_PER_UNIT[unit])
-        for name, unit in channels.outputs.items()
-    }
-    return units | {name: DisplayUnit(unit, 1.0 / SI_PER_UNIT[unit]) for name, unit in channels.inputs.items()}
+    return {name: display_unit(unit) for name, unit in {**channels.outputs, **channels.inputs}.items()}
 
 
 def pulse_edges(scenario: Scenario) -> list[Transient]:
