@@ -18,7 +18,7 @@ from flight_core.vectors import FloatArray
 class Signal:
     """One topic: N samples of k named channels, SI units and radians.
 
-    stamp_ns: shape (N,), int64, the instant of each sample. values: shape (N, k).
+    stamp_ns: shape (N,), int64, the instant of each sample, ascending. values: shape (N, k).
     """
 
     stamp_ns: NDArray[np.int64]
@@ -33,8 +33,8 @@ class Signal:
 
     def until(self, end_ns: int) -> "Signal":
         """The samples up to and including an instant."""
-        keep = self.stamp_ns <= end_ns
-        return Signal(self.stamp_ns[keep], self.names, self.values[keep])
+        count = int(np.searchsorted(self.stamp_ns, end_ns, side="right"))
+        return Signal(self.stamp_ns[:count], self.names, self.values[:count])
 
     def within(self, windows: Sequence[tuple[int, int]]) -> "Signal":
         """The samples inside windows (first, last instant), ns."""

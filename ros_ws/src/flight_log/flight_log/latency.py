@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Latency of the loop from y to u, by the times at which the log says that they were sent."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
@@ -13,16 +15,30 @@ CHANNEL = "y_to_u"
 TOPICS = ("y", "u")
 
 
-def latency(sent: Mapping[str, Mapping[int, int]]) -> Signal | None:
+class Times(NamedTuple):
+    """Stamps of some messages of a topic and the times of their sending, ns, shape (N,)."""
+
+    stamp_ns: NDArray[np.int64]
+    sent_ns: NDArray[np.int64]
+
+
+def latency(sent: Mapping[str, Sequence[Times]]) -> Signal | None:
     """Time from the sending of a y to the sending of the u with its stamp, s: one channel, by the stamps of u.
 
-    `sent` holds the times of sending by stamp, ns, by the full names of all topics y and u. None when the log does not hold
-    it: it holds no y or no u, or several aircraft, or all times are equal, as in a flight in one process.
+    `sent` holds the times by the full names of all topics y and u. None when the log does not hold it: it holds no y or no u,
+    or several aircraft, or all times are equal, as in a flight in one process.
     """
     topics = {topic.rpartition("/")[2]: topic for topic in sent}
-    if len(sent) != len(TOPICS) or len(topics) != len(TOPICS):
+    if len(sent) != len(TOPICS) or len(topics) != len(TOPICS) or not all(sent.values()):
         return None
-    y, u = (sent[topics[name]] for name in TOPICS)
-    stamps = sorted(stamp for stamp in u if stamp in y)
-    values = np.array([(u[stamp] - y[stamp]) / NANOSECONDS for stamp in stamps])
-    return Signal(np.array(stamps, dtype=np.int64), (CHANNEL,), values[:, None]) if values.any() else None
+    y, u = (_last_of_each(sent[topics[name]]) for name in TOPICS)
+    stamps, of_y, of_u = np.intersect1d(y.stamp_ns, u.stamp_ns, assume_unique=True, return_indices=True)
+    values = (u.sent_ns[of_u] - y.sent_ns[of_y]) / NANOSECONDS
+    return Signal(stamps, (CHANNEL,), values[:, None]) if values.any() else None
+
+
+def _last_of_each(times: Sequence[Times]) -> Times:
+    """The times in the order of their stamps, the last one of each stamp."""
+    stamp_ns, sent_ns = (np.concatenate(arrays)[::-1] for arrays in zip(*times, strict=True))
+    unique_ns, place = np.unique(stamp_ns, return_index=True)
+    return Times(unique_ns, sent_ns[place])

@@ -82,6 +82,17 @@ def stamp_of(data: bytes) -> int:
     return int.from_bytes(data[STAMP][:4], "little", signed=True) * NANOSECONDS + int.from_bytes(data[STAMP][4:], "little")
 
 
+def stamps_of(messages: Sequence[bytes]) -> NDArray[np.int64]:
+    """The stamps of messages that begin with them, ns, shape (N,)."""
+    stamps = np.frombuffer(b"".join([message[STAMP] for message in messages]), dtype=np.uint8).reshape(-1, 8)
+    return _stamps(stamps)
+
+
+def _stamps(stamps: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Stamps in ns from their bytes, shape (N, 8)."""
+    return stamps.view("<i4")[:, 0].astype(np.int64) * NANOSECONDS + stamps.view("<u4")[:, 1]
+
+
 def _instance(frame_id: str) -> str:
     """The instance of the publisher, without the message authentication code."""
     return frame_id.partition(MARK)[0]
@@ -179,8 +190,7 @@ class _JointStateDecoder:
         same = ((table ^ self._template) & self._constant).max(axis=1) == 0
         rest += [message for message, matches in zip(same_size, same, strict=True) if not matches]
         table = table[same]
-        stamps = np.ascontiguousarray(table[:, STAMP])
-        stamp_ns = stamps.view("<i4")[:, 0].astype(np.int64) * NANOSECONDS + stamps.view("<u4")[:, 1]
+        stamp_ns = _stamps(np.ascontiguousarray(table[:, STAMP]))
         values = np.ascontiguousarray(table[:, self._values]).view("<f8")
         return [Samples(self._names, stamp_ns, values, self._sender)] if len(table) else [], rest
 

@@ -10,9 +10,10 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple, TypeVar
 
 import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -30,12 +31,14 @@ from mcap.records import (
     Statistics,
 )
 from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 
 # What reading raises when bytes were changed: between records, inside a record, inside a compressed chunk.
 DECODE_ERRORS = (McapError, MemoryError, OverflowError, UnicodeDecodeError, struct.error, zstandard.ZstdError)
 
 RECORD = struct.Struct("<BQ")  # opcode and length, before each record (MCAP specification, Records)
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time and publish time, before each message
+TIMES_OF_MESSAGE = np.arange(6, MESSAGE.size)  # the bytes of the two times
 TIMES = struct.Struct("<QQ")  # log times of the first and the last message, before each chunk
 CHUNK = struct.Struct("<QQQII")  # these, size and checksum of the records, length of the compression's name before this name
 LENGTH = struct.Struct("<Q")  # before the records of a chunk
@@ -70,8 +73,20 @@ class _Decompressor(threading.local):
 _OF_THREAD = _Decompressor()
 
 
+class MessageBatch(NamedTuple):
+    """Messages of one channel in one chunk, in their order."""
+
+    channel_id: int
+    data: list[bytes]
+    log_ns: NDArray[np.int64]
+    publish_ns: NDArray[np.int64]
+
+
+R = TypeVar("R")
+
+
 class Scan:
-    """One file, read once by `records`. The attributes are valid afterwards."""
+    """One file, read once by `records` or `batches`. The attributes are valid afterwards."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -92,6 +107,13 @@ class Scan:
         Schemas and channels of the index come first, so that a damaged chunk does not lose them. Raises OSError when the file
         cannot be read, and nothing when its content is damaged.
         """
+        return self._read(decode)
+
+    def batches(self) -> Iterator[McapRecord | MessageBatch]:
+        """As `records`, with the messages of each channel in a chunk together, which is several times faster."""
+        return self._read(decode_batches)
+
+    def _read(self, decode: Callable[[int, bytes], Iterator[R]]) -> Iterator[R | Schema | Channel]:
         with self.path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             index = self._index(stream, size)
@@ -103,7 +125,7 @@ class Scan:
                 except DECODE_ERRORS:
                     self.damaged += 1
                     continue
-                missing -= sum(isinstance(record, Message) for record in records)
+                missing -= sum(_messages_in(record) for record in records)
                 yield from records
             if missing > 0 and not self.damaged:  # a changed opcode makes a record unrecognisable
                 self.damaged += 1
@@ -180,6 +202,46 @@ def split(data: bytes) -> Iterator[McapRecord]:
         else:
             yield from decode(opcode, data[position:end])
         position = end
+
+
+def _messages_in(record: object) -> int:
+    return len(record.data) if isinstance(record, MessageBatch) else isinstance(record, Message)
+
+
+def decode_batches(opcode: int, content: bytes) -> Iterator[McapRecord | MessageBatch]:
+    """As `decode`, with the messages of each channel together. Raises one of DECODE_ERRORS."""
+    for record in _split_batches(decompress(content)) if opcode == Opcode.CHUNK else decode(opcode, content):
+        if isinstance(record, Message):
+            times = (np.array([time], dtype=np.uint64).view(np.int64) for time in (record.log_time, record.publish_time))
+            yield MessageBatch(record.channel_id, [record.data], *times)
+        else:
+            yield record
+
+
+def _split_batches(data: bytes) -> Iterator[McapRecord | MessageBatch]:
+    """The records in a chunk, and then its messages by channel. Raises one of DECODE_ERRORS."""
+    places: dict[int, list[int]] = {}  # of the records of messages, by channel
+    ends: dict[int, list[int]] = {}
+    position, size, head, unpack = 0, len(data), RECORD.size, RECORD.unpack_from
+    while position < size:
+        opcode, length = unpack(data, position)
+        begin = position + head
+        position = begin + length
+        if position > size:
+            raise McapError("a record longer than its container")
+        if opcode == Opcode.MESSAGE and length >= MESSAGE.size:
+            channel = data[begin] | data[begin + 1] << 8
+            if channel not in places:
+                places[channel], ends[channel] = [], []
+            places[channel].append(begin)
+            ends[channel].append(position)
+        else:
+            yield from decode(opcode, data[begin:position])
+    content = np.frombuffer(data, dtype=np.uint8)
+    for channel, begins in places.items():
+        times = content[np.array(begins)[:, None] + TIMES_OF_MESSAGE].view("<i8")
+        messages = [data[begin + MESSAGE.size : end] for begin, end in zip(begins, ends[channel], strict=True)]
+        yield MessageBatch(channel, messages, times[:, 0], times[:, 1])
 
 
 def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from numpy.typing import NDArray
 
 from flight_core.files import is_file, is_folder
@@ -21,10 +21,10 @@ from flight_core.vectors import FloatArray
 from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
 from flight_log.latency import TOPICS as TIMED_TOPICS
-from flight_log.latency import latency
-from flight_log.named_vectors import PATH, STAMP, Decoder, decode_routes, decoder, flight_start_ns, stamp_of
+from flight_log.latency import Times, latency
+from flight_log.named_vectors import PATH, STAMP, Decoder, decode_routes, decoder, flight_start_ns, stamps_of
 from flight_log.rosbag2_metadata import METADATA, bag_files, is_compressed, read_bag_metadata
-from flight_log.scan import Scan
+from flight_log.scan import MessageBatch, Scan
 
 ROUTE = "route"
 BATCH = 4096  # messages that are decoded together
@@ -123,9 +123,9 @@ class _TopicSamples:
         self._spans: dict[str, tuple[int, int]] = {}  # by publisher: its first and its last stamp
         self._refused = 0
 
-    def add(self, message: bytes) -> None:
-        self._batch.append(message)
-        if len(self._batch) == BATCH:
+    def add(self, messages: list[bytes]) -> None:
+        self._batch += messages
+        if len(self._batch) >= BATCH:
             self._decode_batch()
 
     def _decode_batch(self) -> None:
@@ -147,10 +147,11 @@ class _TopicSamples:
         if not self._samples:
             return None
         names = self._names()
-        stamps, values = zip(*self._samples[names], strict=True)
-        stamp_ns = np.concatenate(stamps)
-        order = np.argsort(stamp_ns, kind="stable")
-        return Signal(stamp_ns[order], names, np.concatenate(values)[order])
+        stamps, values = (np.concatenate(arrays) for arrays in zip(*self._samples[names], strict=True))
+        if np.any(stamps[1:] < stamps[:-1]):
+            order = np.argsort(stamps, kind="stable")
+            stamps, values = stamps[order], values[order]
+        return Signal(stamps, names, values)
 
     def _names(self) -> tuple[str, ...]:
         """The names of the first sample, or of more samples that have further names beside these."""
@@ -185,30 +186,40 @@ class _Log:
         self.truncated: list[str] = []  # names of the truncated files
         self.last_ns = 0  # log time of the last message
         self.known_end_ns = 0  # the latest log time in any index or metadata
-        self.sent: dict[str, dict[int, int]] = {}  # of y and u by full topic name: times of sending by stamp, ns
+        self.sent: dict[str, list[Times]] = {}  # of y and u by full topic name
         self.reports: dict[str, list[tuple[int, bytes]]] = {}  # of bridges by full topic name: time of sending, ns, and message
-        self.clock_step_ns = 0  # how far the system clock was set, by the last y or u: the nodes keep the time of their stamps
+        self.times: Times | None = None  # of the last y or u of a chunk
 
-    def reader_of(self, topic: str, type_name: str) -> Callable[[Message], None] | None:
+    def reader_of(self, topic: str, type_name: str) -> Callable[[MessageBatch], None] | None:
         """What takes the messages of a topic; None for a topic that plays no part."""
         samples = self.samples_of(topic, type_name)
         if samples is not None and topic.rpartition("/")[2] in TIMED_TOPICS:
+            times = self.sent.setdefault(topic, [])
 
-            def take(message: Message) -> None:
-                samples.add(message.data)
-                if len(message.data) >= STAMP.stop:
-                    stamp_ns = stamp_of(message.data)
-                    self.sent.setdefault(topic, {})[stamp_ns] = message.publish_time
-                    offset_ns = message.publish_time - stamp_ns
-                    self.clock_step_ns = offset_ns if abs(offset_ns) > LEAST_CLOCK_STEP_NS else 0
+            def take(batch: MessageBatch) -> None:
+                samples.add(batch.data)
+                stamped = np.array([len(data) >= STAMP.stop for data in batch.data])
+                if stamped.any():
+                    stamps = stamps_of([data for data in batch.data if len(data) >= STAMP.stop])
+                    self.times = Times(stamps, batch.publish_ns[stamped])
+                    times.append(self.times)
 
             return take
         if samples is not None:
-            return lambda message: samples.add(message.data)
+            return lambda batch: samples.add(batch.data)
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             reports = self.reports.setdefault(topic, [])
-            return lambda message: reports.append((message.publish_time - self.clock_step_ns, message.data))
+            return lambda batch: reports.extend(zip(map(self._time_of_stamps, batch.publish_ns), batch.data, strict=True))
         return None
+
+    def _time_of_stamps(self, sent_ns: np.int64) -> int:
+        """A time of sending by the clock of the stamps: the nodes keep their time when the system clock is set."""
+        if self.times is not None:
+            nearest = np.argmin(np.abs(self.times.sent_ns - sent_ns))
+            offset_ns = self.times.sent_ns[nearest] - self.times.stamp_ns[nearest]
+            if abs(offset_ns) > LEAST_CLOCK_STEP_NS:
+                return int(sent_ns - offset_ns)
+        return int(sent_ns)
 
     def samples_of(self, topic: str, type_name: str) -> _TopicSamples | None:
         """The samples of a topic; None for a type without named vectors that is no route."""
@@ -271,12 +282,12 @@ def _bag_metadata(run: Path, log: _Log) -> Mapping[str, Any]:
 
 def _read_mcap(file: Path, log: _Log) -> None:
     schemas: dict[int, str] = {}
-    channels: dict[int, Callable[[Message], None]] = {}
+    channels: dict[int, Callable[[MessageBatch], None]] = {}
     scan = Scan(file)
     try:
-        for record in scan.records():
-            if isinstance(record, Message):
-                log.last_ns = max(log.last_ns, record.log_time)
+        for record in scan.batches():
+            if isinstance(record, MessageBatch):
+                log.last_ns = max(log.last_ns, int(record.log_ns.max()))
                 if (take := channels.get(record.channel_id)) is not None:
                     take(record)
             elif isinstance(record, Schema):
@@ -303,7 +314,7 @@ def _read_other(run: Path, log: _Log) -> None:
         with Reader(run) as reader:
             for connection, _, message in reader.messages():
                 if (samples := log.samples_of(connection.topic, connection.msgtype)) is not None:
-                    samples.add(bytes(message))
+                    samples.add([bytes(message)])
     except Exception as error:  # of SQLite, of YAML, of a decompressor: the content may be damaged anywhere
         raise ParameterError(f"{run}: cannot be read ({error or type(error).__name__}), expected a bag of rosbag2") from None
 
