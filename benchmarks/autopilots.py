@@ -638,6 +638,8 @@ Flights of ArduPlane 4.8.0-dev and PX4 1.16.0 in software, on two cores beside o
 says what the kit is. Age limits of y and u: 1 s, for the host. The identified gains fly the scenario that `identify` writes:
 pulses of 50 mrad/s in q and 150 mrad/s in p in coordinated turns, a step of at most 2 m/s in V. The errors of PX4's
 airplane are those of y, which has the low-pass of its map since its first flight; *true* is by the rates of its simulator.
+Flights before 2026-11-23 have the times of their commands from the first y of the bridge, not from the first y_m: some
+seconds early. Their rms while commanded is to be measured again.
 
 {UNMET}
 """
