@@ -3,6 +3,7 @@
 """Monte Carlo campaigns: statistics of constant size, chunks that do not depend on engine or order, kill and resume."""
 
 import json
+import os
 import shlex
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import dask
 import numpy as np
 import psutil
 import pytest
@@ -400,6 +402,12 @@ def test_a_campaign_goes_on_with_a_scheduler_that_is_back() -> None:
     with cluster(int(address.rsplit(":", 1)[1])):
         results += list(flown)
     assert sorted(results) == [((k,), k**2) for k in range(20)]
+
+
+def test_a_chunk_that_ends_its_workers_is_one_sentence() -> None:
+    sentence = "--engine dask: found a chunk that ended 2 workers, as one .* expected a smaller --chunk"
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), pytest.raises(ParameterError, match=sentence):
+        next(engines.dask(1)(lambda _: os._exit(1), [(0,)]))
 
 
 def test_two_dask_workers_give_the_same_figures_and_a_killed_one_repeats_only_its_chunks(

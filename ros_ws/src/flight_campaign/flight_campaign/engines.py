@@ -53,7 +53,7 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
-        from distributed import CancelledError, Client, LocalCluster, as_completed  # noqa: PLC0415 - half a second
+        from distributed import CancelledError, Client, KilledWorker, LocalCluster, as_completed  # noqa: PLC0415 - half a second
         from distributed.comm import CommClosedError  # noqa: PLC0415 - as above
 
         waiting, count, patience = iter(jobs), workers or os.cpu_count() or 1, CONNECT
@@ -89,6 +89,9 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                         yield job, result
                 except (CancelledError, CommClosedError):
                     lost, patience = list(underway.values()), RECONNECT
+                except KilledWorker as error:
+                    found = f"a chunk that ended {error.allowed_failures + 1} workers, as one that needs too much memory does"
+                    raise ParameterError(f"--engine dask: found {found}, expected a smaller --chunk") from None
                 else:
                     return
 
