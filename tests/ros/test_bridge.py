@@ -285,6 +285,8 @@ def test_a_stopped_bridge_a_second_autopilot_and_a_lost_terminal_each_release_th
 
     def engage() -> None:
         setup.peer.until(lambda: setup.engage(each=command) == "", each=command)
+        setup.joys.clear()
+        setup.peer.until(lambda: len(setup.joys) > 5, each=command)
 
     engage()
     with bridge.stopped():  # until the autopilot flies on its own law
@@ -314,8 +316,12 @@ def test_an_engagement_that_is_not_waited_for_any_more_is_withdrawn(setup: Bridg
         "awaited": True,
         "source": "a test",
     }
+    request = {"topic": "/ap/request", "type": "std_msgs/msg/UInt8", "rate": 5.0, "stamped": False}
+    requests = {"enter": request | {"when": "engaging"}, "leave": request | {"when": "release"}}  # as with the map of PX4
+    qos = {"reliability": "reliable", "durability": "volatile", "depth": 1}
     setup.change_map(conditions={"guided": condition}, engage_timeout=1e3)
-    setup.change_map("topics", **{"/ap/mode": {"reliability": "reliable", "durability": "volatile", "depth": 1}})
+    setup.change_map("messages", **requests)
+    setup.change_map("topics", **{"/ap/mode": qos, "/ap/request": qos})
     setup.autopilot()
     bridge = setup.bridge("-p", "dry_run:=false")
     mode = setup.peer.node.create_publisher(UInt8, "/ap/mode", 1)

@@ -4,6 +4,7 @@
 
 import os
 import time
+from collections import Counter
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -310,19 +311,21 @@ class BridgeNode(FlightNode[BridgeParameters]):
     def _find_conflicts(self) -> None:
         """Tell the bridge which topics have two publishers: of two autopilots y would be mixed, and both would be flown.
 
-        Any number of transmitters may override.
+        They are those that are read and those of setpoints. Transmitters may override in any number, others may request a mode.
         """
         read = {
             subscription.name
             for subscription, rows in self._readers
             if not all(isinstance(row, OverrideRow) for _, row in rows)
         }
-        sent = {outgoing.publisher.topic_name for outgoing in self._outgoing.values()}
-        counts = {topic: self.count_publishers(topic) for topic in sorted(read | sent)}
+        setpoints = {self._outgoing[row.message].publisher.topic_name for row in self._map.inputs.values()}
+        own = Counter(outgoing.publisher.topic_name for outgoing in self._outgoing.values())  # two messages may share a topic
+        counts = {topic: self.count_publishers(topic) - own[topic] for topic in sorted(read | setpoints)}
         self._bridge.conflict = "; ".join(
-            f"{topic} has {count} publishers, expected {'this bridge' if topic in sent else 'the autopilot'} alone"
+            f"{topic} has {count} publishers{' beside this bridge' if topic in setpoints else ''}, expected "
+            f"{'none' if topic in setpoints else 'the autopilot alone'}"
             for topic, count in counts.items()
-            if count > 1
+            if count > (topic not in setpoints)
         )
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
