@@ -109,7 +109,7 @@ def test_turbulence_moves_the_aircraft_as_much_as_under_the_autopilots_own_law(p
     ended = began + (one["stop"] or SCENARIO.flight.duration) - one["start"]
     t, q = plane.log("ATTITUDE", "pitchspeed")
     own, law = (np.std(q[(t > start) & (t < stop)]) for start, stop in ((began - before, began), (began, ended)))
-    assert ended - began > before / 2.0, "too short for an rms"
+    assert ended - began > before / 2.0, f"too short for an rms: {one['reason']}"
     assert law < 2.0 * own
     assert one["stop"] is None or "outside the envelope" in one["reason"]
 
