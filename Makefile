@@ -27,25 +27,25 @@ ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group docs --gro
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
 
-# Files of tests/ros come first: they wait more than they compute.
-XDIST = $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+XDIST = $(BIN)/python -m pytest --maxprocesses 4 --dist loadfile
 
 .PHONY: fly test test-fast test-sitl check docs evidence foxglove messages setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
 
-# Two workers fill two cores: threads of OpenBLAS would only wait for each other.
+# The workers fill the processors: threads of OpenBLAS would only wait for each other.
 test test-fast: export OPENBLAS_NUM_THREADS = 1
 
+# Files of tests/ros come first. They wait more than they compute: there is a worker more than processors.
 # Those that fly in real time and measure it come last, by themselves.
 test: check
 	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; trap "exit 130" INT; \
-	  $(XDIST) --no-loadscope-reorder -m "not alone" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
+	  $(XDIST) -n $$(($$(nproc) + 1)) --no-loadscope-reorder -m "not alone" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
 	  $(BIN)/python -m pytest -m alone tests/ros || status=$$?; exit $$status)
 
 test-fast: .venv/.all .venv/.workspace
-	@$(XDIST) --quiet -m "not slow" tests/pure
+	@$(XDIST) -n auto --quiet -m "not slow" tests/pure
 
 test-sitl: setup-all
 	$(BIN)/python -m pytest tests/sitl -m "not long" $(ARGS)
