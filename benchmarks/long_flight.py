@@ -27,8 +27,8 @@ from typing import Any
 
 import numpy as np
 import psutil
-from benchmarks.host_delays import Intervals
-from benchmarks.processes import RISE_DI, delay_monitors, real_time
+from benchmarks.host_delays import Intervals, missed_excluding_delays
+from benchmarks.processes import PRIORITY, RISE_DI, delay_monitors, real_time
 from benchmarks.view import Client, figures_of_ticks, watching
 from tests.browser import CHROMIUM, Browser
 
@@ -79,7 +79,8 @@ def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], in
 
     The second result is the most memory of `rise-di fly` after that, while it writes the report, bytes.
     """
-    command = [RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
+    within = real_time() if mode == "in real time" else ()
+    command = [*within, RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
     memory: dict[str, list[int]] = {}
     with ExitStack() as stack:
         flight = stack.enter_context(psutil.Popen(command, stdout=subprocess.DEVNULL))
@@ -115,17 +116,26 @@ def end(flight: psutil.Popen) -> None:
         flight.wait()
 
 
-def missing(tape: Tape, scenario: Scenario) -> dict[str, int]:
-    """How many samples of each topic the log lacks, from its first to its last instant."""
+def missing(tape: Tape, scenario: Scenario, delays: Intervals | None, *, real_time: bool) -> dict[str, dict[str, int]]:
+    """How many samples of each topic the log lacks between its first and its last, also excluding host delays where known.
+
+    In real time a late tick skips instants. It is late by 0 to 1 period, so a gap ends half a period after the next stamp.
+    Each u carries the stamp of a y, and `figures_of_ticks` counts the ticks of the controller.
+    """
     guidance = scenario.guidance
     if guidance is None:
         raise ValueError("found no guidance")
-    rates = {"y": scenario.aircraft.rate, "y_m": scenario.reference_model.rate, "u": scenario.controller.rate}
+    rates = {"y": scenario.aircraft.rate, "y_m": scenario.reference_model.rate}
+    rates |= {} if real_time else {"u": scenario.controller.rate}
     rates |= dict.fromkeys(("u_m", "guidance"), guidance.rate)
-    lacking = {}
+    lacking: dict[str, dict[str, int]] = {}
     for name, rate in rates.items():
-        stamps = tape[name].stamp_ns
-        lacking[name] = int((stamps[-1] - stamps[0]) // period_ns(rate, name)) + 1 - len(stamps)
+        stamps, period = tape[name].stamp_ns, period_ns(rate, name)
+        lateness = period // 2 if real_time else 0
+        gaps = np.column_stack((stamps[:-1] + period, stamps[1:] + lateness))[np.diff(stamps) > 1.5 * period]
+        for words, known in (("missing samples", ()), ("missing samples, excluding host delays", delays)):
+            if known is not None:
+                lacking.setdefault(words, {})[name] = missed_excluding_delays(gaps, known, period)
     return lacking
 
 
@@ -164,7 +174,7 @@ def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None
         "outcome": json.loads((run / "summary.json").read_text(encoding="utf-8"))["outcome"],
         "minutes": (tape["y"].stamp_ns[-1] - tape.start_ns) / NANOSECONDS / 60.0,
         "legs": int(log["leg"].max()),
-        "missing": missing(tape, scenario),
+        "missing": missing(tape, scenario, delays, real_time=real_time),
         "lost": sum(int(count) for count in read.metadata.get(LOST_MESSAGES, {}).values()),
         "ticks": figures_of_ticks(tape["internals"], delays, period_ns(scenario.controller.rate, "rate")) if real_time else {},
         "guidance": {"steps": replay.steps, "differing": replay.differing},
@@ -201,8 +211,9 @@ def main() -> None:
         clock = time.time_ns() - time.monotonic_ns()
         host = [(since + clock, until + clock) for since, until in delays()] if delays else None
         aircraft = "osprey with an observer" if options.observer else "c172p"
+        priority = f" at FIFO {PRIORITY}" if host else ""
         found = {
-            "flight": f"the {aircraft}, {options.mode}",
+            "flight": f"the {aircraft}, {options.mode}{priority}",
             "took": took,
             **figures((runs / "latest").resolve(), memory, host, real_time=timed),
         }

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 from benchmarks.host_delays import missed_excluding_delays
+from benchmarks.long_flight import missing, triangle
 from benchmarks.view import figures_of_ticks
 
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Signal
+from flight_core.tape import Signal, Tape
 
 PERIOD_NS = 2_000_000
 
@@ -44,3 +45,15 @@ def test_a_pause_of_a_second_counts_inside_a_window_and_not_outside_of_it() -> N
         assert math.isclose(figures["late p99 (ms)"], 1.0)
     delay = [(1_002_000_000, 1_502_000_000)]  # of the host, half of the pause
     assert figures_of_ticks(internals, delay, PERIOD_NS)["missed ticks, excluding host delays"] == 250
+
+
+def test_instants_that_a_late_tick_skips_are_missing_samples_except_in_host_delays() -> None:
+    scenario = triangle(1.0, observer=True)  # y and y_m at 500 Hz, u_m and guidance at 50 Hz
+    every = np.arange(0, 100 * PERIOD_NS, PERIOD_NS)
+    slow = Signal(every[::10], (), np.zeros((10, 0)))
+    y = Signal(np.delete(every, (20, 50, 51)), (), np.zeros((97, 0)))
+    tape = Tape({"y": y, "y_m": Signal(every, (), np.zeros((100, 0))), "u_m": slow, "guidance": slow})
+    delays = [(int(20.2 * PERIOD_NS), 21 * PERIOD_NS)]  # the late tick 19 or the skipped tick 20
+    found = missing(tape, scenario, delays, real_time=True)
+    assert found["missing samples"] == {"y": 3, "y_m": 0, "u_m": 0, "guidance": 0}
+    assert found["missing samples, excluding host delays"] == {"y": 2, "y_m": 0, "u_m": 0, "guidance": 0}
