@@ -52,7 +52,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of the modules above."""
+    """Mark the tests of the modules above. The quick ones come last: no worker computes long after the others have ended."""
     for item in items:
         folder = item.path.relative_to(REPOSITORY / "tests").parts[0]
         name = item.path.stem.removeprefix("test_")
@@ -60,6 +60,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("slow")
         if folder == "ros" and name in ALONE:
             item.add_marker("alone")
+    items.sort(key=lambda item: item.path.parent.name == "pure" and item.get_closest_marker("slow") is None)
 
 
 @pytest.fixture(scope="session")
