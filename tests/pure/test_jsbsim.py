@@ -204,7 +204,9 @@ def test_a_computation_without_end_in_the_isolated_process_times_out_by_its_proc
         isolated.call(re.match, "(a+)+$", "a" * 100 + "b", timeout=2.0)  # tries 2**100 ways
     after = os.times()
     used = after.children_user + after.children_system - before.children_user - before.children_system
-    assert 1.9 < used < 3.5  # Linux looks at the limit once a tick; the rest is what starts and ends a process
+    # Linux counts whole ticks for the limit: beside load of real-time priority 2 s where the process ran for 1.2 s. The rest is
+    # what starts and ends a process.
+    assert 1.0 < used < 3.5
 
 
 def test_the_isolated_process_keeps_a_limit_of_processor_time_that_the_user_has() -> None:

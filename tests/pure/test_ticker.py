@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ticks: deadlines on the monotonic clock, overruns, the busy-wait before a deadline, requests to Linux's scheduler."""
 
+import os
 import platform
 import re
 import subprocess
@@ -81,6 +82,7 @@ def kernel() -> tuple[int, ...]:
 @pytest.mark.skipif(
     kernel() < (6, 12) or not (THREADS.parent / "sched").exists(), reason="needs Linux 6.12, CONFIG_SCHED_DEBUG"
 )
+@pytest.mark.skipif(os.sched_getscheduler(0) != os.SCHED_OTHER, reason="only the default policy has time slices")
 def test_every_thread_of_a_node_has_short_time_slices() -> None:
     code = """
 import threading, time
