@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ Result = dict[str, Any]
 WIDTH = 120  # characters of a line of prose
 HARD_SPACE = "\u00a0"  # no line is broken here
 BUSY = 0.1  # share of the processors in use just before a measurement; the page marks results above it
+MINUTE = 60.0  # s, to which the date of a measurement is known
 ECHOES = ("bare echo, single", "bare echo, multi", "bare echo, events")  # rows of the group "node"
 MEASURED = re.compile(r"^    .+    # \d{4}-\d\d-\d\d ", re.MULTILINE)  # a command with its date
 GOAL, NOT_MET, UNMET = "- Goal: ", "**not met**", "UNMET"
@@ -68,11 +70,24 @@ def render(measurements: Sequence[Measurement], results: Mapping[str, Result], b
         results=results,
         hosts=sorted({*hosts, *re.findall(r"^- (.+, Python \S+)$", before, re.MULTILINE)}),
         value=lambda name: results[name]["result"] if name in results else None,
+        beside=lambda name: beside(name, results),
     )
     kept = {_heading(section): section for section in _sections(before) if MEASURED.search(section)}
     return finished(
         "".join(section if MEASURED.search(section) else kept.get(_heading(section), section) for section in _sections(page))
     )
+
+
+def beside(name: str, results: Mapping[str, Result]) -> list[str]:
+    """The measurements that ran at the same time on such a host, by more than the minute to which the dates are known."""
+
+    def times(result: Result) -> tuple[float, float]:
+        begin = datetime.strptime(result["date"], "%Y-%m-%d %H:%M UTC").replace(tzinfo=UTC).timestamp()
+        return begin, begin + result["seconds"]
+
+    here, (begin, end) = results[name]["machine"], times(results[name])
+    others = {other: times(one) for other, one in results.items() if other != name and one["machine"] == here}
+    return [other for other, (since, until) in others.items() if min(end, until) - max(begin, since) > MINUTE]
 
 
 def _sections(page: str) -> list[str]:

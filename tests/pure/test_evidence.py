@@ -290,6 +290,15 @@ def test_a_busy_host_is_marked_only_for_timed_measurements() -> None:
     assert "host was busy" not in page(replay=RESULTS["replay"] | {"busy": 1.0})
 
 
+def test_a_timed_measurement_names_those_that_ran_at_the_same_time() -> None:
+    hour = {"seconds": 3600.0}
+    fuzz = RESULTS["long-fuzz"] | hour | {"date": "2020-01-02 04:00 UTC"}  # the others began at 03:04
+    assert "long-fuzz ran at the same time" in page(**{"faults": RESULTS["faults"] | hour, "long-fuzz": fuzz})
+    assert "at the same time" not in page(**{"replay": RESULTS["replay"] | hour, "long-fuzz": fuzz})  # it has no times
+    later = fuzz | {"date": "2020-01-02 04:04 UTC"}
+    assert "at the same time" not in page(**{"faults": RESULTS["faults"] | hour, "long-fuzz": later})
+
+
 def test_a_random_fault_that_failed_is_named_with_its_seed() -> None:
     failed = {"seed": 417, "case": "storm on y, recorder killed", "error": "not within 3 s: detected"}
     drawn = {"draws": 9, "two": 1, "lockstep": 0, "passed": 7, "failed": [failed]}  # and one that was not injected
