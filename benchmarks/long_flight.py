@@ -211,7 +211,7 @@ def main() -> None:
         clock = time.time_ns() - time.monotonic_ns()
         host = [(since + clock, until + clock) for since, until in delays()] if delays else None
         aircraft = "osprey with an observer" if options.observer else "c172p"
-        priority = f" at FIFO {PRIORITY}" if host else ""
+        priority = "" if host is None else f" at FIFO {PRIORITY}"
         found = {
             "flight": f"the {aircraft}, {options.mode}{priority}",
             "took": took,
