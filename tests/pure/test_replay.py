@@ -395,7 +395,9 @@ def test_each_parameter_set_has_its_own_digest() -> None:
     digest = GUST.controller.digest()
     assert 0 <= digest < 2**48
     assert int(float(digest)) == digest
-    assert vary(GUST.controller, {"lockstep": True, "y_rate": 500.0, "autostart": False}).digest() == digest
+    assert (
+        vary(GUST.controller, {"lockstep": True, "y_rate": 500.0, "autostart": False, "start_active": False}).digest() == digest
+    )
     changes: tuple[dict[str, Any], ...] = ({"k_g": flipped(1.0)}, {"upper": [1.0] * 4}, {"sign": "implicit"})
     others = [*(vary(GUST.controller, change) for change in changes), SERVO.controller, LEADING]
     assert len({digest, *(other.digest() for other in others)}) == 6

@@ -315,6 +315,16 @@ def test_a_deactivated_controller_publishes_trim_but_a_standby_that_was_never_ac
     assert peer_node.received["internals"] == []
 
 
+def test_a_controller_that_starts_inactive_publishes_trim_until_it_is_activated(start_node: Start, peer_node: Peer) -> None:
+    start_node("rise_di_controller", "-p", "start_active:=false")
+    peer_node.until(lambda: len(peer_node.received["u"]) > 20, each=lambda: peer_node.send(0.01))
+    assert peer_node.call(GetState, "controller/get_state", GetState.Request()).current_state.label == "inactive"
+    assert not any(any(u.position) for u in peer_node.received["u"])
+    assert peer_node.received["internals"] == []
+    assert peer_node.transition(Transition.TRANSITION_ACTIVATE)
+    engage(peer_node)
+
+
 def test_node_survives_an_invalid_transition(start_node: Start, peer_node: Peer) -> None:
     process = start_node("rise_di_controller")
     engage(peer_node)

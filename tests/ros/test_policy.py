@@ -139,6 +139,8 @@ def test_the_policy_allows_no_wildcard() -> None:
 
 
 @pytest.mark.parametrize("node", allowed())
-def test_the_policy_allows_no_service_request_but_that_of_the_bridge_to_the_controller(node: str) -> None:
+def test_the_policy_allows_no_service_request_but_those_of_the_bridge_to_the_controller(node: str) -> None:
     """The controller is active only while the bridge is engaged."""
-    assert allowed()[node].request == (frozenset({"/controller/change_state"}) if node == "bridge" else frozenset())
+    assert allowed()[node].request == (
+        frozenset({"/controller/change_state", "/controller/get_state"}) if node == "bridge" else frozenset()
+    )

@@ -8,10 +8,11 @@ from collections import Counter
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
@@ -90,6 +91,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
         self._first_y, self._start_ns = False, 0
         self._report_ns = 0  # of the last report on the engagement
         self._controller = self.create_client(ChangeState, "controller/change_state")
+        self._controller_state = self.create_client(GetState, "controller/get_state")
         self._controller_ready = False
         self._u_sender: str | None = None
         self._activation: Any = None  # the pending activation of the controller
@@ -244,11 +246,17 @@ class BridgeNode(FlightNode[BridgeParameters]):
         refusal = "" if bridge.phase in {Phase.ENGAGED, Phase.ENGAGING} else bridge.refusal(now_ns)
         sentence = "; would refuse: ".join(filter(None, (bridge.reason, refusal)))
         self._engagement.publish(KeyValue(key=bridge.phase.name, value=sentence))
-        ready, before, self._u_sender = self._controller.service_is_ready(), self._u_sender, bridge.u_lock.publisher
+        ready = self._controller.service_is_ready() and self._controller_state.service_is_ready()
+        before, self._u_sender = self._u_sender, bridge.u_lock.publisher
         restarted = bool(before) and self._u_sender != before  # it can take less time than the loss of the service
         if ready and (restarted or not self._controller_ready) and bridge.phase is not Phase.ENGAGED:
-            self._activate(active=False)
+            self._controller_state.call_async(GetState.Request()).add_done_callback(self._deactivate_unengaged)
         self._controller_ready = ready
+
+    def _deactivate_unengaged(self, state: Future) -> None:
+        """Deactivate a controller that was found active: with `ros2 run` it starts so."""
+        if state.result().current_state.id == State.PRIMARY_STATE_ACTIVE and self._bridge.phase is not Phase.ENGAGED:
+            self._activate(active=False)
 
     def _log_phase(self) -> None:
         phase, reason = self._bridge.phase, self._bridge.reason

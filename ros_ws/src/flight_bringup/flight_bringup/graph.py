@@ -126,7 +126,7 @@ def parameter_overrides(
     Real time: the nodes with a t = 0 get its instant. Lockstep: the aircraft gets the rate of u and the duration, controller
     and guidance the rate of y, the reference model that of u_m. Guidance gets the numbers that follow from other sections. The
     recorder gets the files to attach to the log; this function writes them into the folder of the run. With an autopilot the
-    bridge gets the channel map, and the recorder the topics of the autopilot.
+    bridge gets the channel map, the recorder the topics of the autopilot, and the controller starts inactive.
     """
     if spec is BRIDGE:
         return {} if autopilot is None else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
@@ -138,6 +138,8 @@ def parameter_overrides(
         overrides[GUIDANCE] |= {name: list(value) if isinstance(value, tuple) else value for name, value in guidance.by_rule()}
         overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *GUIDANCE_VIEWS]
     overrides[RECORDER]["directory"] = str(run)
+    if autopilot is not None:
+        overrides[CONTROLLER]["start_active"] = False  # the bridge activates it: only while engaged
     if lockstep:
         overrides[AIRCRAFT] |= {
             "control_rate": scenario.controller.rate,

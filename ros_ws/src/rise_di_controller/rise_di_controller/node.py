@@ -32,7 +32,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
     def __init__(self) -> None:
         FlightNode.__init__(self, "controller", ControllerParameters)
         LifecycleNodeMixin.__init__(self)
-        self._active = self._was_active = False
+        self._active = False
+        self._publishes = self.parameters.autostart  # a standby that was never activated publishes no u beside another's
         self._controller = Controller(self.parameters)
         outputs = self.parameters.outputs
         self._y_subscription, self._y_decoder = self.subscribe(Y), self.decoder(Y, outputs)
@@ -52,7 +53,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         self._last_ns = 0  # of the last tick
         if self.parameters.autostart:
             self.trigger_configure()
-            self.trigger_activate()
+            if self.parameters.start_active:
+                self.trigger_activate()
         else:
             self.get_logger().info("unconfigured: waiting to be configured and activated (autostart is false)")
 
@@ -64,7 +66,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Allow the law to engage with the next fresh y and y_m."""
-        self._active = self._was_active = True
+        self._active = self._publishes = True
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -124,8 +126,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         output = self._controller.tick(now_ns, late_ns, active=self._active)
         if self._controller.mode is not before:
             self.get_logger().info(f"{before.name} -> {self._controller.mode.name}")
-        if output is None or not (self._was_active or self._controller.has_internals):
-            return False  # a standby that was never activated publishes no u beside that of another controller
+        if output is None or not self._publishes:
+            return False
         # A tick that was stopped half-way does not publish its old u: the aircraft has started its failsafe, and u would jump.
         if self.parameters.lockstep or self.now_ns() - now_ns <= self._max_age_ns:
             self._publish_u(self._u_encoder.encode(output.stamp_ns, output.u))

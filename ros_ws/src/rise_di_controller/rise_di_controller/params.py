@@ -131,7 +131,11 @@ class ControllerParameters(KeyedParameters):
     upper: Numbers | None = Field(default=None, description="upper limits of u from trim, units of u; none where absent")
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s; none where absent")
     on_deactivate: Literal["trim", "hold"] = Field(default="trim", description="u after deactivation: ramped to trim or held")
-    autostart: bool = Field(default=True, description="whether the node configures and activates itself at start")
+    autostart: bool = Field(default=True, description="whether the node configures itself at start, and activates as below")
+    start_active: bool = Field(
+        default=True,
+        description="whether autostart also activates it; if not, u is at trim until another node does, as a bridge",
+    )
     feedforward: FeedforwardParameters | None = Field(
         default=None, description="an extension of the paper: adds the input of a nominal model along y_m; off where absent"
     )
@@ -277,7 +281,7 @@ class ControllerParameters(KeyedParameters):
 
         BLAKE2b of names and values. It changes with any bit of any gain. Parameters that concern only the node are left out.
         """
-        content = self.model_dump(exclude={"lockstep", "y_rate", "autostart", "key_file"})
+        content = self.model_dump(exclude={"lockstep", "y_rate", "autostart", "start_active", "key_file"})
         if content["law"] == "rise_di":  # logs of versions that had no other law have no name either
             del content["law"]
         return int.from_bytes(blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big")
