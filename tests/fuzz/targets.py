@@ -40,7 +40,7 @@ from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError, StampedVector
 from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
-from flight_log.named_vectors import decoder
+from flight_log.named_vectors import decoder, tables
 from flight_log.playback import read_playback
 from flight_log.repair import repair
 from flight_log.rosbag2_metadata import FileContents, TopicCount, bag_metadata_yaml, read_bag_metadata
@@ -151,7 +151,8 @@ def message(data: bytes, folder: Path) -> None:
     for messages in ([data], [_SAMPLE, data, _SAMPLE]):
         decode = decoder(JOINT_STATE)
         assert decode is not None
-        decode(messages)
+        for table in tables(messages):
+            decode(table)
     run = write_run(folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)]))
     rejected(lambda: read_run(run))
     rejected(lambda: read_playback(run))

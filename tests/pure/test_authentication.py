@@ -16,7 +16,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.authentication import BLANK, DIGITS, KEY_BYTES, MessageAuthenticator, mac_slice, read_key
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
-from flight_log.named_vectors import decoder
+from flight_log.named_vectors import decoder, tables
 
 KEY = bytes(range(KEY_BYTES))
 
@@ -62,7 +62,8 @@ def test_signed_samples_of_a_log_are_decoded_as_one_group() -> None:
     authenticator = MessageAuthenticator(KEY, "/y", None)
     decode = decoder(JOINT_STATE)
     assert decode is not None
-    decoded = decode([signed(k, (0.1 * k, -k), authenticator) for k in range(5)])
+    (table,) = tables([signed(k, (0.1 * k, -k), authenticator) for k in range(5)])
+    decoded = decode(table)
     assert len(decoded.samples) == 1  # one layout, although the codes differ
     assert decoded.samples[0].stamp_ns.tolist() == list(range(5))
     assert np.array_equal(decoded.samples[0].values, [[0.1 * k, -k] for k in range(5)])

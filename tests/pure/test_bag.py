@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writing and reading bags: with independent readers, truncated and damaged files, bags of other recorders."""
 
+import struct
 import tracemalloc
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,8 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Message
+from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -25,9 +30,9 @@ from flight_core.tape import Tape
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.message_definitions import definition
-from flight_log.named_vectors import JOINT_STATE_TYPES, Samples, decoder, encoded, joint_state_types, stamp_of
+from flight_log.named_vectors import JOINT_STATE_TYPES, Samples, decoder, encoded, joint_state_types, stamp_of, tables
 from flight_log.playback import read_playback
-from flight_log.scan import Scan
+from flight_log.scan import MESSAGE_INDEX, RECORD, MessageBatch, Scan, decode_batches
 from flight_log.tape_reader import ROSBAG2, read_run
 from flight_log.tape_writer import write_run
 from flight_view.flight import Flight
@@ -357,6 +362,44 @@ MIXTURES = {
 }
 
 
+def messages_of(chunk: bytes, places: Sequence[int]) -> list[tuple[int, bytes, int, int]]:
+    """Channel, content and times of the messages of a chunk, with an index that has them at `places`."""
+    index = MESSAGE_INDEX.pack(1, 16 * len(places)) + b"".join(struct.pack("<Qq", 0, place) for place in places)
+    return [
+        (batch.channel_id, bytes(message), int(log_ns), int(publish_ns))
+        for batch in decode_batches(Opcode.CHUNK, chunk, [index])
+        if isinstance(batch, MessageBatch)
+        for message, log_ns, publish_ns in zip(batch.data, batch.log_ns, batch.publish_ns, strict=True)
+    ]
+
+
+def first_chunk(log: bytes) -> tuple[bytes, list[int]]:
+    """The content of the first chunk of a log, and the places of its messages."""
+    place, chunk, places = len(MCAP0_MAGIC), b"", list[int]()
+    while True:
+        opcode, length = RECORD.unpack_from(log, place)
+        content = log[place + RECORD.size : place + RECORD.size + length]
+        if opcode == Opcode.CHUNK and chunk:
+            return chunk, sorted(places)
+        if opcode == Opcode.CHUNK:
+            chunk = content
+        elif opcode == Opcode.MESSAGE_INDEX and chunk:
+            places += [offset for _, offset in struct.iter_unpack("<QQ", content[MESSAGE_INDEX.size :])]
+        place += RECORD.size + length
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_wrong_message_index_changes_nothing_that_is_read(data: st.DataObject, recorded: Path) -> None:
+    """The index saves the steps from message to message: it must agree with them, or they are taken."""
+    chunk, places = first_chunk((recorded / "run_0.mcap").read_bytes())
+    by_steps = messages_of(chunk, [])
+    assert messages_of(chunk, places) == by_steps
+    assert len(by_steps) == len(places) > 10
+    listed = data.draw(st.lists(st.sampled_from(places) | st.integers(-(2**63), 2**63 - 1) | st.integers(0, 5000)))
+    assert messages_of(chunk, listed) == by_steps
+
+
 @pytest.mark.parametrize("messages", MIXTURES.values(), ids=MIXTURES)
 def test_messages_decoded_together_equal_those_decoded_one_by_one(messages: list[bytes]) -> None:
     decode = decoder(JOINT_STATE)
@@ -364,7 +407,8 @@ def test_messages_decoded_together_equal_those_decoded_one_by_one(messages: list
     decoded = [
         (samples.names, int(stamp), values.tobytes())
         for part in (messages[:4], messages[4:])
-        for samples in decode(part).samples
+        for table in tables(part)
+        for samples in decode(table).samples
         for stamp, values in zip(samples.stamp_ns, samples.values, strict=True)
     ]
     assert sorted(decoded) == one_by_one(messages)
@@ -379,9 +423,9 @@ def test_other_types_have_no_decoder_and_malformed_messages_are_counted() -> Non
     assert decoder("rcl_interfaces/msg/Log") is None
     decode = decoder(JOINT_STATE)
     assert decode is not None
-    decoded = decode([SAMPLES[0][:20], SAMPLES[1], b""])
-    assert decoded.unreadable == 2
-    assert [len(samples.stamp_ns) for samples in decoded.samples] == [1]
+    decoded = [decode(table) for table in tables([SAMPLES[0][:20], SAMPLES[1], b""])]
+    assert [one.unreadable for one in decoded] == [1, 0, 1]
+    assert [len(samples.stamp_ns) for one in decoded for samples in one.samples] == [1]
 
 
 def test_the_engagements_of_a_log_begin_with_the_phase_engaged_and_end_with_their_reason(tmp_path: Path) -> None:

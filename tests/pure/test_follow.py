@@ -21,7 +21,7 @@ from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_log.disk import is_locked, try_lock
 from flight_log.follow import Follower, Messages
-from flight_log.named_vectors import decoder
+from flight_log.named_vectors import decoder, tables
 from flight_log.scan import RECORD
 
 CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())
@@ -35,7 +35,7 @@ def vectors(found: list[Messages], topic: str) -> tuple[NDArray[np.int64], Float
     """Stamps and values of a topic."""
     decode = decoder(JOINT_STATE)
     assert decode is not None
-    parts = [part for one in found if one.topic == topic for part in decode(one.data).samples]
+    parts = [part for one in found if one.topic == topic for table in tables(one.data) for part in decode(table).samples]
     return np.concatenate([one.stamp_ns for one in parts]), np.concatenate([one.values for one in parts])
 
 

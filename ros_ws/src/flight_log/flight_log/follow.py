@@ -23,11 +23,8 @@ from mcap.writer import MCAP0_MAGIC
 from flight_core.rates import NANOSECONDS
 from flight_log.named_vectors import stamp_of
 from flight_log.rosbag2_metadata import bag_files
-from flight_log.scan import DECODE_ERRORS, MAX_CHUNK_BYTES, RECORD, decode, decompress, split
+from flight_log.scan import DECODE_ERRORS, MAX_CHUNK_BYTES, MESSAGE_INDEX, RECORD, decode, decompress, split
 
-MESSAGE_INDEX = struct.Struct(
-    "<HI"
-)  # channel and size, before pairs of log time and offset (MCAP specification, Message Index)
 HEAD = struct.Struct("<BQ14xQ")  # of RECORD and MESSAGE: opcode, length, publish time
 # As plain numbers: of a log of one hour 400,000 records are compared.
 CHUNK, MESSAGE, INDEX = int(Opcode.CHUNK), int(Opcode.MESSAGE), int(Opcode.MESSAGE_INDEX)

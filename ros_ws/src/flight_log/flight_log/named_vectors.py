@@ -6,8 +6,9 @@ The messages of a topic usually have one sender and the same channels. They then
 learns the byte layout from one message and decodes all messages of that layout together.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,7 +52,10 @@ class Decoded(NamedTuple):
     unreadable: int
 
 
-Decoder = Callable[[Sequence[bytes]], Decoded]
+Table = NDArray[np.uint8]
+"""Messages of one length, one in each row."""
+
+Decoder = Callable[[Table], Decoded]
 
 
 @cache
@@ -77,19 +81,21 @@ def decoder(type_name: str) -> Decoder | None:
     return _JointStateDecoder() if type_name == JOINT_STATE else None
 
 
+def tables(messages: Iterable[bytes]) -> Iterator[Table]:
+    """Messages in their order, those of equal length that follow one another in a table."""
+    for size, group in groupby(messages, len):
+        alike = list(group)
+        yield np.frombuffer(b"".join(alike), dtype=np.uint8).reshape(len(alike), size)
+
+
 def stamp_of(data: bytes) -> int:
     """The stamp of a message that begins with it, ns."""
     return int.from_bytes(data[STAMP][:4], "little", signed=True) * NANOSECONDS + int.from_bytes(data[STAMP][4:], "little")
 
 
-def stamps_of(messages: Sequence[bytes]) -> NDArray[np.int64]:
+def stamps_of(table: Table) -> NDArray[np.int64]:
     """The stamps of messages that begin with them, ns, shape (N,)."""
-    stamps = np.frombuffer(b"".join([message[STAMP] for message in messages]), dtype=np.uint8).reshape(-1, 8)
-    return _stamps(stamps)
-
-
-def _stamps(stamps: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Stamps in ns from their bytes, shape (N, 8)."""
+    stamps = np.ascontiguousarray(table[:, STAMP])
     return stamps.view("<i4")[:, 0].astype(np.int64) * NANOSECONDS + stamps.view("<u4")[:, 1]
 
 
@@ -132,10 +138,10 @@ def _position(marked: bytes, marks: FloatArray) -> slice:
     return slice(start, start + marks.nbytes)
 
 
-def decode_routes(messages: Sequence[bytes]) -> Decoded:
+def decode_routes(table: Table) -> Decoded:
     """Routes of nav_msgs/Path in the frame map (east, north, up): a sample with the channels WAYPOINT for each waypoint."""
     samples, unreadable = [], 0
-    for message in messages:
+    for message in map(bytes, table):
         try:
             route: Any = typestore().deserialize_cdr(message, PATH)
         except SerdeError:
@@ -155,15 +161,20 @@ class _JointStateDecoder:
         self._store = joint_state_types()
         self._names: tuple[str, ...] = ()
         self._sender = ""
-        self._template = np.zeros(0, dtype=np.uint8)  # the bytes of the message that the layout was learnt from
-        self._constant = np.zeros(0, dtype=np.uint8)  # 255 for the bytes that are equal in all messages of the layout, else 0
+        self._template = np.zeros(0, dtype="<u4")  # the message that the layout was learnt from
+        self._constant = np.zeros(0, dtype="<u4")  # 255 for the bytes that are equal in all messages of the layout, else 0
         self._values = slice(0, 0)
 
-    def __call__(self, messages: Sequence[bytes]) -> Decoded:
-        if not self._names and messages:
-            self._learn(messages[0])
-        samples, rest = self._decode_layout(messages)
-        unreadable = 0
+    def __call__(self, table: Table) -> Decoded:
+        if not self._names and len(table):
+            self._learn(bytes(table[0]))
+        same = self._same_layout(table)
+        samples = []
+        if same.any():
+            alike = table if same.all() else table[same]
+            values = np.ascontiguousarray(alike[:, self._values]).view("<f8")
+            samples.append(Samples(self._names, stamps_of(alike), values, self._sender))
+        unreadable, rest = 0, [bytes(message) for message in table[~same]]
         for message in rest:
             try:
                 one: Any = self._store.deserialize_cdr(message, JOINT_STATE)
@@ -179,20 +190,13 @@ class _JointStateDecoder:
             self._learn(rest[-1])
         return Decoded(samples, unreadable)
 
-    def _decode_layout(self, messages: Sequence[bytes]) -> tuple[list[Samples], list[bytes]]:
-        """The samples in messages of the learnt layout, and the other messages."""
-        size = len(self._template)
-        same_size = [message for message in messages if len(message) == size] if self._names else []
-        rest = [message for message in messages if len(message) != size] if self._names else list(messages)
-        if not same_size:
-            return [], rest
-        table = np.frombuffer(b"".join(same_size), dtype=np.uint8).reshape(-1, size)
-        same = ((table ^ self._template) & self._constant).max(axis=1) == 0
-        rest += [message for message, matches in zip(same_size, same, strict=True) if not matches]
-        table = table[same]
-        stamp_ns = _stamps(np.ascontiguousarray(table[:, STAMP]))
-        values = np.ascontiguousarray(table[:, self._values]).view("<f8")
-        return [Samples(self._names, stamp_ns, values, self._sender)] if len(table) else [], rest
+    def _same_layout(self, table: Table) -> NDArray[np.bool_]:
+        """Which messages have the learnt layout."""
+        if not self._names or table.shape[1] != self._template.nbytes:
+            return np.zeros(len(table), dtype=np.bool_)
+        different = table.view("<u4") ^ self._template
+        different &= self._constant
+        return np.asarray(different.max(axis=1) == 0)
 
     def _learn(self, message: bytes) -> None:
         """Learn the layout: serialise marked values with the same strings, and find the position of the marks."""
@@ -209,6 +213,7 @@ class _JointStateDecoder:
         if len(marked) != len(message) or message[values] != one.position.tobytes():
             return
         self._names, self._values, self._sender = tuple(one.name), values, _instance(one.header.frame_id)
-        self._template = np.frombuffer(message, dtype=np.uint8)
-        self._constant = np.full(len(message), 255, dtype=np.uint8)
-        self._constant[STAMP] = self._constant[self._values] = self._constant[mac_slice(message)] = 0
+        self._template = np.frombuffer(message, dtype="<u4")  # a message without velocity and effort ends with their lengths
+        constant = np.full(len(message), 255, dtype=np.uint8)
+        constant[STAMP] = constant[self._values] = constant[mac_slice(message)] = 0
+        self._constant = constant.view("<u4")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
-from flight_log.named_vectors import JOINT_STATE, decoder, flight_start_ns, stamp_of
+from flight_log.named_vectors import JOINT_STATE, decoder, flight_start_ns, stamp_of, tables
 from flight_log.rosbag2_metadata import is_compressed, read_bag_metadata
 from flight_log.stored_messages import StoredMessage, stored_messages
 
@@ -112,7 +112,7 @@ def _start_ns(stored: Sequence[StoredMessage], otherwise: int) -> int:
     decode = None if truth is None else decoder(truth.type_name)
     if truth is None or decode is None:
         return otherwise
-    for names, stamp_ns, values, _ in decode([truth.data]).samples:
+    for names, stamp_ns, values, _ in decode(next(tables([truth.data]))).samples:
         if "t" in names and (start_ns := flight_start_ns(int(stamp_ns[0]), float(values[0, names.index("t")]))) is not None:
             return start_ns
     return otherwise

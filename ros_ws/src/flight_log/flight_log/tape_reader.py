@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable, Collection, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
@@ -17,22 +17,23 @@ from flight_core.files import is_file, is_folder
 from flight_core.parameters import ParameterError, printable, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
-from flight_core.vectors import FloatArray
 from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times, latency
-from flight_log.named_vectors import PATH, STAMP, Decoder, decode_routes, decoder, flight_start_ns, stamps_of
+from flight_log.named_vectors import PATH, STAMP, Decoder, Table, decode_routes, decoder, flight_start_ns, stamps_of, tables
 from flight_log.rosbag2_metadata import METADATA, bag_files, is_compressed, read_bag_metadata
 from flight_log.scan import MessageBatch, Scan
 
 ROUTE = "route"
-BATCH = 4096  # messages that are decoded together
+BATCH = 512  # messages that are decoded together: of 1024, the tables are so large that the memory for each is new
 LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by the age of its sample
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace with one of these topics is that of an aircraft
 
 ROSBAG2 = "rosbag2"
 """In the folder of a run: the bag of `ros2 bag record` where that recorded the flight. A log beside it has the attachments."""
+
+T = TypeVar("T", bound=np.generic)
 
 SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w .()-]{0,99}\.yaml")
 """Names under which the scenario of a log may be written beside it: not metadata.yaml, and no path to another folder."""
@@ -113,31 +114,65 @@ def _names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
     }
 
 
+class _Rows(Generic[T]):
+    """Rows of an array that grows. It grows in place: to collect parts and join them takes the memory of all rows twice."""
+
+    def __init__(self, first: NDArray[T]) -> None:
+        self._rows, self.count = first.copy(), len(first)
+
+    def append(self, rows: NDArray[T]) -> None:
+        end = self.count + len(rows)
+        if end > len(self._rows):
+            self._resize(end + end // 2)
+        self._rows[self.count : end] = rows
+        self.count = end
+
+    def all(self) -> NDArray[T]:
+        self._resize(self.count)
+        return self._rows
+
+    def _resize(self, count: int) -> None:
+        self._rows.resize((count, *self._rows.shape[1:]), refcheck=False)  # there is no view of them yet
+
+
+class _Collected(NamedTuple):
+    stamp_ns: _Rows[np.int64]
+    values: _Rows[np.float64]
+
+
 class _TopicSamples:
     """Samples of one topic, decoded in batches. Those with the same names are its signal."""
 
     def __init__(self, decode: Decoder) -> None:
         self._decode = decode
-        self._batch: list[bytes] = []
-        self._samples: dict[tuple[str, ...], list[tuple[NDArray[np.int64], FloatArray]]] = {}  # by names: stamps, values
+        self._batch: list[Table] = []  # of one length
+        self._batched = 0  # messages
+        self._samples: dict[tuple[str, ...], _Collected] = {}  # by names
         self._spans: dict[str, tuple[int, int]] = {}  # by publisher: its first and its last stamp
         self._refused = 0
 
-    def add(self, messages: list[bytes]) -> None:
-        self._batch += messages
-        if len(self._batch) >= BATCH:
+    def add(self, table: Table) -> None:
+        if self._batched >= BATCH or (self._batch and self._batch[0].shape[1] != table.shape[1]):
             self._decode_batch()
+        self._batch.append(table)
+        self._batched += len(table)
 
     def _decode_batch(self) -> None:
-        decoded = self._decode(self._batch)
-        self._batch = []
+        if not self._batch:
+            return
+        decoded = self._decode(np.concatenate(self._batch))
+        self._batch, self._batched = [], 0
         self._refused += decoded.unreadable
         for names, stamp_ns, values, sender in decoded.samples:
             if values.shape[1] == len(names):
                 first, last = int(stamp_ns.min()), int(stamp_ns.max())
                 before, after = self._spans.get(sender, (first, last))
                 self._spans[sender] = min(first, before), max(last, after)
-                self._samples.setdefault(names, []).append((stamp_ns, values))
+                if names in self._samples:
+                    self._samples[names].stamp_ns.append(stamp_ns)
+                    self._samples[names].values.append(values)
+                else:
+                    self._samples[names] = _Collected(_Rows(stamp_ns), _Rows(values))
             else:
                 self._refused += len(stamp_ns)
 
@@ -147,7 +182,7 @@ class _TopicSamples:
         if not self._samples:
             return None
         names = self._names()
-        stamps, values = (np.concatenate(arrays) for arrays in zip(*self._samples[names], strict=True))
+        stamps, values = self._samples[names].stamp_ns.all(), self._samples[names].values.all()
         if np.any(stamps[1:] < stamps[:-1]):
             order = np.argsort(stamps, kind="stable")
             stamps, values = stamps[order], values[order]
@@ -159,7 +194,7 @@ class _TopicSamples:
         return max((names for names in self._samples if set(first) <= set(names)), key=self._count)
 
     def _count(self, names: tuple[str, ...]) -> int:
-        return sum(len(stamp_ns) for stamp_ns, _ in self._samples[names])
+        return self._samples[names].stamp_ns.count
 
     def conflict(self, name: str) -> str:
         """The note on publishers at the same time, of which the nodes refuse all but one; empty for one after the other."""
@@ -198,10 +233,8 @@ class _Log:
 
             def take(batch: MessageBatch) -> None:
                 samples.add(batch.data)
-                stamped = np.array([len(data) >= STAMP.stop for data in batch.data])
-                if stamped.any():
-                    stamps = stamps_of([data for data in batch.data if len(data) >= STAMP.stop])
-                    self.times = Times(stamps, batch.publish_ns[stamped])
+                if batch.data.shape[1] >= STAMP.stop:
+                    self.times = Times(stamps_of(batch.data), batch.publish_ns)
                     times.append(self.times)
 
             return take
@@ -209,7 +242,9 @@ class _Log:
             return lambda batch: samples.add(batch.data)
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             reports = self.reports.setdefault(topic, [])
-            return lambda batch: reports.extend(zip(map(self._time_of_stamps, batch.publish_ns), batch.data, strict=True))
+            return lambda batch: reports.extend(
+                zip(map(self._time_of_stamps, batch.publish_ns), map(bytes, batch.data), strict=True)
+            )
         return None
 
     def _time_of_stamps(self, sent_ns: np.int64) -> int:
@@ -314,7 +349,7 @@ def _read_other(run: Path, log: _Log) -> None:
         with Reader(run) as reader:
             for connection, _, message in reader.messages():
                 if (samples := log.samples_of(connection.topic, connection.msgtype)) is not None:
-                    samples.add([bytes(message)])
+                    samples.add(next(tables([bytes(message)])))
     except Exception as error:  # of SQLite, of YAML, of a decompressor: the content may be damaged anywhere
         raise ParameterError(f"{run}: cannot be read ({error or type(error).__name__}), expected a bag of rosbag2") from None
 

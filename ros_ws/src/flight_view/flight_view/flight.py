@@ -25,7 +25,7 @@ from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
-from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, typestore
+from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, tables, typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_view.series import Series
 from guidance import modes as guidance
@@ -227,11 +227,11 @@ class Flight:
 
     def _decode(self, topic: _Topic) -> None:
         """The messages of a topic that have been read, together: one by one is slow."""
-        decoded = topic.decode(topic.messages)
-        topic.messages = []
-        self._unreadable += decoded.unreadable
-        for samples in decoded.samples:
-            self._take_samples(topic, samples)
+        messages, topic.messages = topic.messages, []
+        for decoded in map(topic.decode, tables(messages)):
+            self._unreadable += decoded.unreadable
+            for samples in decoded.samples:
+                self._take_samples(topic, samples)
 
     def _take_samples(self, topic: _Topic, decoded: Samples) -> None:
         names, stamp_ns, values, _ = decoded
