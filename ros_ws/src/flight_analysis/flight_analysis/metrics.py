@@ -113,10 +113,11 @@ def true_error(tape: Tape) -> Signal | None:
     """
     if "truth" not in tape:
         return None
-    x, names = tape["truth"].group("x"), tape["y"].names
-    if not set(names) <= set(x.names):
+    truth, names = tape["truth"], tape["y"].names
+    states = [f"x.{name}" for name in names]
+    if not set(states) <= set(truth.names):
         return None
-    return _minus_reference(Signal(x.stamp_ns, names, np.column_stack([x[name] for name in names])), tape["y_m"])
+    return _minus_reference(Signal(truth.stamp_ns, names, _columns(truth, states)), tape["y_m"])
 
 
 def best_error(tape: Tape) -> tuple[str, Signal]:
@@ -128,12 +129,18 @@ def best_error(tape: Tape) -> tuple[str, Signal]:
 def _minus_reference(y: Signal, y_m: Signal) -> Signal:
     if len(y.stamp_ns) == 0 or len(y_m.stamp_ns) == 0:
         return Signal(np.zeros(0, dtype=np.int64), y.names, np.zeros((0, len(y.names))))
-    inside = (y.stamp_ns >= y_m.stamp_ns[0]) & (y.stamp_ns <= y_m.stamp_ns[-1])
-    stamps = y.stamp_ns[inside]
+    first, end = np.searchsorted(y.stamp_ns, y_m.stamp_ns[0]), np.searchsorted(y.stamp_ns, y_m.stamp_ns[-1], side="right")
+    stamps, values = y.stamp_ns[first:end], y.values[first:end]
+    if np.array_equal(stamps, y_m.stamp_ns):
+        return Signal(stamps, y.names, values - _columns(y_m, y.names))
     # float64 represents stamps exactly relative to the first one, but not ns since the epoch.
     at, knots = (stamps - y_m.stamp_ns[0]).astype(float), (y_m.stamp_ns - y_m.stamp_ns[0]).astype(float)
     reference = np.column_stack([np.interp(at, knots, y_m[name]) for name in y.names])
-    return Signal(stamps, y.names, y.values[inside] - reference)
+    return Signal(stamps, y.names, values - reference)
+
+
+def _columns(signal: Signal, names: Sequence[str]) -> FloatArray:
+    return np.column_stack([signal[name] for name in names])
 
 
 def noise_floor(tape: Tape) -> dict[str, float]:

@@ -10,6 +10,7 @@ the extremes of a very long curve, since all its samples take the page long to u
 import base64
 import zlib
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
@@ -34,15 +35,41 @@ DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
 """Colours of the frame on a light page, and the colours that replace them on a dark page."""
 
 
+class Instants(NamedTuple):
+    """The instants of a curve."""
+
+    t_ns: NDArray[np.int64]  # since the start of the flight, with one more at the start of each gap
+    gaps: NDArray[np.intp]  # the samples before which a NaN stands for a gap
+
+
 class SampleStore:
     """All samples of the long curves of a page, packed. Equal arrays are stored once, under a hash of their content."""
 
     def __init__(self) -> None:
-        self.packed: dict[str, str] = {}
+        self._packed: dict[str, Future[str]] = {}
+        self._pool = ThreadPoolExecutor()  # compression leaves the interpreter to the other threads
+        self._instants: dict[
+            tuple[int, int, bool], tuple[Instants, NDArray[np.int64]]
+        ] = {}  # with the stamps, whose id they keep
+        self._times: dict[int, tuple[str, NDArray[np.int64]]] = {}
+
+    @property
+    def packed(self) -> dict[str, str]:
+        """The arrays as a page holds them, by name."""
+        return {name: packed.result() for name, packed in self._packed.items()}
+
+    def instants(self, stamp_ns: NDArray[np.int64], start_ns: int, *, steps: bool) -> Instants:
+        """The instants of a curve, once for all channels of a signal. A step curve has no gaps."""
+        key = id(stamp_ns), start_ns, steps
+        if key not in self._instants:
+            self._instants[key] = _instants(stamp_ns - start_ns, steps), stamp_ns
+        return self._instants[key][0]
 
     def times(self, t_ns: NDArray[np.int64]) -> str:
         """Store instants as float64 steps in ns, the first from 0. Equal steps compress well."""
-        return self._add("t", np.diff(t_ns, prepend=np.int64(0)).astype("<f8"))
+        if id(t_ns) not in self._times:
+            self._times[id(t_ns)] = self._add("t", np.diff(t_ns, prepend=np.int64(0)).astype("<f8")), t_ns
+        return self._times[id(t_ns)][0]
 
     def values(self, values: FloatArray) -> str:
         """Store values as float32, rounded to MANTISSA bits: noise does not compress, and a pixel shows fewer digits.
@@ -54,13 +81,13 @@ class SampleStore:
         return self._add("v", np.diff(bits + (1 << spare - 1) >> spare << spare, prepend=np.uint32(0)))
 
     def _add(self, kind: str, array: NDArray[Any]) -> str:
-        name = kind + blake2b(array.tobytes(), digest_size=8).hexdigest()
-        if name not in self.packed:
-            self.packed[name] = pack(array.tobytes(), array.itemsize)
+        name = kind + blake2b(array.data, digest_size=8).hexdigest()
+        if name not in self._packed:
+            self._packed[name] = self._pool.submit(pack, array, array.itemsize)
         return name
 
 
-def pack(content: bytes, width: int = 1) -> str:
+def pack(content: bytes | NDArray[Any], width: int = 1) -> str:
     """Base64 of the zlib stream of bytes, after a byte shuffle of items of `width` bytes.
 
     The shuffle puts the first bytes of all items first, then the second bytes, and so on: high bytes of small steps are equal.
@@ -213,9 +240,10 @@ def _trace(context: PlotContext, curve: Curve, channel: str, factor: float, most
 def extremes(values: FloatArray, most: int) -> NDArray[np.intp]:
     """Rows of the minimum, the maximum and the first NaN of each of `most` / 2 bins, as the page decimates a view."""
     width = -(-len(values) // (most // 2))
-    bins = np.concatenate([values, np.full(-len(values) % width, np.nan)]).reshape(-1, width)
+    bins = np.append(values, np.full(-len(values) % width, values[-1])).reshape(-1, width)
     gaps = np.isnan(bins)
-    low, high = np.where(gaps, np.inf, bins).argmin(axis=1), np.where(gaps, -np.inf, bins).argmax(axis=1)
+    below, above = (np.where(gaps, np.inf, bins), np.where(gaps, -np.inf, bins)) if gaps.any() else (bins, bins)
+    low, high = below.argmin(axis=1), above.argmax(axis=1)
     gap = np.where(gaps.any(axis=1), gaps.argmax(axis=1), low)
     rows = np.unique(np.array([low, high, gap]) + width * np.arange(len(bins)))
     return rows[rows < len(values)]
@@ -230,16 +258,18 @@ def stored(context: PlotContext, signal: Signal, channel: str, factor: float) ->
 def _drawn(
     context: PlotContext, signal: Signal, channel: str, factor: float, steps: bool
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    return _break_at_gaps(signal.stamp_ns - context.tape.start_ns, signal[channel] * factor, steps)
+    """Instants and values of a channel times a factor, with a NaN at the start of each gap."""
+    t_ns, gaps = context.samples.instants(signal.stamp_ns, context.tape.start_ns, steps=steps)
+    values = signal[channel] * factor
+    return t_ns, np.insert(values, gaps, np.nan) if len(gaps) else values
 
 
-def _break_at_gaps(t_ns: NDArray[np.int64], values: FloatArray, steps: bool) -> tuple[NDArray[np.int64], FloatArray]:
-    """Instants and values with a NaN at the start of each gap. A step curve has no gaps."""
+def _instants(t_ns: NDArray[np.int64], steps: bool) -> Instants:
     periods = np.diff(t_ns)
     if steps or len(periods) == 0:
-        return t_ns, values
+        return Instants(t_ns, np.zeros(0, dtype=np.intp))
     before = np.flatnonzero(periods > MIN_GAP_PERIODS * np.median(periods))
-    return np.insert(t_ns, before + 1, t_ns[before]), np.insert(values, before + 1, np.nan)
+    return Instants(np.insert(t_ns, before + 1, t_ns[before]), before + 1)
 
 
 def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int, end: float) -> None:
