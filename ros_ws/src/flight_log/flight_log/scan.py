@@ -236,12 +236,8 @@ def decode_batches(opcode: int, content: bytes, message_indexes: Sequence[bytes]
     The message indexes of a chunk save most of the time. A wrong one changes nothing.
     """
     if opcode == Opcode.CHUNK:
-        sizes = [len(index) // INDEX_ENTRY.itemsize for index in message_indexes]
-        places = [
-            np.frombuffer(index, INDEX_ENTRY, size, MESSAGE_INDEX.size)["place"]
-            for index, size in zip(message_indexes, sizes, strict=True)
-        ]
-        yield from _split_batches(decompress(content), np.sort(np.concatenate([NO_PLACES, *places])))
+        places = np.sort(np.concatenate([NO_PLACES, *map(_places, message_indexes)]))
+        yield from _split_batches(decompress(content), places)
         return
     for record in decode(opcode, content):
         if isinstance(record, Message):
@@ -249,6 +245,12 @@ def decode_batches(opcode: int, content: bytes, message_indexes: Sequence[bytes]
             yield MessageBatch(record.channel_id, np.frombuffer(record.data, dtype=np.uint8)[None], *times)
         else:
             yield record
+
+
+def _places(message_index: bytes) -> NDArray[np.int64]:
+    """The places of messages in their chunk, as an index has them; the index may be damaged."""
+    count = (len(message_index) - MESSAGE_INDEX.size) // INDEX_ENTRY.itemsize
+    return np.frombuffer(message_index, INDEX_ENTRY, count, MESSAGE_INDEX.size)["place"] if count > 0 else NO_PLACES
 
 
 def _split_batches(data: bytes, places: NDArray[np.int64]) -> Iterator[McapRecord | MessageBatch]:
