@@ -12,6 +12,7 @@ import struct
 import subprocess
 import sys
 import time
+import tracemalloc
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -180,6 +181,24 @@ def test_a_row_of_a_recovered_overrun_is_kept_in_order_and_one_of_another_time_i
         samples.append(np.array(stamps, dtype=np.int64), np.ones((2, 1)))
     assert samples.stamp_ns.tolist() == [0, 50_000_000, 50_000_000, 60_000_000, 70_000_000]
     assert samples.refused == 1
+
+
+def test_a_flight_of_any_length_becomes_coarser_without_large_temporary_arrays() -> None:
+    rows, channels = 20_000, 30
+    samples, values = (
+        Series(tuple(map(str, range(channels))), max_rows=rows),
+        np.random.default_rng(1).normal(size=(rows, channels)),
+    )
+    samples.append(np.arange(rows), values)
+    tracemalloc.start()
+    samples.append(np.arange(rows, rows + 4), values[:4])
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < values.astype(np.float32).nbytes / 2  # of all rows at once it would be 1.5 times that
+    groups = values.astype(np.float32).reshape(-1, 4, channels)
+    assert (samples.values[: rows // 2 : 2] == groups.min(axis=1)).all()
+    assert (samples.values[1 : rows // 2 : 2] == groups.max(axis=1)).all()
+    assert (samples.stamp_ns[: rows // 2] == np.arange(0, rows, 2)).all()
 
 
 def test_a_browser_gets_thinned_samples_again_from_the_start(recorded: Path) -> None:

@@ -14,6 +14,7 @@ DISORDER_NS = 1_000_000_000
 """A controller that recovers from an overrun has ticks a few ms older than the one before."""
 
 FIRST_ROWS = 4096
+BLOCK = 4096  # rows that are thinned together; whole groups of four
 
 
 class Series:
@@ -64,10 +65,11 @@ class Series:
 
     def _thin(self) -> None:
         """Replace each four rows by two, the minima and the maxima of each channel: a plot keeps its peaks."""
-        whole = self.count - self.count % 4
-        groups = self._values[:whole].reshape(-1, 4, len(self.names))
-        thin = np.stack([np.fmin.reduce(groups, axis=1), np.fmax.reduce(groups, axis=1)], axis=1)
+        whole, k = self.count - self.count % 4, len(self.names)
+        for start in range(0, whole, BLOCK):  # in place: temporary arrays of all rows would stay in the heap of the process
+            groups = self._values[start : min(start + BLOCK, whole)].reshape(-1, 4, k)
+            thin = np.stack([np.fmin.reduce(groups, axis=1), np.fmax.reduce(groups, axis=1)], axis=1).reshape(-1, k)
+            self._values[start // 2 : start // 2 + len(thin)] = thin
         half = whole // 2
         self._stamp_ns[:half] = self._stamp_ns[:whole:2].copy()
-        self._values[:half] = thin.reshape(half, len(self.names))
         self.count, self.thinned = half, self.thinned + 1
