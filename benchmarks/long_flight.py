@@ -27,9 +27,10 @@ from typing import Any
 
 import numpy as np
 import psutil
-from benchmarks.host_delays import Intervals, missed_excluding_delays
+from benchmarks.host_delays import Intervals, excluding_delays, missed_excluding_delays
 from benchmarks.processes import PRIORITY, RISE_DI, delay_monitors, real_time
 from benchmarks.view import Client, figures_of_ticks, watching
+from numpy.typing import NDArray
 from tests.browser import CHROMIUM, Browser
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
@@ -46,6 +47,7 @@ TURBULENCE = {  # of 1.5 m/s: at the altitude of the c172p; moderate at 100 m ab
     "c172p": {"altitude": 1219.2, "sigma": 1.5, "seed": 1},
     "osprey": {"altitude": 100.0, "wind": 15.4, "seed": 1},
 }
+LONGEST = 20  # skips that are named
 PERIOD, REPORT_PERIOD = 2.0, 0.1  # s between samples of the memory, in flight and while the report is written
 IN_VIEW = """(() => {
   document.querySelector("figure")?.scrollIntoView();
@@ -116,10 +118,10 @@ def end(flight: psutil.Popen) -> None:
         flight.wait()
 
 
-def missing(tape: Tape, scenario: Scenario, delays: Intervals | None, *, real_time: bool) -> dict[str, dict[str, int]]:
-    """How many samples of each topic the log lacks between its first and its last, also excluding host delays where known.
+def skips(tape: Tape, scenario: Scenario, *, real_time: bool) -> dict[str, tuple[NDArray[np.int64], int]]:
+    """By topic, begin and end of each time without a sample between the first and the last of the log, ns, and the period, ns.
 
-    In real time a late tick skips instants. It is late by 0 to 1 period, so a gap ends half a period after the next stamp.
+    In real time a late tick skips instants. It is late by 0 to 1 period, so a skip ends half a period after the next stamp.
     Each u carries the stamp of a y, and `figures_of_ticks` counts the ticks of the controller.
     """
     guidance = scenario.guidance
@@ -128,15 +130,36 @@ def missing(tape: Tape, scenario: Scenario, delays: Intervals | None, *, real_ti
     rates = {"y": scenario.aircraft.rate, "y_m": scenario.reference_model.rate}
     rates |= {} if real_time else {"u": scenario.controller.rate}
     rates |= dict.fromkeys(("u_m", "guidance"), guidance.rate)
-    lacking: dict[str, dict[str, int]] = {}
+    found = {}
     for name, rate in rates.items():
         stamps, period = tape[name].stamp_ns, period_ns(rate, name)
         lateness = period // 2 if real_time else 0
-        gaps = np.column_stack((stamps[:-1] + period, stamps[1:] + lateness))[np.diff(stamps) > 1.5 * period]
-        for words, known in (("missing samples", ()), ("missing samples, excluding host delays", delays)):
-            if known is not None:
-                lacking.setdefault(words, {})[name] = missed_excluding_delays(gaps, known, period)
-    return lacking
+        ends = np.column_stack((stamps[:-1] + period, stamps[1:] + lateness))
+        found[name] = (ends[np.diff(stamps) > 1.5 * period], period)
+    return found
+
+
+def missing(tape: Tape, scenario: Scenario, delays: Intervals | None, *, real_time: bool) -> dict[str, dict[str, int]]:
+    """How many samples of each topic the log lacks, also excluding host delays where known."""
+    skipped = skips(tape, scenario, real_time=real_time)
+    return {
+        words: {name: missed_excluding_delays(ends, known, period) for name, (ends, period) in skipped.items()}
+        for words, known in (("missing samples", ()), ("missing samples, excluding host delays", delays))
+        if known is not None
+    }
+
+
+def longest_skips(tape: Tape, scenario: Scenario, delays: Intervals) -> list[dict[str, Any]]:
+    """The longest skips of samples in real time excluding host delays: topic, flight time and length, s; at most LONGEST."""
+    found: list[dict[str, Any]] = []
+    for name, (ends, period) in skips(tape, scenario, real_time=True).items():
+        lengths = excluding_delays(ends, delays)
+        found += [
+            {"topic": name, "t": float(begin - tape.start_ns) / NANOSECONDS, "length": float(length) / NANOSECONDS}
+            for (begin, _), length in zip(ends, lengths, strict=True)
+            if length >= period
+        ]
+    return sorted(found, key=lambda one: one["length"], reverse=True)[:LONGEST]
 
 
 def opened(report: Path) -> dict[str, float] | None:
@@ -175,6 +198,7 @@ def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None
         "minutes": (tape["y"].stamp_ns[-1] - tape.start_ns) / NANOSECONDS / 60.0,
         "legs": int(log["leg"].max()),
         "missing": missing(tape, scenario, delays, real_time=real_time),
+        "longest skips": longest_skips(tape, scenario, delays) if real_time and delays is not None else [],
         "lost": sum(int(count) for count in read.metadata.get(LOST_MESSAGES, {}).values()),
         "ticks": figures_of_ticks(tape["internals"], delays, period_ns(scenario.controller.rate, "rate")) if real_time else {},
         "guidance": {"steps": replay.steps, "differing": replay.differing},

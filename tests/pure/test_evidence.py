@@ -94,6 +94,7 @@ LONG_FLIGHT |= {
     "memory": {"recorder.main": [100e6, 103e6], "rise-di fly": [90e6, 91e6]},
 }
 LONG_FLIGHT |= {"ticks": {"missed ticks": 3, "missed ticks, excluding host delays": 0}}
+LONG_FLIGHT |= {"longest skips": [{"topic": "y", "t": 12.34, "length": 0.004}, {"topic": "u", "t": 50.0, "length": 0.01}]}
 LONG_FLIGHT |= {
     "report": {"size": 48.1e6, "memory": 900e6, "written": 12.5, "opened": {"figures in view": 1.2, "all figures": 2.6}}
 }
@@ -170,6 +171,7 @@ def test_a_long_flight_states_its_goals_and_those_that_it_misses() -> None:
         "memory of recorder.main at most 2 % larger at the end of the flight than in the middle. Measured: 3 %, **not met**.",
         "- Goal: memory of rise-di fly at most 2 % larger at the end of the flight than in the middle. Measured: 1.11 %, met.",
         "- Goal: no missing sample. Measured: 4, **not met**.\n- Missing samples: y 3, u 1.",
+        "- The longest skips, excluding host delays: y 4 ms at 12.3 s, u 10 ms at 50.0 s.",
         "- Goal: no missed tick, excluding host delays. Measured: 0, met.",
         "- Goal: the report is written within 10 s. Measured: 12.5 s, **not met**.",
         "- Goal: all figures of the report (48 MB) drawn within 3 s. Measured: 2.6 s, met.",

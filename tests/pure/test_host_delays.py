@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from benchmarks.host_delays import missed_excluding_delays
-from benchmarks.long_flight import missing, triangle
+from benchmarks.long_flight import longest_skips, missing, triangle
 from benchmarks.view import figures_of_ticks
 
 from flight_core.rates import NANOSECONDS
@@ -57,3 +57,7 @@ def test_instants_that_a_late_tick_skips_are_missing_samples_except_in_host_dela
     found = missing(tape, scenario, delays, real_time=True)
     assert found["missing samples"] == {"y": 3, "y_m": 0, "u_m": 0, "guidance": 0}
     assert found["missing samples, excluding host delays"] == {"y": 2, "y_m": 0, "u_m": 0, "guidance": 0}
+    (longest,) = longest_skips(tape, scenario, delays)  # of tick 20 less than a period remains
+    assert longest["topic"] == "y"
+    assert math.isclose(longest["t"], 50 * PERIOD_NS / NANOSECONDS)
+    assert math.isclose(longest["length"], 2.5 * PERIOD_NS / NANOSECONDS)  # until half a period after tick 52
