@@ -4,6 +4,7 @@
 
 import os
 import shutil
+import subprocess
 import tempfile
 from pathlib import Path
 
@@ -88,3 +89,11 @@ def recorded(tape: Tape, osprey_gust: Scenario, tmp_path_factory: pytest.TempPat
 def run(recorded: Path, tmp_path: Path) -> Path:
     """A copy of `recorded` to damage."""
     return Path(shutil.copytree(recorded, tmp_path / "run"))
+
+
+def with_policy(*policy: str) -> list[str]:
+    """What runs a command with a scheduling policy, as options of chrt; skips the test where that is not permitted."""
+    command = [shutil.which("chrt") or "", *policy]
+    if not command[0] or subprocess.run([*command, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("needs chrt, and the right to a real-time priority")
+    return command

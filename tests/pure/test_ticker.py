@@ -10,6 +10,7 @@ import sys
 import time
 
 import pytest
+from tests.conftest import with_policy
 
 from flight_ros.scheduling import SLICE_NS, THREADS, TIMER_SLACK
 from flight_ros.ticker import MAX_SPIN_FRACTION, SPIN_TIME, Ticker
@@ -93,3 +94,23 @@ print([(one / "sched").read_text() for one in THREADS.iterdir()])
 """
     ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert [int(slice_ns) for slice_ns in re.findall(r"se\.slice\s*:\s*(\d+)", ran.stdout)] == [SLICE_NS, SLICE_NS]
+
+
+@pytest.mark.parametrize(
+    ("policy", "priority"),
+    [(("--fifo", "50"), 48), (("--rr", "50"), 48), (("--fifo", "2"), 1), (("--other", "0"), 0)],
+    ids=["FIFO", "round robin", "no lower one", "default policy"],
+)
+def test_a_lowered_real_time_priority_is_that_of_the_threads_that_follow(policy: tuple[str, str], priority: int) -> None:
+    code = """
+import os, threading
+from flight_ros.scheduling import lower_real_time_priority
+before = os.sched_getscheduler(0)
+lower_real_time_priority(2)
+assert os.sched_getscheduler(0) == before
+thread = threading.Thread(target=lambda: print(os.sched_getparam(0).sched_priority))
+thread.start()
+thread.join()
+"""
+    ran = subprocess.run([*with_policy(*policy), sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert int(ran.stdout) == priority

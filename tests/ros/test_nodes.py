@@ -2,16 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each node alone: parameter errors, waiting for a publisher, clean shutdown."""
 
+import os
 import re
 import signal
 import subprocess
 
 import numpy as np
+import psutil
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from tests.conftest import REPOSITORY
+from tests.conftest import REPOSITORY, with_policy
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer
 
@@ -133,6 +135,13 @@ def test_a_recorder_that_cannot_write_names_the_folder(start_node: Start) -> Non
     node = start_node("flight_recorder", "-p", "directory:=/proc/nowhere")
     assert node.end() == 2
     assert "recorder.directory: /proc/nowhere cannot be written" in node.output
+
+
+@pytest.mark.parametrize(("package", "priority"), [("rise_di_controller", 50), ("flight_recorder", 48)])
+def test_the_inner_loop_preempts_the_recorder_at_real_time_priority(package: str, priority: int, start_node: Start) -> None:
+    node = start_node(package, within=with_policy("--fifo", "50")).wait_for("ready")
+    assert {os.sched_getparam(thread.id).sched_priority for thread in psutil.Process(node.popen.pid).threads()} == {priority}
+    node.interrupt().succeed()
 
 
 @pytest.mark.parametrize(("package", "executable"), NODES.items())

@@ -14,9 +14,24 @@ from pathlib import Path
 
 TIMER_SLACK = Path("/proc/self/timerslack_ns")  # of the main thread; Linux
 THREADS = Path("/proc/self/task")
+REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
 SLICE_NS = 100_000  # the shortest that Linux accepts; by default 0.7 ms times 1 + log2 of the cores
 SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}  # numbers of the system call; glibc has no function for it before 2.41
 ATTRIBUTES = "=IIQiIQQQ"  # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
+
+
+def lower_real_time_priority(levels: int) -> None:
+    """Lower the real-time priority of all threads of this process, where it has one (chrt), by `levels`; the lowest is 1.
+
+    Threads that start later inherit it. Processes of one priority do not preempt each other, so that a recorder that compresses
+    delays a tick of the law by milliseconds. Rate-monotonic priorities are the optimal fixed ones.
+    Source: sched(7); C. L. Liu and J. W. Layland, Journal of the ACM 20(1), 1973, theorem 2.
+    """
+    if (policy := os.sched_getscheduler(0)) in REAL_TIME:
+        priority = max(os.sched_getparam(0).sched_priority - levels, os.sched_get_priority_min(policy))
+        for path in THREADS.iterdir():  # the import of rclpy starts some
+            with suppress(ProcessLookupError):  # the thread has ended
+                os.sched_setparam(int(path.name), os.sched_param(priority))
 
 
 def disable_timer_slack() -> None:
