@@ -13,9 +13,10 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Message
+from mcap.records import Message, Statistics
 from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -32,7 +33,7 @@ from flight_log.engagements import Engagement
 from flight_log.message_definitions import definition
 from flight_log.named_vectors import JOINT_STATE_TYPES, Samples, decoder, encoded, joint_state_types, stamp_of, tables
 from flight_log.playback import read_playback
-from flight_log.scan import MESSAGE_INDEX, RECORD, MessageBatch, Scan, decode_batches
+from flight_log.scan import MESSAGE_INDEX, RECORD, RECORD_READERS, MessageBatch, Part, Scan, decode_batches
 from flight_log.tape_reader import ROSBAG2, read_run
 from flight_log.tape_writer import write_run
 from flight_view.flight import Flight
@@ -189,6 +190,22 @@ def test_a_file_with_changed_bytes_gives_recorded_samples_or_is_rejected(tape: T
             read += 1
             assert set(zip(back["y"].stamp_ns.tolist(), map(bytes, back["y"].values), strict=True)) <= samples
     assert read > 10  # of 60: the samples are in two chunks, and three changed bytes sometimes leave one of them intact
+
+
+@pytest.mark.parametrize("wrong", [0, 7, 2**60])
+def test_a_wrong_count_of_messages_in_the_index_changes_no_sample(
+    wrong: int, tape: Tape, recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(stream: ReadDataStream) -> Statistics:
+        found: Statistics = Statistics.read(stream)
+        found.channel_message_counts = dict.fromkeys(found.channel_message_counts, wrong)
+        return found
+
+    monkeypatch.setitem(RECORD_READERS, Opcode.STATISTICS, read)
+    back = read_run(recorded).tape
+    assert {name: signal.values.tobytes() for name, signal in back.signals.items()} == {
+        name: signal.values.tobytes() for name, signal in tape.signals.items()
+    }
 
 
 def test_a_file_that_grows_while_it_is_read_is_read_up_to_its_first_size(tmp_path: Path) -> None:
@@ -371,7 +388,7 @@ def messages_of(chunk: bytes, index: bytes) -> list[tuple[int, bytes, int, int]]
     """Channel, content and times of the messages of a chunk with this message index."""
     return [
         (batch.channel_id, bytes(message), int(log_ns), int(publish_ns))
-        for batch in decode_batches(Opcode.CHUNK, chunk, [index])
+        for batch in decode_batches([Part(Opcode.CHUNK, chunk, [index])])
         if isinstance(batch, MessageBatch)
         for message, log_ns, publish_ns in zip(batch.data, batch.log_ns, batch.publish_ns, strict=True)
     ]

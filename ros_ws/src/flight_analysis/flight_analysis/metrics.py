@@ -135,12 +135,12 @@ def _minus_reference(y: Signal, y_m: Signal) -> Signal:
         return Signal(stamps, y.names, values - _columns(y_m, y.names))
     # float64 represents stamps exactly relative to the first one, but not ns since the epoch.
     at, knots = (stamps - y_m.stamp_ns[0]).astype(float), (y_m.stamp_ns - y_m.stamp_ns[0]).astype(float)
-    reference = np.column_stack([np.interp(at, knots, y_m[name]) for name in y.names])
+    reference = np.stack([np.interp(at, knots, y_m[name]) for name in y.names]).T
     return Signal(stamps, y.names, values - reference)
 
 
 def _columns(signal: Signal, names: Sequence[str]) -> FloatArray:
-    return np.column_stack([signal[name] for name in names])
+    return np.stack([signal[name] for name in names]).T
 
 
 def noise_floor(tape: Tape) -> dict[str, float]:

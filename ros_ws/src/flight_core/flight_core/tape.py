@@ -18,7 +18,8 @@ from flight_core.vectors import FloatArray
 class Signal:
     """One topic: N samples of k named channels, SI units and radians.
 
-    stamp_ns: shape (N,), int64, the instant of each sample, ascending. values: shape (N, k).
+    stamp_ns: shape (N,), int64, the instant of each sample, ascending. values: shape (N, k), of a log with each channel
+    contiguous in memory.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -46,7 +47,8 @@ class Signal:
         """The channels "prefix.name", as a signal with channels "name"."""
         columns = [i for i, name in enumerate(self.names) if name.startswith(prefix + ".")]
         names = tuple(self.names[i].removeprefix(prefix + ".") for i in columns)
-        return Signal(self.stamp_ns, names, self.values[:, columns])
+        adjacent = bool(columns) and columns[-1] - columns[0] < len(columns)  # then without a copy
+        return Signal(self.stamp_ns, names, self.values[:, slice(columns[0], columns[-1] + 1) if adjacent else columns])
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,9 @@ LENGTH = struct.Struct("<Q")  # before the records of a chunk
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, offsets of the summary and of its offsets, checksum
 CRC = struct.Struct("<I")
 
+JOINED_BYTES = 256 << 10
+"""Compressed bytes of the chunks that are decoded together: a second of a flight."""
+
 MAX_CHUNK_BYTES = 64 << 20
 """Limit for a chunk that is larger than its compressed bytes. A damaged chunk of 1 kB may give any size, and hold 20 MB.
 
@@ -81,8 +84,16 @@ class _Decompressor(threading.local):
 _OF_THREAD = _Decompressor()
 
 
+class Part(NamedTuple):
+    """A record between the two magics of a file."""
+
+    opcode: int
+    content: bytes
+    message_indexes: list[bytes]  # the contents of those behind a chunk
+
+
 class MessageBatch(NamedTuple):
-    """N messages of one channel and one length, one after the other in a chunk."""
+    """N messages of one channel and one length, one after the other in a chunk, or in some that follow one another."""
 
     channel_id: int
     data: NDArray[np.uint8]  # (N, length)
@@ -101,6 +112,7 @@ class Scan:
         self.complete = False  # it has its footer
         self.damaged = 0  # chunks and other parts that could not be read
         self.known_end_ns = 0  # the latest log time in the index and the chunk headers, including lost messages
+        self.message_counts: dict[int, int] = {}  # by channel, as the index has them; known from the first record on
 
     @property
     def faults(self) -> str:
@@ -115,28 +127,34 @@ class Scan:
         Schemas and channels of the index come first, so that a damaged chunk does not lose them. Raises OSError when the file
         cannot be read, and nothing when its content is damaged.
         """
-        return self._read(lambda opcode, content, _: decode(opcode, content))
+        return self._read(lambda parts: (record for part in parts for record in decode(part.opcode, part.content)), 0)
 
     def batches(self) -> Iterator[McapRecord | MessageBatch]:
-        """As `records`, with the messages of each channel in a chunk together, which is many times faster."""
-        return self._read(decode_batches)
+        """As `records`, with the messages of each channel in some chunks together, which is many times faster."""
+        return self._read(decode_batches, JOINED_BYTES)
 
-    def _read(self, decode: Callable[[int, bytes, list[bytes]], Iterator[R]]) -> Iterator[R | Schema | Channel]:
+    def _read(self, decode: Callable[[Sequence[Part]], Iterator[R]], joined: int) -> Iterator[R | Schema | Channel]:
         with self.path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             index = self._index(stream, size)
             yield from (record for record in index if isinstance(record, Schema | Channel))
             missing = sum(record.message_count for record in index if isinstance(record, Statistics))
-            for opcode, content, message_indexes in _with_message_indexes(self._frames(stream, size, index)):
-                try:
-                    records = list(decode(opcode, content, message_indexes))
-                except DECODE_ERRORS:
-                    self.damaged += 1
-                    continue
+            for parts in _joined(_with_message_indexes(self._frames(stream, size, index)), joined):
+                records = self._decoded(parts, decode)
                 missing -= sum(_messages_in(record) for record in records)
                 yield from records
             if missing > 0 and not self.damaged:  # a changed opcode makes a record unrecognisable
                 self.damaged += 1
+
+    def _decoded(self, parts: Sequence[Part], decode: Callable[[Sequence[Part]], Iterator[R]]) -> list[R]:
+        """The records of parts without the damaged parts."""
+        try:
+            return list(decode(parts))
+        except DECODE_ERRORS:
+            if len(parts) > 1:
+                return [record for part in parts for record in self._decoded([part], decode)]
+            self.damaged += 1
+            return []
 
     def _index(self, stream: IO[bytes], size: int) -> list[McapRecord]:
         """The records of the index (the MCAP summary); empty when the file is truncated or the index damaged."""
@@ -160,6 +178,13 @@ class Scan:
             return []
         ends = [record.message_end_time for record in index if isinstance(record, Statistics | ChunkIndex)]
         self.known_end_ns = max(ends, default=0)
+        most = size // INDEX_ENTRY.itemsize  # the message indexes alone take that much
+        self.message_counts = {
+            channel: min(count, most)
+            for record in index
+            if isinstance(record, Statistics)
+            for channel, count in record.channel_message_counts.items()
+        }
         return index
 
     def _frames(self, stream: IO[bytes], size: int, index: Sequence[McapRecord]) -> Iterator[tuple[int, bytes]]:
@@ -195,18 +220,35 @@ class Scan:
         self.complete = False
 
 
-def _with_message_indexes(frames: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes, list[bytes]]]:
+def _with_message_indexes(frames: Iterator[tuple[int, bytes]]) -> Iterator[Part]:
     """Each record with the message indexes behind it, which only a chunk has."""
-    before: tuple[int, bytes, list[bytes]] | None = None
+    before: Part | None = None
     for opcode, content in frames:
         if before is not None and opcode == Opcode.MESSAGE_INDEX:
-            before[2].append(content)
+            before.message_indexes.append(content)
             continue
         if before is not None:
             yield before
-        before = opcode, content, []
+        before = Part(opcode, content, [])
     if before is not None:
         yield before
+
+
+def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
+    """Chunks that follow one another, up to `most` bytes of content together or one alone; each other record alone."""
+    chunks: list[Part] = []
+    size = 0
+    for part in parts:
+        if chunks and (part.opcode != Opcode.CHUNK or size + len(part.content) > most):
+            yield chunks
+            chunks, size = [], 0
+        if part.opcode == Opcode.CHUNK:
+            chunks.append(part)
+            size += len(part.content)
+        else:
+            yield [part]
+    if chunks:
+        yield chunks
 
 
 def split(data: bytes) -> Iterator[McapRecord]:
@@ -230,16 +272,15 @@ def _messages_in(record: object) -> int:
     return len(record.data) if isinstance(record, MessageBatch) else isinstance(record, Message)
 
 
-def decode_batches(opcode: int, content: bytes, message_indexes: Sequence[bytes] = ()) -> Iterator[McapRecord | MessageBatch]:
-    """As `decode`, with messages of a channel together. Raises one of DECODE_ERRORS.
+def decode_batches(parts: Sequence[Part]) -> Iterator[McapRecord | MessageBatch]:
+    """As `decode` of chunks, or of one other record, with messages of a channel together. Raises one of DECODE_ERRORS.
 
     The message indexes of a chunk save most of the time. A wrong one changes nothing.
     """
-    if opcode == Opcode.CHUNK:
-        places = np.sort(np.concatenate([NO_PLACES, *map(_places, message_indexes)]))
-        yield from _split_batches(decompress(content), places)
+    if parts[0].opcode == Opcode.CHUNK:
+        yield from _split_batches([(decompress(part.content), _places(part.message_indexes)) for part in parts])
         return
-    for record in decode(opcode, content):
+    for record in decode(parts[0].opcode, parts[0].content):
         if isinstance(record, Message):
             times = (np.array([time], dtype=np.uint64).view(np.int64) for time in (record.log_time, record.publish_time))
             yield MessageBatch(record.channel_id, np.frombuffer(record.data, dtype=np.uint8)[None], *times)
@@ -247,22 +288,29 @@ def decode_batches(opcode: int, content: bytes, message_indexes: Sequence[bytes]
             yield record
 
 
-def _places(message_index: bytes) -> NDArray[np.int64]:
-    """The places of messages in their chunk, as an index has them; the index may be damaged."""
-    count = (len(message_index) - MESSAGE_INDEX.size) // INDEX_ENTRY.itemsize
-    return np.frombuffer(message_index, INDEX_ENTRY, count, MESSAGE_INDEX.size)["place"] if count > 0 else NO_PLACES
+def _places(message_indexes: Sequence[bytes]) -> NDArray[np.int64]:
+    """The places of messages in their chunk in their order, as its indexes have them; these may be damaged."""
+    ends = (len(content) - (len(content) - MESSAGE_INDEX.size) % INDEX_ENTRY.itemsize for content in message_indexes)
+    entries = b"".join(content[MESSAGE_INDEX.size : end] for content, end in zip(message_indexes, ends, strict=True))
+    return np.sort(np.frombuffer(entries, INDEX_ENTRY)["place"])
 
 
-def _split_batches(data: bytes, places: NDArray[np.int64]) -> Iterator[McapRecord | MessageBatch]:
-    """The records in a chunk, and then its messages by channel. Raises one of DECODE_ERRORS.
+def _split_batches(chunks: Sequence[tuple[bytes, NDArray[np.int64]]]) -> Iterator[McapRecord | MessageBatch]:
+    """The records in chunks, and then their messages by channel. Raises one of DECODE_ERRORS.
 
-    `places` are those of its messages in their order, as the message indexes have them.
+    A chunk has the places of its messages in their order, as the message indexes have them.
     """
-    try:
-        others, places = _walk(data, places)
-    except DECODE_ERRORS:  # an index may be wrong, or of another chunk
-        others, places = _walk(data, NO_PLACES)
-    yield from others
+    found: list[NDArray[np.int64]] = []
+    size = 0
+    for data, indexed in chunks:
+        try:
+            others, places = _walk(data, indexed)
+        except DECODE_ERRORS:  # an index may be wrong, or of another chunk
+            others, places = _walk(data, NO_PLACES)
+        yield from others
+        found.append(places + size)
+        size += len(data)
+    data, places = b"".join(data for data, _ in chunks), np.concatenate(found)
     places = places[np.argsort(_heads(data)["channel"][places], kind="stable")]
     heads = _heads(data)[places]
     sizes = heads["length"] - MESSAGE.size

@@ -114,37 +114,37 @@ def _names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
     }
 
 
-class _Rows(Generic[T]):
-    """Rows of an array that grows. It grows in place: to collect parts and join them takes the memory of all rows twice."""
+class _Columns(Generic[T]):
+    """Samples, one in each column of an array that grows: metrics and figures use whole channels, each contiguous in memory."""
 
-    def __init__(self, first: NDArray[T]) -> None:
-        self._rows, self.count = first.copy(), len(first)
+    def __init__(self, first: NDArray[T], expected: int) -> None:
+        self.count = len(first)
+        self._array = np.empty((*first.shape[1:], max(expected, self.count)), first.dtype)
+        self._array[..., : self.count] = first.T
 
     def append(self, rows: NDArray[T]) -> None:
         end = self.count + len(rows)
-        if end > len(self._rows):
-            self._resize(end + end // 2)
-        self._rows[self.count : end] = rows
+        if end > self._array.shape[-1]:
+            before = self._array
+            self._array = np.empty((*before.shape[:-1], end + end // 2), before.dtype)
+            self._array[..., : self.count] = before[..., : self.count]
+        self._array[..., self.count : end] = rows.T
         self.count = end
 
     def all(self) -> NDArray[T]:
-        self._resize(self.count)
-        return self._rows
-
-    def _resize(self, count: int) -> None:
-        self._rows.resize((count, *self._rows.shape[1:]), refcheck=False)  # there is no view of them yet
+        return self._array[..., : self.count].T
 
 
 class _Collected(NamedTuple):
-    stamp_ns: _Rows[np.int64]
-    values: _Rows[np.float64]
+    stamp_ns: _Columns[np.int64]
+    values: _Columns[np.float64]
 
 
 class _TopicSamples:
     """Samples of one topic, decoded in batches. Those with the same names are its signal."""
 
-    def __init__(self, decode: Decoder) -> None:
-        self._decode = decode
+    def __init__(self, decode: Decoder, expected: int) -> None:
+        self._decode, self._expected = decode, expected
         self._batch: list[Table] = []  # of one length
         self._batched = 0  # messages
         self._samples: dict[tuple[str, ...], _Collected] = {}  # by names
@@ -172,7 +172,7 @@ class _TopicSamples:
                     self._samples[names].stamp_ns.append(stamp_ns)
                     self._samples[names].values.append(values)
                 else:
-                    self._samples[names] = _Collected(_Rows(stamp_ns), _Rows(values))
+                    self._samples[names] = _Collected(_Columns(stamp_ns, self._expected), _Columns(values, self._expected))
             else:
                 self._refused += len(stamp_ns)
 
@@ -225,9 +225,9 @@ class _Log:
         self.reports: dict[str, list[tuple[int, bytes]]] = {}  # of bridges by full topic name: time of sending, ns, and message
         self.times: Times | None = None  # of the last y or u of a chunk
 
-    def reader_of(self, topic: str, type_name: str) -> Callable[[MessageBatch], None] | None:
-        """What takes the messages of a topic; None for a topic that plays no part."""
-        samples = self.samples_of(topic, type_name)
+    def reader_of(self, topic: str, type_name: str, expected: int) -> Callable[[MessageBatch], None] | None:
+        """What takes the messages of a topic, `expected` in its file; None for a topic that plays no part."""
+        samples = self.samples_of(topic, type_name, expected)
         if samples is not None and topic.rpartition("/")[2] in TIMED_TOPICS:
             times = self.sent.setdefault(topic, [])
 
@@ -256,11 +256,11 @@ class _Log:
                 return int(sent_ns - offset_ns)
         return int(sent_ns)
 
-    def samples_of(self, topic: str, type_name: str) -> _TopicSamples | None:
+    def samples_of(self, topic: str, type_name: str, expected: int = 0) -> _TopicSamples | None:
         """The samples of a topic; None for a type without named vectors that is no route."""
         is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
         if topic not in self.topics and (decode := decode_routes if is_route else decoder(type_name)) is not None:
-            self.topics[topic] = _TopicSamples(decode)
+            self.topics[topic] = _TopicSamples(decode, expected)
         return self.topics.get(topic)
 
     def add(self, record: McapRecord) -> None:
@@ -328,7 +328,8 @@ def _read_mcap(file: Path, log: _Log) -> None:
             elif isinstance(record, Schema):
                 schemas[record.id] = record.name
             elif isinstance(record, Channel):
-                if (take := log.reader_of(record.topic, schemas.get(record.schema_id, ""))) is not None:
+                expected = scan.message_counts.get(record.id, 0)
+                if (take := log.reader_of(record.topic, schemas.get(record.schema_id, ""), expected)) is not None:
                     channels[record.id] = take
             else:
                 log.add(record)

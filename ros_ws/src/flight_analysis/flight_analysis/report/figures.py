@@ -167,7 +167,7 @@ def integral_figure(context: PlotContext) -> Figure | None:
     channels = {f"{label} {name}": f"{group}.{name}" for name in outputs for group, label in INTEGRALS.items()}
     if not outputs:
         return None
-    values = np.column_stack([internals[channel] for channel in channels.values()])
+    values = np.stack([internals[channel] for channel in channels.values()]).T
     curve = Curve(Signal(internals.stamp_ns, tuple(channels), values), PLANT)
     return time_series_figure(context, {"": curve}, columns=2, height=120)
 
@@ -288,7 +288,7 @@ def tick_figure(context: PlotContext) -> Figure | None:
     steps = ticks["dt"][ticks["dt"] > 0.0]
     if not (ticks["late"].any() or ticks["age"].any() or np.unique(steps).size > 1):
         return None
-    signal = Signal(ticks.stamp_ns, channels, np.column_stack([ticks[name] for name in channels]))
+    signal = Signal(ticks.stamp_ns, channels, np.stack([ticks[name] for name in channels]).T)
     units = dict.fromkeys(channels, DisplayUnit("ms", 1e3))
     return time_series_figure(context._replace(units=units), {"ticks": Curve(signal, PLANT, 1.0)}, height=100)
 

@@ -159,7 +159,7 @@ def cross_track_figure(context: PlotContext) -> Figure | None:
 
 
 def _signal(context: PlotContext, channels: Mapping[str, FloatArray]) -> Signal:
-    return Signal(context.tape["guidance"].stamp_ns, tuple(channels), np.column_stack(list(channels.values())))
+    return Signal(context.tape["guidance"].stamp_ns, tuple(channels), np.stack(list(channels.values())).T)
 
 
 def _over_commands(
