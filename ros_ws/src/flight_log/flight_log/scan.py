@@ -7,7 +7,10 @@ import struct
 import threading
 import zlib
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -56,6 +59,8 @@ CRC = struct.Struct("<I")
 JOINED_BYTES = 256 << 10
 """Compressed bytes of the chunks that are decoded together: a second of a flight."""
 
+AHEAD = 3  # groups of chunks that are decoded before they are asked for
+
 MAX_CHUNK_BYTES = 64 << 20
 """Limit for a chunk that is larger than its compressed bytes. A damaged chunk of 1 kB may give any size, and hold 20 MB.
 
@@ -102,6 +107,7 @@ class MessageBatch(NamedTuple):
 
 
 R = TypeVar("R")
+T = TypeVar("T")
 
 
 class Scan:
@@ -127,34 +133,27 @@ class Scan:
         Schemas and channels of the index come first, so that a damaged chunk does not lose them. Raises OSError when the file
         cannot be read, and nothing when its content is damaged.
         """
-        return self._read(lambda parts: (record for part in parts for record in decode(part.opcode, part.content)), 0)
+        return self._read(lambda parts: (record for part in parts for record in decode(part.opcode, part.content)), 0, map)
 
     def batches(self) -> Iterator[McapRecord | MessageBatch]:
         """As `records`, with the messages of each channel in some chunks together, which is many times faster."""
-        return self._read(decode_batches, JOINED_BYTES)
+        return self._read(decode_batches, JOINED_BYTES, map_ahead)
 
-    def _read(self, decode: Callable[[Sequence[Part]], Iterator[R]], joined: int) -> Iterator[R | Schema | Channel]:
+    def _read(
+        self, decode: Callable[[Sequence[Part]], Iterator[R]], joined: int, apply: Callable[..., Iterator[tuple[list[R], int]]]
+    ) -> Iterator[R | Schema | Channel]:
         with self.path.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             index = self._index(stream, size)
             yield from (record for record in index if isinstance(record, Schema | Channel))
             missing = sum(record.message_count for record in index if isinstance(record, Statistics))
-            for parts in _joined(_with_message_indexes(self._frames(stream, size, index)), joined):
-                records = self._decoded(parts, decode)
+            parts = _joined(_with_message_indexes(self._frames(stream, size, index)), joined)
+            for records, damaged in apply(partial(_decoded, decode), parts):
+                self.damaged += damaged
                 missing -= sum(_messages_in(record) for record in records)
                 yield from records
             if missing > 0 and not self.damaged:  # a changed opcode makes a record unrecognisable
                 self.damaged += 1
-
-    def _decoded(self, parts: Sequence[Part], decode: Callable[[Sequence[Part]], Iterator[R]]) -> list[R]:
-        """The records of parts without the damaged parts."""
-        try:
-            return list(decode(parts))
-        except DECODE_ERRORS:
-            if len(parts) > 1:
-                return [record for part in parts for record in self._decoded([part], decode)]
-            self.damaged += 1
-            return []
 
     def _index(self, stream: IO[bytes], size: int) -> list[McapRecord]:
         """The records of the index (the MCAP summary); empty when the file is truncated or the index damaged."""
@@ -249,6 +248,28 @@ def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
             yield [part]
     if chunks:
         yield chunks
+
+
+def _decoded(decode: Callable[[Sequence[Part]], Iterator[R]], parts: Sequence[Part]) -> tuple[list[R], int]:
+    """The records of parts without the damaged parts, and how many these are."""
+    try:
+        return list(decode(parts)), 0
+    except DECODE_ERRORS:
+        if len(parts) == 1:
+            return [], 1
+    alone = [_decoded(decode, [part]) for part in parts]
+    return [record for records, _ in alone for record in records], sum(damaged for _, damaged in alone)
+
+
+def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """As `map`, with the next results from a thread: decompression and NumPy leave the interpreter to the caller meanwhile."""
+    with ThreadPoolExecutor(1) as pool:
+        ahead: deque[Future[R]] = deque()
+        for item in items:
+            ahead.append(pool.submit(function, item))
+            if len(ahead) > AHEAD:
+                yield ahead.popleft().result()
+        yield from (one.result() for one in ahead)
 
 
 def split(data: bytes) -> Iterator[McapRecord]:
