@@ -33,6 +33,7 @@ from benchmarks.view import Client, figures_of_ticks, watching
 from numpy.typing import NDArray
 from tests.browser import CHROMIUM, Browser
 
+from aircraft_sim.turbulence import MODERATE
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
 from flight_analysis.report.run_folder import write_report
@@ -45,7 +46,7 @@ from flight_log.tape_reader import read_run
 SIDE = 6000.0  # m, of the triangle
 TURBULENCE = {  # of 1.5 m/s: at the altitude of the c172p; moderate at 100 m above ground (MIL-F-8785C)
     "c172p": {"altitude": 1219.2, "sigma": 1.5, "seed": 1},
-    "osprey": {"altitude": 100.0, "wind": 15.4, "seed": 1},
+    "osprey": MODERATE | {"seed": 1},
 }
 LONGEST = 20  # skips that are named
 PERIOD, REPORT_PERIOD = 2.0, 0.1  # s between samples of the memory, in flight and while the report is written

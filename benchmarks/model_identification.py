@@ -23,6 +23,7 @@ from rich.progress import track
 from rich.table import Table
 
 from aircraft_sim.airframe import load_airframe
+from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import AIR_RELATIVE, gust_directions, sampled_matrices
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.innovation_filters import Actuation, recording
@@ -39,7 +40,7 @@ from rise_di_controller.params import ControllerParameters
 AIR: dict[str, dict[str, Any]] = {
     "calm": {"gusts": {}},
     "two gusts": {},
-    "turbulence": {"gusts": {}, "turbulence": {"altitude": 100.0, "wind": 15.4}},
+    "turbulence": {"gusts": {}, "turbulence": MODERATE},
 }
 UNCERTAINTIES, AIRCRAFT, SEED = (0.3, 0.5), 3, 5
 ENTRIES = ("B[V, thrust]", "B[q, elevator]", "A[p, p]", "B[p, aileron]", "A[r, beta]", "B[r, rudder]")

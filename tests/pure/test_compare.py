@@ -11,6 +11,7 @@ import pytest
 from tests.closed_loop import error
 from typer.testing import CliRunner
 
+from aircraft_sim.turbulence import MODERATE
 from control_laws.catalogue import LAWS, Gains, initial_gains
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -117,7 +118,7 @@ def test_the_score_of_a_campaign_is_that_of_the_single_process_simulation(wind: 
     gains = {key: np.array([getattr(controller, key)]).T for key in ("Lambda", "beta")}
     gains |= {"K": np.array([controller.law_params().K]).T, "softening": np.array([[short.scenario.rise_di().softening]])}
     (found,) = law_comparison.compare(short, {"rise": {"gust": as_tuned(gains)}}, 1, [0.3], 1)
-    turbulence = tuning.DRYDEN | {"seed": tuning.TUNING_TURBULENCE_SEED}
+    turbulence = MODERATE | {"seed": tuning.TUNING_TURBULENCE_SEED}
     flown = short.scenario if wind == GUST else short.scenario.vary(aircraft={"gusts": {}, "turbulence": turbulence})
     true = error(simulate(flown))
     rms = np.array([error_metrics(true[name]).rms for name in controller.outputs])

@@ -26,6 +26,11 @@ LOWEST, LOW, HIGH = 10.0 * FOOT, 1000.0 * FOOT, 2000.0 * FOOT
 
 HIGH_LENGTH = 1750.0 * FOOT  # m, MIL-F-8785C 3.7.2.1, Dryden form
 
+MODERATE_WIND, MODERATE_SIGMA = 15.4, 3.05
+"""m/s, of moderate turbulence: W_20 of 30 kt (MIL-F-8785C 3.7.3.4), and the intensity at high altitude, 10 ft/s."""
+
+MODERATE = {"altitude": 100.0, "wind": MODERATE_WIND}  # m above the ground, m/s
+
 STATES = 5  # one of the longitudinal filter, two of the lateral, two of the vertical one
 BLOCK = 64  # steps that share a generator: creating one takes as long as hundreds of its numbers
 

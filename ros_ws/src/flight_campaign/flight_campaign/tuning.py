@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from aircraft_sim.plant import PlantParams
+from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import gust_directions, nominal_and_sampled
 from control_laws.catalogue import AIRCRAFT, INTEGRATORS, LAWS, NONE, Gains, Law, initial_gains
 from control_laws.nominal_model import NominalModel
@@ -34,7 +35,6 @@ ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1"
 GUST, TURBULENCE = "gust", "turbulence"
 """The winds of a benchmark: that of its scenario, and turbulence in its place."""
 
-DRYDEN = {"altitude": 100.0, "wind": 15.4}  # m; m/s at 20 ft, moderate turbulence by MIL-F-8785C, 3.7.3.4
 TUNING_TURBULENCE_SEED = 40  # of the turbulence in a cost; a comparison flies another one
 
 
@@ -86,8 +86,8 @@ class Benchmark(NamedTuple):
 def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE_SEED) -> Benchmark:
     """The benchmark of a scenario: its manoeuvre, actuators and noise; y, y_m and law at one rate, topics without delay.
 
-    Its winds are those of the scenario, and DRYDEN of `turbulence_seed` alone. Raises ParameterError for a scenario that a
-    campaign cannot fly, and for outputs whose unit has no score.
+    Its winds are those of the scenario, and moderate turbulence of `turbulence_seed` alone. Raises ParameterError for a
+    scenario that a campaign cannot fly, and for outputs whose unit has no score.
     """
     scenario = scenario.vary(
         aircraft={"rate": scenario.controller.rate, "step": min(STEP, 1.0 / scenario.controller.rate)},
@@ -97,7 +97,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
     airframe, _ = scenario.aircraft.load()
     controller = scenario.controller
     with_model = scenario.vary(controller=with_feedforward(controller, airframe).model_dump())
-    turbulent = with_model.vary(aircraft={"gusts": {}, "turbulence": DRYDEN | {"seed": turbulence_seed}})
+    turbulent = with_model.vary(aircraft={"gusts": {}, "turbulence": MODERATE | {"seed": turbulence_seed}})
     rows, columns = law_order(airframe, controller)
     actuators, m = scenario.aircraft.actuators, len(controller.inputs)
 

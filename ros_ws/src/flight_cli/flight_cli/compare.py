@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import WindEffect
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
@@ -177,7 +178,7 @@ def _notes(scenario: Scenario, benchmark: Benchmark, laws: Iterable[str], aims: 
         uncertain=gain_tuning.UNCERTAIN_AIRCRAFT,
         level=100.0 * gain_tuning.UNCERTAINTY,
         seeds=len(SEEDS),
-        **gain_tuning.DRYDEN,
+        **MODERATE,
     )
 
 

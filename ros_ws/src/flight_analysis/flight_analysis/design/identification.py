@@ -20,7 +20,7 @@ from aircraft_sim.disturbance import AXES, Gusts
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, FlightCondition, Trim, WindModel
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import sideslip_zero, trim_solution
-from aircraft_sim.turbulence import HIGH, LOW, LOWEST
+from aircraft_sim.turbulence import HIGH, LOW, LOWEST, MODERATE_SIGMA, MODERATE_WIND
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import gain_selection
@@ -156,7 +156,6 @@ GUST_START = 50.0  # s
 TURN, CLIMB = math.pi / 2.0, 100.0  # rad, m: the targets of guidance in place of the pulses
 TURN_START, CLIMB_START = 2.0, 30.0  # s
 LIGHT_SIGMA = 1.52  # m/s, of light turbulence at high altitude: 5 ft/s, MIL-F-8785C 3.7.2
-MODERATE_WIND, MODERATE_SIGMA = 15.4, 3.05  # m/s, of moderate turbulence: 30 kt at 20 ft, MIL-F-8785C 3.7.3.4; 10 ft/s
 
 
 def reference_parameters(speed: float, authority: float) -> dict[str, Any]:

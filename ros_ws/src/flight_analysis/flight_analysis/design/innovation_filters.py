@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import AXES
-from aircraft_sim.turbulence import dryden
+from aircraft_sim.turbulence import MODERATE, dryden
 from control_laws import observer_design
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names, ObserverModel, Weights
@@ -28,7 +28,6 @@ DRIFT, LOOSE = 0.003, 1.5e-4  # noises of the filter beside the wind, as `observ
 MIN_NOISE = 1e-2  # 1, noise of y in the filter, in units of 1 m/s or 0.1 rad/s: what the model leaves out of a perfect sensor
 LEAK = 1e-3  # 1, of observer_design.LEAK: over a minute the filter must not forget its angles
 HOLD = 5  # periods for which sin(x) - x is held: it changes slowly
-ALTITUDE, WIND = 100.0, 15.4  # m, m/s at 20 ft: Dryden's moderate turbulence, the wind of level 1
 LEVELS = np.array([0.002, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])  # 1, strengths of the wind in the filter, from calm air to gusts
 
 
@@ -141,7 +140,7 @@ def wind_model(axes: Sequence[str], speed: float) -> tuple[FloatArray, FloatArra
     They have its spectrum at low and at high frequencies. With T = L / V0 that is 2 sigma^2 T / (1 + (T omega)^2) along the
     flight and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. Arguments: `speed` V0, m/s.
     """
-    spectrum, places = dryden(ALTITUDE, WIND, 0.0), np.array([AXES.index(axis) for axis in axes], dtype=np.int64)
+    spectrum, places = dryden(**MODERATE, sigma=0.0), np.array([AXES.index(axis) for axis in axes], dtype=np.int64)
     time, along = spectrum.length[places] / speed, places == AXES.index("longitudinal")
     noise = spectrum.sigma[places] * np.sqrt(np.where(along, 2.0, 3.0) / time)
     return np.where(along, time, time / np.sqrt(3.0)), noise

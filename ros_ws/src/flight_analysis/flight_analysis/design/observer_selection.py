@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import Airframe
-from aircraft_sim.turbulence import dryden
+from aircraft_sim.turbulence import MODERATE, dryden
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import (
     ExtendedStateWeights,
@@ -41,7 +41,6 @@ RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file ch
 
 MAX_RELAXATION = 18.0  # of a channel: beyond it the search ends
 
-ALTITUDE, WIND = 100.0, 15.4  # m, m/s at 20 ft: Dryden's moderate turbulence, for which the rule's wind stands
 
 SHARE = 0.9  # of the integral gain of PI that is Lambda; the rest is the slope of the softened sign
 
@@ -66,7 +65,7 @@ def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> O
     Arguments: `axes` of the wind in the order of the model's columns; `speed` V0, m/s.
     """
     T = model.total_lag
-    spectrum, order = dryden(ALTITUDE, WIND, 0.0), {"longitudinal": 0, "lateral": 1, "vertical": 2}
+    spectrum, order = dryden(**MODERATE, sigma=0.0), {"longitudinal": 0, "lateral": 1, "vertical": 2}
     places = [order[axis] for axis in axes]
     length, sigma = spectrum.length[places], spectrum.sigma[places]
     gust = 0.12 * sigma * np.sqrt(2.0 * speed / length)
