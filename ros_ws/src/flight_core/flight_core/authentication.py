@@ -47,6 +47,11 @@ def read_key(path: str, key: str) -> bytes:
     return secret
 
 
+def instance(frame_id: str) -> str:
+    """The instance of the publisher in `header.frame_id`, without the message authentication code."""
+    return frame_id.partition(MARK)[0]
+
+
 def mac_slice(message: bytes | bytearray) -> slice:
     """Slice of a message that holds the digits of its code; an empty slice behind the instance where it has no code."""
     if len(message) < TEXT_PLACE:

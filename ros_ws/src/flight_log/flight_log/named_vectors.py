@@ -17,7 +17,7 @@ from rosbags.serde.errors import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from flight_core.authentication import MARK, mac_slice
+from flight_core.authentication import instance, mac_slice
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.vectors import FloatArray
 
@@ -97,11 +97,6 @@ def stamps_of(table: Table) -> NDArray[np.int64]:
     """The stamps of messages that begin with them, ns, shape (N,)."""
     stamps = np.ascontiguousarray(table[:, STAMP])
     return stamps.view("<i4")[:, 0].astype(np.int64) * NANOSECONDS + stamps.view("<u4")[:, 1]
-
-
-def _instance(frame_id: str) -> str:
-    """The instance of the publisher, without the message authentication code."""
-    return frame_id.partition(MARK)[0]
 
 
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
@@ -185,7 +180,7 @@ class _JointStateDecoder:
                 continue
             stamp = one.header.stamp
             stamps = np.array([stamp.sec * NANOSECONDS + stamp.nanosec])
-            samples.append(Samples(tuple(one.name), stamps, one.position[None], _instance(one.header.frame_id)))
+            samples.append(Samples(tuple(one.name), stamps, one.position[None], instance(one.header.frame_id)))
         if rest:
             self._learn(rest[-1])
         return Decoded(samples, unreadable)
@@ -212,7 +207,7 @@ class _JointStateDecoder:
         values = _position(marked, marks)
         if len(marked) != len(message) or message[values] != one.position.tobytes():
             return
-        self._names, self._values, self._sender = tuple(one.name), values, _instance(one.header.frame_id)
+        self._names, self._values, self._sender = tuple(one.name), values, instance(one.header.frame_id)
         self._template = np.frombuffer(message, dtype="<u4")  # a message without velocity and effort ends with their lengths
         constant = np.full(len(message), 255, dtype=np.uint8)
         constant[STAMP] = constant[self._values] = constant[mac_slice(message)] = 0

@@ -18,7 +18,7 @@ from builtin_interfaces.msg import Time
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from flight_core.authentication import BLANK, MARK, MessageAuthenticator, mac_slice
+from flight_core.authentication import BLANK, MessageAuthenticator, instance, mac_slice
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from flight_ros.rclpy_private import DeserializationError
@@ -45,7 +45,7 @@ def from_message(message: JointState, wanted: Sequence[str]) -> StampedVector:
     """The wanted channels of a message. Raises ChannelError for invalid names, lengths or values."""
     stamp = message.header.stamp
     value = select(wanted, message.name, message.position)
-    return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, _instance(message.header.frame_id))
+    return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, instance(message.header.frame_id))
 
 
 class Encoder:
@@ -147,7 +147,7 @@ class Decoder(_AuthenticatingDecoder):
         if encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position)) != raw:
             return  # more than a named vector: the middleware decodes it each time
         self._names, self._place, self._mac = list(message.name), encoder.place, mac_slice(raw)
-        self._sender = _instance(message.header.frame_id)
+        self._sender = instance(message.header.frame_id)
         self._order = [self._names.index(name) for name in self._wanted]
         self._fixed = self._fixed_part(raw)
 
@@ -174,11 +174,6 @@ class NamedDecoder(_AuthenticatingDecoder):
         if len(set(names)) < len(names):
             raise ChannelError("name", f"each channel expected once among {', '.join(names)}")
         return NamedSample(sample.stamp_ns, dict(zip(names, sample.value.tolist(), strict=True)), sample.sender)
-
-
-def _instance(frame_id: str) -> str:
-    """The instance of the publisher, without the message authentication code."""
-    return frame_id.partition(MARK)[0]
 
 
 def stamp_of(raw: bytes) -> int:
