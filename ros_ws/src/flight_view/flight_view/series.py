@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from flight_core.vectors import FloatArray
 
-MAX_ROWS = 200_000
-"""Rows of a topic. 30 channels then need 24 MB; 100 Hz last 33 min before the samples become coarser."""
+MAX_ROWS = 100_000
+"""Rows of a topic. 30 channels then need 12 MB; 100 Hz last 17 min before the samples become coarser, 50 Hz 33 min."""
 
 DISORDER_NS = 1_000_000_000
 """A controller that recovers from an overrun has ticks a few ms older than the one before."""
