@@ -325,13 +325,15 @@ def test_a_controller_that_starts_inactive_publishes_trim_until_it_is_activated(
     engage(peer_node)
 
 
-def test_node_survives_an_invalid_transition(start_node: Start, peer_node: Peer) -> None:
+def test_an_invalid_transition_is_refused_and_the_node_goes_on(start_node: Start, peer_node: Peer) -> None:
     process = start_node("rise_di_controller")
     engage(peer_node)
     client = peer_node.node.create_client(ChangeState, "controller/change_state")
     peer_node.until(client.service_is_ready)
-    client.call_async(ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE)))
-    peer_node.until(lambda: any("request rejected" in line for line in process.lines), each=lambda: peer_node.send(0.01))
+    answer = client.call_async(ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE)))
+    peer_node.until(answer.done, each=lambda: peer_node.send(0.01))
+    assert not answer.result().success
+    process.wait_for("request rejected: ")
     wait_for_messages(peer_node, "u", 20, each=lambda: peer_node.send(0.01))
 
 

@@ -9,6 +9,7 @@ from rclpy.context import Context
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
@@ -64,6 +65,22 @@ class WaitSet:
             wait_set.add_subscription(handle)
         wait_set.wait(timeout_ns)
         return bool(wait_set.get_ready_entities("subscription"))
+
+
+def answer_invalid_transitions(node: Node) -> None:
+    """Let a lifecycle node answer a request for an invalid transition with success false. rclpy raises, and sends no answer."""
+    service = node._service_change_state
+    change_state = service.callback
+
+    def answer(request: Any, response: Any) -> Any:
+        try:
+            return change_state(request, response)
+        except _rclpy.RCLError as error:
+            node.get_logger().error(f"request rejected: {' '.join(str(error).split())}")
+            response.success = False
+            return response
+
+    service.callback = answer
 
 
 def ready_callback(executor: SingleThreadedExecutor) -> Callable[[], None] | None:

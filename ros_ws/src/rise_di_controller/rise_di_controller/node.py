@@ -15,6 +15,7 @@ from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS
+from flight_ros.rclpy_private import answer_invalid_transitions
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
@@ -32,6 +33,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
     def __init__(self) -> None:
         FlightNode.__init__(self, "controller", ControllerParameters)
         LifecycleNodeMixin.__init__(self)
+        answer_invalid_transitions(self)
         self._active = False
         self._publishes = self.parameters.autostart  # a standby that was never activated publishes no u beside another's
         self._controller = Controller(self.parameters)
