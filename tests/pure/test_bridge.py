@@ -18,7 +18,7 @@ from flight_bringup.fly import _follow_real_time, _interrupt
 from flight_bringup.processes import handle_signals
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, StampedVector
 
 if TYPE_CHECKING:
     from flight_bringup.clients import FlightMonitor
@@ -38,7 +38,7 @@ def receive_outputs(bridge: Bridge, t: float, names: tuple[str, ...] = OUTPUTS, 
 
 
 def receive_u(bridge: Bridge, t: float, u: float = 0.0, sender: str = "controller") -> None:
-    bridge.take_u(np.full(4, u), sender, at(t))
+    bridge.take_u(StampedVector(at(t), np.full(4, u), sender), at(t))
 
 
 def unlimited(name: str) -> ChannelMap:
@@ -134,6 +134,15 @@ def test_a_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None
         if phase is Phase.RELEASE:
             assert np.isnan(raw).all()
     assert bridge.reason == "u is 0.20 s old"
+
+
+def test_a_u_of_a_played_log_is_refused_by_its_stamp() -> None:
+    bridge = new_bridge()
+    receive_outputs(bridge, 0.0)
+    for t, reason in ((-60.0, "stamp 60 s old"), (60.0, "stamp 60 s ahead of the clock")):
+        with pytest.raises(ChannelError, match=reason):
+            bridge.take_u(StampedVector(at(t), np.zeros(4), "player"), at(0.0))
+    assert bridge.engage(at(0.0)) == "u not received yet"
 
 
 def test_the_bridge_does_not_re_engage_by_itself() -> None:
@@ -281,6 +290,24 @@ def refresh(bridge: Bridge, t: float, **status: float) -> None:
 
 def sent(bridge: Bridge, t: float) -> set[str]:
     return {name for name in bridge.channel_map.messages if bridge.sends(name, at(t))}
+
+
+@pytest.mark.parametrize("lost", ["the mode is not offboard", "two autopilots"])
+def test_neutral_values_end_with_a_lost_condition_or_a_conflicting_publisher(lost: str) -> None:
+    content = unlimited("px4").model_dump()
+    content["silence"] = {"max_age": 0.2, "neutral": 5.0, "release": 0.5}
+    bridge = new_bridge(ChannelMap.validate_mapping(content, "map"))
+    refresh(bridge, 0.0, offboard=14.0)
+    assert bridge.engage(at(0.0)) == ""
+    receive_outputs(bridge, 0.25, tuple(bridge.outputs), 21.0)
+    assert bridge.step(at(0.25)) is Phase.NEUTRAL
+    assert bridge.step(at(0.5)) is Phase.NEUTRAL
+    if lost == "two autopilots":
+        bridge.conflict = lost
+    else:
+        bridge.take_condition("offboard", 4.0, at(0.5))
+    assert bridge.step(at(0.51)) is Phase.RELEASE
+    assert lost in bridge.reason
 
 
 def test_engagement_requests_the_mode_sends_setpoints_in_it_and_requests_hold_after_it() -> None:

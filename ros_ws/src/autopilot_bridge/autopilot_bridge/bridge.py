@@ -17,7 +17,14 @@ from autopilot_bridge.channel_map import to_channel, to_raw
 from autopilot_bridge.params import ROUNDING, ChannelMap, ConditionRow, InputRow, MeasuredRow, OutputRow
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, seconds
-from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer
+from flight_core.vectors import (
+    ChannelError,
+    FloatArray,
+    StampedVector,
+    require_newer,
+    require_not_future,
+    require_not_old,
+)
 
 
 class Phase(IntEnum):
@@ -68,6 +75,7 @@ class Bridge:
         rows = channel_map.inputs.values()
         self._lower, self._upper = (np.array([getattr(row, key) for row in rows]) for key in ("lower", "upper"))
         self._max_age_ns = nanoseconds(channel_map.silence.max_age)
+        self._max_y_age_ns = nanoseconds(max(row.max_age for row in channel_map.outputs.values()))
 
     # Inputs
 
@@ -96,11 +104,18 @@ class Bridge:
         takeover_ns = sys.maxsize if self.phase is Phase.ENGAGED else self._max_age_ns
         self.u_lock.check(sender, now_ns, takeover_ns, takeover_ns)
 
-    def take_u(self, u: FloatArray, sender: str, now_ns: int) -> None:
-        """Take u, shape (m,) in the map's order. Raises ChannelError as `require_sender` does."""
-        self.require_sender(sender, now_ns)
-        self._u = u
-        self.u_lock.refresh(sender, now_ns)
+    def take_u(self, sample: StampedVector, now_ns: int) -> None:
+        """Take u, shape (m,) in the map's order. Raises ChannelError as `require_sender` does, and where its stamp is bad.
+
+        A stamp is bad ahead of the clock by more than the age limit. After a timeout it is also bad behind it by more than
+        this and the age limit of y, whose stamp u has: a played log does not begin to fly the autopilot.
+        """
+        self.require_sender(sample.sender, now_ns)
+        require_not_future(sample.stamp_ns, now_ns, self._max_age_ns)
+        if self.u_timed_out(now_ns):
+            require_not_old(sample.stamp_ns, now_ns, self._max_age_ns + self._max_y_age_ns)
+        self._u = sample.value
+        self.u_lock.refresh(sample.sender, now_ns)
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a condition. A condition that is lost ends an engagement at the next step."""
@@ -137,6 +152,11 @@ class Bridge:
         """The conditions that do not hold, as a sentence; those that an engagement awaits, or the others."""
         rows = ((name, row) for name, row in self.channel_map.conditions.items() if row.awaited is awaited)
         return "; ".join(filter(None, (self._violation(name, row, now_ns) for name, row in rows)))
+
+    def _lost(self, now_ns: int) -> str:
+        """Why the autopilot is not to be commanded any more, whatever y and u are, as a sentence; empty where it is."""
+        unmet = (self._unmet(now_ns, awaited=awaited) for awaited in (False, True))
+        return "; ".join(filter(None, (self.conflict, *unmet)))
 
     def _violation(self, name: str, row: ConditionRow, now_ns: int) -> str:
         reading = self._conditions.get(name)
@@ -251,13 +271,15 @@ class Bridge:
         """Phase at an instant.
 
         A stale y or u, a value outside the envelope, a lost condition or a conflicting publisher ends an engagement. The phases
-        ENGAGING, NEUTRAL and RELEASE end after their times.
+        ENGAGING, NEUTRAL and RELEASE end after their times, NEUTRAL also with a lost condition or a conflicting publisher.
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)
+        elif self.phase is Phase.NEUTRAL and (lost := self._lost(now_ns)):
+            self.disengage(lost, now_ns)
         elif self.phase is Phase.ENGAGED:
-            lost = filter(None, (self.conflict, *(self._unmet(now_ns, awaited=awaited) for awaited in (False, True))))
-            if ended := "; ".join(filter(None, (*lost, _sentence(self.stale(now_ns))))) or self._outside():
+            measured = _sentence(self.stale(now_ns))
+            if ended := "; ".join(filter(None, (self._lost(now_ns), measured))) or self._outside():
                 self.disengage(ended, now_ns)
             elif timeout := self._u_timeout(now_ns):
                 self.reason = timeout

@@ -96,6 +96,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
         self._u_sender: str | None = None
         self._activation: Any = None  # the pending activation of the controller
         self._activation_ns = 0
+        self._awaits_controller = False  # engaged before the service of the controller was found
         self.get_logger().info(
             f"map {self._map.name}: "
             + ("dry run, nothing is sent" if dry_run else f"disengaged, waiting for {self.get_name()}/engage")
@@ -193,7 +194,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
                 if sample is not None:
                     self._bridge.require_sender(sample.sender, now_ns)
                     with self._decoder.once(sample.stamp_ns):
-                        self._bridge.take_u(sample.value, sample.sender, now_ns)
+                        self._bridge.take_u(sample, now_ns)
                     accepted = True
             except ChannelError as error:
                 self.reject(self._u_subscription, error.reason, str(error))
@@ -222,8 +223,9 @@ class BridgeNode(FlightNode[BridgeParameters]):
 
     def _activate(self, active: bool) -> None:
         """Request that the controller is active: only while engaged, so that its integrals do not wind up."""
+        self._awaits_controller = active and not self._controller.service_is_ready()
         if not self._controller.service_is_ready():
-            return  # u of another node, which has no lifecycle
+            return  # not discovered yet, or u of another node, which has no lifecycle
         transition = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
         future = self._controller.call_async(ChangeState.Request(transition=Transition(id=transition)))
         self._activation, self._activation_ns = (future, self.now_ns()) if active else (None, 0)
@@ -235,7 +237,7 @@ class BridgeNode(FlightNode[BridgeParameters]):
         if self._activation.done():
             success, self._activation = self._activation.result().success, None
             if not success:
-                self._bridge.disengage("the controller refused to activate: see its log", now_ns)
+                self._bridge.disengage("the controller refused to activate, or was active already: see its log", now_ns)
         elif now_ns - self._activation_ns > ACTIVATION_TIMEOUT_NS:
             self._activation = None
             self._bridge.disengage("timed out waiting for the controller to activate", now_ns)
@@ -252,6 +254,8 @@ class BridgeNode(FlightNode[BridgeParameters]):
         if ready and (restarted or not self._controller_ready) and bridge.phase is not Phase.ENGAGED:
             self._controller_state.call_async(GetState.Request()).add_done_callback(self._deactivate_unengaged)
         self._controller_ready = ready
+        if self._awaits_controller and bridge.phase is Phase.ENGAGED:
+            self._activate(active=True)
 
     def _deactivate_unengaged(self, state: Future) -> None:
         """Deactivate a controller that was found active: with `ros2 run` it starts so."""
