@@ -4,12 +4,14 @@
 
 import json
 import tracemalloc
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import yaml
+from mcap.opcode import Opcode
 from mcap.records import Message
-from mcap.writer import CompressionType
+from mcap.writer import MCAP0_MAGIC, CompressionType
 from tests.conftest import REPOSITORY
 from tests.fuzz.targets import log, write_run
 from tests.joint_states import JOINT_STATE, vector
@@ -22,7 +24,7 @@ from flight_core.parameters import MAX_SENTENCE_LENGTH, ParameterError
 from flight_log.playback import read_playback
 from flight_log.repair import repair
 from flight_log.rosbag2_metadata import METADATA, read_bag_metadata
-from flight_log.scan import Scan
+from flight_log.scan import CHUNK, LENGTH, RECORD, Scan
 from flight_log.tape_reader import read_run
 
 CORPUS = REPOSITORY / "tests" / "corpus"
@@ -52,6 +54,19 @@ def test_a_chunk_is_decompressed_to_its_declared_size_and_64_mb_at_most(name: st
         tracemalloc.stop()
     assert scan.damaged == 1
     assert peak < 10e6  # instead of half a gigabyte or a terabyte; the file has 33 kB
+
+
+@pytest.mark.parametrize("read", [Scan.records, Scan.batches])
+def test_a_chunk_inside_a_chunk_is_damaged(read: Callable[[Scan], Iterator[object]], tmp_path: Path) -> None:
+    content = b""
+    for _ in range(2000):  # a reader that follows them exceeds the interpreter's depth
+        chunk = CHUNK.pack(0, 0, len(content), 0, 0) + LENGTH.pack(len(content)) + content
+        content = RECORD.pack(Opcode.CHUNK, len(chunk)) + chunk
+    file = tmp_path / "run_0.mcap"
+    file.write_bytes(MCAP0_MAGIC + content)
+    scan = Scan(file)
+    assert list(read(scan)) == []
+    assert scan.damaged == 1
 
 
 def test_an_lz4_chunk_with_changed_bytes_is_skipped(tmp_path: Path) -> None:

@@ -157,13 +157,18 @@ def test_the_note_on_a_truncated_file_gives_the_missing_time_by_metadata_yaml(ta
     assert f"{missing:.3f} s are missing after it" in back.notes[0]
 
 
+@pytest.mark.parametrize("opcode", [None, Opcode.DATA_END, Opcode.FOOTER], ids=["content", "opcode of an end", "of a footer"])
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_damaged_chunk_is_left_out_and_all_others_are_read(number: int, tape: Tape, run: Path) -> None:
+def test_a_damaged_chunk_is_left_out_and_all_others_are_read(number: int, opcode: Opcode | None, tape: Tape, run: Path) -> None:
     file = run / "run_0.mcap"
     chunks = sorted(summary_of(file).chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
     assert len(chunks) > 2
     content = bytearray(file.read_bytes())
-    content[chunks[number].chunk_start_offset + chunks[number].chunk_length - 100] ^= 1
+    start = chunks[number].chunk_start_offset
+    if opcode is None:
+        content[start + chunks[number].chunk_length - 100] ^= 1
+    else:
+        content[start] = opcode
     file.write_bytes(content)
     back = read_run(run).tape
     assert back.notes == ("run_0.mcap is damaged: 1 of its parts left out",)
@@ -190,6 +195,24 @@ def test_a_file_with_changed_bytes_gives_recorded_samples_or_is_rejected(tape: T
             read += 1
             assert set(zip(back["y"].stamp_ns.tolist(), map(bytes, back["y"].values), strict=True)) <= samples
     assert read > 10  # of 60: the samples are in two chunks, and three changed bytes sometimes leave one of them intact
+
+
+def test_the_memory_for_chunks_of_few_bytes_that_hold_much_is_bounded(tmp_path: Path) -> None:
+    size, count = 8 << 20, 30
+    with BagWriter(tmp_path) as bag:
+        channel = bag.add_topic("/y", JOINT_STATE, "")
+        for k in range(count):
+            bag.write(channel, k, k, k, bytes(size))
+            bag.flush()
+    assert bag.path.stat().st_size < count * size // 1000
+    tracemalloc.start()
+    try:
+        messages = sum(len(batch.data) for batch in Scan(bag.path).batches() if isinstance(batch, MessageBatch))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert messages == count
+    assert peak < 12 * size  # chunk and batch of each of AHEAD, of the one that is decoded and of the one that is counted
 
 
 @pytest.mark.parametrize("wrong", [0, 7, 2**60])
@@ -488,6 +511,18 @@ def test_engagements_after_a_step_of_the_clock_have_the_time_of_the_stamps(tmp_p
     (engagement,) = read_run(tmp_path / "run").engagements or []
     assert engagement.start_ns == pytest.approx(12 * NANOSECONDS, abs=40_000_000)  # its y is 30 ms old
     assert engagement.stop_ns == pytest.approx(17 * NANOSECONDS, abs=40_000_000)
+
+
+def test_a_publisher_with_the_channels_in_another_order_is_read_by_their_names(tmp_path: Path) -> None:
+    with BagWriter(tmp_path) as bag:
+        channel = bag.add_topic("/y", JOINT_STATE, "")
+        for k in range(20):
+            q_first = k < 10
+            names, values = (("q", "V"), (k, 50.0)) if q_first else (("V", "q"), (50.0, k))
+            bag.write(channel, k, k, k, vector(k, names, values, "/first" if q_first else "/second"))
+    tape = read_run(tmp_path).tape
+    assert (tape["y"].names, tape.notes) == (("q", "V"), ())
+    assert tape["y"].values.tolist() == [[k, 50.0] for k in range(20)]
 
 
 def test_samples_of_two_publishers_at_the_same_time_are_noted(tmp_path: Path) -> None:

@@ -56,10 +56,10 @@ LENGTH = struct.Struct("<Q")  # before the records of a chunk
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, offsets of the summary and of its offsets, checksum
 CRC = struct.Struct("<I")
 
-JOINED_BYTES = 256 << 10
-"""Compressed bytes of the chunks that are decoded together: a second of a flight."""
+JOINED_BYTES = 1 << 20
+"""Bytes of the records in chunks that are decoded together: about a second of a flight."""
 
-AHEAD = 3  # groups of chunks that are decoded before they are asked for
+AHEAD = 2  # groups of chunks that are decoded before they are asked for
 
 MAX_CHUNK_BYTES = 64 << 20
 """Limit for a chunk that is larger than its compressed bytes. A damaged chunk of 1 kB may give any size, and hold 20 MB.
@@ -203,9 +203,10 @@ class Scan:
             opcode, length = RECORD.unpack(stream.read(RECORD.size))
             next_known = known[bisect_right(known, position)]
             position += RECORD.size + length
-            if position <= next_known:
-                if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                    return
+            ends = opcode in (Opcode.DATA_END, Opcode.FOOTER)
+            if ends and position <= next_known == size:
+                return
+            if position <= next_known and not ends:
                 yield opcode, stream.read(length)
             elif next_known < size:
                 self.damaged += 1
@@ -234,16 +235,18 @@ def _with_message_indexes(frames: Iterator[tuple[int, bytes]]) -> Iterator[Part]
 
 
 def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
-    """Chunks that follow one another, up to `most` bytes of content together or one alone; each other record alone."""
+    """Chunks that follow one another, with up to `most` bytes of records together or one alone; each other record alone."""
     chunks: list[Part] = []
     size = 0
     for part in parts:
-        if chunks and (part.opcode != Opcode.CHUNK or size + len(part.content) > most):
+        is_chunk = part.opcode == Opcode.CHUNK and len(part.content) >= CHUNK.size  # else it is damaged
+        more = CHUNK.unpack_from(part.content)[2] if is_chunk else 0
+        if chunks and (not is_chunk or size + more > most):
             yield chunks
             chunks, size = [], 0
-        if part.opcode == Opcode.CHUNK:
+        if is_chunk:
             chunks.append(part)
-            size += len(part.content)
+            size += more
         else:
             yield [part]
     if chunks:
@@ -285,7 +288,7 @@ def split(data: bytes) -> Iterator[McapRecord]:
             channel, sequence, log_time, publish_time = MESSAGE.unpack_from(data, position)
             yield Message(channel, log_time, data[position + MESSAGE.size : end], publish_time, sequence)
         else:
-            yield from decode(opcode, data[position:end])
+            yield from _decode_inner(opcode, data[position:end])
         position = end
 
 
@@ -372,9 +375,16 @@ def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDA
             if opcode == Opcode.MESSAGE and length >= MESSAGE.size:
                 found.append(position)
             else:
-                others += decode(opcode, data[begin : begin + length])
+                others += _decode_inner(opcode, data[begin : begin + length])
             position = begin + length
     return others, np.sort(np.append(places, found)) if found else places
+
+
+def _decode_inner(opcode: int, content: bytes) -> Iterator[McapRecord]:
+    """As `decode`, of a record in a chunk, which holds no other chunk (MCAP specification, Chunk)."""
+    if opcode == Opcode.CHUNK:
+        raise McapError("a chunk inside a chunk")
+    return decode(opcode, content)
 
 
 def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:

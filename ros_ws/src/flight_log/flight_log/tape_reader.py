@@ -163,8 +163,9 @@ class _TopicSamples:
         decoded = self._decode(np.concatenate(self._batch))
         self._batch, self._batched = [], 0
         self._refused += decoded.unreadable
-        for names, stamp_ns, values, sender in decoded.samples:
-            if values.shape[1] == len(names):
+        for received, stamp_ns, unordered, sender in decoded.samples:
+            if unordered.shape[1] == len(received):
+                names, values = self._ordered(received, unordered)
                 first, last = int(stamp_ns.min()), int(stamp_ns.max())
                 before, after = self._spans.get(sender, (first, last))
                 self._spans[sender] = min(first, before), max(last, after)
@@ -175,6 +176,13 @@ class _TopicSamples:
                     self._samples[names] = _Collected(_Columns(stamp_ns, self._expected), _Columns(values, self._expected))
             else:
                 self._refused += len(stamp_ns)
+
+    def _ordered(self, names: tuple[str, ...], values: NDArray[np.float64]) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+        """Names and values in the order in which these names were received first: values are matched by name."""
+        for known in self._samples:
+            if known != names and sorted(known) == sorted(names):
+                return known, values[:, [names.index(name) for name in known]]
+        return names, values
 
     def signal(self) -> Signal | None:
         """All samples in the order of their stamps; None without samples."""

@@ -238,6 +238,8 @@ class Flight:
         # A pose has the channels that a bridge has received so far: those with fewer than the widest one are left out.
         if topic.name == POSE and set(names) > set(topic.names):
             topic.columns = None
+        if names != topic.names and sorted(names) == sorted(topic.names):  # of another publisher: values are matched by name
+            names, values = topic.names, values[:, [names.index(name) for name in topic.names]]
         if topic.columns is None:
             kept = GROUPS.get(topic.name)
             chosen = [i for i, name in enumerate(names) if kept is None or name in kept or name.partition(".")[0] in kept]

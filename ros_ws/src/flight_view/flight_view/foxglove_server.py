@@ -51,13 +51,14 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
     try:
         for first in before.values():
             _channel(first, follower, channels, context)
-        while not ended.wait(POLL_PERIOD) and not follower.complete:
+        while not ended.wait(POLL_PERIOD) and not follower.complete and not follower.fault:
             for one in follower.read():
                 if (channel := _channel(one, follower, channels, context)) is not None and isinstance(one, Messages):
                     for sent_ns, data in zip(one.sent_ns, one.data, strict=True):
                         channel.log(data, log_time=sent_ns)
     finally:
         server.stop()
+    require(not follower.fault, "--foxglove", follower.fault, "a log that can be read further")
 
 
 def _channel(
