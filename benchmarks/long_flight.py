@@ -38,7 +38,7 @@ from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
 from flight_analysis.report.run_folder import write_report
 from flight_bringup.scenarios import find_scenario
-from flight_core.rates import NANOSECONDS, period_ns
+from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.tape import Tape
 from flight_log.bag import LOST_MESSAGES
 from flight_log.tape_reader import read_run
@@ -120,9 +120,10 @@ def end(flight: psutil.Popen) -> None:
 
 
 def skips(tape: Tape, scenario: Scenario, *, real_time: bool) -> dict[str, tuple[NDArray[np.int64], int]]:
-    """By topic, begin and end of each time without a sample between the first and the last of the log, ns, and the period, ns.
+    """By topic, begin and end of each time without a sample in the flight, ns, and the period, ns.
 
-    In real time a late tick skips instants. It is late by 0 to 1 period, so a skip ends half a period after the next stamp.
+    What follows the flight is the end of the processes. In real time a late tick skips instants. It is late by 0 to 1 period,
+    so a skip ends half a period after the next stamp.
     Each u carries the stamp of a y, and `figures_of_ticks` counts the ticks of the controller.
     """
     guidance = scenario.guidance
@@ -131,9 +132,9 @@ def skips(tape: Tape, scenario: Scenario, *, real_time: bool) -> dict[str, tuple
     rates = {"y": scenario.aircraft.rate, "y_m": scenario.reference_model.rate}
     rates |= {} if real_time else {"u": scenario.controller.rate}
     rates |= dict.fromkeys(("u_m", "guidance"), guidance.rate)
-    found = {}
+    found, end_ns = {}, tape.start_ns + nanoseconds(scenario.flight.duration)
     for name, rate in rates.items():
-        stamps, period = tape[name].stamp_ns, period_ns(rate, name)
+        stamps, period = tape[name].until(end_ns).stamp_ns, period_ns(rate, name)
         lateness = period // 2 if real_time else 0
         ends = np.column_stack((stamps[:-1] + period, stamps[1:] + lateness))
         found[name] = (ends[np.diff(stamps) > 1.5 * period], period)

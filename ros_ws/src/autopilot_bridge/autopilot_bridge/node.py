@@ -5,6 +5,8 @@
 import os
 import time
 from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -310,15 +312,13 @@ class BridgeNode(FlightNode[BridgeParameters]):
         refused = (what for what in self.rejected if what.startswith(f"{subscription.topic.name}: "))
         return next(filter(None, (*faults, *refused)), "its publisher sends no samples")
 
-    def check_graph(self) -> None:
+    def graph_checks(self) -> list[Callable[[], None]]:
         """Also report a topic to which the autopilot subscribes with another type or an incompatible quality of service.
 
         A topic with another publisher ends the engagement.
         """
-        super().check_graph()
-        for outgoing in self._outgoing.values():
-            self.check_subscribers(outgoing.publisher)
-        self._find_conflicts()
+        outgoing = (partial(self.check_subscribers, one.publisher) for one in self._outgoing.values())
+        return [*super().graph_checks(), *outgoing, self._find_conflicts]
 
     def _find_conflicts(self) -> None:
         """Tell the bridge which topics have two publishers: of two autopilots y would be mixed, and both would be flown.

@@ -269,11 +269,10 @@ class RecorderNode(FlightNode[RecorderParameters]):
         topic = self._poll(Topic(name, message, foreign=True), strongest_compatible(offered))
         self._topics.append(self._record(topic, offered))
 
-    def check_graph(self) -> None:
-        super().check_graph()
-        for topic in self._topics:
-            if topic.foreign:
-                self.check_publishers(topic.name, topic.channel.type.name)
+    def graph_checks(self) -> list[Callable[[], None]]:
+        foreign = (topic for topic in self._topics if topic.foreign)
+        checks = (partial(self.check_publishers, topic.name, topic.channel.type.name) for topic in foreign)
+        return [*super().graph_checks(), *checks]
 
     def _offered(self, name: str, message_type: str) -> list[QoSProfile]:
         return [peer.qos_profile for peer in self.get_publishers_info_by_topic(name) if peer.topic_type == message_type]

@@ -7,6 +7,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -267,12 +268,16 @@ class FlightNode(Node, Generic[P]):
             self.get_logger().error(f"the system clock was set by {seconds(step_ns - self._clock_step_ns):+.3f} s: {advice}")
             self._clock_step_ns = step_ns
 
-    def check_graph(self) -> None:
-        """Log an error for each peer with another message type or incompatible QoS: its topic would stay silent."""
-        for publisher in self._flight_publishers:
-            self.check_subscribers(publisher)
-        for subscription in self.polled_subscriptions:
-            self.check_publishers(subscription.name, type_name(subscription.topic.type), subscription.qos)
+    def graph_checks(self) -> list[Callable[[], None]]:
+        """Checks of the graph, a topic each: to ask the middleware for all topics takes about a period of 2 ms.
+
+        They log an error for each peer with another message type or incompatible QoS: its topic would stay silent.
+        """
+        subscribed = ((one.name, type_name(one.topic.type), one.qos) for one in self.polled_subscriptions)
+        return [
+            *(partial(self.check_subscribers, publisher) for publisher in self._flight_publishers),
+            *(partial(self.check_publishers, *topic) for topic in subscribed),
+        ]
 
     def check_publishers(self, topic: str, message_type: str, qos: QoSProfile | None = None) -> None:
         """Log an error for each publisher of a topic that does not match a subscription of this type and QoS."""
