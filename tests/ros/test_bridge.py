@@ -183,12 +183,13 @@ def test_the_unchanged_controller_tracks_through_the_map_and_when_killed_release
     controller.popen.kill()
     killed = time.time()
     setup.until_logged(bridge, "ENGAGED -> RELEASE: u is")
+    last = stamp(setup.peer.received["u"][-1]) - killed  # on a busy host its sender did not run for a while before
     restarted = setup.node("rise_di_controller.main")  # the middleware takes 2 s to see that its service was gone
     setup.until_logged(bridge, "RELEASE -> DISENGAGED: u is")
     setup.peer.spin(0.3)
     finite, released = setup.after(killed)
     assert max(finite) < MAX_AGE + LATE
-    assert MAX_AGE - 0.05 < min(released) < MAX_AGE + LATE  # the last u may be a period of 20 ms older than the kill
+    assert last + MAX_AGE < min(released) < MAX_AGE + LATE
     assert RELEASE - LATE < max(released) - min(released) < RELEASE + LATE
     assert len(released) > 10  # 25 at 50 Hz
     setup.until_logged(restarted, "-> INACTIVE", HANG)  # so that its integrals do not wind up
