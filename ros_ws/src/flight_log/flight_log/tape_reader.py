@@ -173,7 +173,8 @@ class _TopicSamples:
                     self._samples[names].stamp_ns.append(stamp_ns)
                     self._samples[names].values.append(values)
                 else:
-                    self._samples[names] = _Collected(_Columns(stamp_ns, self._expected), _Columns(values, self._expected))
+                    expected = 0 if self._samples else self._expected  # other names are few, or those of a hostile log
+                    self._samples[names] = _Collected(_Columns(stamp_ns, expected), _Columns(values, expected))
             else:
                 self._refused += len(stamp_ns)
 
