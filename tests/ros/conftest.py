@@ -29,6 +29,9 @@ from flight_log.scan import Scan
 
 _numbers = itertools.count(os.getpid())  # a domain is used again late: processes may take a while to leave it
 
+DEFAULT_SIGHUP = ("env", "--default-signal=HUP")
+"""Prefix of a command under test: nodes ignore SIGHUP where nohup ran the tests."""
+
 Start = Callable[..., "Process"]
 Recorder = Callable[..., "Process"]
 
@@ -37,7 +40,7 @@ class Process:
     """A process under test and the lines of its output. It ends with pytest, also where no fixture ends it."""
 
     def __init__(self, *arguments: str, cwd: Path, within: Sequence[str] = (), stdin: int | None = None) -> None:
-        command, pipe = [*within, *end_with_parent(), sys.executable, "-m", *arguments], subprocess.PIPE
+        command, pipe = [*DEFAULT_SIGHUP, *within, *end_with_parent(), sys.executable, "-m", *arguments], subprocess.PIPE
         self.popen = subprocess.Popen(command, cwd=cwd, stdin=stdin, stdout=pipe, stderr=subprocess.STDOUT, text=True)
         self.lines: list[str] = []
         self._changed = threading.Condition()

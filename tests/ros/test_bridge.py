@@ -62,8 +62,7 @@ class BridgeSetup:
         self._start = start
         self.map = str(folder / "ardupilot.yaml")
         Path(self.map).write_bytes((LIBRARY / "ardupilot_2024.yaml").read_bytes())
-        for place in (("silence",), *(("outputs", name) for name in ("q", "V", "p", "r"))):
-            self.change_map(*place, max_age=MAX_AGE)
+        self.change_age_limits(MAX_AGE)
         self.peer = peer_node
         self.joys: list[Joy] = []
         peer_node.node.create_subscription(Joy, "/ap/joy", self.joys.append, BEST_EFFORT)
@@ -77,6 +76,11 @@ class BridgeSetup:
             row = row[key]
         row.update(values)
         Path(self.map).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+    def change_age_limits(self, max_age: float) -> None:
+        """Change the age limits of y and u, s."""
+        for place in (("silence",), *(("outputs", name) for name in ("q", "V", "p", "r"))):
+            self.change_map(*place, max_age=max_age)
 
     def autopilot(self) -> Process:
         """Start the simulated autopilot."""
@@ -95,6 +99,17 @@ class BridgeSetup:
     def engage(self, each: Callable[[], None] | None = None) -> str:
         """Call the service; the reason of a refusal, empty where there is none."""
         return str(self.peer.call(SetBool, "bridge/engage", SetBool.Request(data=True), each).message)
+
+    def engage_while(self, command: Callable[[], None]) -> None:
+        """Engage and wait for six further messages to the autopilot, while u is published."""
+        self.peer.until(lambda: self.engage(each=command) == "", each=command)
+        self.joys.clear()
+        self.peer.until(lambda: len(self.joys) > 5, each=command)
+
+    def until_released(self, bridge: Process, command: Callable[[], None], *reason: str) -> None:
+        """Wait until the bridge releases the channels for this reason, while u is published."""
+        words = ("ENGAGED -> RELEASE: ", *reason)
+        self.peer.until(lambda: any(all(word in line for word in words) for line in bridge.lines), each=command)
 
     def engage_from_trim(self) -> None:
         """Wait for trim and engage: the bridge deactivates the controller, and activates it when it engages."""
@@ -275,30 +290,28 @@ def test_a_step_of_the_system_clock_leaves_the_engagement_and_its_release_as_the
     assert all(map(math.isnan, setup.joys[-1].axes))
 
 
-def test_a_stopped_bridge_a_second_autopilot_and_a_lost_terminal_each_release_the_channels(setup: BridgeSetup) -> None:
+def test_a_stopped_bridge_releases_the_channels_and_can_be_engaged_again(setup: BridgeSetup) -> None:
     command = partial(setup.peer.command, 0.0, 0.0, 0.0, 0.0)
     autopilot = setup.autopilot()
     bridge = setup.bridge("-p", "dry_run:=false")
-
-    def until_released(*reason: str) -> None:
-        words = ("ENGAGED -> RELEASE: ", *reason)
-        setup.peer.until(lambda: any(all(word in line for word in words) for line in bridge.lines), each=command)
-
-    def engage() -> None:
-        setup.peer.until(lambda: setup.engage(each=command) == "", each=command)
-        setup.joys.clear()
-        setup.peer.until(lambda: len(setup.joys) > 5, each=command)
-
-    engage()
+    setup.engage_while(command)
     with bridge.stopped():  # until the autopilot flies on its own law
         setup.peer.until(lambda: "timeout" in autopilot.lines, each=command)
-    until_released("the bridge did not run for ")
-    engage()
+    setup.until_released(bridge, command, "the bridge did not run for ")
+    setup.engage_while(command)
+
+
+def test_a_second_autopilot_and_a_lost_terminal_each_release_the_channels(setup: BridgeSetup) -> None:
+    command = partial(setup.peer.command, 0.0, 0.0, 0.0, 0.0)
+    setup.change_age_limits(1e3)  # a delay of the host does not release them before
+    setup.autopilot()
+    bridge = setup.bridge("-p", "dry_run:=false")
+    setup.engage_while(command)
     second = setup.autopilot()
-    until_released("/ap/", " has 2 publishers, expected the autopilot alone")
+    setup.until_released(bridge, command, "/ap/", " has 2 publishers, expected the autopilot alone")
     assert "has 2 publishers" in setup.engage(each=command)
     second.popen.kill()
-    engage()
+    setup.engage_while(command)
     setup.joys.clear()
     bridge.popen.send_signal(signal.SIGHUP)
     bridge.succeed()

@@ -14,7 +14,7 @@ import psutil
 import pytest
 from rosbags.highlevel import AnyReader
 from tests.conftest import REPOSITORY
-from tests.ros.conftest import Process, Start
+from tests.ros.conftest import DEFAULT_SIGHUP, Process, Start
 from tests.ros.peer import HANG
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -70,7 +70,7 @@ def test_a_second_interrupt_does_not_interrupt_the_shutdown(engaged: Engaged, tm
 
 def test_a_lost_terminal_ends_the_flight_with_its_log_and_report(tmp_path: Path) -> None:
     terminal, of_flight = pty.openpty()
-    words = ["setsid", "--ctty", sys.executable, "-m", "flight_cli.cli", "fly", "osprey_gust"]
+    words = [*DEFAULT_SIGHUP, "setsid", "--ctty", sys.executable, "-m", "flight_cli.cli", "fly", "osprey_gust"]
     flight = subprocess.Popen(words, cwd=tmp_path, stdin=of_flight, stdout=of_flight, stderr=of_flight)
     os.close(of_flight)
     try:
