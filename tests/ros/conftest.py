@@ -30,7 +30,7 @@ from flight_log.scan import Scan
 _numbers = itertools.count(os.getpid())  # a domain is used again late: processes may take a while to leave it
 
 DEFAULT_SIGHUP = ("env", "--default-signal=HUP")
-"""Prefix of a command under test: nodes ignore SIGHUP where nohup ran the tests."""
+"""Prefix of a command under test: nohup ignores SIGHUP for all processes of the tests."""
 
 Start = Callable[..., "Process"]
 Recorder = Callable[..., "Process"]
