@@ -1,18 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ticks: deadlines on the monotonic clock, overruns, the busy-wait before a deadline, requests to Linux's scheduler."""
+"""Ticks: deadlines on the monotonic clock, overruns, the busy-wait before a deadline."""
 
-import os
-import platform
-import re
-import subprocess
-import sys
 import time
 
 import pytest
-from tests.conftest import with_policy
 
-from flight_ros.scheduling import SLICE_NS, THREADS, TIMER_SLACK
 from flight_ros.ticker import MAX_SPIN_FRACTION, SPIN_TIME, Ticker
 
 PERIOD_NS = 10_000_000
@@ -66,51 +59,3 @@ def test_the_busy_wait_before_a_deadline_is_limited_to_a_fraction_of_the_period(
     ticker.due()
     ticker.wait(1.0)
     assert slept == [pytest.approx(0.95 * period_ns / 1e9 - spin_time)]
-
-
-@pytest.mark.skipif(not TIMER_SLACK.exists(), reason="no Linux, or no /proc")
-def test_the_timer_slack_of_the_thread_is_set_to_its_minimum() -> None:
-    # in a process of its own, as the setting lasts; the default of Linux is 50 us (prctl(2), PR_SET_TIMERSLACK)
-    code = "from flight_ros.scheduling import *; disable_timer_slack(); print(TIMER_SLACK.read_text())"
-    ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert int(ran.stdout) == 1
-
-
-def kernel() -> tuple[int, ...]:
-    return tuple(map(int, re.findall(r"\d+", platform.release())[:2]))
-
-
-@pytest.mark.skipif(
-    kernel() < (6, 12) or not (THREADS.parent / "sched").exists(), reason="needs Linux 6.12, CONFIG_SCHED_DEBUG"
-)
-@pytest.mark.skipif(os.sched_getscheduler(0) != os.SCHED_OTHER, reason="only the default policy has time slices")
-def test_every_thread_of_a_node_has_short_time_slices() -> None:
-    code = """
-import threading, time
-from flight_ros.scheduling import *
-threading.Thread(target=time.sleep, args=(0.1,)).start()
-request_short_slices()
-print([(one / "sched").read_text() for one in THREADS.iterdir()])
-"""
-    ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert [int(slice_ns) for slice_ns in re.findall(r"se\.slice\s*:\s*(\d+)", ran.stdout)] == [SLICE_NS, SLICE_NS]
-
-
-@pytest.mark.parametrize(
-    ("policy", "priority"),
-    [(("--fifo", "50"), 48), (("--rr", "50"), 48), (("--fifo", "2"), 1), (("--other", "0"), 0)],
-    ids=["FIFO", "round robin", "no lower one", "default policy"],
-)
-def test_a_lowered_real_time_priority_is_that_of_the_threads_that_follow(policy: tuple[str, str], priority: int) -> None:
-    code = """
-import os, threading
-from flight_ros.scheduling import lower_real_time_priority
-before = os.sched_getscheduler(0)
-lower_real_time_priority(2)
-assert os.sched_getscheduler(0) == before
-thread = threading.Thread(target=lambda: print(os.sched_getparam(0).sched_priority))
-thread.start()
-thread.join()
-"""
-    ran = subprocess.run([*with_policy(*policy), sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert int(ran.stdout) == priority

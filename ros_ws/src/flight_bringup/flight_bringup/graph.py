@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The graph of a flight: its nodes, their start order, their parameter overrides. Launch files and process runner share it."""
 
+import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -116,6 +117,11 @@ def start_lead(startup: float) -> float:
     The second stage gets half as long again as the first one took. The nodes get half a second to discover each other.
     """
     return 0.5 + 1.5 * startup
+
+
+def start_instant(lead: float) -> float:
+    """System time of t = 0, s, `lead` from now: a whole 0.01 s, from which the controller counts its ticks."""
+    return round(time.time() + lead, 2)
 
 
 def parameter_overrides(

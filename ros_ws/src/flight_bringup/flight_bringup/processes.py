@@ -27,10 +27,12 @@ from flight_bringup.graph import (
     NodeSpec,
     parameter_overrides,
     second_stage,
+    start_instant,
     start_lead,
 )
 from flight_core.outcome import LOST_CONTACT
 from flight_core.parameters import ParameterError
+from flight_core.scheduling import leave_real_time_priority
 from flight_core.signals import handle_shutdown
 
 if TYPE_CHECKING:
@@ -138,9 +140,10 @@ class FlightProcesses:
                 time.sleep(DISCOVERY_TIME)
             self._monitor.require_free_domain()
             lead = start_lead(time.monotonic() - begin)
-            self.start_time, self.started = round(time.time() + lead, 3), time.monotonic() + lead
+            self.start_time, self.started = start_instant(lead), time.monotonic() + lead
             for node in self._second:
                 self._start(node)
+            leave_real_time_priority()  # the nodes have it
         except BaseException:
             self.stop()
             raise

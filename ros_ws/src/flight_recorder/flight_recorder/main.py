@@ -9,7 +9,7 @@ def main() -> None:
     """Run the recorder."""
     # Not early: a matched recorder receives the history of all publishers. That delays a flight by 10 to 35 ms, and by 20 to
     # 70 ms while the recorder also loads its modules.
-    start_nodes("flight_recorder.node:RecorderNode", early=False, below_loop=2)
+    start_nodes("flight_recorder.node:RecorderNode", early=False, lower_by=3)
 
 
 if __name__ == "__main__":

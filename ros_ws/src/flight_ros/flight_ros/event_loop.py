@@ -18,11 +18,11 @@ from rclpy.signals import SignalHandlerOptions
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
+from flight_core.scheduling import disable_timer_slack, request_short_slices
 from flight_core.signals import handle_shutdown
 from flight_ros import transport
 from flight_ros.flight_node import FlightNode
 from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, destroy_participant, ready_callback
-from flight_ros.scheduling import disable_timer_slack, request_short_slices
 from flight_ros.ticker import Ticker
 from flight_ros.topics import NodeState
 

@@ -16,18 +16,19 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_default_context
 
+from flight_core.scheduling import lower_real_time_priority
 from flight_core.signals import handle_shutdown
 from flight_ros import transport
 from flight_ros.rclpy_private import Participant, create_participant
-from flight_ros.scheduling import lower_real_time_priority
 
 
-def start_nodes(*nodes: str, early: bool = True, below_loop: int = 0) -> None:
+def start_nodes(*nodes: str, early: bool = True, lower_by: int = 0) -> None:
     """Run nodes, each "module:class", by `flight_ros.event_loop.run`. A signal during the start ends with exit status 0 too.
 
-    `early`: create a DDS participant before the imports. `below_loop`: levels of real-time priority below the inner loop.
+    `early`: create a DDS participant before the imports. `lower_by`: levels of real-time priority, more for
+    nodes of a longer period.
     """
-    lower_real_time_priority(below_loop)
+    lower_real_time_priority(lower_by)
     gc.disable()  # `run` enables it; collections during the imports find nothing and take a tenth of the time
     handle_shutdown(_exit)
     early_participant = _create_early_participant() if early else None

@@ -7,7 +7,7 @@ from flight_ros.startup import start_nodes
 
 def main() -> None:
     """Start the guidance node."""
-    start_nodes("guidance.node:GuidanceNode", below_loop=1)
+    start_nodes("guidance.node:GuidanceNode", lower_by=2)
 
 
 if __name__ == "__main__":

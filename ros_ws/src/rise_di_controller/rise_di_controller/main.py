@@ -7,7 +7,7 @@ from flight_ros.startup import start_nodes
 
 def main() -> None:
     """Start the controller node."""
-    start_nodes("rise_di_controller.node:ControllerNode")
+    start_nodes("rise_di_controller.node:ControllerNode", lower_by=1)
 
 
 if __name__ == "__main__":

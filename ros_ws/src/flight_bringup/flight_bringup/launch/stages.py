@@ -29,7 +29,7 @@ from launch_ros.substitutions import ExecutableInPackage
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
-from flight_bringup.graph import NodeSpec, start_lead
+from flight_bringup.graph import NodeSpec, start_instant, start_lead
 from flight_bringup.processes import READY_TIMEOUT, end_with_parent
 from flight_bringup.scenarios import scenarios
 from flight_log.bag import BagWriter, LogAttachments
@@ -169,7 +169,7 @@ def start_in_stages(
     def ready(spec: NodeSpec) -> Sequence[Action]:
         del waiting[spec]
         lead = start_lead(time.monotonic() - begin)
-        return () if waiting else second(lead, round(time.time() + lead, 3))
+        return () if waiting else second(lead, start_instant(lead))
 
     def warn(context: LaunchContext) -> list[Action]:
         names = ", ".join(spec.executable for spec in waiting)

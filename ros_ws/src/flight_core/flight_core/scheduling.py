@@ -23,15 +23,28 @@ ATTRIBUTES = "=IIQiIQQQ"  # struct sched_attr: size, policy, flags, nice, priori
 def lower_real_time_priority(levels: int) -> None:
     """Lower the real-time priority of all threads of this process, where it has one (chrt), by `levels`; the lowest is 1.
 
-    Threads that start later inherit it. Processes of one priority do not preempt each other, so that a recorder that compresses
-    delays a tick of the law by milliseconds. Rate-monotonic priorities are the optimal fixed ones.
+    Threads that start later inherit it. Processes of one priority do not preempt each other: a recorder that compresses delays
+    a tick of the law by milliseconds, and a tick of the law, of up to 3 ms, the next y_m. Rate-monotonic priorities, the lower
+    the longer the period, are the optimal fixed ones.
     Source: sched(7); C. L. Liu and J. W. Layland, Journal of the ACM 20(1), 1973, theorem 2.
     """
     if (policy := os.sched_getscheduler(0)) in REAL_TIME:
-        priority = max(os.sched_getparam(0).sched_priority - levels, os.sched_get_priority_min(policy))
-        for path in THREADS.iterdir():  # the import of rclpy starts some
-            with suppress(ProcessLookupError):  # the thread has ended
-                os.sched_setparam(int(path.name), os.sched_param(priority))
+        _schedule_threads(policy, max(os.sched_getparam(0).sched_priority - levels, os.sched_get_priority_min(policy)))
+
+
+def leave_real_time_priority() -> None:
+    """Give all threads of this process the default policy, where it has a real-time priority (chrt).
+
+    For a command that starts nodes of that priority and watches them: a wake-up or a garbage collection of it delays no tick.
+    """
+    if os.sched_getscheduler(0) in REAL_TIME:
+        _schedule_threads(os.SCHED_OTHER, 0)
+
+
+def _schedule_threads(policy: int, priority: int) -> None:
+    for path in THREADS.iterdir():  # the import of rclpy starts some
+        with suppress(ProcessLookupError):  # the thread has ended
+            os.sched_setscheduler(int(path.name), policy, os.sched_param(priority))
 
 
 def disable_timer_slack() -> None:
