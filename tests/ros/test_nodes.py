@@ -137,8 +137,10 @@ def test_a_recorder_that_cannot_write_names_the_folder(start_node: Start) -> Non
     assert "recorder.directory: /proc/nowhere cannot be written" in node.output
 
 
-@pytest.mark.parametrize(("package", "priority"), [("rise_di_controller", 50), ("flight_recorder", 48)])
-def test_the_inner_loop_preempts_the_recorder_at_real_time_priority(package: str, priority: int, start_node: Start) -> None:
+@pytest.mark.parametrize(
+    ("package", "priority"), [("reference_model", 50), ("rise_di_controller", 49), ("flight_recorder", 47)]
+)
+def test_a_node_of_a_longer_period_has_a_lower_real_time_priority(package: str, priority: int, start_node: Start) -> None:
     node = start_node(package, within=with_policy("--fifo", "50")).wait_for("ready")
     assert {os.sched_getparam(thread.id).sched_priority for thread in psutil.Process(node.popen.pid).threads()} == {priority}
     node.interrupt().succeed()

@@ -79,6 +79,11 @@ def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
     assert internals.header.frame_id.startswith("/controller#")
     assert tape["y"].stamp_ns[0] == tape.start_ns  # the log begins with the first sample
     assert delays[-1] or np.diff(tape["y"].stamp_ns).max() <= 20_000_000
+    # Ticks are due 1 ms after whole periods of 10 ms, and y at whole 2 ms: a clock that is slewed differs by less than 0.1 ms.
+    logged = tape["internals"]
+    due = logged["age"] - logged["late"] + (logged.stamp_ns % 10_000_000) / 1e9
+    assert np.abs(due % 0.01 - 0.001).max() < 1e-4
+    assert np.abs((tape["y"].stamp_ns + 1_000_000) % 2_000_000 - 1_000_000).max() < 1000  # ns
     # u carries the stamp of the y from which it was computed; one that is held on a busy host, that of its tick
     held = tape["internals"].stamp_ns[tape["internals"]["mode"] != Mode.ENGAGED]
     assert set(tape["u"].stamp_ns.tolist()) - set(held.tolist()) <= set(tape["y"].stamp_ns.tolist())
