@@ -56,7 +56,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
         return self._simulator.period_ns
 
     def start_ns(self) -> int:
-        return nanoseconds(self.parameters.start_time)
+        return nanoseconds(self.parameters.start_time) or super().start_ns()
 
     def on_parameters(self, parameters: AircraftParameters) -> None:
         """Begin and end faults between two samples."""

@@ -170,7 +170,7 @@ def _require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: boo
 
 def _run_real_time(node: FlightNode[Any], stop: _Stop) -> None:
     executor = _start([node])
-    start_ns = node.start_ns() or time.time_ns()
+    start_ns = node.start_ns()
     if (age := time.time_ns() - start_ns) > MAX_START_AGE_NS:
         key = f"{node.get_name()}.start_time"
         raise ParameterError(f"{key}: found an instant {seconds(age):.0f} s ago, expected a future one, or 0")

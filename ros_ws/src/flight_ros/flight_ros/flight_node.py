@@ -91,8 +91,9 @@ class FlightNode(Node, Generic[P]):
         raise NotImplementedError
 
     def start_ns(self) -> int:
-        """System time of tick 0 in ns; 0 starts immediately."""
-        return 0
+        """System time of tick 0, ns: the next whole period of the system clock, so that nodes of equal rates tick together."""
+        now_ns, period_ns = time.time_ns(), self.period_ns()
+        return now_ns - now_ns % period_ns + period_ns
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         """One tick; `now_ns` is the nominal instant of tick.number on the system clock's scale."""

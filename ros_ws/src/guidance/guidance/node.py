@@ -110,7 +110,7 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
         return self._guidance.period_ns
 
     def start_ns(self) -> int:
-        return nanoseconds(self.parameters.start_time)
+        return nanoseconds(self.parameters.start_time) or super().start_ns()
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         self._follow_controller(now_ns)

@@ -47,7 +47,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
         return self._reference.period_ns
 
     def start_ns(self) -> int:
-        return nanoseconds(self.parameters.start_time)
+        return nanoseconds(self.parameters.start_time) or super().start_ns()
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         before = self._reference.source()

@@ -5,7 +5,6 @@
 It subscribes to y and y_m and publishes u and internals. It handles overruns, conflicting publishers and stale inputs.
 """
 
-import time
 from functools import partial
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -24,9 +23,9 @@ from rise_di_controller.guard import Mode
 from rise_di_controller.params import ControllerParameters
 
 BEHIND_NS = 1_000_000
-"""From the instants of y and y_m at 500 Hz, whole 2 ms of the system clock (`start_instant`), to a tick: both have arrived, and
-their nodes have finished their ticks of up to 1 ms. Ticks at a random part of the period delay u by up to 2 ms more, and those
-at the instants of y and y_m wait for a processor of two."""
+"""From the instants of y and y_m at 500 Hz, whole 2 ms of the system clock, to a tick: both have arrived, and their nodes have
+finished their ticks of up to 1 ms. Ticks at a random part of the period delay u by up to 2 ms more, and those at the instants
+of y and y_m wait for a processor of two."""
 
 
 class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
@@ -92,9 +91,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
         return self._controller.period_ns
 
     def start_ns(self) -> int:
-        """The next whole period of the system clock, and BEHIND_NS, or half a period where that is less."""
-        now_ns, period = time.time_ns(), self.period_ns()
-        return now_ns - now_ns % period + period + min(BEHIND_NS, period // 2)
+        """BEHIND_NS, or half a period where that is less, after a whole period of the system clock."""
+        return super().start_ns() + min(BEHIND_NS, self.period_ns() // 2)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         now_ns += tick.late_ns
