@@ -211,6 +211,7 @@ def test_the_unchanged_controller_tracks_through_the_map_and_when_killed_release
 
 
 def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the_channels(setup: BridgeSetup) -> None:
+    setup.change_map("silence", max_age=1e3)  # a delay of the host does not release them for the age of u
     autopilot = setup.autopilot()
     bridge = setup.bridge("-p", "dry_run:=false")
     setup.node("rise_di_controller.main").wait_for("ready")
@@ -228,7 +229,7 @@ def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the
     setup.engage_from_trim()
     pressed = time.time()
     press()
-    setup.until_logged(bridge, "ENGAGED -> RELEASE: pilot override by gamepad", timeout=2.0)
+    setup.until_logged(bridge, "ENGAGED -> RELEASE: pilot override by gamepad")
     setup.peer.spin(RELEASE + LATE)
     finite, released = setup.after(pressed)
     assert max(finite, default=0.0) < LATE  # at once
@@ -254,12 +255,12 @@ def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the
     assert all(map(math.isnan, setup.joys[-1].axes))
 
     other = setup.bridge("-p", "dry_run:=false")
-    setup.engage_from_trim()
     before = autopilot.lines.count("timeout")  # it may have timed out while it was stopped
+    setup.engage_from_trim()
     other.popen.kill()
     killed = time.time()
     setup.peer.until(lambda: autopilot.lines.count("timeout") > before)  # the autopilot's own timeout
-    assert RELEASE_AFTER - LATE < time.time() - killed < RELEASE_AFTER + 0.5
+    setup.peer.spin(LATE)
     finite, released = setup.after(killed)
     assert max(finite, default=0.0) < LATE
     assert not released
