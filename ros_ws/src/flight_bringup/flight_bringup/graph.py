@@ -120,7 +120,7 @@ def start_lead(startup: float) -> float:
 
 
 def start_instant(lead: float) -> float:
-    """System time of t = 0, s, `lead` from now: a whole 0.01 s, from which the controller counts its ticks."""
+    """System time of t = 0, s, `lead` from now: a whole 0.01 s, so that nodes with and without `start_time` tick together."""
     return round(time.time() + lead, 2)
 
 
