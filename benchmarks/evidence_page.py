@@ -42,7 +42,7 @@ class Measurement(NamedTuple):
 SPEED = {
     "law": ("one step of the law", 10.0, "10 s"),
     "node": ("the controller's tick compared with an echo's callback", 10.0, "1 min"),
-    "latency": ("from y sent to u received, over DDS", 10.0, "3 min"),
+    "latency": ("from y sent to u received, over DDS", 10.0, "4 min"),
     "ticks": ("lateness of ticks", 60.0, "8 min"),
     "flight": ("CPU and memory of each process of a flight in real time", 10.0, "1 min"),
     "start": ("from the start of a process to its first u", 10.0, "1 min"),

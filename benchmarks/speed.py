@@ -49,6 +49,7 @@ SCENARIO = "osprey_gust"
 RATES = (100, 500, 1000)  # Hz
 EXECUTORS = ("single", "multi", "events")
 FLOOR_SECONDS = 15.0  # longest measurement of a baseline
+ROUNDS = 3  # in which nodes and their baselines alternate, since the speed of the host drifts
 NODE_RATE = 500.0  # Hz, at which callbacks are timed
 OBSERVER_RATE = 100.0  # Hz, of the matrices of the shipped observer
 OBSERVED = {
@@ -137,6 +138,17 @@ class Driven:
     late: dict[int, float] = field(default_factory=dict)  # lateness of the tick, s
     cpu_ns: int = 0  # processor time of the process
 
+    def __add__(self, other: "Driven") -> "Driven":
+        """The answers of both; no two have the same stamp."""
+        return Driven(
+            self.start or other.start,
+            self.sent + other.sent,
+            self.received | other.received,
+            self.age | other.age,
+            self.late | other.late,
+            self.cpu_ns + other.cpu_ns,
+        )
+
     @property
     def round_trips(self) -> list[int]:
         """From y sent to u received, ns."""
@@ -175,7 +187,7 @@ def node_rows(seconds: float, folder: Path) -> Iterator[Row]:
     took: dict[str, list[dict[str, float]]] = {}
     with open_node("peer") as node:
         peer = Peer(node)
-        for _ in range(3):  # alternating, since the speed of the host drifts
+        for _ in range(ROUNDS):
             for executor in EXECUTORS:
                 with Child("timed_echo", "--executor", executor, "--hz", f"{NODE_RATE}") as child:
                     peer.drive(NODE_RATE, length, child)
@@ -208,13 +220,16 @@ def latency_rows(seconds: float, folder: Path) -> Iterator[Row]:
     with open_node("peer") as node:
         peer = Peer(node)
         for hz in RATES:
+            driven, echoed = Driven(), dict.fromkeys(EXECUTORS, Driven())
+            for _ in range(ROUNDS):
+                for executor in EXECUTORS:
+                    with Child("echo", "--executor", executor) as child:
+                        echoed[executor] += peer.drive(hz, seconds / ROUNDS, child)
+                with controller_at(hz, folder) as child:
+                    driven += peer.drive(hz, seconds / ROUNDS, child)
             floor = f"bare echo, single, {hz} Hz"
-            for executor in EXECUTORS:
-                with Child("echo", "--executor", executor) as child:
-                    driven = peer.drive(hz, min(seconds, FLOOR_SECONDS), child)
-                yield Row(f"bare echo, {executor}, {hz} Hz", _latency(driven, driven.round_trips), floor)
-            with controller_at(hz, folder) as child:
-                driven = peer.drive(hz, seconds, child)
+            for executor, of in echoed.items():
+                yield Row(f"bare echo, {executor}, {hz} Hz", _latency(of, of.round_trips), floor)
             goals = (Goal("CPU (us each)", 2.0, of_floor=True),)
             yield Row(f"controller, tick to u, {hz} Hz", _latency(driven, driven.answers), floor, goals)
             yield Row(f"controller, y to u with the wait for the tick, {hz} Hz", us(driven.round_trips), floor)
@@ -223,7 +238,8 @@ def latency_rows(seconds: float, folder: Path) -> Iterator[Row]:
 
 
 def _latency(driven: Driven, values: Sequence[float]) -> dict[str, float]:
-    return us(values) | {"CPU (us each)": driven.cpu_each, "answered (%)": 100.0 * len(driven.received) / driven.sent}
+    times = us(values) if values else {}  # none was answered
+    return times | {"CPU (us each)": driven.cpu_each, "answered (%)": 100.0 * len(driven.received) / driven.sent}
 
 
 def tick_rows(seconds: float) -> Iterator[Row]:
