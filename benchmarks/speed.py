@@ -48,7 +48,7 @@ from flight_ros.topics import INTERNALS, PUBLISH, RECORD, Y_M, U, Y
 SCENARIO = "osprey_gust"
 RATES = (100, 500, 1000)  # Hz
 EXECUTORS = ("single", "multi", "events")
-FLOOR_SECONDS = 15.0  # longest measurement of a baseline
+FLOOR_SECONDS = 15.0  # longest measurement of a baseline of the ticks
 ROUNDS = 3  # in which nodes and their baselines alternate, since the speed of the host drifts
 NODE_RATE = 500.0  # Hz, at which callbacks are timed
 OBSERVER_RATE = 100.0  # Hz, of the matrices of the shipped observer
