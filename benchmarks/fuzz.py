@@ -30,7 +30,7 @@ MEMORY_MB = 1500  # of the process; the libraries of the readers take 250
 MAX_LENGTH = 16 * 1024  # bytes of an input
 STACK = [
     *("aircraft_sim", "autopilot_bridge", "flight_analysis", "flight_core", "flight_log", "flight_recorder", "flight_view"),
-    *("guidance", "rise_di_controller"),
+    *("flight_guidance", "rise_di_controller"),
 ]
 
 

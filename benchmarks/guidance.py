@@ -41,11 +41,11 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
-from guidance.guidance import Guidance
-from guidance.lateral import least_radius
-from guidance.modes import Lateral, Mode
-from guidance.params import GuidanceParameters
-from guidance.protection import FLOOR
+from flight_guidance.guidance import Guidance
+from flight_guidance.lateral import least_radius
+from flight_guidance.modes import Lateral, Mode
+from flight_guidance.params import GuidanceParameters
+from flight_guidance.protection import FLOOR
 
 SIGMA = 1.5  # m/s, of the turbulence
 RATES = ("q", "p", "r")

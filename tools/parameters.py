@@ -12,8 +12,8 @@ from autopilot_bridge.params import BridgeParameters
 from flight_analysis.closed_loop.scenario import FlightParameters
 from flight_core.fields import REQUIRED
 from flight_core.parameters import ParameterError, Parameters
+from flight_guidance.params import GuidanceParameters
 from flight_recorder.params import RecorderParameters
-from guidance.params import GuidanceParameters
 from reference_model.params import ReferenceModelParameters
 from rise_di_controller import laws
 from rise_di_controller.params import ControllerParameters

@@ -14,7 +14,7 @@ MODULES = {
     "flight_log": "pure: bag follow full_disk log_contents playback recorded_before repair",
     "flight_ros": "pure: lockstep_inputs ticker; ros: fuzz_messages health messages rclpy_private security",
     "reference_model": "pure: live_commands reference_model; ros: live_commands",
-    "guidance": "pure: feasibility guidance guided_flight route_file; ros: guidance",
+    "flight_guidance": "pure: feasibility guidance guided_flight route_file; ros: guidance",
     "rise_di_controller": "pure: any_plant decomposition engagement feedforward guard law paper_identities saturation schedule"
     " signs; ros: controller",
     "aircraft_sim": "pure: actuators aircraft airframe_library disturbance faults_in_flight jsbsim pose sensors turbulence"

@@ -39,6 +39,10 @@ from flight_bringup.scenarios import find_scenario, share
 from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError, StampedVector
+from flight_guidance.guidance import Guidance
+from flight_guidance.modes import TARGETS as MODE_TARGETS
+from flight_guidance.params import GuidanceParameters
+from flight_guidance.route_file import READERS, Origin, read_route
 from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
 from flight_log.named_vectors import decoder, tables
 from flight_log.playback import read_playback
@@ -49,10 +53,6 @@ from flight_log.tape_reader import read_run
 from flight_view.control import Control, RefusedError
 from flight_view.flight import Flight
 from flight_view.server import ADDRESS, Server, answer
-from guidance.guidance import Guidance
-from guidance.modes import TARGETS as MODE_TARGETS
-from guidance.params import GuidanceParameters
-from guidance.route_file import READERS, Origin, read_route
 from rise_di_controller.controller import Controller
 from rise_di_controller.rise_di import RiseDiParameters
 

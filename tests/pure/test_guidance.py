@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from guidance import path, protection
-from guidance.attitude import AttitudeParams, body_rates
-from guidance.lateral import (
+from flight_guidance import path, protection
+from flight_guidance.attitude import AttitudeParams, body_rates
+from flight_guidance.lateral import (
     PathError,
     PathParams,
     bank_for,
@@ -26,9 +26,9 @@ from guidance.lateral import (
     path_acceleration,
     slip_estimate,
 )
-from guidance.params import GuidanceParameters
-from guidance.path import Arc, Line
-from guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_lag, pitch_for, slewed
+from flight_guidance.params import GuidanceParameters
+from flight_guidance.path import Arc, Line
+from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_lag, pitch_for, slewed
 
 SPEED = 40.0  # m/s
 HOLD = AttitudeParams(k_phi=1.25, k_theta=1.0, roll_rate=0.3, load=0.5, n_alpha=1e9, k_beta=0.0)

@@ -23,15 +23,15 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_guidance import guidance, modes
+from flight_guidance.guidance import Guidance
+from flight_guidance.modes import Mode, Vertical
+from flight_guidance.params import GuidanceParameters
+from flight_guidance.protection import climb_range
+from flight_guidance.route_file import Waypoint, read_route
 from flight_log.bag import BagWriter
 from flight_log.named_vectors import PATH, typestore
 from flight_log.tape_reader import read_run
-from guidance import guidance, modes
-from guidance.guidance import Guidance
-from guidance.modes import Mode, Vertical
-from guidance.params import GuidanceParameters
-from guidance.protection import climb_range
-from guidance.route_file import Waypoint, read_route
 
 ROUTE = find_scenario("osprey_route")
 SECTION: dict[str, Any] = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0, "throttle_authority": [3.0, 3.0]}

@@ -25,10 +25,10 @@ from flight_analysis.report.tables import flight_tables
 from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from guidance import path
-from guidance.guidance import names
-from guidance.modes import Lateral, Mode, Vertical
-from guidance.path import Arc, Line, Route
+from flight_guidance import path
+from flight_guidance.guidance import names
+from flight_guidance.modes import Lateral, Mode, Vertical
+from flight_guidance.path import Arc, Line, Route
 
 T = np.arange(0.0, 40.0, 0.02)  # s
 SPEED = 40.0  # m/s, trim

@@ -24,12 +24,13 @@ IMPORTS: dict[str, set[str]] = {
     "reference_model": {"flight_core"},
     "aircraft_sim": {"flight_core"},
     "rise_di_controller": {"flight_core"},
-    "guidance": {"flight_core"},
+    "flight_guidance": {"flight_core"},
     "autopilot_bridge": {"flight_core"},
     "flight_recorder": {"flight_core", "flight_log"},
     "control_laws": {"flight_core", "rise_di_controller"},
     "flight_analysis.closed_loop": {
-        "aircraft_sim", "flight_core", "flight_log", "flight_recorder", "guidance", "reference_model", "rise_di_controller",
+        "aircraft_sim", "flight_core", "flight_guidance", "flight_log", "flight_recorder", "reference_model",
+        "rise_di_controller",
     },
     "flight_analysis.metrics": {"flight_core", "rise_di_controller"},
     "flight_analysis.design": {
@@ -37,24 +38,25 @@ IMPORTS: dict[str, set[str]] = {
         "flight_core", "flight_log", "reference_model", "rise_di_controller",
     },
     "flight_analysis.report": {
-        "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core", "flight_log", "guidance",
-        "rise_di_controller",
+        "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_core", "flight_guidance",
+        "flight_log", "rise_di_controller",
     },
     "flight_campaign": {
         "aircraft_sim", "control_laws", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.metrics",
-        "flight_analysis.report", "flight_core", "guidance", "reference_model", "rise_di_controller",
+        "flight_analysis.report", "flight_core", "flight_guidance", "reference_model", "rise_di_controller",
     },
     "flight_bringup": {
-        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.report", "flight_core", "flight_log", "guidance",
+        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.report", "flight_core", "flight_guidance",
+        "flight_log",
     },
     "flight_view": {
         "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_analysis.report", "flight_core", "flight_log",
-        "guidance", "rise_di_controller",
+        "flight_guidance", "rise_di_controller",
     },
     "flight_cli": {
         "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop", "flight_analysis.design",
         "flight_analysis.metrics", "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log",
-        "flight_view", "guidance", "rise_di_controller",
+        "flight_view", "flight_guidance", "rise_di_controller",
     },
 }  # fmt: skip
 """Which units of the stack a unit imports; nodes, executables and clients import flight_ros beside these."""
@@ -62,7 +64,7 @@ IMPORTS: dict[str, set[str]] = {
 CLIENTS = {
     "flight_bringup": {"flight_ros", "rise_di_controller"},
     "flight_cli": {"flight_ros"},
-    "guidance": {"rise_di_controller"},
+    "flight_guidance": {"rise_di_controller"},
 }
 """What nodes and clients of a unit import further."""
 
@@ -164,7 +166,7 @@ def test_the_command_line_shows_its_help_without_loading_what_commands_need() ->
     assert not modules_loaded_by("from flight_cli.cli import application\napplication([])") & heavy
 
 
-NODES = ["rise_di_controller", "reference_model", "guidance", "autopilot_bridge", "flight_recorder", "aircraft_sim"]
+NODES = ["rise_di_controller", "reference_model", "flight_guidance", "autopilot_bridge", "flight_recorder", "aircraft_sim"]
 
 
 @pytest.mark.parametrize("node", NODES)

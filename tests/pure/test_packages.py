@@ -20,7 +20,7 @@ EXECUTABLES = {
     "aircraft_sim": "aircraft",
     "autopilot_bridge": "bridge",
     "reference_model": "reference_model",
-    "guidance": "guidance",
+    "flight_guidance": "guidance",
     "rise_di_controller": "controller",
     "flight_recorder": "recorder",
     "flight_cli": "rise-di",

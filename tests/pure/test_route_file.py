@@ -12,7 +12,7 @@ import pytest
 from pymap3d.vincenty import vdist
 
 from flight_core.parameters import ParameterError
-from guidance.route_file import FLATTENING, MAX_DISTANCE, SEMI_MAJOR, Origin, Waypoint, local, read_route
+from flight_guidance.route_file import FLATTENING, MAX_DISTANCE, SEMI_MAJOR, Origin, Waypoint, local, read_route
 
 ZURICH = Origin(47.4, 8.5)
 SQUARE = [(8.5, 47.4, 500.0), (8.52, 47.4, 550.0), (8.52, 47.42, 600.5)]  # longitude, latitude, altitude

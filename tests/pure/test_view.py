@@ -32,6 +32,8 @@ from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
+from flight_guidance.path import route_outline
+from flight_guidance.route_file import Waypoint
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.disk import try_lock
 from flight_log.engagements import KEY_VALUE
@@ -44,8 +46,6 @@ from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
 from flight_view.text import picture
 from flight_view.watch import newest_run, require_log, services_note
-from guidance.path import route_outline
-from guidance.route_file import Waypoint
 
 TOKEN = "a-token"  # noqa: S105 - of a test
 CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())

@@ -26,10 +26,10 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
+from flight_guidance.modes import Lateral, Vertical
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
-from guidance.modes import Lateral, Vertical
 from rise_di_controller.guard import Mode as ControllerMode
 
 PEER_TOPICS = ("u_m", "guidance", "pose", "/diagnostics")
@@ -50,19 +50,19 @@ def test_a_lockstep_flight_takes_a_target_and_ends_with_the_name_of_a_lost_guida
     command = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5, "osprey_route")), "--lockstep", "--runs", "runs")
     command.wait_for_log(tmp_path / "runs", FIRST_CHUNKS)
     assert "in force: altitude=60" in start("flight_cli.cli", "target", "altitude=60").succeed().output
-    command.child("guidance.main").kill()
+    command.child("flight_guidance.main").kill()
     assert command.end() == 3
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
     assert summary["outcome"] == "guidance was killed by SIGKILL"
 
 
 def test_guidance_alone_starts_from_the_parameters_of_a_run(start: Start, tmp_path: Path) -> None:
-    refused = start("guidance.main", "--ros-args", "--params-file", str(find_scenario("osprey_route").path))
+    refused = start("flight_guidance.main", "--ros-args", "--params-file", str(find_scenario("osprey_route").path))
     assert refused.end() == 2
     assert "`parameters.yaml` of a run has them" in refused.output
     start("flight_cli.cli", "fly", "osprey_route", "--in-process", "--duration", "1", "--runs", "runs").succeed()
     parameters = tmp_path / "runs" / "latest" / "parameters.yaml"
-    start("guidance.main", "--ros-args", "--params-file", str(parameters)).wait_for("ready")
+    start("flight_guidance.main", "--ros-args", "--params-file", str(parameters)).wait_for("ready")
 
 
 def test_a_keyed_guidance_takes_targets_with_the_key_alone_and_no_route(start: Start, peer_node: Peer, tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ class Flight:
     """A guidance node alone; the peer is aircraft and controller."""
 
     def __init__(self, start: Start, peer_node: Peer, scenario: Path) -> None:
-        self.peer, self.process = peer_node, start("guidance.main", "--ros-args", "--params-file", str(scenario))
+        self.peer, self.process = peer_node, start("flight_guidance.main", "--ros-args", "--params-file", str(scenario))
         self.mode: float = ControllerMode.ENGAGED
         self.rng = np.random.default_rng(1)
 

@@ -108,7 +108,7 @@ def test_the_policy_allows_exactly_those_of_guidance(start: Start, tmp_path: Pat
     for lockstep in (False, True):
         overrides = parameter_overrides(GUIDANCE, scenario, tmp_path, 0.0, lockstep=lockstep)
         words = (word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}"))
-        node = start("guidance.main", "--ros-args", "--params-file", str(scenario.path), *words).wait_for("ready")
+        node = start("flight_guidance.main", "--ros-args", "--params-file", str(scenario.path), *words).wait_for("ready")
         found = found.merged(discovered(peer_node, ("guidance",))["guidance"])
         node.interrupt()
         node.end()

@@ -26,7 +26,7 @@ from flight_log.tape_reader import read_run
 MODULES = {
     "aircraft": "aircraft_sim.main",
     "reference_model": "reference_model.main",
-    "guidance": "guidance.main",
+    "guidance": "flight_guidance.main",
     "controller": "rise_di_controller.main",
     "recorder": "flight_recorder.main",
 }

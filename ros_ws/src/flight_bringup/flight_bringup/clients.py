@@ -28,6 +28,8 @@ from flight_core.authentication import MessageAuthenticator
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
 from flight_core.vectors import ChannelError, FloatArray
+from flight_guidance.modes import TARGETS
+from flight_guidance.odometry import MAP
 from flight_ros import transport
 from flight_ros.messages import Decoder, Encoder, NamedDecoder, stamp_of
 from flight_ros.player import Player
@@ -49,8 +51,6 @@ from flight_ros.topics import (
     U,
     Y,
 )
-from guidance.modes import TARGETS
-from guidance.odometry import MAP
 from rise_di_controller.guard import Mode
 
 __all__ = ["ControlClient", "EngagementClient", "FlightMonitor", "Player", "TargetClient"]

@@ -29,7 +29,7 @@ class NodeSpec(NamedTuple):
 RECORDER = NodeSpec("flight_recorder", "recorder")
 AIRCRAFT = NodeSpec("aircraft_sim", "aircraft")
 REFERENCE_MODEL = NodeSpec("reference_model", "reference_model")
-GUIDANCE = NodeSpec("guidance", "guidance")
+GUIDANCE = NodeSpec("flight_guidance", "guidance")
 CONTROLLER = NodeSpec("rise_di_controller", "controller")
 BRIDGE = NodeSpec("autopilot_bridge", "bridge")
 

@@ -13,7 +13,7 @@ def main() -> None:
     start_nodes(
         "aircraft_sim.node:AircraftNode",
         "reference_model.node:ReferenceModelNode",
-        *(["guidance.node:GuidanceNode"] if guided else []),
+        *(["flight_guidance.node:GuidanceNode"] if guided else []),
         "rise_di_controller.node:ControllerNode",
         "flight_recorder.node:RecorderNode",
     )

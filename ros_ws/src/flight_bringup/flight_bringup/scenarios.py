@@ -9,8 +9,8 @@ from typing import Any
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
 from flight_core.files import is_file, writing
 from flight_core.parameters import require
-from guidance.feasibility import speeds
-from guidance.route_file import Waypoint
+from flight_guidance.feasibility import speeds
+from flight_guidance.route_file import Waypoint
 
 
 def share() -> Path:

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Missions of a fleet: the aircraft of a guided scenario fly its route, with reference model, pose and guidance of each.
 
-The last axis of every array is the aircraft. The equations are those of the nodes: `guidance.modes.follow` and `command`,
-`aircraft_sim.pose`, `reference_model.model`.
+The last axis of every array is the aircraft. The equations are those of the nodes: `flight_guidance.modes.follow` and
+`command`, `aircraft_sim.pose`, `reference_model.model`.
 """
 
 from dataclasses import dataclass
@@ -25,11 +25,11 @@ from flight_core.kinematics import heading_rate
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import divide, period_ns, seconds
 from flight_core.vectors import Array, FloatArray
-from guidance import modes, path
-from guidance.lateral import PathError
-from guidance.modes import GuidanceParams, GuidanceState, Lateral, Mode, Target, Vertical
-from guidance.params import GuidanceParameters
-from guidance.path import Line, Route
+from flight_guidance import modes, path
+from flight_guidance.lateral import PathError
+from flight_guidance.modes import GuidanceParams, GuidanceState, Lateral, Mode, Target, Vertical
+from flight_guidance.params import GuidanceParameters
+from flight_guidance.path import Line, Route
 from reference_model import model
 
 

@@ -25,7 +25,7 @@ from flight_cli.output import (
 )
 from flight_core import outcome as ends
 from flight_core.parameters import ParameterError, require
-from guidance.route_file import Origin, read_route
+from flight_guidance.route_file import Origin, read_route
 
 STATUS = {ends.COMPLETED: 0, ends.INTERRUPTED: INTERRUPTED}
 

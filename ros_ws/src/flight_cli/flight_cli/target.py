@@ -10,7 +10,7 @@ import typer
 
 from flight_core.authentication import read_key
 from flight_core.parameters import ParameterError, require
-from guidance.modes import TARGETS
+from flight_guidance.modes import TARGETS
 
 KeyFile = Annotated[
     str, typer.Option(metavar="FILE", help="The `key_file` of guidance, where it has one: targets are refused without it.")

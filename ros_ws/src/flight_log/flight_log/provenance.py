@@ -28,7 +28,7 @@ STACK = (
     "flight_recorder",
     "flight_ros",
     "flight_view",
-    "guidance",
+    "flight_guidance",
     "reference_model",
     "rise_di_controller",
 )

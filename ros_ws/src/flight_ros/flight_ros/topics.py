@@ -72,7 +72,7 @@ Y_M = Topic("y_m", JointState)
 U = Topic("u", JointState)
 POSE = Topic("pose", JointState)  # phi, theta, psi, north, east, altitude, v_north, v_east, climb: those that are known
 U_M = Topic("u_m", JointState, foreign=True)
-TARGET = Topic("target", JointState, foreign=True)  # what to hold: channels of guidance.modes.Target
+TARGET = Topic("target", JointState, foreign=True)  # what to hold: channels of flight_guidance.modes.Target
 ROUTE = Topic("route", Path, foreign=True)  # waypoints in the frame map: east, north, altitude
 GUIDANCE = Topic("guidance", JointState)
 ODOMETRY, PATH, MARKERS = Topic("odometry", Odometry), Topic("path", Path), Topic("markers", MarkerArray)

@@ -22,8 +22,8 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.fields import short_repr
 from flight_core.parameters import ParameterError, flatten, nest
 from flight_core.rates import NANOSECONDS
+from flight_guidance.modes import TARGETS
 from flight_view.flight import Flight
-from guidance.modes import TARGETS
 from rise_di_controller.params import ControllerParameters
 
 RANGE = (0.5, 2.0)  # of a gain in the scenario: what the page may set

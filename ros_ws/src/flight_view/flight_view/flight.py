@@ -21,6 +21,10 @@ from flight_analysis.report.summary import display_units, pulse_edges
 from flight_core.parameters import ParameterError, printable
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
+from flight_guidance import modes as guidance
+from flight_guidance.odometry import ROUTE_FRAMES
+from flight_guidance.path import route_outline
+from flight_guidance.route_file import Waypoint
 from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
@@ -28,10 +32,6 @@ from flight_log.follow import Follower, Messages
 from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, tables, typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_view.series import Series
-from guidance import modes as guidance
-from guidance.odometry import ROUTE_FRAMES
-from guidance.path import route_outline
-from guidance.route_file import Waypoint
 from rise_di_controller.guard import Mode
 
 RATE = 50.0  # Hz

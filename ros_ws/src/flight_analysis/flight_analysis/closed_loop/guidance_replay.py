@@ -11,11 +11,11 @@ from flight_analysis.closed_loop.replay import Difference
 from flight_core.channels import ATTITUDE
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Tape
-from guidance import guidance, modes
-from guidance.modes import Begin, GuidanceState
-from guidance.params import GuidanceParameters
-from guidance.path import Route
-from guidance.route_file import Waypoint
+from flight_guidance import guidance, modes
+from flight_guidance.modes import Begin, GuidanceState
+from flight_guidance.params import GuidanceParameters
+from flight_guidance.path import Route
+from flight_guidance.route_file import Waypoint
 
 
 class GuidanceReplay(NamedTuple):

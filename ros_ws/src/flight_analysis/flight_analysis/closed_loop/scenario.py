@@ -17,8 +17,8 @@ from flight_core.files import read_file
 from flight_core.parameters import ParameterError, Parameters, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario import A_SCENARIO, Sections, parse_sections
+from flight_guidance.params import GuidanceParameters
 from flight_recorder.params import RecorderParameters
-from guidance.params import GuidanceParameters
 from reference_model.params import ReferenceModelParameters
 from rise_di_controller.params import ControllerParameters
 from rise_di_controller.rise_di import RiseDiParameters

@@ -15,8 +15,8 @@ from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
 from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
-from guidance.guidance import Guidance
-from guidance.params import GuidanceParameters
+from flight_guidance.guidance import Guidance
+from flight_guidance.params import GuidanceParameters
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from flight_analysis.metrics import SETTLING_DWELL, error_metrics, settling_time
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from guidance.modes import TARGETS, Lateral, Vertical
+from flight_guidance.modes import TARGETS, Lateral, Vertical
 
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(("phi", "theta", "heading", "course"), "rad"),

@@ -24,8 +24,8 @@ from flight_analysis.report.plotting import (
 from flight_analysis.report.summary import QUANTITY_UNITS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from guidance.modes import Lateral, Mode, Vertical
-from guidance.path import Route, route_outline
+from flight_guidance.modes import Lateral, Mode, Vertical
+from flight_guidance.path import Route, route_outline
 from rise_di_controller import guard
 
 TRACK_POINTS = 2400

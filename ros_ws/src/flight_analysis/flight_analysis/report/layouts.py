@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
-from guidance import guidance
+from flight_guidance import guidance
 from rise_di_controller import internals
 
 COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b")

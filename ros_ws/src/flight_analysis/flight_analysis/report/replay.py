@@ -12,7 +12,7 @@ from flight_analysis.report.guided_figures import flown_routes
 from flight_analysis.report.plotting import PlotContext, pack, stored
 from flight_analysis.report.summary import NO_UNIT, RecordedFlight
 from flight_core.tape import Signal
-from guidance.path import route_outline
+from flight_guidance.path import route_outline
 from rise_di_controller.guard import Mode
 
 HERE = Path(__file__).parent

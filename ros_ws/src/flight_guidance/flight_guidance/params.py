@@ -22,14 +22,14 @@ from flight_core.parameters import (
 )
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
-from guidance import protection
-from guidance.attitude import AttitudeParams
-from guidance.feasibility import Performance, flyable_legs, speeds
-from guidance.lateral import PathParams, least_period, least_radius
-from guidance.modes import TARGETS, GuidanceParams, Limits, read_target
-from guidance.path import Route, leads
-from guidance.route_file import Waypoint
-from guidance.vertical import VerticalParams, path_lag
+from flight_guidance import protection
+from flight_guidance.attitude import AttitudeParams
+from flight_guidance.feasibility import Performance, flyable_legs, speeds
+from flight_guidance.lateral import PathParams, least_period, least_radius
+from flight_guidance.modes import TARGETS, GuidanceParams, Limits, read_target
+from flight_guidance.path import Route, leads
+from flight_guidance.route_file import Waypoint
+from flight_guidance.vertical import VerticalParams, path_lag
 
 BY_RULE = ("outputs", "natural_frequency", "speed", "throttle_authority", "roll_authority")
 FLOOR_FRACTION = 0.8

@@ -5,15 +5,15 @@ from xml.etree import ElementTree
 from setuptools import setup
 
 setup(
-    name="guidance",
+    name="flight_guidance",
     version=ElementTree.parse("package.xml").findtext("version"),
     description="Guidance of the RISE-DI flight stack: attitude, altitude, course and routes outside the control law.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
-    packages=["guidance"],
+    packages=["flight_guidance"],
     data_files=[
-        ("share/ament_index/resource_index/packages", ["resource/guidance"]),
-        ("share/guidance", ["package.xml"]),
+        ("share/ament_index/resource_index/packages", ["resource/flight_guidance"]),
+        ("share/flight_guidance", ["package.xml"]),
     ],
-    entry_points={"console_scripts": ["guidance = guidance.main:main"]},
+    entry_points={"console_scripts": ["guidance = flight_guidance.main:main"]},
 )

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from flight_core.parameters import require
-from guidance import path, protection
-from guidance.lateral import least_period, least_radius
-from guidance.modes import LARGEST
-from guidance.path import Leg, Line
-from guidance.route_file import Waypoint
+from flight_guidance import path, protection
+from flight_guidance.lateral import least_period, least_radius
+from flight_guidance.modes import LARGEST
+from flight_guidance.path import Leg, Line
+from flight_guidance.route_file import Waypoint
 
 
 class Performance(NamedTuple):

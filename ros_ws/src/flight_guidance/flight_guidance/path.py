@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from flight_core.parameters import require
 from flight_core.vectors import Scalar, array_namespace
-from guidance.lateral import PathError
+from flight_guidance.lateral import PathError
 
 Point = tuple[Scalar, Scalar]  # north, east, m
 

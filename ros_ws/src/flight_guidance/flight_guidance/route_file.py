@@ -17,7 +17,7 @@ from xml.etree.ElementTree import ParseError, TreeBuilder, XMLParser
 from flight_core.fields import short_repr
 from flight_core.files import parse_yaml, read_file
 from flight_core.parameters import ParameterError, require
-from guidance.path import Point
+from flight_guidance.path import Point
 
 SEMI_MAJOR, FLATTENING = 6378137.0, 1.0 / 298.257223563
 """a in m and f of the ellipsoid WGS84. Source: NGA.STND.0036 (2014)."""

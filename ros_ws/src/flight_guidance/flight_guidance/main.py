@@ -7,7 +7,7 @@ from flight_ros.startup import start_nodes
 
 def main() -> None:
     """Start the guidance node."""
-    start_nodes("guidance.node:GuidanceNode", lower_by=2)
+    start_nodes("flight_guidance.node:GuidanceNode", lower_by=2)
 
 
 if __name__ == "__main__":

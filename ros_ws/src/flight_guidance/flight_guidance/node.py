@@ -20,6 +20,12 @@ from flight_core.parameters import ParameterError, require
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError, StampedVector, require_not_future, require_not_old, select
+from flight_guidance import path
+from flight_guidance.guidance import Guidance, GuidanceOutput
+from flight_guidance.modes import Mode
+from flight_guidance.odometry import BODY, MAP, ROUTE_FRAMES, body_velocity, quaternion
+from flight_guidance.params import GuidanceParameters
+from flight_guidance.route_file import Waypoint
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS
@@ -40,12 +46,6 @@ from flight_ros.topics import (
     Y,
     publisher_qos,
 )
-from guidance import path
-from guidance.guidance import Guidance, GuidanceOutput
-from guidance.modes import Mode
-from guidance.odometry import BODY, MAP, ROUTE_FRAMES, body_velocity, quaternion
-from guidance.params import GuidanceParameters
-from guidance.route_file import Waypoint
 from rise_di_controller.guard import Mode as ControllerMode
 
 MAX_TARGETS = 16  # messages of target a tick; later ones wait, so that a storm delays no u_m

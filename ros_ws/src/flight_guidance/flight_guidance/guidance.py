@@ -15,8 +15,8 @@ import numpy as np
 from flight_core.channels import POSE
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer, require_not_future
-from guidance import modes
-from guidance.modes import (
+from flight_guidance import modes
+from flight_guidance.modes import (
     TARGETS,
     Begin,
     Commands,
@@ -28,8 +28,8 @@ from guidance.modes import (
     Target,
     Vertical,
 )
-from guidance.params import GuidanceParameters
-from guidance.path import Route
+from flight_guidance.params import GuidanceParameters
+from flight_guidance.path import Route
 
 LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip")

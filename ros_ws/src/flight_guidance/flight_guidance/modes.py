@@ -19,11 +19,11 @@ from flight_core.kinematics import clip, euler_rates, heading_rate, tilt
 from flight_core.rates import seconds
 from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, Scalar, array_namespace
-from guidance import path, protection
-from guidance.attitude import AttitudeParams, BodyRates, body_rates
-from guidance.lateral import PathError, PathParams, bank_for, course_acceleration, path_acceleration, slip_estimate
-from guidance.path import Arc, Leg, Point, Route
-from guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
+from flight_guidance import path, protection
+from flight_guidance.attitude import AttitudeParams, BodyRates, body_rates
+from flight_guidance.lateral import PathError, PathParams, bank_for, course_acceleration, path_acceleration, slip_estimate
+from flight_guidance.path import Arc, Leg, Point, Route
+from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
 
 LARGEST = 1e9
 """Largest value of pose, y and target, SI. The squares of larger ones overflow; the orbit of the moon is 4e8 m away."""
