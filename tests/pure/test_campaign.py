@@ -38,7 +38,7 @@ from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_u
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.laws import AnyLaw
 
 SHORT = find_scenario("osprey_servo").vary(flight={"duration": 5.0})
 VALUES = arrays(np.float64, st.integers(1, 60), elements=st.floats(1e-6, 1e4))
@@ -272,7 +272,7 @@ def test_an_invalid_sweep_is_refused(sweep: Sweep, sentence: str) -> None:
 
 
 def test_a_sweep_of_a_law_without_that_parameter_is_refused() -> None:
-    pi = replace(SHORT, controller=ControllerParameters.validate_mapping(SECTIONS["pi"], "controller"))
+    pi = replace(SHORT, controller=AnyLaw.validate_mapping(SECTIONS["pi"], "controller"))
     with pytest.raises(ParameterError, match=r"^--sweep: found beta, expected a parameter .*: Lambda, input_scale$"):
         define(pi, 20, 0.3, 77, 20, sweep=Sweep(parameter="beta", factors=(1.0,)))
 

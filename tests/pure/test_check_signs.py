@@ -25,7 +25,7 @@ from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_log.tape_writer import write_run
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.laws import AnyLaw
 
 app = application([*COMMANDS])
 MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
@@ -140,7 +140,7 @@ def flown(controller: dict[str, Any], duration: float, seed: int, wind: float) -
     values = shared | LOOP | controller
     aircraft = {"rate": 100.0, "gusts": {}, "turbulence": turbulence, "sensors": sensors}
     flight = base.vary(flight={"duration": duration}, aircraft=aircraft, reference_model={"rate": 100.0})
-    flight = replace(flight, controller=ControllerParameters.validate_mapping(values, "controller"))
+    flight = replace(flight, controller=AnyLaw.validate_mapping(values, "controller"))
     tape = simulate(flight)
     signals = dict(tape.signals)
     for topic in ("y", "u"):  # both have the stamp of the measurement, which arrives later

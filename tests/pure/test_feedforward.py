@@ -20,6 +20,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_campaign.campaign import define, fly_chunk_figures
 from flight_cli.cli import COMMANDS, application
 from flight_core.integrators import rk4
+from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
@@ -27,6 +28,7 @@ from rise_di_controller import feedforward, guard
 from rise_di_controller import law as rise
 from rise_di_controller.feedforward import Nominal, nominal_model
 from rise_di_controller.guard import ControllerState
+from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerParameters
 
 app = application([*COMMANDS])
@@ -66,7 +68,7 @@ CONTROLLER: dict[str, Any] = SERVO.controller.model_dump() | {
 def small_aircraft(rate: float = 100.0, **model: Any) -> ControllerParameters:
     """A controller of the small aircraft; lead is half a period unless `model` has it."""
     values = CONTROLLER | {"rate": rate, "feedforward": MODEL | {"lead": (0.5 / rate,) * 2} | model}
-    return ControllerParameters.validate_mapping(values, "controller")
+    return AnyLaw.validate_mapping(values, "controller")
 
 
 def reference(t: float) -> FloatArray:
@@ -211,7 +213,7 @@ def ticks(
 def test_engagement_and_re_engagement_during_a_manoeuvre_are_bumpless() -> None:
     states = ticks(small_aircraft(), reference, missing=(0.8, 1.2))
     modes = [state.mode for state in states]
-    engaged = [0, modes.index(guard.Mode.ENGAGED, modes.index(guard.Mode.HOLD))]
+    engaged = [0, modes.index(Mode.ENGAGED, modes.index(Mode.HOLD))]
     assert engaged[1] == 70
     # With y = y_m the law is at rest, so u changes by the feedforward only, by 0.04 to 0.07 per tick. The whole u_ff would be
     # a jump of 0.8 at the first engagement and of 4.6 at the second.
@@ -229,7 +231,7 @@ def test_engagement_and_re_engagement_during_a_manoeuvre_are_bumpless() -> None:
 def test_new_gains_change_neither_the_feedforward_nor_the_input() -> None:
     old = small_aircraft()
     values = old.model_dump() | {"k_g": 5.0, "Lambda": (2.0, 2.0), "delay": 0.02}
-    new = ControllerParameters.validate_mapping(values, "controller")
+    new = AnyLaw.validate_mapping(values, "controller")
     state = ticks(old, lambda t: reference(t) + 0.1 * t)[-1]
     assert state.law is not None
     law = rise.retune(state.law, old.law_params(), new.law_params())
@@ -284,7 +286,7 @@ def test_the_gains_command_writes_the_nominal_model_on_request_and_the_section_r
     assert "feedforward" not in path.read_text(encoding="utf-8")
     assert CliRunner().invoke(app, [*arguments, "--feedforward"]).exit_code == 0
     section = yaml.safe_load(path.read_text(encoding="utf-8"))["/**/controller"]["ros__parameters"]
-    written = ControllerParameters.validate_mapping(section, "controller")
+    written = AnyLaw.validate_mapping(section, "controller")
     nominal, expected = nominal_of(written), nominal_of(with_feedforward(written, load_airframe("osprey")))
     for actual, desired in zip(nominal, expected, strict=True):
         np.testing.assert_allclose(actual, desired, rtol=1e-5, atol=1e-12)  # six digits

@@ -31,8 +31,8 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import decompose, unit_diagonal
 from rise_di_controller.law import LawParams, Sign, engage, step, tuned
+from rise_di_controller.laws import AnyLaw
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law
-from rise_di_controller.params import ControllerParameters
 from rise_di_controller.rise_di import RiseDiParameters
 
 AIRFRAME = load_airframe("osprey")
@@ -464,7 +464,7 @@ def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     output = json.loads(result.stdout)
     section = yaml.safe_load(path.read_text(encoding="utf-8"))["/**/controller"]["ros__parameters"]
-    assert ControllerParameters.validate_mapping(section, "controller").outputs == ("q", "p", "r", "V")
+    assert AnyLaw.validate_mapping(section, "controller").outputs == ("q", "p", "r", "V")
     assert output["engineering"]["controller"]["k_g"] == pytest.approx(section["k_g"], rel=1e-5)
     assert output["theorem"]["delay_margin"] == 0.0
 

@@ -12,9 +12,10 @@ from tests.closed_loop import law_params
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
+from flight_core.modes import Mode
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard, internals
-from rise_di_controller.guard import ControllerState, Mode, align
+from rise_di_controller.guard import ControllerState, align
 from rise_di_controller.internals import Saturation
 from rise_di_controller.law import LawState, Sign, control, engage, retune, step, step_with_anti_windup
 from rise_di_controller.params import ControllerParameters

@@ -62,9 +62,8 @@ IMPORTS: dict[str, set[str]] = {
 """Which units of the stack a unit imports; nodes, executables and clients import flight_ros beside these."""
 
 CLIENTS = {
-    "flight_bringup": {"flight_ros", "rise_di_controller"},
+    "flight_bringup": {"flight_ros"},
     "flight_cli": {"flight_ros"},
-    "flight_guidance": {"rise_di_controller"},
 }
 """What nodes and clients of a unit import further."""
 

@@ -25,13 +25,15 @@ from flight_analysis.design.gain_selection import with_feedforward
 from flight_analysis.design.observer_selection import gains_by_rule, model_for, with_aircraft_observer
 from flight_analysis.report import layouts
 from flight_bringup.scenarios import find_scenario
+from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard, laws
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, field_names, fields, restored
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import ControllerState, GuardParams, Mode
+from rise_di_controller.guard import ControllerState, GuardParams
 from rise_di_controller.law import gain
+from rise_di_controller.laws import AnyLaw
 from rise_di_controller.linear_loop import linear_law
 from rise_di_controller.observer import ObserverParams, ObserverState, correct, initial_estimates, predict
 from rise_di_controller.params import ControllerParameters
@@ -91,12 +93,12 @@ EVERY_LAW = pytest.mark.parametrize("name", [*NAMES, *OBSERVED])
 
 
 def controller(name: str, **changes: Any) -> ControllerParameters:
-    return ControllerParameters.validate_mapping(sections()[name] | changes, "controller") if changes else valid(name)
+    return AnyLaw.validate_mapping(sections()[name] | changes, "controller") if changes else valid(name)
 
 
 @cache
 def valid(name: str) -> ControllerParameters:
-    return ControllerParameters.validate_mapping(sections()[name], "controller")
+    return AnyLaw.validate_mapping(sections()[name], "controller")
 
 
 @cache
@@ -564,7 +566,7 @@ def test_an_observer_with_other_matrices_restarts_without_a_jump(name: str) -> N
 
 def refused(sentence: str, values: dict[str, Any]) -> None:
     with pytest.raises(ParameterError) as error:
-        ControllerParameters.validate_mapping(values, "controller")
+        AnyLaw.validate_mapping(values, "controller")
     assert str(error.value).startswith(sentence), str(error.value)
     assert len(str(error.value).splitlines()) == 1
 
@@ -711,9 +713,9 @@ def test_a_feedforward_with_other_signs_or_a_zero_in_the_right_half_plane_is_ref
 def test_the_digest_knows_the_law_and_logs_without_a_law_keep_theirs() -> None:
     digests = {name: controller(name).digest() for name in (*NAMES, *OBSERVED)}
     assert len(set(digests.values())) == len(digests)
-    named = ControllerParameters.validate_mapping(sections()["rise_di"] | {"law": "rise_di"}, "controller")
+    named = AnyLaw.validate_mapping(sections()["rise_di"] | {"law": "rise_di"}, "controller")
     without_name = {key: value for key, value in sections()["rise_di"].items() if key != "law"}
-    assert named.digest() == ControllerParameters.validate_mapping(without_name, "controller").digest()
+    assert named.digest() == AnyLaw.validate_mapping(without_name, "controller").digest()
 
 
 def test_a_log_is_varied_only_within_its_law() -> None:

@@ -12,9 +12,9 @@ from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis import metrics
 from flight_analysis.metrics import Transient
+from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
-from rise_di_controller.guard import Mode
 from rise_di_controller.internals import Saturation
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.modes import Mode
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError, StampedVector
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import Mode
 
 MAX_AGE, TAKEOVER = 100, 1000
 

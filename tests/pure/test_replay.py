@@ -27,6 +27,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.gain_selection import with_feedforward
 from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import COMMANDS, application
+from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
@@ -35,7 +36,6 @@ from flight_log.stored_messages import PARAMETER_EVENT, parameter_changes
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import Mode
 from rise_di_controller.params import ControllerParameters
 from rise_di_controller.rise_di import RiseDiParameters
 

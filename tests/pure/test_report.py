@@ -26,10 +26,10 @@ from flight_analysis.report.plotting import Figure, Interval, PlotContext, Sampl
 from flight_analysis.report.summary import DisplayUnit, RecordedFlight, summarise
 from flight_analysis.report.tables import events
 from flight_bringup.scenarios import find_scenario
+from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from rise_di_controller.guard import Mode
 from rise_di_controller.internals import Saturation
 
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")

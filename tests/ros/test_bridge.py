@@ -38,10 +38,10 @@ from autopilot_bridge.params import LIBRARY, load_map
 from flight_bringup import processes
 from flight_bringup.clients import ControlClient
 from flight_cli.cli import COMMANDS, application
+from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
-from rise_di_controller.guard import Mode
 
 app = application([*COMMANDS])
 

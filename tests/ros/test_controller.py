@@ -23,11 +23,11 @@ from tests.ros.conftest import Process, Start
 from tests.ros.peer import OUTPUTS, Peer, peer, stamp_ns
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.vectors import FloatArray
 from flight_ros.messages import to_message
 from flight_ros.topics import RECORD
-from rise_di_controller.guard import Mode
 
 Instants = np.ndarray[Any, np.dtype[np.int64]]
 

@@ -24,13 +24,13 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.clients import ControlClient
 from flight_bringup.scenarios import find_scenario
 from flight_core.channels import POSE
+from flight_core.modes import Mode as ControllerMode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_guidance.modes import Lateral, Vertical
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
-from rise_di_controller.guard import Mode as ControllerMode
 
 PEER_TOPICS = ("u_m", "guidance", "pose", "/diagnostics")
 LEVEL = {"altitude": 50.0, "v_north": 25.0}

@@ -14,9 +14,9 @@ from tests.ros.conftest import Start
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import tracking_error
+from flight_core.modes import Mode
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
-from rise_di_controller.guard import Mode
 
 DURATION = 12.0
 

@@ -17,11 +17,11 @@ from tests.ros.test_lockstep import ROUGH, both_cores_busy, scenario_file
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.design.gain_selection import with_feedforward
+from flight_core.modes import Mode
 from flight_core.parameters import flatten, nest
 from flight_core.rates import period_ns
 from flight_log.tape_reader import read_run
 from flight_ros.topics import publisher_qos
-from rise_di_controller.guard import Mode
 
 PEER_TOPICS = ("internals",)
 

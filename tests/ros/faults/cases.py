@@ -40,12 +40,12 @@ from tests.ros.peer import peer
 from tests.small_disk import fill, small_disk
 
 from flight_analysis.closed_loop.scenario import load_scenario
+from flight_core.modes import Mode
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from flight_log.scan import Scan
 from flight_ros.event_loop import LATE_REQUEST_PAUSE
 from flight_ros.messages import to_message
-from rise_di_controller.guard import Mode
 
 SLACK = 0.05
 """s. From a node's tick to the probe, over the threads of the middleware: some milliseconds each. Host scheduling delays

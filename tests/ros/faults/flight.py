@@ -33,6 +33,7 @@ from tests.ros.peer import peer
 
 from autopilot_bridge.params import LIBRARY
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
+from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray, StampedVector
 from flight_ros import transport
@@ -40,7 +41,6 @@ from flight_ros.messages import Decoder, to_message
 from flight_ros.rclpy_private import WaitSet
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import DIAGNOSTICS, HISTORY_NS, INTERNALS, POSE, PUBLISH, TARGET, TRUTH, U_M, Y_M, Topic, U, Y
-from rise_di_controller.guard import Mode
 
 
 class Kind(Enum):

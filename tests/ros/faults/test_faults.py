@@ -20,7 +20,7 @@ from tests.ros.faults.flight import HOLD, MAX_AGE, RAMP, TICK, U_MAX_AGE, Flight
 from tests.ros.faults.foreign import JUMP
 
 from flight_analysis.closed_loop.scenario import load_scenario
-from rise_di_controller.guard import Mode
+from flight_core.modes import Mode
 
 MOVES = 0.15
 """rad, 1: how far the law moves u in a steady flight with late ticks, and while u settles. One sample of a conflicting

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from flight_core.modes import Mode
 from flight_core.rates import seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from rise_di_controller.guard import Mode
 from rise_di_controller.internals import Saturation
 
 Windows = Mapping[str, tuple[float, float]]

@@ -25,6 +25,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
 from flight_core.authentication import MessageAuthenticator
+from flight_core.modes import Mode
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
 from flight_core.vectors import ChannelError, FloatArray
@@ -51,7 +52,6 @@ from flight_ros.topics import (
     U,
     Y,
 )
-from rise_di_controller.guard import Mode
 
 __all__ = ["ControlClient", "EngagementClient", "FlightMonitor", "Player", "TargetClient"]
 

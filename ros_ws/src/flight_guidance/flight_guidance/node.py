@@ -16,6 +16,7 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from flight_core import channels
+from flight_core.modes import Mode as ControllerMode
 from flight_core.parameters import ParameterError, require
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
@@ -46,7 +47,6 @@ from flight_ros.topics import (
     Y,
     publisher_qos,
 )
-from rise_di_controller.guard import Mode as ControllerMode
 
 MAX_TARGETS = 16  # messages of target a tick; later ones wait, so that a storm delays no u_m
 ODOMETRY_PERIOD_NS, PATH_PERIOD_NS = NANOSECONDS // 10, NANOSECONDS

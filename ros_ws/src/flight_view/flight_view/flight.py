@@ -18,6 +18,7 @@ from rosbags.serde.errors import SerdeError
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.metrics import settling_bands
 from flight_analysis.report.summary import display_units, pulse_edges
+from flight_core.modes import Mode
 from flight_core.parameters import ParameterError, printable
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
@@ -32,7 +33,6 @@ from flight_log.follow import Follower, Messages
 from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, tables, typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_view.series import Series
-from rise_di_controller.guard import Mode
 
 RATE = 50.0  # Hz
 RATES = {"internals": math.inf, **dict.fromkeys(("guidance", "pose", "truth", "u", "y", "y_m"), RATE)}

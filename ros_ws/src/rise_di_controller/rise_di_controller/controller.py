@@ -7,11 +7,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+from flight_core.modes import Mode
 from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
 from rise_di_controller import guard, internals
-from rise_di_controller.guard import Mode
 from rise_di_controller.params import ControllerParameters
 
 

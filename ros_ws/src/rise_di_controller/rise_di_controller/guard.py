@@ -9,12 +9,12 @@
 """
 
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flight_core.failsafe import failsafe_scale
+from flight_core.modes import Mode
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import feedforward, observer
@@ -22,18 +22,6 @@ from rise_di_controller.control_law import Measurements, TunedLaw
 from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.observer import ObserverParams, ObserverState
 from rise_di_controller.saturation import Limits, saturate
-
-
-class Mode(IntEnum):
-    """Mode of the controller; published as a number in `internals`."""
-
-    WAITING = 0  # no y or no y_m received yet; nothing is commanded
-    ENGAGED = 1  # the law commands u
-    HOLD = 2  # failsafe: y or y_m is stale, u is held and nothing is integrated
-    RAMP = 3  # failsafe: stale for longer than the hold time, u ramps to trim
-    TRIM = 4  # failsafe: u is at trim
-    INACTIVE = 5  # deactivated: u is held or ramps to trim
-
 
 # Least distance of two samples from which a slope is taken, as a fraction of the extrapolation. Closer samples are noisier:
 # the extrapolation would amplify the noise of their difference more than 20 times.

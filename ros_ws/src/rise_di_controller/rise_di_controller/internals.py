@@ -48,8 +48,9 @@ def groups(
 def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     """Channel names of `internals`: the scalars, then "group.name".
 
-    Scalars: mode (guard.Mode), dt (s), y_m_offset (s), late (s, delay of the tick after its deadline), age (s, of y at the
-    tick), number (counts the samples from 1 since the start: a gap is a lost sample), parameters (ControllerParameters.digest).
+    Scalars: mode (flight_core.modes.Mode), dt (s), y_m_offset (s), late (s, delay of the tick after its deadline), age (s, of y
+    at the tick), number (counts the samples from 1 since the start: a gap is a lost sample), parameters
+    (ControllerParameters.digest).
     """
     return (*SCALARS, *(f"{group}.{name}" for group, members in grouped.items() for name in members))
 

@@ -7,10 +7,12 @@ A package registers a law by an entry point in its setup.py; see docs/laws.md:
     entry_points={"rise_di_controller.laws": ["pi = control_laws.pi:PiParameters"]}
 """
 
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import EntryPoints, entry_points
+from typing import Any
 
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 from rise_di_controller.params import ControllerParameters
 from rise_di_controller.rise_di import RiseDiParameters
 
@@ -48,3 +50,22 @@ def schema(name: object) -> type[ControllerParameters]:
             f"law: found {name!r}, which needs {found.needs}, expected a law of y and y_m: the topics have no more"
         )
     return found
+
+
+class AnyLaw(ControllerParameters):
+    """The section `controller` of a scenario: the parameters of the law that its key `law` names, RISE-DI by default."""
+
+    @classmethod
+    def validate_mapping(cls, values: Mapping[str, Any], where: str) -> ControllerParameters:  # type: ignore[override]
+        """Build the parameters of the law. Raises ParameterError."""
+        name = values.get("law", DEFAULT)
+        try:
+            chosen = schema(name)
+        except ParameterError as error:
+            raise ParameterError(f"{where}.{error}") from None
+        of_default = {} if name == DEFAULT else schema(DEFAULT).model_fields
+        own = [key for key in chosen.model_fields if key not in ControllerParameters.model_fields]
+        for key in values:
+            foreign = key in of_default and key not in chosen.model_fields
+            require(not foreign, f"{where}.{key}", f"a parameter of {DEFAULT}", f"those of {name}: {', '.join(own) or 'none'}")
+        return chosen.validate_mapping(values, where)

@@ -10,6 +10,7 @@ from functools import partial
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
+from flight_core.modes import Mode
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_ros.flight_node import FlightNode
@@ -19,7 +20,7 @@ from flight_ros.rclpy_private import answer_invalid_transitions
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
-from rise_di_controller.guard import Mode
+from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerParameters
 
 BEHIND_NS = 1_000_000
@@ -36,7 +37,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
     """
 
     def __init__(self) -> None:
-        FlightNode.__init__(self, "controller", ControllerParameters)
+        FlightNode.__init__(self, "controller", AnyLaw)
         LifecycleNodeMixin.__init__(self)
         answer_invalid_transitions(self)
         self._active = False

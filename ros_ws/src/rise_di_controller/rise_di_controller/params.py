@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the controller under any control law: validation, and conversion to the arrays of guard, feedforward, observer.
 
-The parameters of a law are a subclass; `ControllerParameters.validate_mapping` finds it by the name of the law.
+The parameters of a law are a subclass; `AnyLaw.validate_mapping` finds it by the name of the law.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from hashlib import blake2b
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -143,25 +143,6 @@ class ControllerParameters(KeyedParameters):
         default=None,
         description="an extension of the paper: corrects the trim by estimates of wind and model error; off where absent",
     )
-
-    @classmethod
-    def validate_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
-        """Build the set of the law that the mapping names, RISE-DI by default. Raises ParameterError."""
-        from rise_di_controller import laws  # noqa: PLC0415 - it has the laws, which import this module
-
-        name = values.get("law", laws.DEFAULT)
-        try:
-            schema = laws.schema(name)
-        except ParameterError as error:
-            raise ParameterError(f"{where}.{error}") from None
-        others = {} if name == laws.DEFAULT else laws.schema(laws.DEFAULT).model_fields
-        own = [key for key in schema.model_fields if key not in ControllerParameters.model_fields]
-        for key in values:
-            foreign = key in others and key not in schema.model_fields
-            expected = f"those of {name}: {', '.join(own) or 'none'}"
-            require(not foreign, f"{where}.{key}", f"a parameter of {laws.DEFAULT}", expected)
-        found: Self = super(ControllerParameters, schema).validate_mapping(values, where)  # type: ignore[assignment]
-        return found
 
     @classmethod
     def tunable(cls) -> frozenset[str]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario, parse_scenario_sections
+from flight_core.modes import Mode
 from flight_core.parameters import flatten, nest, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
@@ -17,7 +18,8 @@ from flight_core.vectors import FloatArray, StampedVector
 from flight_log.tape_reader import StoredFile
 from rise_di_controller import feedforward, guard, internals
 from rise_di_controller.control_law import TunedLaw, restored
-from rise_di_controller.guard import ControllerState, GuardParams, Mode
+from rise_di_controller.guard import ControllerState, GuardParams
+from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerParameters
 
 COPIED_CHANNELS = ("y_m_offset", "number", "parameters")
@@ -86,7 +88,7 @@ class ReplayResult(NamedTuple):
 def recorded_parameters(scenario: StoredFile) -> ControllerParameters:
     """The controller's section of the scenario in a log; other sections are not validated. Raises ParameterError."""
     sections = parse_scenario_sections(scenario.content, Path(scenario.name))
-    return ControllerParameters.validate_mapping(sections["controller"], "controller")
+    return AnyLaw.validate_mapping(sections["controller"], "controller")
 
 
 def recorded_scenario(stored: StoredFile) -> Scenario:
@@ -99,7 +101,7 @@ def vary(parameters: ControllerParameters, changes: Mapping[str, Any]) -> Contro
     flat = dict(flatten(parameters.model_dump()))
     for name in changes:
         flat = {key: value for key, value in flat.items() if key != name and not key.startswith(name + ".")}
-    return ControllerParameters.validate_mapping(nest(flat | dict(changes)), "controller")
+    return AnyLaw.validate_mapping(nest(flat | dict(changes)), "controller")
 
 
 def replay(

@@ -20,6 +20,7 @@ from flight_core.scenario import A_SCENARIO, Sections, parse_sections
 from flight_guidance.params import GuidanceParameters
 from flight_recorder.params import RecorderParameters
 from reference_model.params import ReferenceModelParameters
+from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerParameters
 from rise_di_controller.rise_di import RiseDiParameters
 
@@ -83,7 +84,7 @@ SCHEMAS: dict[str, type[Parameters]] = {
     "flight": FlightParameters,
     "aircraft": AircraftParameters,
     "reference_model": ReferenceModelParameters,
-    "controller": ControllerParameters,
+    "controller": AnyLaw,
     "recorder": RecorderParameters,
     "guidance": GuidanceParameters,
 }

@@ -24,9 +24,9 @@ from flight_analysis.report.plotting import (
     time_series_figure,
 )
 from flight_analysis.report.summary import NO_UNIT, DisplayUnit
+from flight_core.modes import Mode
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from rise_di_controller.guard import Mode
 from rise_di_controller.internals import Saturation
 
 PLANT, REFERENCE, ERROR, MEASURED, WIND, GUST = "#123c52", "#f6a85f", "#8b1f4f", "#e3b6c9", "#2a7f62", "#7f7f7f"

@@ -22,18 +22,18 @@ from flight_analysis.report.plotting import (
     time_series_figure,
 )
 from flight_analysis.report.summary import QUANTITY_UNITS
+from flight_core.modes import Mode as ControllerMode
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.modes import Lateral, Mode, Vertical
 from flight_guidance.path import Route, route_outline
-from rise_di_controller import guard
 
 TRACK_POINTS = 2400
 TRACK_HEIGHT = 560  # pixels
 WIND_ARROWS = 8
 ARROW_PIXELS = 45.0  # of the strongest wind
 LEAST_WIND = 0.3  # m/s, below which no arrow is drawn
-MODE_SHADES = {Mode.DEAD_RECKONING: MODE_COLOURS[guard.Mode.HOLD], Mode.POSE_LOST: MODE_COLOURS[guard.Mode.RAMP]}
+MODE_SHADES = {Mode.DEAD_RECKONING: MODE_COLOURS[ControllerMode.HOLD], Mode.POSE_LOST: MODE_COLOURS[ControllerMode.RAMP]}
 
 Bounds = Mapping[str, tuple[float, float]]  # least and largest command by channel, SI; infinite without a limit
 

@@ -11,9 +11,9 @@ import numpy as np
 from flight_analysis.report.guided_figures import flown_routes
 from flight_analysis.report.plotting import PlotContext, pack, stored
 from flight_analysis.report.summary import NO_UNIT, RecordedFlight
+from flight_core.modes import Mode
 from flight_core.tape import Signal
 from flight_guidance.path import route_outline
-from rise_di_controller.guard import Mode
 
 HERE = Path(__file__).parent
 SCENE = HERE / "scene"

@@ -1,0 +1,16 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Mode of the controller, which its node publishes in `internals` and which guidance, log and page read."""
+
+from enum import IntEnum
+
+
+class Mode(IntEnum):
+    """Mode of the controller; published as a number in `internals`."""
+
+    WAITING = 0  # no y or no y_m received yet; nothing is commanded
+    ENGAGED = 1  # the law commands u
+    HOLD = 2  # failsafe: y or y_m is stale, u is held and nothing is integrated
+    RAMP = 3  # failsafe: stale for longer than the hold time, u ramps to trim
+    TRIM = 4  # failsafe: u is at trim
+    INACTIVE = 5  # deactivated: u is held or ramps to trim
