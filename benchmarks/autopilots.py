@@ -30,7 +30,7 @@ import yaml
 from benchmarks.evidence_page import UNMET, finished, goal
 
 from autopilot_bridge.params import ChannelMap, load_map
-from control_laws.excitation import ExcitationParameters
+from control_laws.excitation import ExcitationConfig
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.design.bridge_identification import channel_pairs, experiment
 from flight_analysis.design.identification import NOISE_SHARE
@@ -304,7 +304,7 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         place = controller["inputs"].index("elevator")
         controller["amplitude"][place] *= STRONGER_ELEVATOR
         scenario.write_text(yaml.safe_dump(content), encoding="utf-8")
-        duration = ExcitationParameters.validate_mapping(controller, "controller").duration
+        duration = ExcitationConfig.validate_mapping(controller, "controller").duration
         plane.say("param", "SIM_WIND_SPD", "5")
         flown = plane.fly(scenario, channel_map, EXPERIMENT * experiments, "--send")
         flown.wait_for("DISENGAGED")

@@ -44,7 +44,7 @@ from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from flight_guidance.guidance import Guidance
 from flight_guidance.lateral import least_radius
 from flight_guidance.modes import Lateral, Mode
-from flight_guidance.params import GuidanceParameters
+from flight_guidance.params import GuidanceConfig
 from flight_guidance.protection import FLOOR
 
 SIGMA = 1.5  # m/s, of the turbulence
@@ -95,7 +95,7 @@ class Pose(NamedTuple):
 class PoseReceiver(Guidance):
     """Guidance that receives pose so. As the node does, it refuses a sample that is not newer or stands still, and goes on."""
 
-    def __init__(self, how: Pose, parameters: GuidanceParameters) -> None:
+    def __init__(self, how: Pose, parameters: GuidanceConfig) -> None:
         super().__init__(parameters)
         self._how, self._number, self._generator = how, 0, np.random.default_rng(1)
         self._sent: deque[StampedVector] = deque()
@@ -127,8 +127,8 @@ class PoseReceiver(Guidance):
 class Manoeuvre(NamedTuple):
     """A manoeuvre: the section of guidance and the duration, s; and its figures."""
 
-    plan: Callable[[GuidanceParameters], tuple[dict[str, Any], float]]
-    figures: Callable[[Tape, GuidanceParameters, bool], Iterator[Figure]]  # the last: whether the air is calm
+    plan: Callable[[GuidanceConfig], tuple[dict[str, Any], float]]
+    figures: Callable[[Tape, GuidanceConfig, bool], Iterator[Figure]]  # the last: whether the air is calm
     winds: tuple[float, ...] = (0.0,)
     turbulent: bool = True
     pose: Pose = Pose()
@@ -156,7 +156,7 @@ def rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def of_phi(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+def of_phi(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Overshoot and settling of a step of the bank; rms in turbulence."""
     if calm:
         yield Figure("overshoot (%)", 100.0 * (tape["guidance"]["pose.phi"].max() / BANK - 1.0), 8.0)
@@ -165,7 +165,7 @@ def of_phi(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figu
         yield Figure("rms (deg)", math.degrees(rms(after(tape, START + 5.0, "pose.phi")[0] - BANK)), 3.0)
 
 
-def of_heading(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+def of_heading(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Overshoot of a turn, and what it costs in altitude and airspeed."""
     psi, altitude, V, commanded = after(tape, START, "pose.psi", "pose.altitude", "y.V", "target.V")
     yield Figure("overshoot (%)", 100.0 * (np.unwrap(psi).max() / TURN - 1.0), 2.0 if calm else 5.0)
@@ -173,7 +173,7 @@ def of_heading(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[
     yield Figure("V (m/s)", np.abs(section.speed + V - commanded).max(), 2.0 if calm else 5.0)
 
 
-def of_pose(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+def of_pose(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Heading and altitude as received over the last 10 s, the true bank then, and how long the wings were levelled."""
     end = tape.time("guidance")[-1] - 10.0
     psi, altitude, wanted, lateral = after(tape, end, "pose.psi", "pose.altitude", "target.altitude", "mode.lateral")
@@ -185,7 +185,7 @@ def of_pose(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Fig
     yield Figure("pose stale (s)", float(stale.sum()) * seconds(section.params().period_ns), math.inf)
 
 
-def of_altitude(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+def of_altitude(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Overshoot of a climb and what it costs in airspeed."""
     altitude, V = after(tape, START, "pose.altitude", "y.V")
     start = tape["guidance"]["target.altitude"][0]
@@ -196,7 +196,7 @@ def of_altitude(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator
         yield Figure("V below 0.8 V0 (m/s)", 0.8 * section.speed - (section.speed + V.min()), 2.0)
 
 
-def of_speed(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+def of_speed(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Overshoot of an acceleration and what it costs in altitude; rms of V in turbulence over that of the wind."""
     altitude, V = after(tape, START, "pose.altitude", "y.V")
     step = FASTER * section.speed
@@ -209,7 +209,7 @@ def of_speed(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Fi
         yield Figure("rms over wind's", rms(late - step) / SIGMA, 1.2)
 
 
-def of_route(waypoints: int, tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+def of_route(waypoints: int, tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Largest cross-track error from 30 s on and before the last orbit, in s of flight."""
     leg, xtrack = after(tape, 30.0, "leg", "xtrack")
     flown = np.abs(xtrack[leg < leg.max()])
@@ -218,13 +218,13 @@ def of_route(waypoints: int, tape: Tape, section: GuidanceParameters, calm: bool
     yield Figure("cross-track (s)", flown.max() / section.speed, 0.35 if calm else 0.5)
 
 
-def of_orbit(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+def of_orbit(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Rms of the cross-track error, in s of flight."""
     end = tape.time("guidance")[-1]
     yield Figure("rms (s)", rms(after(tape, end - lap(section), "xtrack")[0]) / section.speed, 0.02 if calm else 0.15)
 
 
-def of_switch(tape: Tape, section: GuidanceParameters, calm: bool) -> Iterator[Figure]:
+def of_switch(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]:
     """Largest jump of u within 20 ms of a change of the mode, in percent of the range of each input."""
     t, u = tape.time("u"), tape["u"].values
     span = u.max(axis=0) - u.min(axis=0)
@@ -237,7 +237,7 @@ RANGES: dict[str, float] = {}
 """Range of each input of the aircraft that flies."""
 
 
-def of_limits(tape: Tape, section: GuidanceParameters, calm: bool, pose: Pose) -> Iterator[Figure]:
+def of_limits(tape: Tape, section: GuidanceConfig, calm: bool, pose: Pose) -> Iterator[Figure]:
     """How far the bank is beyond its limit, and the airspeed below nine tenths of the floor, in any manoeuvre."""
     phi, V = tape["pose"]["phi"], tape["guidance"]["y.V"]
     limit = 2.0 if calm else 3.0
@@ -246,12 +246,12 @@ def of_limits(tape: Tape, section: GuidanceParameters, calm: bool, pose: Pose) -
     yield Figure("V below 0.9 floor (m/s)", 0.9 * floor - (section.speed + V.min()), 0.0)
 
 
-def lap(section: GuidanceParameters) -> float:
+def lap(section: GuidanceConfig) -> float:
     """Time round the smallest orbit, s."""
     return 2.0 * math.pi * section.least_radius() / section.speed
 
 
-def round_route(places: Sequence[tuple[float, float, float]], section: GuidanceParameters) -> tuple[dict[str, Any], float]:
+def round_route(places: Sequence[tuple[float, float, float]], section: GuidanceConfig) -> tuple[dict[str, Any], float]:
     """A route over places: north and east in least radii, which the fillets have, and altitude over that of trim, m."""
     radius = float(math.ceil(least_radius(section.speed, section.wind, section.bank)))
     north, east, altitude = np.transpose(places) * [[radius], [radius], [1.0]]
@@ -270,7 +270,7 @@ SWITCHES: tuple[dict[str, float], ...] = (
 """Commands one after another; altitude and theta count from those of trim."""
 
 
-def turn_round(section: GuidanceParameters) -> tuple[dict[str, Any], float]:
+def turn_round(section: GuidanceConfig) -> tuple[dict[str, Any], float]:
     """A turn to the right onto the heading at which psi jumps, 180 deg."""
     duration = math.pi * section.speed / (GRAVITY * math.tan(section.bank)) + 40.0
     return {"program": {"heading": {"start": [START, START + 5.0], "value": [TURN, math.pi]}}}, FAULT + duration
@@ -290,7 +290,7 @@ POSES: Mapping[str, Pose] = {
 """A pose worse than the true one."""
 
 
-def switching(section: GuidanceParameters) -> tuple[dict[str, Any], float]:
+def switching(section: GuidanceConfig) -> tuple[dict[str, Any], float]:
     """A change of both modes every SWITCH_PERIOD."""
     steps: dict[str, dict[str, list[float]]] = {}
     for k, switch in enumerate(SWITCHES):

@@ -35,7 +35,7 @@ from flight_campaign.statistics import score, score_units
 from flight_cli.gains import observed
 from flight_core.parameters import ParameterError
 from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 AIR: dict[str, dict[str, Any]] = {
     "calm": {"gusts": {}},
@@ -85,7 +85,7 @@ def _gust_flight() -> tuple[Course, fleet.Vehicle]:
     return build_course(scenario), fleet.vehicle(scenario)
 
 
-def gust_flight(controller: ControllerParameters, uncertainty: float, number: int) -> tuple[float, float]:
+def gust_flight(controller: ControllerConfig, uncertainty: float, number: int) -> tuple[float, float]:
     """Score of an uncertain aircraft in gusts under a controller, and the delay margin of its linear loop, ms."""
     scenario, nominal = find_scenario("osprey_observer"), load_airframe("osprey")
     (course, vehicle), law = _gust_flight(), controller.tuned_law()

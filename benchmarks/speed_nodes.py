@@ -23,7 +23,7 @@ from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 
-from flight_core.parameters import NodeParameters
+from flight_core.parameters import NodeConfig
 from flight_core.rates import NANOSECONDS
 from flight_ros.event_loop import run
 from flight_ros.flight_node import FlightNode
@@ -157,9 +157,9 @@ def ticker_node(hz: float, seconds: float) -> dict[str, Any]:
     skipped: list[tuple[int, int]] = []  # from the first missed deadline to the next tick, monotonic ns
     period = round(NANOSECONDS / hz)
 
-    class Empty(FlightNode[NodeParameters]):
+    class Empty(FlightNode[NodeConfig]):
         def __init__(self) -> None:
-            super().__init__("ticker", NodeParameters)
+            super().__init__("ticker", NodeConfig)
 
         def period_ns(self) -> int:
             return period

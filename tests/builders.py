@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from tests.closed_loop import error
 
-from aircraft_sim.params import AircraftParameters
+from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
 from flight_analysis.metrics import error_metrics
 from flight_core.tape import Tape
@@ -16,9 +16,9 @@ from flight_core.vectors import FloatArray
 MS = 1_000_000  # ns
 
 
-def aircraft_parameters(**values: Any) -> AircraftParameters:
+def aircraft_parameters(**values: Any) -> AircraftConfig:
     """The osprey at 100 Hz with steps of 2 ms, with these values instead or in addition."""
-    return AircraftParameters.validate_mapping({"airframe": "osprey", "rate": 100.0, "step": 0.002} | values, "aircraft")
+    return AircraftConfig.validate_mapping({"airframe": "osprey", "rate": 100.0, "step": 0.002} | values, "aircraft")
 
 
 def truth_of(simulator: Simulator) -> dict[str, float]:

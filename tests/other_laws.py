@@ -9,7 +9,7 @@ import yaml
 from tests.conftest import REPOSITORY
 
 from flight_bringup.scenarios import find_scenario
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 EXAMPLE = REPOSITORY / "examples" / "pid_law"
 _SECTION = "/**/controller"
@@ -22,7 +22,7 @@ def _section(text: str) -> dict[str, Any]:
 
 _RISE_DI = _section(find_scenario("osprey_servo").path.read_text(encoding="utf-8"))
 
-COMMON = {key: value for key, value in _RISE_DI.items() if key in ControllerParameters.model_fields}
+COMMON = {key: value for key, value in _RISE_DI.items() if key in ControllerConfig.model_fields}
 """The parameters that every law has."""
 
 _BLOCKS = re.findall(r"```yaml\n(.*?)```", (REPOSITORY / "docs" / "laws.md").read_text(encoding="utf-8"), re.DOTALL)

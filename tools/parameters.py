@@ -7,16 +7,16 @@ from pathlib import Path
 from types import MappingProxyType, NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from aircraft_sim.params import AircraftParameters
-from autopilot_bridge.params import BridgeParameters
-from flight_analysis.closed_loop.scenario import FlightParameters
+from aircraft_sim.params import AircraftConfig
+from autopilot_bridge.params import BridgeConfig
+from flight_analysis.closed_loop.scenario import FlightConfig
 from flight_core.fields import REQUIRED
-from flight_core.parameters import ParameterError, Parameters
-from flight_guidance.params import GuidanceParameters
-from flight_recorder.params import RecorderParameters
-from reference_model.params import ReferenceModelParameters
+from flight_core.parameters import Config, ParameterError
+from flight_guidance.params import GuidanceConfig
+from flight_recorder.params import RecorderConfig
+from reference_model.params import ReferenceModelConfig
 from rise_di_controller import laws
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "parameters.md"
 LEAD = """# Parameters
@@ -25,14 +25,14 @@ Every parameter of a scenario file, by section, and of the node `bridge`, which 
 SI and radians, if nothing else is said. A key that is not here is refused. The page is made from the classes that validate a
 scenario: `python -m tools.parameters`.
 """
-SECTIONS: Mapping[str, type[Parameters]] = {
-    "flight": FlightParameters,
-    "aircraft": AircraftParameters,
-    "reference_model": ReferenceModelParameters,
-    "guidance": GuidanceParameters,
-    "controller": ControllerParameters,
-    "bridge": BridgeParameters,
-    "recorder": RecorderParameters,
+SECTIONS: Mapping[str, type[Config]] = {
+    "flight": FlightConfig,
+    "aircraft": AircraftConfig,
+    "reference_model": ReferenceModelConfig,
+    "guidance": GuidanceConfig,
+    "controller": ControllerConfig,
+    "bridge": BridgeConfig,
+    "recorder": RecorderConfig,
 }
 TYPES = {float: "number", int: "integer", str: "string", bool: "boolean", dict: "object", object: "any"}
 
@@ -45,11 +45,11 @@ def page() -> str:
             schema = laws.schema(name)
         except ParameterError:  # a law that needs the full state cannot be flown over topics
             continue
-        parts.append(_section(f"`controller` with `law: {name}`", schema, set(ControllerParameters.model_fields)))
+        parts.append(_section(f"`controller` with `law: {name}`", schema, set(ControllerConfig.model_fields)))
     return "\n".join(parts)
 
 
-def _section(title: str, schema: type[Parameters], known: Set[str] = frozenset()) -> str:
+def _section(title: str, schema: type[Config], known: Set[str] = frozenset()) -> str:
     rows = [
         f"| `{key}` | {kind} | {default} | {bounds} | {text} |"
         for key, kind, default, bounds, text in _rows(schema)
@@ -59,14 +59,14 @@ def _section(title: str, schema: type[Parameters], known: Set[str] = frozenset()
     return "\n".join([f"## {title}", "", *head, *rows, ""])
 
 
-def _rows(schema: type[Parameters], prefix: str = "") -> Iterator[tuple[str, ...]]:
+def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, ...]]:
     """Key, type, default, bounds and meaning of each parameter of a set; those of a group under a dotted key."""
     for name, field in schema.model_fields.items():
         one, rules = _resolved(field.annotation, field.rules)
         named = get_origin(one) is dict
         group = _resolved(get_args(one)[1])[0] if named else one
         key = f"{prefix}{name}"
-        if isinstance(group, type) and issubclass(group, Parameters):
+        if isinstance(group, type) and issubclass(group, Config):
             meaning = field.description or ("" if named else group.__doc__ or "")
             yield key, "group", "none" if named else "", "", _text(meaning)
             yield from _rows(group, f"{key}.NAME." if named else f"{key}.")

@@ -14,5 +14,5 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/pid_law"]),
         ("share/pid_law", ["package.xml", "osprey_pid.yaml"]),
     ],
-    entry_points={"rise_di_controller.laws": ["pid = pid_law.pid:PidParameters"]},
+    entry_points={"rise_di_controller.laws": ["pid = pid_law.pid:PidConfig"]},
 )

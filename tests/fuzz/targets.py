@@ -41,7 +41,7 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance.guidance import Guidance
 from flight_guidance.modes import TARGETS as MODE_TARGETS
-from flight_guidance.params import GuidanceParameters
+from flight_guidance.params import GuidanceConfig
 from flight_guidance.route_file import READERS, Origin, read_route
 from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
 from flight_log.named_vectors import decoder, tables
@@ -54,7 +54,7 @@ from flight_view.control import Control, RefusedError
 from flight_view.flight import Flight
 from flight_view.server import ADDRESS, Server, answer
 from rise_di_controller.controller import Controller
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.rise_di import RiseDiConfig
 
 MAX_SENTENCE_LENGTH = 2000
 """Characters of an error sentence, however long the input is."""
@@ -156,7 +156,7 @@ def message(data: bytes, folder: Path) -> None:
     run = write_run(folder, log([("/y", JOINT_STATE, data), (PARAMETER_EVENTS, PARAMETER_EVENT, data)]))
     rejected(lambda: read_run(run))
     rejected(lambda: read_playback(run))
-    rejected(lambda: parameter_changes(run, "/controller", RiseDiParameters.model_fields))
+    rejected(lambda: parameter_changes(run, "/controller", RiseDiConfig.model_fields))
 
 
 def route(data: bytes, folder: Path) -> None:
@@ -231,7 +231,7 @@ MODES = [name for name in MODE_TARGETS if name not in {"north", "east", "radius"
 
 
 @lru_cache(maxsize=1)
-def _guided() -> GuidanceParameters:
+def _guided() -> GuidanceConfig:
     guidance = find_scenario("osprey_route").guidance
     assert guidance is not None
     return guidance

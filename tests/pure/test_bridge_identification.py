@@ -13,7 +13,7 @@ from scipy.signal import cont2discrete, dlsim
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.params import AircraftParameters
+from aircraft_sim.params import AircraftConfig
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws import excitation
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
@@ -46,7 +46,7 @@ MAP, SPEED, DELAY = load_map("ardupilot"), 25.0, 0.05  # m/s; s, by which y is l
 OSPREY = load_airframe("osprey")
 
 
-def aircraft() -> AircraftParameters:
+def aircraft() -> AircraftConfig:
     """The osprey with servos and noise, and y late by DELAY: what the map's aircraft is not known to be."""
     servo = find_scenario("osprey_servo")
     sensors = servo.aircraft.sensors.model_dump() | {"delay": DELAY}

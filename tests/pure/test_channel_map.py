@@ -23,7 +23,7 @@ from tests.published_messages import FOREIGN_MAPS, PACKAGES, PUBLISHED, blank, k
 
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.channel_map import STEP, Line, get_field, message_type, read_raw, set_field, to_channel, to_raw
-from autopilot_bridge.params import LIBRARY, BridgeParameters, ChannelMap, MeasuredRow, OverrideRow, load_map
+from autopilot_bridge.params import LIBRARY, BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
@@ -327,6 +327,6 @@ def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], va
 def test_a_missing_map_is_one_sentence() -> None:
     sentence = r"bridge\.map: found 'nowhere', expected one of ardupilot, ardupilot_2024, mavros, px4, rosflight"
     with pytest.raises(ParameterError, match=sentence):
-        BridgeParameters.validate_mapping({"map": "nowhere"}, "bridge")
+        BridgeConfig.validate_mapping({"map": "nowhere"}, "bridge")
     with pytest.raises(ParameterError, match="lockstep"):
-        BridgeParameters.validate_mapping({"map": "px4", "lockstep": True}, "bridge")
+        BridgeConfig.validate_mapping({"map": "px4", "lockstep": True}, "bridge")

@@ -22,7 +22,7 @@ from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard
 from rise_di_controller.guard import ControllerState
 from rise_di_controller.law import LawParams, control, retune
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 PERIOD_NS = 10_000_000
 SINES = {  # u always moves; p is small, because the bank that builds up without control loads the rudder
@@ -46,7 +46,7 @@ class Conditions(NamedTuple):
     y: bool = True  # whether a fresh y is received
     y_m: bool = True  # whether a fresh y_m is received
     active: bool = True
-    parameters: ControllerParameters = SERVO.controller
+    parameters: ControllerConfig = SERVO.controller
 
 
 class Tick(NamedTuple):
@@ -182,7 +182,7 @@ def test_re_engagement_after_deactivation_is_bumpless(policy: str) -> None:
     assert_bumpless_re_engagement(records, {Mode.INACTIVE})
 
 
-def gains(rng: np.random.Generator, sign: str) -> ControllerParameters:
+def gains(rng: np.random.Generator, sign: str) -> ControllerConfig:
     """The scenario's gains, each times a random factor between 0.6 and 1.4."""
     section, changes = SERVO.rise_di(), {}
     for key in ("k_d", "Lambda", "beta"):

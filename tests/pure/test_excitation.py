@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from control_laws import excitation
-from control_laws.excitation import ExcitationParameters, multisine
+from control_laws.excitation import ExcitationConfig, multisine
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
@@ -28,14 +28,14 @@ TIMETABLE: dict[str, Any] = {
 DT = 1e-3  # s
 
 
-def controller(**changes: Any) -> ExcitationParameters:
+def controller(**changes: Any) -> ExcitationConfig:
     servo = find_scenario("osprey_servo").controller
     common = ("rate", "outputs", "inputs", "D", "input_scale", "lag", "delay", "max_age", "hold", "ramp", "lower", "upper")
     values = {key: getattr(servo, key) for key in common} | {"law": "excitation"} | TIMETABLE | changes
-    return ExcitationParameters.validate_mapping(values, "controller")
+    return ExcitationConfig.validate_mapping(values, "controller")
 
 
-def excited(params: ExcitationParameters) -> FloatArray:
+def excited(params: ExcitationConfig) -> FloatArray:
     """The excitation every DT in units of the amplitude, (T, m)."""
     arrays = params.law_params()
     return np.array([excitation.signal(k * DT, arrays) for k in range(round(params.duration / DT))])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aircraft_sim.params import AircraftParameters
+from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
@@ -21,7 +21,7 @@ NEVER = math.inf
 GUST = {"start": 0.5, "speed": 4.0, "length": 3.0}
 
 
-def flown(before: AircraftParameters, after: AircraftParameters) -> FloatArray:
+def flown(before: AircraftConfig, after: AircraftConfig) -> FloatArray:
     """Rows of y and truth of a flight with another set from BEGIN on; u rolls and pitches."""
     simulator, rows = Simulator(before), []
     for number in range(SAMPLES):
@@ -33,7 +33,7 @@ def flown(before: AircraftParameters, after: AircraftParameters) -> FloatArray:
     return np.array(rows)
 
 
-def varied(scenario: Scenario, **values: Any) -> AircraftParameters:
+def varied(scenario: Scenario, **values: Any) -> AircraftConfig:
     return scenario.vary(aircraft=values).aircraft
 
 
@@ -76,6 +76,6 @@ def test_a_gust_changes_neither_the_past_nor_a_gust_that_acts(osprey_gust: Scena
 
 
 def test_faults_may_change_in_flight_and_nothing_else() -> None:
-    names = AircraftParameters.tunable()
+    names = AircraftConfig.tunable()
     assert {"actuators.stuck_at", "sensors.noise", "gusts.lateral.start"} <= names
     assert not names & {"airframe", "rate", "step", "actuators", "actuators.lag", "sensors", "sensors.delay", "gusts"}

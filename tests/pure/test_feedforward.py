@@ -29,7 +29,7 @@ from rise_di_controller import law as rise
 from rise_di_controller.feedforward import Nominal, nominal_model
 from rise_di_controller.guard import ControllerState
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 app = application([*COMMANDS])
 MS = 1_000_000
@@ -65,7 +65,7 @@ CONTROLLER: dict[str, Any] = SERVO.controller.model_dump() | {
 }
 
 
-def small_aircraft(rate: float = 100.0, **model: Any) -> ControllerParameters:
+def small_aircraft(rate: float = 100.0, **model: Any) -> ControllerConfig:
     """A controller of the small aircraft; lead is half a period unless `model` has it."""
     values = CONTROLLER | {"rate": rate, "feedforward": MODEL | {"lead": (0.5 / rate,) * 2} | model}
     return AnyLaw.validate_mapping(values, "controller")
@@ -77,13 +77,13 @@ def reference(t: float) -> FloatArray:
     return np.array([np.sin(t) ** 3, (1.0 - np.cos(2.0 * t)) ** 2 / 2.0])
 
 
-def nominal_of(params: ControllerParameters) -> Nominal:
+def nominal_of(params: ControllerConfig) -> Nominal:
     nominal = params.nominal()
     assert nominal is not None
     return nominal
 
 
-def largest_error(params: ControllerParameters) -> float:
+def largest_error(params: ControllerConfig) -> float:
     """Largest error in 6 s with the guard, sampled at the controller's rate, integrated in steps of a tenth of a period."""
     limits, law, state, x = params.guard(), params.tuned_law(), guard.initial_state(2), np.zeros(4)
     samples: list[StampedVector] = []
@@ -165,7 +165,7 @@ def short(**changes: Any) -> Scenario:
     return SERVO.vary(flight={"duration": 12.0}, aircraft=slow, reference_model=reference_model).vary(**changes)
 
 
-def recomputed(params: ControllerParameters, tape: Tape) -> tuple[FloatArray, FloatArray]:
+def recomputed(params: ControllerConfig, tape: Tape) -> tuple[FloatArray, FloatArray]:
     """Inputs u and u_ff of every step of a tape, from its y, y_m and dt only."""
     log, limits, law = tape["internals"], params.guard(), params.law_params()
     y, y_m = log.group("y").values, log.group("y_m").values
@@ -196,7 +196,7 @@ def test_u_is_recomputed_from_the_log_to_the_last_bit(enabled: bool) -> None:
 
 
 def ticks(
-    params: ControllerParameters, y: Callable[[float], FloatArray], missing: tuple[float, float] = (9.0, 9.0)
+    params: ControllerConfig, y: Callable[[float], FloatArray], missing: tuple[float, float] = (9.0, 9.0)
 ) -> list[ControllerState]:
     """States at every 10 ms from 0.5 to 1.5 s, while the reference moves; no samples are received in `missing`."""
     state, states = guard.initial_state(2), []

@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from flight_core.fields import Field, Kind, Problems, kind_of
-from flight_core.parameters import ParameterError, Parameters
+from flight_core.parameters import Config, ParameterError
 
 # Each with the declaration of rules as its argument: the stack's Field or pydantic's.
 ANNOTATIONS: list[Callable[[Any], Any]] = [
@@ -62,14 +62,14 @@ def test_a_field_takes_what_strict_pydantic_takes_and_holds_the_same(
         assert repr(held) == repr(expected)
 
 
-class Inner(Parameters):
+class Inner(Config):
     """A group."""
 
     a: float = Field(gt=0, description="the rate, Hz")
     b: dict[str, tuple[int, ...]] = Field(default={})
 
 
-class Outer(Parameters):
+class Outer(Config):
     """A set with a group and a union."""
 
     inner: Inner

@@ -33,7 +33,7 @@ from rise_di_controller.decomposition import decompose, unit_diagonal
 from rise_di_controller.law import LawParams, Sign, engage, step, tuned
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.rise_di import RiseDiConfig
 
 AIRFRAME = load_airframe("osprey")
 SERVOS: LoopSetting = selection.loop_setting(find_scenario("osprey_servo"))._replace(delay=0.0, rate_limit={})
@@ -240,7 +240,7 @@ def test_beta_stays_below_the_rate_of_the_actuators(osprey: Study) -> None:
 def test_a_written_gain_set_is_read_back(selected: selection.Selection) -> None:
     text = selection.as_yaml(selected)
     section = yaml.safe_load(text)["/**/controller"]["ros__parameters"]
-    read = RiseDiParameters.validate_mapping(section, "controller")
+    read = RiseDiConfig.validate_mapping(section, "controller")
     written = selected.engineering.controller
     for key, value in written.model_dump(exclude_none=True).items():
         if isinstance(value, (str, bool)) or key in {"outputs", "inputs", "D"}:

@@ -18,7 +18,7 @@ from rise_di_controller import guard, internals
 from rise_di_controller.guard import ControllerState, align
 from rise_di_controller.internals import Saturation
 from rise_di_controller.law import LawState, Sign, control, engage, retune, step, step_with_anti_windup
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits, saturate
 
 MS = 1_000_000
@@ -67,14 +67,14 @@ def tick(
     ms: float,
     y: StampedVector | None,
     y_m: list[StampedVector],
-    params: ControllerParameters = PARAMS,
+    params: ControllerConfig = PARAMS,
     active: bool = True,
 ) -> tuple[ControllerState, guard.TickInputs | None]:
     return guard.tick(state, round(ms * MS), y, y_m, params.guard(), params.tuned_law(), active)
 
 
 def run(
-    *ticks: tuple[float, StampedVector | None, list[StampedVector]], params: ControllerParameters = PARAMS
+    *ticks: tuple[float, StampedVector | None, list[StampedVector]], params: ControllerConfig = PARAMS
 ) -> list[ControllerState]:
     states = [guard.initial_state(4)]
     for ms, y, y_m in ticks:

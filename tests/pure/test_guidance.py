@@ -26,7 +26,7 @@ from flight_guidance.lateral import (
     path_acceleration,
     slip_estimate,
 )
-from flight_guidance.params import GuidanceParameters
+from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Arc, Line
 from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_lag, pitch_for, slewed
 
@@ -96,7 +96,7 @@ def test_the_altitude_loop_keeps_its_margin_where_the_flight_path_lags_the_pitch
     # theta = gamma_c + low-pass of (theta - gamma), T_L gamma_dot = theta - gamma, h_dot = V gamma. JSBSim's f16 at 154 m/s and
     # 12 km, V_s = 121.9 m/s, fell into a limit cycle of 22 s with k_h = 0.2 and T = 2 s.
     frequencies = (4.0, 1.2, 5.0, 4.0)
-    loop = GuidanceParameters(natural_frequency=frequencies, speed=154.0, stall_speed=stall_speed).params().vertical
+    loop = GuidanceConfig(natural_frequency=frequencies, speed=154.0, stall_speed=stall_speed).params().vertical
     lag, time = path_lag(stall_speed, 154.0), loop.alpha_time
     poles = Polynomial([1.0, time, lag * time]).roots()
     assert np.min(-np.real(poles) / np.abs(poles)) >= 0.5 - 1e-9  # the damping of the flight path
@@ -104,9 +104,9 @@ def test_the_altitude_loop_keeps_its_margin_where_the_flight_path_lags_the_pitch
 
 
 def test_without_a_stall_speed_the_altitude_loop_is_that_of_a_path_which_follows_within_two_seconds() -> None:
-    loop = GuidanceParameters(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=154.0).params().vertical
+    loop = GuidanceConfig(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=154.0).params().vertical
     assert (loop.k_h, loop.alpha_time) == (0.2, 2.0)
-    given = GuidanceParameters(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=154.0, altitude_gain=0.3, alpha_time=1.0)
+    given = GuidanceConfig(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=154.0, altitude_gain=0.3, alpha_time=1.0)
     assert given.params().vertical[::4] == (0.3, 1.0)
 
 

@@ -26,7 +26,7 @@ from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from flight_guidance import guidance, modes
 from flight_guidance.guidance import Guidance
 from flight_guidance.modes import Mode, Vertical
-from flight_guidance.params import GuidanceParameters
+from flight_guidance.params import GuidanceConfig
 from flight_guidance.protection import climb_range
 from flight_guidance.route_file import Waypoint, read_route
 from flight_log.bag import BagWriter
@@ -113,7 +113,7 @@ def pose(stamp_ns: int) -> StampedVector:
 
 def flying(**section: Any) -> Guidance:
     """Guidance after its first step, in a bank of 0.1 rad to the right."""
-    made = Guidance(GuidanceParameters.validate_mapping(SECTION | section, "guidance"))
+    made = Guidance(GuidanceConfig.validate_mapping(SECTION | section, "guidance"))
     made.take_pose(pose(0), 0)
     made.take_y(StampedVector(0, np.zeros(4)), 0)
     assert made.step(0, 0) is not None
@@ -156,7 +156,7 @@ def test_a_stale_pose_levels_the_wings_by_dead_reckoning_then_stops_all_rates(y_
 
 @pytest.mark.parametrize("command", [{}, {"heading": 0.5}])
 def test_a_shorter_route_replaces_one_on_a_later_leg(command: dict[str, float]) -> None:
-    section = GuidanceParameters.validate_mapping(SECTION, "guidance")
+    section = GuidanceConfig.validate_mapping(SECTION, "guidance")
     made, points = flying(), [Waypoint(900.0 * k, 0.0, 100.0) for k in range(5)]
     made.take_route(section.plan(points))
     made.take_target({"leg": 3.0})
@@ -170,7 +170,7 @@ def test_a_shorter_route_replaces_one_on_a_later_leg(command: dict[str, float]) 
 
 
 def test_a_route_replaces_an_altitude_and_an_airspeed_that_were_commanded_before_the_engagement() -> None:
-    made, section = flying(), GuidanceParameters.validate_mapping(SECTION, "guidance")
+    made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
     made.pause(paused=True, forget=False)
     made.take_target({"altitude": 500.0, "V": 21.0})
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 110.0, 26.0)]))
@@ -181,7 +181,7 @@ def test_a_route_replaces_an_altitude_and_an_airspeed_that_were_commanded_before
 
 @pytest.mark.parametrize("leg", [2.0, 0.5, -1.0, 99.0])
 def test_a_leg_that_the_route_does_not_have_is_refused(leg: float) -> None:
-    made, section = flying(), GuidanceParameters.validate_mapping(SECTION, "guidance")
+    made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))  # a line and the orbit
     with pytest.raises(ChannelError, match=f"target.leg: found {leg:g}, expected a whole number from 0 to 1"):
         made.take_target({"leg": leg})
@@ -191,7 +191,7 @@ def test_a_leg_that_the_route_does_not_have_is_refused(leg: float) -> None:
 def test_a_new_route_voids_the_legs_of_the_program() -> None:
     route = {"north": [0.0, 900.0, 1800.0], "east": [0.0] * 3, "altitude": [100.0] * 3}
     steps = {"leg": {"start": [0.05], "value": [2.0]}, "V": {"start": [0.07], "value": [26.0]}}
-    made, section = flying(route=route, program=steps), GuidanceParameters.validate_mapping(SECTION, "guidance")
+    made, section = flying(route=route, program=steps), GuidanceConfig.validate_mapping(SECTION, "guidance")
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))  # a line and the orbit
     signal = run(made, 1, 5)
     assert signal["leg"].tolist() == [0.0] * 4
@@ -201,7 +201,7 @@ def test_a_new_route_voids_the_legs_of_the_program() -> None:
 def test_a_new_route_leaves_the_airspeed_of_a_program_step_with_a_leg() -> None:
     route = {"north": [0.0, 900.0, 1800.0], "east": [0.0] * 3, "altitude": [100.0] * 3}
     steps = {"leg": {"start": [0.05], "value": [2.0]}, "V": {"start": [0.05], "value": [26.0]}}
-    made, section = flying(route=route, program=steps), GuidanceParameters.validate_mapping(SECTION, "guidance")
+    made, section = flying(route=route, program=steps), GuidanceConfig.validate_mapping(SECTION, "guidance")
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
     signal = run(made, 1, 5)
     assert signal["leg"].tolist() == [0.0] * 4
@@ -210,7 +210,7 @@ def test_a_new_route_leaves_the_airspeed_of_a_program_step_with_a_leg() -> None:
 
 @pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
 def test_a_route_that_is_sent_while_guidance_is_off_is_flown_from_its_engagement(by: str) -> None:
-    made, section = flying(), GuidanceParameters.validate_mapping(SECTION, "guidance")
+    made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
 
     def switch(*, on: bool) -> None:
         if by == "guidance/engage":
@@ -257,7 +257,7 @@ def test_commands_of_the_time_in_which_another_flew_are_not_flown(by: str) -> No
 
 
 def test_a_skip_on_the_last_leg_is_refused_and_leaves_the_commands() -> None:
-    made, section = flying(), GuidanceParameters.validate_mapping(SECTION, "guidance")
+    made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
     assert run(made, 1, 2)["leg"][0] == 0.0
     assert made.skip()
@@ -301,7 +301,7 @@ def test_a_new_command_continues_the_climb_rate_and_bounds_the_slew_of_u_m() -> 
     made = flying()
     made.take_target({"phi": 0.5, "climb": 2.0})
     signal = run(made, 1, 100, np.zeros(4))
-    section = GuidanceParameters.validate_mapping(SECTION, "guidance")
+    section = GuidanceConfig.validate_mapping(SECTION, "guidance")
     for name, rate in zip(section.outputs, section.params().slew, strict=True):
         assert np.abs(np.diff(signal[f"u_m.{name}"])).max() <= 0.02 * rate * (1.0 + 1e-9)
     assert np.diff(signal["climb_c"]).max() <= 0.02 * section.acceleration * (1.0 + 1e-9)
@@ -350,7 +350,7 @@ def test_a_command_that_cannot_be_flown_is_refused_and_changes_nothing(values: d
 )
 def test_parameters_that_cannot_be_flown_are_refused(section: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
-        GuidanceParameters.validate_mapping(SECTION | section, "guidance")
+        GuidanceConfig.validate_mapping(SECTION | section, "guidance")
 
 
 def test_the_numbers_that_are_left_out_follow_from_the_other_sections() -> None:
@@ -363,7 +363,7 @@ def test_the_numbers_that_are_left_out_follow_from_the_other_sections() -> None:
     assert (params.vertical.climb, params.path.period) == (2.5, section.least_period())
     assert params.attitude.k_beta == pytest.approx(5.0 / 14.0 * 25.0 * math.radians(1.0) / 1.5)
     assert params.attitude.roll_rate == 0.35  # 45 rad/s^2 of aileron would permit more
-    weak = GuidanceParameters.validate_mapping(SECTION | {"roll_authority": 1.036}, "guidance")
+    weak = GuidanceConfig.validate_mapping(SECTION | {"roll_authority": 1.036}, "guidance")
     assert weak.largest_roll_rate() == pytest.approx(1.036 / 6.0)  # the 737 of JSBSim
 
 
@@ -458,7 +458,7 @@ def test_replay_leaves_a_route_that_arrived_in_flight_unchecked() -> None:
 class RoutedInFlight(Guidance):
     """Guidance that takes a route at 1 s."""
 
-    def __init__(self, parameters: GuidanceParameters) -> None:
+    def __init__(self, parameters: GuidanceConfig) -> None:
         super().__init__(parameters)
         self._new = parameters.plan([Waypoint(*point) for point in WAYPOINTS])
 

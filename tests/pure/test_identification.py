@@ -44,7 +44,7 @@ from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from reference_model.params import ReferenceModelParameters
+from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 
 DT = 0.005
@@ -173,7 +173,7 @@ def test_an_output_without_response_ends_the_identification() -> None:
 def test_the_commanded_airspeed_needs_a_third_of_the_throttle(speed: float, authority: float) -> None:
     # The filter's answer to a step, 2 m/s (1 - (1 + w t) exp(-w t)), is steepest at t = 1/w: 2 m/s w / e. The pulse's edge of
     # 0.1 s rounds that off by less than 1 %.
-    params = ReferenceModelParameters.validate_mapping(reference_parameters(speed, authority), "reference_model")
+    params = ReferenceModelConfig.validate_mapping(reference_parameters(speed, authority), "reference_model")
     y_m, row = Reference(params), list(params.outputs).index("V")
     samples = np.array([y_m.sample(k)[row] for k in range(round(30.0 * params.rate))])
     steepest = float(np.max(np.abs(np.diff(samples)))) * params.rate

@@ -21,11 +21,11 @@ from tests import launch_stand_in as stand_in
 from tests.conftest import REPOSITORY
 from tests.launch_stand_in import ExecuteProcess, LaunchContext, Node, OpaqueFunction, ProcessExited, TimerAction
 
-from autopilot_bridge.params import LIBRARY, BridgeParameters, load_map
+from autopilot_bridge.params import LIBRARY, BridgeConfig, load_map
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, parse_scenario_sections
 from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import COMMANDS, application
-from flight_core.parameters import ParameterError, Parameters
+from flight_core.parameters import Config, ParameterError
 from flight_log.bag import LogAttachments
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
@@ -35,8 +35,8 @@ from flight_ros.transport import DISCOVERY_VARIABLE, PROFILE_VARIABLE
 app = application([*COMMANDS])
 FILES = sorted((REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "launch").glob("*.launch.py"))
 INSTALLED = REPOSITORY / "ros_ws" / "install"
-NODES: dict[str, type[Parameters]] = {name: schema for name, schema in SCHEMAS.items() if name != "flight"}
-NODES["bridge"] = BridgeParameters
+NODES: dict[str, type[Config]] = {name: schema for name, schema in SCHEMAS.items() if name != "flight"}
+NODES["bridge"] = BridgeConfig
 SHARED = "flight_bringup.launch.stages"
 PID = 0  # of a process of this launch
 T = TypeVar("T")

@@ -17,7 +17,7 @@ from tests.pure.test_replay import BUSY, FLY, LOST, SHORT, Tick, driven, equal, 
 
 from aircraft_sim.airframe import load_airframe
 from control_laws import lqg
-from control_laws.pi import PiParameters
+from control_laws.pi import PiConfig
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -28,7 +28,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, StampedVector
-from rise_di_controller import guard, laws
+from rise_di_controller import guard, laws, params
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, field_names, fields, restored
 from rise_di_controller.controller import Controller
 from rise_di_controller.guard import ControllerState, GuardParams
@@ -36,7 +36,7 @@ from rise_di_controller.law import gain
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.linear_loop import linear_law
 from rise_di_controller.observer import ObserverParams, ObserverState, correct, initial_estimates, predict
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
 AIRFRAME = load_airframe("osprey")
@@ -56,7 +56,7 @@ def _example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     metadata = installed / "pid_law-0.1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: pid_law\nVersion: 0.1.0\n", encoding="utf-8")
-    (metadata / "entry_points.txt").write_text(f"[{laws.GROUP}]\npid = pid_law.pid:PidParameters\n", encoding="utf-8")
+    (metadata / "entry_points.txt").write_text(f"[{laws.GROUP}]\npid = pid_law.pid:PidConfig\n", encoding="utf-8")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(EXAMPLE))
         patch.syspath_prepend(str(installed))
@@ -92,17 +92,17 @@ OBSERVED = ("lqg, observer", "rise_di, observer", "pi, observer")
 EVERY_LAW = pytest.mark.parametrize("name", [*NAMES, *OBSERVED])
 
 
-def controller(name: str, **changes: Any) -> ControllerParameters:
+def controller(name: str, **changes: Any) -> ControllerConfig:
     return AnyLaw.validate_mapping(sections()[name] | changes, "controller") if changes else valid(name)
 
 
 @cache
-def valid(name: str) -> ControllerParameters:
+def valid(name: str) -> ControllerConfig:
     return AnyLaw.validate_mapping(sections()[name], "controller")
 
 
 @cache
-def prepared(parameters: ControllerParameters) -> tuple[GuardParams, TunedLaw]:
+def prepared(parameters: ControllerConfig) -> tuple[GuardParams, TunedLaw]:
     return parameters.guard(), parameters.tuned_law()
 
 
@@ -122,7 +122,7 @@ def sample(ms: float, value: Any) -> StampedVector:
     return StampedVector(round(ms * MS), value + np.zeros(4))
 
 
-def tick(parameters: ControllerParameters, state: ControllerState, ms: float, y: Any, y_m: Any = 0.0) -> ControllerState:
+def tick(parameters: ControllerConfig, state: ControllerState, ms: float, y: Any, y_m: Any = 0.0) -> ControllerState:
     """The state after a tick with fresh y and y_m."""
     return guard.tick(state, round(ms * MS), sample(ms, y), [sample(ms, y_m)], *prepared(parameters))[0]
 
@@ -427,7 +427,7 @@ class Matrices(NamedTuple):
     F: FloatArray
 
 
-def matrices(parameters: ControllerParameters) -> Matrices:
+def matrices(parameters: ControllerConfig) -> Matrices:
     nominal = parameters.nominal()
     assert parameters.observer is not None
     assert nominal is not None
@@ -574,7 +574,7 @@ def refused(sentence: str, values: dict[str, Any]) -> None:
 def test_the_page_names_every_registered_law_and_its_parameters() -> None:
     page = (REPOSITORY / "docs" / "laws.md").read_text(encoding="utf-8")
     for name in laws.names():
-        own = [] if name in {"lqi", "indi"} else set(laws.schema(name).model_fields) - set(ControllerParameters.model_fields)
+        own = [] if name in {"lqi", "indi"} else set(laws.schema(name).model_fields) - set(ControllerConfig.model_fields)
         for word in (name, *own):
             assert f"`{word}`" in page, word
 
@@ -598,7 +598,7 @@ def test_an_entry_point_that_is_no_law_is_refused(monkeypatch: pytest.MonkeyPatc
         "empty": ["control_laws.pi:Absent"],
         "module": ["control_laws.pi"],
         "function": ["control_laws.pi:params_of"],
-        "twice": ["control_laws.pi:PiParameters", "control_laws.l1:L1Parameters"],
+        "twice": ["control_laws.pi:PiConfig", "control_laws.l1:L1Config"],
     }
     entries = EntryPoints(EntryPoint(name, value, laws.GROUP) for name, found in values.items() for value in found)
     monkeypatch.setattr(laws, "_registered", lambda: entries)
@@ -607,12 +607,12 @@ def test_an_entry_point_that_is_no_law_is_refused(monkeypatch: pytest.MonkeyPatc
         "empty": "found 'empty', which cannot be loaded (module 'control_laws.pi' has no attribute 'Absent'), expected",
         "module": "found 'module', registered as <module",
         "function": "found 'function', registered as <function params_of",
-        "twice": "found 'twice', registered as control_laws.l1:L1Parameters and as control_laws.pi:PiParameters, expected one",
+        "twice": "found 'twice', registered as control_laws.l1:L1Config and as control_laws.pi:PiConfig, expected one",
     }.items():
         refused(f"controller.law: {sentence}", COMMON | {"law": name})
 
 
-class Colliding(PiParameters):
+class Colliding(PiConfig):
     """PI whose state has the name of a channel of the log."""
 
     def control_law(self) -> ControlLaw:
@@ -624,7 +624,7 @@ class Colliding(PiParameters):
         return super().control_law()._replace(engage=lambda measured, params: State(measured.y))
 
 
-class Short(PiParameters):
+class Short(PiConfig):
     """PI whose state has one value for all channels."""
 
     def control_law(self) -> ControlLaw:
@@ -722,3 +722,9 @@ def test_a_log_is_varied_only_within_its_law() -> None:
     assert vary(controller("pi"), {"K": [1.0] * 4}).model_dump()["K"] == (1.0,) * 4
     with pytest.raises(ParameterError, match=r"controller\.k_g: found a parameter of rise_di, expected those of pi: K, Lambda"):
         vary(controller("pi"), {"k_g": 1.0})
+
+
+def test_former_name_of_controller_config_warns() -> None:
+    """A law of an outside package that imports ControllerParameters still loads."""
+    with pytest.warns(FutureWarning, match="now ControllerConfig"):
+        assert params.ControllerParameters is ControllerConfig

@@ -19,7 +19,7 @@ from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
-from reference_model.params import ReferenceModelParameters
+from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
 
@@ -35,7 +35,7 @@ MS = 1_000_000  # ns
 
 
 def reference(**live: Any) -> Reference:
-    return Reference(ReferenceModelParameters.validate_mapping(SECTION | {"live": live}, "reference_model"))
+    return Reference(ReferenceModelConfig.validate_mapping(SECTION | {"live": live}, "reference_model"))
 
 
 def test_a_command_beyond_its_bound_is_refused_and_changes_nothing() -> None:
@@ -88,12 +88,12 @@ def test_levelling_needs_the_rates_and_the_speed(outputs: list[str]) -> None:
     n = len(outputs)
     section = SECTION | {"outputs": outputs, "second_order": {"natural_frequency": [4.0] * n, "damping": [0.9] * n}}
     with pytest.raises(ParameterError, match=r"live\.speed: found 25"):
-        ReferenceModelParameters.validate_mapping(section | {"live": {"speed": 25.0}}, "reference_model")
+        ReferenceModelConfig.validate_mapping(section | {"live": {"speed": 25.0}}, "reference_model")
 
 
 def test_in_lockstep_u_m_comes_at_instants_of_the_reference() -> None:
     with pytest.raises(ParameterError, match="u_m_rate"):
-        ReferenceModelParameters.validate_mapping(SECTION | {"u_m_rate": 60.0}, "reference_model")
+        ReferenceModelConfig.validate_mapping(SECTION | {"u_m_rate": 60.0}, "reference_model")
 
 
 AIRCRAFT: dict[str, tuple[Any, float]] = {

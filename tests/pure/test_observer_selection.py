@@ -26,7 +26,7 @@ from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.rise_di import RiseDiConfig
 
 OSPREY = load_airframe("osprey")
 SERVO = find_scenario("osprey_servo")
@@ -39,7 +39,7 @@ FLOWN = SERVO.vary(aircraft={"rate": 100.0, "step": 0.005}, reference_model={"ra
 """osprey_servo with y at the rate of the law and steps of 5 ms: half of the time of the shipped one."""
 
 
-def with_observer(controller: RiseDiParameters) -> Scenario:
+def with_observer(controller: RiseDiConfig) -> Scenario:
     """osprey_servo under another controller."""
     return FLOWN.vary(controller=controller.model_dump())
 
@@ -68,7 +68,7 @@ def test_the_shipped_scenarios_have_the_observer_that_the_command_writes(tmp_pat
     assert result.exit_code == 0, result.output
     assert "gains of a search in osprey_servo" in result.output
     section = yaml.safe_load(written.read_text(encoding="utf-8"))["/**/controller"]["ros__parameters"]
-    again = RiseDiParameters.validate_mapping(section, "controller")
+    again = RiseDiConfig.validate_mapping(section, "controller")
     assert again.observer is not None
     for shipped in (find_scenario(name).controller for name in SHIPPED):
         assert shipped.feedforward == again.feedforward
@@ -91,7 +91,7 @@ def test_the_margin_of_a_selected_observer_holds_and_is_the_one_that_was_asked_f
     assert np.prod(by_rule(0.045).relaxation) > np.prod(by_rule(0.03).relaxation)
 
 
-def _plant(controller: RiseDiParameters) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _plant(controller: RiseDiConfig) -> tuple[FloatArray, FloatArray, FloatArray]:
     nominal = controller.nominal()
     assert nominal is not None
     return nominal.A + nominal.gravity, nominal.B, nominal.C

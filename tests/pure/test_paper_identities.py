@@ -20,7 +20,7 @@ from scipy.integrate import cumulative_trapezoid, solve_ivp
 from tests.closed_loop import law_params, reference_outputs
 
 from aircraft_sim import dynamics
-from aircraft_sim.params import AircraftParameters, Gust
+from aircraft_sim.params import AircraftConfig, Gust
 from flight_analysis.design.lyapunov import KnownPlant, decay_matrix, evidence, example, fly
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
@@ -567,7 +567,7 @@ def test_the_softened_sign_settles_behind_a_servo_within_the_limit_of_routh() ->
 def osprey(gust: float = 0.0) -> dynamics.Aircraft:
     """The osprey in a vertical gust of this speed at t = 0."""
     gusts = {"vertical": Gust(start=0.0, speed=gust, length=15.24)}
-    return AircraftParameters(airframe="osprey", rate=100.0, step=0.01, gusts=gusts).load()[1]
+    return AircraftConfig(airframe="osprey", rate=100.0, step=0.01, gusts=gusts).load()[1]
 
 
 V, ALPHA, Q, THETA = range(4)

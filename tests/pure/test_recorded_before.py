@@ -18,7 +18,7 @@ from flight_core.rates import NANOSECONDS
 from flight_log.repair import repair
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.rise_di import RiseDiConfig
 
 TOPICS = {"y", "y_m", "u", "internals", "truth"}
 
@@ -57,7 +57,7 @@ def test_the_summary_is_equal_to_the_last_digit(run: Path) -> None:
 def test_every_bit_is_replayed(run: Path) -> None:
     recorded = read_run(run)
     assert recorded.scenario is not None
-    changes = parameter_changes(run, "/controller", RiseDiParameters.model_fields)
+    changes = parameter_changes(run, "/controller", RiseDiConfig.model_fields)
     result = replay(recorded.tape, recorded_parameters(recorded.scenario), changes=changes)
     assert result.equal(), result.first()
     assert result.checked.all()

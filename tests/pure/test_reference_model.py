@@ -17,17 +17,17 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from reference_model import model
 from reference_model.command import command
-from reference_model.params import ReferenceModelParameters
+from reference_model.params import ReferenceModelConfig
 
 
-def parameters(**changes: object) -> ReferenceModelParameters:
+def parameters(**changes: object) -> ReferenceModelConfig:
     values = {
         "rate": 500.0,
         "outputs": ["q", "p", "r"],
         "second_order": {"natural_frequency": [4.0, 5.0, 4.0], "damping": [0.9, 0.9, 1.0]},
         "rise": 0.1,
     }
-    return ReferenceModelParameters.validate_mapping(values | changes, "reference_model")
+    return ReferenceModelConfig.validate_mapping(values | changes, "reference_model")
 
 
 PULSES = {
@@ -61,7 +61,7 @@ def test_a_coordinated_turn_follows_the_integral_of_the_bank_rate() -> None:
         assert float(command(t, profile)[2]) == pytest.approx(9.81 / 25.0 * math.sin(bank), abs=1e-8)
 
 
-def simulate(params: ReferenceModelParameters, duration: float, dt: float) -> FloatArray:
+def simulate(params: ReferenceModelConfig, duration: float, dt: float) -> FloatArray:
     return reference_outputs(params.model(), params.profile(), dt, round(duration / dt))
 
 
@@ -104,7 +104,7 @@ def test_the_general_form_and_the_second_order_form_are_the_same_model() -> None
 
 def test_a_rate_at_which_the_runge_kutta_steps_diverge_is_refused() -> None:
     # 1 + z + z^2/2 + z^3/6 + z^4/24 = 1 at z = -2.785, here a pole of 278.5 1/s at 100 Hz.
-    def first_order(pole: float) -> ReferenceModelParameters:
+    def first_order(pole: float) -> ReferenceModelConfig:
         linear = {"states": ["q"], "A_m": [-pole], "B_m": [pole]}
         return parameters(rate=100.0, outputs=["q"], second_order=None, linear=linear)
 

@@ -36,8 +36,8 @@ from flight_log.stored_messages import PARAMETER_EVENT, parameter_changes
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 from rise_di_controller.controller import Controller
-from rise_di_controller.params import ControllerParameters
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di import RiseDiConfig
 
 app = application([*COMMANDS])
 GUST = find_scenario("osprey_gust").vary(
@@ -91,7 +91,7 @@ class Tick(NamedTuple):
     changes: tuple[Mapping[str, Any], ...] = ()  # of the parameters, in order
 
 
-def driven(parameters: ControllerParameters, ticks: Sequence[Tick], start_ns: int = EPOCH) -> Tape:
+def driven(parameters: ControllerConfig, ticks: Sequence[Tick], start_ns: int = EPOCH) -> Tape:
     """The tape of a controller that meets these events."""
     outputs, controller = parameters.outputs, Controller(parameters)
     rows: dict[str, list[tuple[int, FloatArray]]] = {"y": [], "y_m": [], "u": [], "internals": []}
@@ -548,7 +548,7 @@ def test_changes_of_parameters_are_read_from_the_log(tmp_path: Path) -> None:
         channel = bag.add_topic("/parameter_events", PARAMETER_EVENT, "")
         for number, message in enumerate(events):
             bag.write(channel, number, number, number, bytes(STORE.serialize_cdr(message, PARAMETER_EVENT)))
-    nodes, known = ("/controller", "/one/controller"), RiseDiParameters.model_fields
+    nodes, known = ("/controller", "/one/controller"), RiseDiConfig.model_fields
     assert {node: parameter_changes(tmp_path / "run", node, known) for node in nodes} == {
         "/controller": [{"upper": [1.0, 2.0]}, {"k_g": 2.5, "sign": "soft", "upper": None}],
         "/one/controller": [{"Lambda": [1.0, 2.0]}],

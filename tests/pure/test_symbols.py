@@ -17,11 +17,11 @@ from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
 from flight_analysis.design.gain_conditions import Bounds, GainSet
 from flight_analysis.design.lyapunov import Evidence
-from flight_core.parameters import Parameters
+from flight_core.parameters import Config
 from rise_di_controller import internals
 from rise_di_controller.law import LawParams, LawState
 from rise_di_controller.observer import ObserverParams, ObserverState
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.rise_di import RiseDiConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 TOPICS = ROOT / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "topics.py"
@@ -97,7 +97,7 @@ def resolve(name: str) -> object:
     for k, part in enumerate(parts[1:], start=2):
         if hasattr(found, part):
             found = getattr(found, part)
-        elif isinstance(found, type) and issubclass(found, Parameters) and part in found.model_fields:
+        elif isinstance(found, type) and issubclass(found, Config) and part in found.model_fields:
             found = found.model_fields[part]
         elif part in getattr(found, "__dataclass_fields__", {}):
             found = found.__dataclass_fields__[part]
@@ -117,15 +117,15 @@ def functions_of(path: Path) -> frozenset[str]:
 def schema_at(annotation: Any) -> Any:
     """The set inside an annotation such as `Set | None` or `dict[str, Set]`, else the annotation."""
     inside = (annotation, *map(schema_at, get_args(annotation)))
-    return next((one for one in inside if isinstance(one, type) and issubclass(one, Parameters)), annotation)
+    return next((one for one in inside if isinstance(one, type) and issubclass(one, Config)), annotation)
 
 
 def is_parameter(name: str) -> bool:
     """Whether the schemas have section.key, section.group.key or section.group.*.key."""
     section, *keys = name.split(".")
-    model: Any = RiseDiParameters if section == "controller" else SCHEMAS.get(section)
+    model: Any = RiseDiConfig if section == "controller" else SCHEMAS.get(section)
     for place, key in enumerate(keys):
-        fields = model.model_fields if isinstance(model, type) and issubclass(model, Parameters) else {}
+        fields = model.model_fields if isinstance(model, type) and issubclass(model, Config) else {}
         if key == "*" and place > 0:
             continue
         if key not in fields:

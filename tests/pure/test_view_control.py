@@ -19,7 +19,7 @@ from flight_analysis.design.gain_selection import check_gains, manoeuvre, margin
 from flight_bringup.scenarios import find_scenario
 from flight_view.control import BURST, LEASE, Control, RefusedError, gains_of, new_key
 from flight_view.server import Server
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 KEY, TOKEN = "ABCD-EFGH", "a-token"
 ALL = ("aircraft", "controller", "guidance")
@@ -283,7 +283,7 @@ def test_a_controller_under_a_bridge_is_deactivated_by_the_bridge_alone(recorded
 def test_margins_that_are_computed_do_not_delay_a_deactivation(desk: Desk) -> None:
     begun, end = threading.Event(), threading.Event()
 
-    def assess(scenario: Scenario, params: ControllerParameters) -> dict[str, Any]:
+    def assess(scenario: Scenario, params: ControllerConfig) -> dict[str, Any]:
         begun.set()
         return {"in time": end.wait(20.0)}
 

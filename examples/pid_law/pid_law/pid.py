@@ -10,7 +10,7 @@ from flight_core.fields import Field
 from flight_core.parameters import NonNegatives, Positives, require_length
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits, limited_integral, saturate
 
 
@@ -76,7 +76,7 @@ def retune(state: PidState, old: PidParams, new: PidParams) -> PidState:
 CONTROL_LAW = ControlLaw(PidState, engage, without_limits(limited), limited, retune)
 
 
-class PidParameters(ControllerParameters):
+class PidConfig(ControllerConfig):
     """The controller under PID control: the parameters of a scenario's section beside those of every law."""
 
     K: Positives = Field(description="proportional gains in scaled inputs, 1/s")

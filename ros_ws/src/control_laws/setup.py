@@ -13,12 +13,12 @@ setup(
     packages=["control_laws"],
     entry_points={
         "rise_di_controller.laws": [
-            "pi = control_laws.pi:PiParameters",
-            "l1 = control_laws.l1:L1Parameters",
-            "lqg = control_laws.lqg:LqgParameters",
-            "indi = control_laws.indi:IndiParameters",
-            "lqi = control_laws.lqi:LqiParameters",
-            "excitation = control_laws.excitation:ExcitationParameters",
+            "pi = control_laws.pi:PiConfig",
+            "l1 = control_laws.l1:L1Config",
+            "lqg = control_laws.lqg:LqgConfig",
+            "indi = control_laws.indi:IndiConfig",
+            "lqi = control_laws.lqi:LqiConfig",
+            "excitation = control_laws.excitation:ExcitationConfig",
         ]
     },
     data_files=[

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from aircraft_sim.disturbance import AXES
 from flight_core.fields import Field
 from flight_core.files import is_file, parse_yaml, read_file
-from flight_core.parameters import Names, Numbers, Parameters, Positive, require
+from flight_core.parameters import Config, Names, Numbers, Positive, require
 from flight_core.units import SI_PER_UNIT
 from flight_core.vectors import FloatArray
 
@@ -25,14 +25,14 @@ Unit = Literal["rad", "deg", "crad", "rad/s", "deg/s", "crad/s", "m/s", "ft/s", 
 Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1)]
 
 
-class Input(Parameters):
+class Input(Config):
     """One input: the unit of its column of B, and the effect of a positive value."""
 
     unit: Unit = Field(description="the unit of this column of B")
     positive: str = Field(description="what a positive value does")
 
 
-class Gravity(Parameters):
+class Gravity(Config):
     """One term f_into += gain sin(angle)."""
 
     into: str = Field(description="the state whose derivative it adds to")
@@ -40,7 +40,7 @@ class Gravity(Parameters):
     gain: float = Field(description="the gain, SI")
 
 
-class Product(Parameters):
+class Product(Config):
     """One term f_into += gain * product of two states."""
 
     into: str = Field(description="the state whose derivative it adds to")
@@ -48,7 +48,7 @@ class Product(Parameters):
     gain: float = Field(description="the gain, SI")
 
 
-class Airframe(Parameters):
+class Airframe(Config):
     """An airframe in the units of its file. `matrix_a` to `products` give SI arrays."""
 
     name: str

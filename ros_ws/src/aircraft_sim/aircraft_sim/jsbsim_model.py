@@ -11,7 +11,7 @@ from aircraft_sim import actuators, jsbsim_trim, pose, turbulence
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, one_minus_cosine
 from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
-from aircraft_sim.params import AircraftParameters
+from aircraft_sim.params import AircraftConfig
 from aircraft_sim.plant import DIVERGENCE_LIMIT
 from flight_core.outcome import FlightEnded
 from flight_core.rates import divide, seconds
@@ -129,7 +129,7 @@ class JsbsimModel:
         """Whether a state is not finite, or above DIVERGENCE_LIMIT in any component."""
         return not bool(np.all(np.abs(self._x) < DIVERGENCE_LIMIT))
 
-    def retune(self, t_ns: int, parameters: AircraftParameters) -> None:
+    def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
         """See `simulator.FlightDynamicsModel`."""
         self._actuator_model = parameters.actuator_model()
         self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))

@@ -8,7 +8,7 @@ A watchdog measures the age of u. A u that times out gets the failsafe: hold the
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from aircraft_sim.params import AircraftParameters
+from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
 from flight_core import channels
 from flight_core.publisher_lock import PublisherLock
@@ -23,7 +23,7 @@ WINDOW = 100
 """Largest lead of a lockstep flight over its log, in samples: less than publishers keep for a recorder that overruns."""
 
 
-class AircraftNode(FlightNode[AircraftParameters]):
+class AircraftNode(FlightNode[AircraftConfig]):
     """At tick k it integrates from t(k-1) to t(k) with the last u held, publishes y and truth, then takes the newest u.
 
     In lockstep it sets the time: it publishes y, truth and pose at its instants. At the controller's instants it waits for u,
@@ -31,7 +31,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
     """
 
     def __init__(self) -> None:
-        super().__init__("aircraft", AircraftParameters)
+        super().__init__("aircraft", AircraftConfig)
         self._simulator = Simulator(self.parameters)
         self._u = np.zeros(len(self._simulator.inputs))
         (self._publisher_lock,) = self.publisher_locks = (PublisherLock(),)
@@ -58,7 +58,7 @@ class AircraftNode(FlightNode[AircraftParameters]):
     def start_ns(self) -> int:
         return nanoseconds(self.parameters.start_time) or super().start_ns()
 
-    def on_parameters(self, parameters: AircraftParameters) -> None:
+    def on_parameters(self, parameters: AircraftConfig) -> None:
         """Begin and end faults between two samples."""
         self._simulator.retune(parameters)
 

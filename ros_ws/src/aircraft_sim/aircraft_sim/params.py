@@ -20,7 +20,7 @@ from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
 from flight_core import parameters
 from flight_core.failsafe import failsafe_scale
 from flight_core.fields import Field
-from flight_core.parameters import KeyedParameters, NonNegative, Numbers, ParameterError, Parameters, Positive, require
+from flight_core.parameters import Config, KeyedConfig, NonNegative, Numbers, ParameterError, Positive, require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
@@ -35,7 +35,7 @@ class AircraftChannels(NamedTuple):
     speed: float  # trim speed V0, m/s
 
 
-class Gust(Parameters):
+class Gust(Config):
     """A 1-cosine gust."""
 
     start: float = Field(ge=0, description="the instant of entry, s")
@@ -43,7 +43,7 @@ class Gust(Parameters):
     length: Positive = Field(description="the distance H from entry to peak, m")
 
 
-class TurbulenceParameters(Parameters):
+class TurbulenceConfig(Config):
     """Dryden turbulence by MIL-F-8785C; `wind` gives its intensity at low altitude, `sigma` at high, both in between."""
 
     altitude: float = Field(ge=LOWEST, description="the altitude above the ground, m; from 10 ft (3.048 m) on")
@@ -63,7 +63,7 @@ class TurbulenceParameters(Parameters):
             require((value is not None) == acts, key, found, f"{expected} at {self.altitude:g} m: it acts {where}")
 
 
-class BiasParameters(Parameters):
+class BiasConfig(Config):
     """A bias on x_dot of one state. It rises from 0 to its value along half a cosine; with rise 0 it is a step."""
 
     start: float = Field(ge=0, description="the instant at which it begins, s")
@@ -71,7 +71,7 @@ class BiasParameters(Parameters):
     rise: float = Field(ge=0, description="the rise time, s; 0 is a step, which lies outside the theorem")
 
 
-class SineParameters(Parameters):
+class SineConfig(Config):
     """A sine on x_dot of one state: amplitude sin(frequency t + phase)."""
 
     amplitude: float = Field(description="the amplitude, SI unit of the state per s")
@@ -79,7 +79,7 @@ class SineParameters(Parameters):
     phase: float = Field(default=0.0, description="the phase, rad")
 
 
-class UncertaintyParameters(Parameters):
+class UncertaintyConfig(Config):
     """An aircraft sampled around the airframe: each entry times 1 + d, d uniform and independent; rows of angles stay."""
 
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
@@ -101,7 +101,7 @@ NumbersOrNone = tuple[float, ...]
 Times = Upper  # from 0 on, .inf for never
 
 
-class ActuatorParameters(Parameters):
+class ActuatorConfig(Config):
     """The actuators, one value per input in the airframe's order. A list that is left out means ideal actuators."""
 
     lag: NonNegativesOrNone = Field(
@@ -115,7 +115,7 @@ class ActuatorParameters(Parameters):
     lost_at: Times = Field(default=(), description="from when on each has no effect and is at trim, s; .inf is never")
 
 
-class SensorParameters(Parameters):
+class SensorConfig(Config):
     """The sensors. The defaults are ideal sensors."""
 
     bias: NumbersOrNone = Field(default=(), description="constant errors, one an output, SI")
@@ -131,7 +131,7 @@ class SensorParameters(Parameters):
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
 
-class AircraftParameters(KeyedParameters):
+class AircraftConfig(KeyedConfig):
     """All parameters of the aircraft's node."""
 
     airframe: str = Field(
@@ -147,11 +147,9 @@ class AircraftParameters(KeyedParameters):
         default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
     )
     gusts: dict[str, Gust] = Field(default={}, description="gusts by the axis of the wind: longitudinal, lateral, vertical")
-    turbulence: TurbulenceParameters | None = Field(
-        default=None, description="turbulence along all axes of the airframe's gusts"
-    )
-    bias: dict[str, BiasParameters] = Field(default={}, description="biases on x_dot by state")
-    sines: dict[str, SineParameters] = Field(default={}, description="sines on x_dot by state")
+    turbulence: TurbulenceConfig | None = Field(default=None, description="turbulence along all axes of the airframe's gusts")
+    bias: dict[str, BiasConfig] = Field(default={}, description="biases on x_dot by state")
+    sines: dict[str, SineConfig] = Field(default={}, description="sines on x_dot by state")
     inertial_coupling: float = Field(
         default=0.0, ge=0, le=1, description="the factor on the airframe's inertial coupling, 0 to 1"
     )
@@ -163,11 +161,11 @@ class AircraftParameters(KeyedParameters):
     wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(0.0, 0.0), description="the steady wind, m/s, where the air moves to: north, east"
     )
-    uncertainty: UncertaintyParameters = Field(
-        default=UncertaintyParameters(), description="how far the aircraft differs from its airframe"
+    uncertainty: UncertaintyConfig = Field(
+        default=UncertaintyConfig(), description="how far the aircraft differs from its airframe"
     )
-    actuators: ActuatorParameters = Field(default=ActuatorParameters(), description="the actuators, ideal where left out")
-    sensors: SensorParameters = Field(default=SensorParameters(), description="the sensors, ideal where left out")
+    actuators: ActuatorConfig = Field(default=ActuatorConfig(), description="the actuators, ideal where left out")
+    sensors: SensorConfig = Field(default=SensorConfig(), description="the sensors, ideal where left out")
 
     control_rate: float = Field(
         default=0.0, ge=0, le=1000, description="in lockstep: the controller's rate, at whose instants u is waited for, Hz"
@@ -370,6 +368,6 @@ def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
     return None if not values or (zero_is_none and not any(values)) else np.array(values, dtype=np.float64)
 
 
-def _by_state(named: Mapping[str, Parameters], keys: Sequence[str], airframe: Airframe) -> list[FloatArray]:
+def _by_state(named: Mapping[str, Config], keys: Sequence[str], airframe: Airframe) -> list[FloatArray]:
     """An array per key, over all states, with 0 for a state that is not named."""
     return [np.array([float(getattr(named.get(state), key, 0.0)) for state in airframe.states]) for key in keys]

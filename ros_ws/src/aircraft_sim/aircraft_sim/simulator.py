@@ -12,7 +12,7 @@ import numpy as np
 
 from aircraft_sim import plant, pose, sensors, truth
 from aircraft_sim.dynamics import Forcing
-from aircraft_sim.params import AircraftParameters
+from aircraft_sim.params import AircraftConfig
 from aircraft_sim.sensors import DelayLine
 from flight_core.kinematics import heading_rate
 from flight_core.outcome import FlightEnded
@@ -47,7 +47,7 @@ class FlightDynamicsModel(Protocol):
     def diverged(self) -> bool:
         """Whether the state is not finite or too large for a flight."""
 
-    def retune(self, t_ns: int, parameters: AircraftParameters) -> None:
+    def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
         """Take the actuator faults and the gusts of these parameters from t on."""
 
 
@@ -59,7 +59,7 @@ class StateSpaceModel:
     lacks are 0, as in trim.
     """
 
-    def __init__(self, parameters: AircraftParameters) -> None:
+    def __init__(self, parameters: AircraftConfig) -> None:
         self._plant = parameters.plant()
         self._state = plant.initial_state(self._plant)
         self._block_ns = 0
@@ -124,7 +124,7 @@ class StateSpaceModel:
         """See FlightDynamicsModel."""
         return plant.diverged(self._state)
 
-    def retune(self, t_ns: int, parameters: AircraftParameters) -> None:
+    def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
         """See FlightDynamicsModel."""
         aircraft = self._plant.aircraft._replace(gusts=parameters.gust_arrays(self._axes))
         self._plant = self._plant._replace(aircraft=aircraft, actuators=parameters.actuator_model())
@@ -134,7 +134,7 @@ class StateSpaceModel:
 class Simulator:
     """A flight dynamics model and its sensors, sample by sample."""
 
-    def __init__(self, parameters: AircraftParameters) -> None:
+    def __init__(self, parameters: AircraftConfig) -> None:
         channels = parameters.channels()
         self.outputs, self.inputs = tuple(channels.outputs), tuple(channels.inputs)
         self.period_ns = period_ns(parameters.rate, "rate")
@@ -154,7 +154,7 @@ class Simulator:
         self._error = np.zeros(len(self.outputs))
         self._number = 0
 
-    def retune(self, parameters: AircraftParameters) -> None:
+    def retune(self, parameters: AircraftConfig) -> None:
         """Take faults and gusts of these parameters from now on. Raises ParameterError where a gust would change the past."""
         now_ns = self._number * self.period_ns
         t = seconds(now_ns)

@@ -21,7 +21,7 @@ from std_srvs.srv import SetBool
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field
 from autopilot_bridge.params import (
-    BridgeParameters,
+    BridgeConfig,
     ConditionRow,
     InputRow,
     MeasuredRow,
@@ -52,11 +52,11 @@ ACTIVATION_TIMEOUT_NS = NANOSECONDS  # of the controller at engagement; it answe
 NamedRow = tuple[str, MeasuredRow | WatchedRow]
 
 
-class BridgeNode(FlightNode[BridgeParameters]):
+class BridgeNode(FlightNode[BridgeConfig]):
     """At each tick it polls the autopilot's topics, publishes a new y, takes the newest u and sends the due messages."""
 
     def __init__(self) -> None:
-        super().__init__("bridge", BridgeParameters)
+        super().__init__("bridge", BridgeConfig)
         self._map = load_map(self.parameters.map)
         dry_run = self._map.dry_run if self.parameters.dry_run is None else self.parameters.dry_run
         self._bridge = Bridge(self._map, dry_run=dry_run)

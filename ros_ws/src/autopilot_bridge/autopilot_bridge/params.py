@@ -13,7 +13,7 @@ from autopilot_bridge.channel_map import PATH, Line, to_raw
 from flight_core.channels import POSE
 from flight_core.fields import Field
 from flight_core.files import is_file, read_yaml
-from flight_core.parameters import KeyedParameters, NonNegative, Numbers, Parameters, Positive, require
+from flight_core.parameters import Config, KeyedConfig, NonNegative, Numbers, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 
@@ -45,7 +45,7 @@ Limits = tuple[float, float]
 Value = bool | int | Raw | str | tuple[int, ...] | tuple[Raw, ...]
 
 
-class Row(Parameters):
+class Row(Config):
     """Common part of the rows of a map: channel = sign scale raw + offset, with frame and source."""
 
     field: str = Field(description="the path of the field in the message, such as twist.angular.y or axes[1]")
@@ -115,7 +115,7 @@ class InputRow(MovingRow):
     )
 
 
-class MessageRow(Parameters):
+class MessageRow(Config):
     """A message to the autopilot. A message without a field of an input is a heartbeat."""
 
     topic: TopicName = Field(description="the autopilot's topic")
@@ -129,7 +129,7 @@ class MessageRow(Parameters):
     values: dict[str, Value] = Field(default={}, description="values of its other fields, by their paths")
 
 
-class WatchedRow(Parameters):
+class WatchedRow(Config):
     """A field of the autopilot that decides on the engagement."""
 
     topic: TopicName = Field(description="the topic")
@@ -171,7 +171,7 @@ class OverrideRow(WatchedRow):
         return raw if self.bits is None else float(int(raw) & self.bits)
 
 
-class QosRow(Parameters):
+class QosRow(Config):
     """The quality of service of a topic."""
 
     reliability: Literal["reliable", "best_effort"]
@@ -179,7 +179,7 @@ class QosRow(Parameters):
     depth: Annotated[int, Field(ge=1, le=1000)]
 
 
-class SilenceParameters(Parameters):
+class SilenceConfig(Config):
     """Failsafe for a u that times out while engaged: neutral values, then release values, then nothing."""
 
     max_age: Positive = Field(description="the age above which u has timed out, s")
@@ -187,7 +187,7 @@ class SilenceParameters(Parameters):
     release: NonNegative = Field(description="how long the release values are then sent, s; 0 skips them")
 
 
-class ChannelMap(Parameters):
+class ChannelMap(Config):
     """A channel map: the topic and field of each channel of y and u."""
 
     name: str
@@ -201,7 +201,7 @@ class ChannelMap(Parameters):
     engage_timeout: Positive = Field(
         default=5.0, description="how long an engagement waits for its awaited conditions, s; then it is refused"
     )
-    silence: SilenceParameters = Field(description="failsafe for a u that times out")
+    silence: SilenceConfig = Field(description="failsafe for a u that times out")
     outputs: Annotated[dict[str, OutputRow], Field(min_length=1)] = Field(description="the channels of y")
     pose: dict[str, PoseRow] = Field(
         default={}, description="the channels of the pose; the newest stamp of the first row is the stamp of the pose"
@@ -305,7 +305,7 @@ def load_map(name: str) -> ChannelMap:
     return ChannelMap.validate_mapping(content, f"map {path.stem}")
 
 
-class BridgeParameters(KeyedParameters):
+class BridgeConfig(KeyedConfig):
     """All parameters of the bridge node."""
 
     map: str = Field(description="the name of a channel map of the library, or the path of a file ending in .yaml")

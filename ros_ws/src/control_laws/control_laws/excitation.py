@@ -11,7 +11,7 @@ from flight_core.fields import Field
 from flight_core.parameters import NonNegative, NonNegatives, Positives, require, require_length
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits, saturate
 
 DOUBLETS = 8.0  # widths: a doublet of 2, a gap of 1, the opposite doublet of 4, a gap of 1
@@ -92,7 +92,7 @@ def _retune(state: ExcitationState, old: ExcitationParams, new: ExcitationParams
 EXCITATION = ControlLaw(ExcitationState, _engage, without_limits(_limited), _limited, _retune)
 
 
-class ExcitationParameters(ControllerParameters):
+class ExcitationConfig(ControllerConfig):
     """A controller that excites its inputs, one after another in the order of `inputs`, and controls nothing."""
 
     amplitude: NonNegatives = Field(description="largest deviation of each input from trim, units of u; 0 for none")

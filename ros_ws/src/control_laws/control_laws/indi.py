@@ -7,7 +7,7 @@ from typing import NamedTuple
 from control_laws.nominal_model import NominalModel, campaign_law, filter_gain, params_of_gains, saturate
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
 
@@ -59,7 +59,7 @@ def control_law(model: NominalModel) -> ControlLaw:
 indi_params = params_of_gains(IndiParams)
 
 
-class IndiParameters(ControllerParameters):
+class IndiConfig(ControllerConfig):
     """INDI, which only campaigns fly."""
 
     needs = "the positions of the actuators"

@@ -12,7 +12,7 @@ from flight_core.parameters import Numbers, ParameterError, Positives, require, 
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
 from rise_di_controller.decomposition import DecompositionError, signs
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
 ADAPTATION_POLE = 1.0
@@ -89,7 +89,7 @@ def params_of(gains: dict[str, FloatArray], model: NominalModel) -> L1Params:
     return L1Params(gains["K"], gains["bandwidth"], model.Omega, model.inverse)
 
 
-class L1Parameters(ControllerParameters):
+class L1Config(ControllerConfig):
     """The controller under L1 adaptive output control."""
 
     K: Positives = Field(description="proportional gain, 1/s")

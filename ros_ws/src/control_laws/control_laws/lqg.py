@@ -8,7 +8,7 @@ from control_laws.nominal_model import NominalModel, saturate
 from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
 
@@ -42,7 +42,7 @@ def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LqgParams:
     return LqgParams()
 
 
-class LqgParameters(ControllerParameters):
+class LqgConfig(ControllerConfig):
     """The controller under LQG."""
 
     def check_law(self) -> None:

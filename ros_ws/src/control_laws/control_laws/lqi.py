@@ -19,7 +19,7 @@ from control_laws.riccati import gain_of
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.linear_loop import zero_order_hold
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
 LEAK = 0.01
@@ -57,7 +57,7 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
     return campaign_law(ErrorIntegral, start_integral, limited)
 
 
-class LqiParameters(ControllerParameters):
+class LqiConfig(ControllerConfig):
     """LQI, which only campaigns fly."""
 
     needs = "the full state"

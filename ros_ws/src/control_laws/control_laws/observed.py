@@ -21,7 +21,7 @@ from rise_di_controller.saturation import Limits
 
 PART, WITHIN, FADE = 0.6, 0.1, 1.0
 """Bound of u_o as a part of the limits of u, the time from 0 to it, s, and the time in which it fades in, s: the defaults of
-`ObserverParameters`."""
+`ObserverConfig`."""
 
 
 def of_design(design: ObserverDesign, of_law: Any, model: NominalModel, part: float = PART) -> ObserverParams:

@@ -11,7 +11,7 @@ from flight_core.fields import Field
 from flight_core.parameters import NonNegatives, Positives, require_length
 from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits, limited_integral
 
 
@@ -70,7 +70,7 @@ def params_of(gains: dict[str, FloatArray], model: NominalModel) -> PiParams:
     return PiParams(gains["K"], gains["Lambda"], model.D[:, None], model.input_scale[:, None])
 
 
-class PiParameters(ControllerParameters):
+class PiConfig(ControllerConfig):
     """The controller under PI control."""
 
     K: Positives = Field(description="proportional gains in scaled inputs, 1/s")

@@ -20,7 +20,7 @@ from flight_campaign.engines import Engine, Job
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
 from flight_core.files import replace_text, writing
-from flight_core.parameters import ParameterError, Parameters, require
+from flight_core.parameters import Config, ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import TunedLaw
 
@@ -33,14 +33,14 @@ SWEPT = ("k_g", "k_d", "Lambda", "beta", "input_scale", "omega", "softening")
 """Parameters of the controller that a sweep may multiply."""
 
 
-class Sweep(Parameters):
+class Sweep(Config):
     """Factors of one parameter of the controller; every aircraft flies with each of them."""
 
     parameter: str
     factors: tuple[float, ...] = Field(min_length=1)
 
 
-class Definition(Parameters):
+class Definition(Config):
     """All inputs of a campaign's figures, except the version of the stack and the arithmetic of the CPU."""
 
     name: str  # of the scenario

@@ -28,7 +28,7 @@ from flight_core.vectors import Array, FloatArray
 from flight_guidance import modes, path
 from flight_guidance.lateral import PathError
 from flight_guidance.modes import GuidanceParams, GuidanceState, Lateral, Mode, Target, Vertical
-from flight_guidance.params import GuidanceParameters
+from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Line, Route
 from reference_model import model
 
@@ -96,7 +96,7 @@ class MissionState(NamedTuple):
     phi_max: Array
 
 
-def require_mission(scenario: Scenario) -> GuidanceParameters:
+def require_mission(scenario: Scenario) -> GuidanceConfig:
     """The section `guidance` of a scenario. Raises ParameterError where a campaign of missions cannot fly or judge it."""
     guidance, aircraft, reference = scenario.guidance, scenario.aircraft, scenario.reference_model
     if guidance is None or guidance.route is None:

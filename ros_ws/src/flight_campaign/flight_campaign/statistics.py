@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 
 from flight_core.fields import Field
-from flight_core.parameters import Parameters, require
+from flight_core.parameters import Config, require
 from flight_core.vectors import FloatArray
 
 PER_DECADE, DECADES = 100, (-8, 6)
@@ -28,7 +28,7 @@ QUANTILES = (0.5, 0.95, 0.99)
 WORST_KEPT = 10  # number of worst flights in a tally
 
 
-class Figure(Parameters):
+class Figure(Config):
     """One figure over many flights. Sums have a fixed order: the same chunks give the same bits."""
 
     count: int = 0
@@ -77,14 +77,14 @@ class Figure(Parameters):
         return self.largest
 
 
-class Worst(Parameters):
+class Worst(Config):
     """One of the worst flights: number of its aircraft and its score, None if it diverged."""
 
     number: int
     score: float | None
 
 
-class Tally(Parameters):
+class Tally(Config):
     """Statistics of many flights."""
 
     flights: int = 0

@@ -27,7 +27,7 @@ from flight_campaign import tuned_gains
 from flight_cli.output import new_table, parse_numbers, print_json, write_text
 from flight_core.parameters import ParameterError, require
 from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.rise_di import RiseDiConfig
 
 CONDITION_FAILS = 1
 OBSERVER_LAWS, OBJECTIVE = ("rise_observer", "pi_observer"), "gust_turbulence"
@@ -144,7 +144,7 @@ def _delay_with(y_rate: float, scenario: Scenario, rate: float | None, delay: fl
     return declared + 1.5 * max(1.0 / y_rate - 1.0 / (rate or scenario.controller.rate), 0.0)
 
 
-def observed(controller: RiseDiParameters, scenario: Scenario, model: Airframe, margin: float) -> tuple[RiseDiParameters, str]:
+def observed(controller: RiseDiConfig, scenario: Scenario, model: Airframe, margin: float) -> tuple[RiseDiConfig, str]:
     """A controller with feedforward and observer of a model, and a sentence on its gains.
 
     The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships with its airframe and lags,

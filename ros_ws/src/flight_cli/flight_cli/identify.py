@@ -41,7 +41,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import SI_PER_UNIT
 from flight_log.tape_reader import read_run
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 CANNOT_FLY = 3
 REFLY_MARGIN, STEP_MARGIN = 0.03, 0.015  # s. Without A the model of the loop has no damping, and less margin than the aircraft.
@@ -193,7 +193,7 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_
         require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
     recorded = read_run(source.log, source.namespace)
     if source.scenario is not None:
-        controller: ControllerParameters = find_scenario(source.scenario).controller
+        controller: ControllerConfig = find_scenario(source.scenario).controller
     elif recorded.scenario is not None:
         controller = recorded_parameters(recorded.scenario)
     else:
@@ -249,7 +249,7 @@ def _show_flights_of_model(console: Console, again: _Reflight, units: dict[str, 
     console.print(f"{again.origin}; outcome: {again.outcome}", highlight=False, soft_wrap=True)
 
 
-def _actuation(controller: ControllerParameters, nominal: Airframe, delay: float) -> Actuation:
+def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) -> Actuation:
     """Lags and delay of a controller's loop, in the airframe's order."""
     require(0.0 <= delay < math.inf, "--delay", delay, "0 s or more")
     for key, found, expected in (

@@ -39,7 +39,7 @@ class ParameterError(ValueError):
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))
-class Parameters:
+class Config:
     """Base of every parameter set: frozen, finite, strictly typed (an int is accepted as a float), without unknown keys."""
 
     model_fields: ClassVar[dict[str, FieldInfo]] = {}
@@ -55,7 +55,7 @@ class Parameters:
                 field.annotation = annotation
                 if given is not REQUIRED:
                     delattr(cls, name)
-        bases = (base.model_fields for base in reversed(cls.__mro__[1:]) if issubclass(base, Parameters))
+        bases = (base.model_fields for base in reversed(cls.__mro__[1:]) if issubclass(base, Config))
         cls.model_fields = {name: field for fields in (*bases, own) for name, field in fields.items()}
 
     def __init__(self, **values: Any) -> None:
@@ -141,7 +141,7 @@ class Parameters:
         """The set as nested dicts, in mode json with lists in place of tuples. `exclude` has fields of this set alone."""
 
         def plain(value: Any) -> Any:
-            if isinstance(value, Parameters):
+            if isinstance(value, Config):
                 return value.model_dump(
                     mode=mode, exclude_none=exclude_none, exclude_defaults=exclude_defaults, exclude_unset=exclude_unset
                 )
@@ -175,7 +175,7 @@ class Parameters:
         return cls.validate_mapping(values, cls.__name__)
 
 
-class NodeParameters(Parameters):
+class NodeConfig(Config):
     """Base of the parameters of a node of a flight."""
 
     lockstep: bool = Field(default=False, description="run in lockstep with the other nodes, as fast as possible")
@@ -186,7 +186,7 @@ class NodeParameters(Parameters):
         return frozenset()
 
 
-class KeyedParameters(NodeParameters):
+class KeyedConfig(NodeConfig):
     """Base of the parameters of a node whose messages can carry a message authentication code."""
 
     key_file: str = Field(

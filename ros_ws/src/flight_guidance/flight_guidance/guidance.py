@@ -28,7 +28,7 @@ from flight_guidance.modes import (
     Target,
     Vertical,
 )
-from flight_guidance.params import GuidanceParameters
+from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route
 
 LIMITED = ("bank", "theta", "climb", "V", "slew")
@@ -119,7 +119,7 @@ def digest(route: Route | None) -> int:
 class Guidance:
     """`modes.step` with its state, the last pose and y, the route and the program of targets."""
 
-    def __init__(self, parameters: GuidanceParameters) -> None:
+    def __init__(self, parameters: GuidanceConfig) -> None:
         self._params: GuidanceParams = parameters.params()
         self.period_ns, self.names = self._params.period_ns, names(parameters.outputs)
         waypoints = parameters.waypoints()

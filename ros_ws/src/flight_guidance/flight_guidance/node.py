@@ -25,7 +25,7 @@ from flight_guidance import path
 from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.modes import Mode
 from flight_guidance.odometry import BODY, MAP, ROUTE_FRAMES, body_velocity, quaternion
-from flight_guidance.params import GuidanceParameters
+from flight_guidance.params import GuidanceConfig
 from flight_guidance.route_file import Waypoint
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
@@ -61,7 +61,7 @@ SENTENCES: Mapping[Mode, str] = {
 LEVELS = {Mode.ENGAGED: DiagnosticStatus.OK, Mode.POSE_LOST: DiagnosticStatus.ERROR}  # else WARN
 
 
-class GuidanceNode(FlightNode[GuidanceParameters]):
+class GuidanceNode(FlightNode[GuidanceConfig]):
     """At each tick it takes the received y, pose, target and route, steps `guidance.Guidance` and publishes u_m and guidance.
 
     In real time it flies while the controller is ENGAGED. In lockstep the number of samples of y gives the time. A step waits
@@ -69,7 +69,7 @@ class GuidanceNode(FlightNode[GuidanceParameters]):
     """
 
     def __init__(self) -> None:
-        super().__init__("guidance", GuidanceParameters)
+        super().__init__("guidance", GuidanceConfig)
         self._guidance = Guidance(self.parameters)
         outputs = self.parameters.outputs
         self._y_subscription, self._y_decoder = self.subscribe(Y), self.decoder(Y, outputs)

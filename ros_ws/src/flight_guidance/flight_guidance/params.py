@@ -10,11 +10,11 @@ from typing import Annotated, Any
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
 from flight_core.parameters import (
-    KeyedParameters,
+    Config,
+    KeyedConfig,
     Names,
     NonNegative,
     Numbers,
-    Parameters,
     Positive,
     Positives,
     require,
@@ -45,7 +45,7 @@ STEEPEST = 0.1
 """Largest climb and sink rate over the trim speed."""
 
 
-class Steps(Parameters):
+class Steps(Config):
     """Commands of one channel of `target`, one after another."""
 
     start: Annotated[tuple[NonNegative, ...], Field(min_length=1)] = Field(description="times, s")
@@ -57,7 +57,7 @@ class Steps(Parameters):
         require(rises, "start", list(self.start), "times in rising order")
 
 
-class RouteParameters(Parameters):
+class RouteConfig(Config):
     """Waypoints in the local tangent plane of `pose`."""
 
     north: Numbers = Field(description="m")
@@ -73,7 +73,7 @@ class RouteParameters(Parameters):
             require_length(key, getattr(self, key), waypoints)
 
 
-class GuidanceParameters(KeyedParameters):
+class GuidanceConfig(KeyedConfig):
     """All parameters of the guidance node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(default=50.0, description="the rate at which u_m is published, Hz")
@@ -130,7 +130,7 @@ class GuidanceParameters(KeyedParameters):
         default=10.0, description="how long the attitude is known by dead reckoning when pose is stale, s"
     )
     program: dict[str, Steps] = Field(default={}, description="targets over flight time by channel")
-    route: RouteParameters | None = Field(default=None, description="the route, flown from the start on")
+    route: RouteConfig | None = Field(default=None, description="the route, flown from the start on")
 
     def _check(self) -> None:
         period_ns(self.rate, "rate")

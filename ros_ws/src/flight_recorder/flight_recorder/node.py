@@ -26,7 +26,7 @@ from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_log.bag import LOST_MESSAGES, BagChannel, BagWriter, LogAttachments
 from flight_log.disk import free_bytes
 from flight_log.message_definitions import definition
-from flight_recorder.params import RecorderParameters
+from flight_recorder.params import RecorderConfig
 from flight_ros.endpoints import type_name
 from flight_ros.flight_node import NO_PUBLISHER_WARNING_NS, FlightNode
 from flight_ros.messages import instant, stamp_of
@@ -66,11 +66,11 @@ class _RecordedTopic:
         return self.subscription.topic.foreign
 
 
-class RecorderNode(FlightNode[RecorderParameters]):
+class RecorderNode(FlightNode[RecorderConfig]):
     """Appends all messages that have arrived to the bag at each tick."""
 
     def __init__(self) -> None:
-        super().__init__("recorder", RecorderParameters)
+        super().__init__("recorder", RecorderConfig)
         wanted = [self._full_name(name) for name in self.parameters.topics]
         self._bag = self._open_bag()
         own, foreign = ([topic for topic in FLIGHT if topic.foreign is kind] for kind in (False, True))

@@ -5,12 +5,12 @@
 from typing import Annotated
 
 from flight_core.fields import Field
-from flight_core.parameters import NodeParameters, NonNegative
+from flight_core.parameters import NodeConfig, NonNegative
 
 OptionalNames = tuple[str, ...]
 
 
-class RecorderParameters(NodeParameters):
+class RecorderConfig(NodeConfig):
     """Parameters of the recorder's node."""
 
     rate: Annotated[float, Field(ge=5, le=1000)] = Field(

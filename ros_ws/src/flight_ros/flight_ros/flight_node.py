@@ -22,7 +22,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from flight_core.authentication import MessageAuthenticator, read_key
 from flight_core.outcome import LOST_CONTACT, FlightEnded
-from flight_core.parameters import KeyedParameters, NodeParameters, ParameterError
+from flight_core.parameters import KeyedConfig, NodeConfig, ParameterError
 from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.vectors import ChannelError, StampedVector
@@ -35,7 +35,7 @@ from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import DIAGNOSTICS, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, PUBLISH, STATE, NodeState, Topic, publisher_qos
 
-P = TypeVar("P", bound=NodeParameters)
+P = TypeVar("P", bound=NodeConfig)
 
 NO_PUBLISHER_WARNING_NS = 3 * NANOSECONDS  # the processes of a flight start one after another
 
@@ -60,7 +60,7 @@ class FlightNode(Node, Generic[P]):
         # Two equal lockstep flights give equal bytes, so the process number is left out.
         process = "" if self.parameters.lockstep else f"#{os.getpid()}"
         self.instance = self.get_fully_qualified_name() + process
-        key_file = self.parameters.key_file if isinstance(self.parameters, KeyedParameters) else ""
+        key_file = self.parameters.key_file if isinstance(self.parameters, KeyedConfig) else ""
         self._key = read_key(key_file, f"{name}.key_file") if key_file else None
         self.has_key = self._key is not None
         # Replay protection: samples stamped before the start of this node are rejected. Stamps of a lockstep flight begin at 0.

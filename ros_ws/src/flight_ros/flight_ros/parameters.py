@@ -9,9 +9,9 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from flight_core.parameters import NodeParameters, flatten, nest
+from flight_core.parameters import NodeConfig, flatten, nest
 
-P = TypeVar("P", bound=NodeParameters)
+P = TypeVar("P", bound=NodeConfig)
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
 

@@ -24,7 +24,7 @@ from flight_core.parameters import ParameterError, flatten, nest
 from flight_core.rates import NANOSECONDS
 from flight_guidance.modes import TARGETS
 from flight_view.flight import Flight
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 RANGE = (0.5, 2.0)  # of a gain in the scenario: what the page may set
 LEASE = 5.0  # s that a page controls after its last request
@@ -36,7 +36,7 @@ OVER = ("ended", "interrupted")  # states of a recording: its flight can be comm
 GUST_LEAD = 0.2  # s from the request to the begin of a gust
 SYSTEM_TIME_NS = 10**17  # stamps above are of the system clock, those of a lockstep flight begin at 0
 
-Assess = Callable[[Scenario, ControllerParameters], dict[str, Any]]
+Assess = Callable[[Scenario, ControllerConfig], dict[str, Any]]
 
 
 class Link(Protocol):
@@ -243,7 +243,7 @@ class Control:
             found["bridge"] = {"map": self._map(), "sends": self._sends()}
         return found
 
-    def _controller(self) -> ControllerParameters:
+    def _controller(self) -> ControllerConfig:
         if self._flight.scenario is None:
             raise RefusedError(HTTPStatus.CONFLICT, "the log has no scenario, so the gains have no range")
         return self._flight.scenario.controller
@@ -273,7 +273,7 @@ class Control:
         self._values = self._link.parameters("controller", sorted(base.tunable()))
         self._digest = self._with(self._values).digest()
 
-    def _with(self, values: Mapping[str, Any]) -> ControllerParameters:
+    def _with(self, values: Mapping[str, Any]) -> ControllerConfig:
         """The controller's parameters with others. Raises ParameterError."""
         base = self._controller()
         content = {**dict(flatten(base.model_dump(exclude_none=True))), **values}
@@ -390,10 +390,10 @@ class Control:
         return self._link.engage()
 
 
-def gains_of(controller: ControllerParameters) -> dict[str, Any]:
+def gains_of(controller: ControllerConfig) -> dict[str, Any]:
     """The numeric parameters of a law that may change in flight, by name: a number, or one for each channel."""
     fields = type(controller).model_fields
-    own = [name for name in fields if name not in ControllerParameters.model_fields and name in controller.tunable()]
+    own = [name for name in fields if name not in ControllerConfig.model_fields and name in controller.tunable()]
     values = {name: getattr(controller, name) for name in own}
     return {name: value for name, value in values.items() if all(isinstance(one, float) for one in _as_list(value))}
 

@@ -14,11 +14,11 @@ from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, stamp_of
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, U_M, Y_M
-from reference_model.params import ReferenceModelParameters
+from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 
 
-class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
+class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     """Computes x_m(k) from x_m(k-1) at tick k and publishes y_m(k). Commands are the scenario's profile until u_m is received.
 
     In lockstep it publishes every y_m up to the instant of /clock and computes the next one ahead. Where `u_m_rate` is set it
@@ -26,7 +26,7 @@ class ReferenceModelNode(FlightNode[ReferenceModelParameters]):
     """
 
     def __init__(self) -> None:
-        super().__init__("reference_model", ReferenceModelParameters)
+        super().__init__("reference_model", ReferenceModelConfig)
         self._reference = Reference(self.parameters)
         self._publish_y_m = self.advertise(Y_M)
         self._encoder = self.encoder(Y_M, self.parameters.outputs)

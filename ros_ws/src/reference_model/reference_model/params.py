@@ -10,11 +10,11 @@ from flight_core import parameters
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
 from flight_core.parameters import (
-    KeyedParameters,
+    Config,
+    KeyedConfig,
     Names,
     Numbers,
     ParameterError,
-    Parameters,
     Positive,
     Positives,
     require,
@@ -26,7 +26,7 @@ from reference_model.live import LiveParams
 from reference_model.model import Model, second_order, stepper
 
 
-class Pulses(Parameters):
+class Pulses(Config):
     """Pulses on one channel."""
 
     start: Numbers = Field(description="start times of the rising edges, s")
@@ -40,7 +40,7 @@ class Pulses(Parameters):
             require(stop > start, f"stop[{k}]", stop, f"later than start[{k}] = {start:g} s")
 
 
-class Sine(Parameters):
+class Sine(Config):
     """A sine on one channel: amplitude sin(frequency t + phase)."""
 
     amplitude: float = Field(description="the amplitude, in the channel's unit")
@@ -48,7 +48,7 @@ class Sine(Parameters):
     phase: float = Field(default=0.0, description="the phase, rad")
 
 
-class CoordinatedTurn(Parameters):
+class CoordinatedTurn(Config):
     """Adds the turn rate of a coordinated turn, g/V0 sin(integral of the commanded bank rate), to a channel."""
 
     bank_rate: str = Field(description="the channel whose integral is the bank angle, e.g. p")
@@ -56,7 +56,7 @@ class CoordinatedTurn(Parameters):
     speed: Positive = Field(description="the speed V0, m/s")
 
 
-class LiveCommands(Parameters):
+class LiveCommands(Config):
     """Live commands on the topic u_m in place of the profile, and their ending when their publisher is lost."""
 
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(default=0.2, description="the age at which u_m times out, s")
@@ -70,14 +70,14 @@ class LiveCommands(Parameters):
     bounds: dict[str, Positive] = Field(default={}, description="largest absolute commands by channel, none where left out")
 
 
-class SecondOrder(Parameters):
+class SecondOrder(Config):
     """The model as one second-order filter per channel."""
 
     natural_frequency: Positives = Field(description="natural frequencies, one per channel, rad/s")
     damping: Numbers = Field(description="damping ratios, one per channel")
 
 
-class Linear(Parameters):
+class Linear(Config):
     """The model as the matrices of equation (2), row by row."""
 
     states: Names = Field(description="the names of the states x_m, the outputs among them")
@@ -85,7 +85,7 @@ class Linear(Parameters):
     B_m: Numbers = Field(description="B_m row by row")
 
 
-class ReferenceModelParameters(KeyedParameters):
+class ReferenceModelConfig(KeyedConfig):
     """All parameters of the reference model node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y_m is published, Hz")

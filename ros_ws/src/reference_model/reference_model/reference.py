@@ -9,7 +9,7 @@ from flight_core.vectors import FloatArray, require_newer
 from reference_model import live, model
 from reference_model.command import command
 from reference_model.live import Live
-from reference_model.params import ReferenceModelParameters
+from reference_model.params import ReferenceModelConfig
 
 BLOCK = 100  # steps for which the profile is evaluated at once
 
@@ -17,7 +17,7 @@ BLOCK = 100  # steps for which the profile is evaluated at once
 class Reference:
     """Equation (2) and its state x_m at the instants k periods. The commands are the profile's until the first live u_m."""
 
-    def __init__(self, parameters: ReferenceModelParameters) -> None:
+    def __init__(self, parameters: ReferenceModelConfig) -> None:
         self._model, self._profile = parameters.model(), parameters.profile()
         self.period_ns = period_ns(parameters.rate, "rate")
         self._stepper = model.stepper(seconds(self.period_ns), self._model)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Protocol of a control law: pure functions over a state. Controller, replay and campaigns fly every law through it.
 
-A law with its validated parameters is a subclass of `params.ControllerParameters`, which the controller finds by its name under
+A law with its validated parameters is a subclass of `params.ControllerConfig`, which the controller finds by its name under
 the entry point group `laws.GROUP`. See docs/laws.md.
 """
 

@@ -12,7 +12,7 @@ from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
 from rise_di_controller import guard, internals
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 
 class ControlOutput(NamedTuple):
@@ -31,7 +31,7 @@ class ControlOutput(NamedTuple):
 class Controller:
     """`guard.tick` with its state and the last samples of y and y_m."""
 
-    def __init__(self, parameters: ControllerParameters) -> None:
+    def __init__(self, parameters: ControllerConfig) -> None:
         self._law, self._guard = parameters.tuned_law(), parameters.guard()
         self._state = guard.initial_state(len(parameters.inputs))
         self.names = internals.names(parameters.logged_groups())
@@ -55,7 +55,7 @@ class Controller:
         """Reset the state and keep u (bumpless transfer)."""
         self._state = guard.initial_state(len(self._state.u))._replace(u=self._state.u)
 
-    def retune(self, parameters: ControllerParameters) -> None:
+    def retune(self, parameters: ControllerConfig) -> None:
         """Replace all parameters between two ticks without a jump of u (bumpless transfer). Equal parameters change nothing.
 
         Raises ParameterError for parameters with another state: of another law, or with an observer that was not there.

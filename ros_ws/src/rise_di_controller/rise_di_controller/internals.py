@@ -50,7 +50,7 @@ def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 
     Scalars: mode (flight_core.modes.Mode), dt (s), y_m_offset (s), late (s, delay of the tick after its deadline), age (s, of y
     at the tick), number (counts the samples from 1 since the start: a gap is a lost sample), parameters
-    (ControllerParameters.digest).
+    (ControllerConfig.digest).
     """
     return (*SCALARS, *(f"{group}.{name}" for group, members in grouped.items() for name in members))
 

@@ -4,7 +4,7 @@
 
 A package registers a law by an entry point in its setup.py; see docs/laws.md:
 
-    entry_points={"rise_di_controller.laws": ["pi = control_laws.pi:PiParameters"]}
+    entry_points={"rise_di_controller.laws": ["pi = control_laws.pi:PiConfig"]}
 """
 
 from collections.abc import Mapping
@@ -13,8 +13,8 @@ from importlib.metadata import EntryPoints, entry_points
 from typing import Any
 
 from flight_core.parameters import ParameterError, require
-from rise_di_controller.params import ControllerParameters
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di import RiseDiConfig
 
 GROUP = "rise_di_controller.laws"
 DEFAULT = "rise_di"
@@ -30,10 +30,10 @@ def names() -> tuple[str, ...]:
     return tuple(sorted({DEFAULT, *_registered().names}))
 
 
-def schema(name: object) -> type[ControllerParameters]:
+def schema(name: object) -> type[ControllerConfig]:
     """The parameters of a law. Raises ParameterError for a law that is not registered, or twice, or that cannot be loaded."""
     if name == DEFAULT:
-        return RiseDiParameters
+        return RiseDiConfig
     if name not in names():
         raise ParameterError(f"law: found {name!r}, expected a registered law: {', '.join(names())}")
     entries = {entry.value: entry for entry in _registered().select(name=str(name))}
@@ -43,8 +43,8 @@ def schema(name: object) -> type[ControllerParameters]:
         found = next(iter(entries.values())).load()
     except (ImportError, AttributeError) as error:
         raise ParameterError(f"law: found {name!r}, which cannot be loaded ({error}), expected an installed package") from None
-    if not (isinstance(found, type) and issubclass(found, ControllerParameters)):
-        raise ParameterError(f"law: found {name!r}, registered as {found!r}, expected a subclass of ControllerParameters")
+    if not (isinstance(found, type) and issubclass(found, ControllerConfig)):
+        raise ParameterError(f"law: found {name!r}, registered as {found!r}, expected a subclass of ControllerConfig")
     if found.needs:
         raise ParameterError(
             f"law: found {name!r}, which needs {found.needs}, expected a law of y and y_m: the topics have no more"
@@ -52,11 +52,11 @@ def schema(name: object) -> type[ControllerParameters]:
     return found
 
 
-class AnyLaw(ControllerParameters):
+class AnyLaw(ControllerConfig):
     """The section `controller` of a scenario: the parameters of the law that its key `law` names, RISE-DI by default."""
 
     @classmethod
-    def validate_mapping(cls, values: Mapping[str, Any], where: str) -> ControllerParameters:  # type: ignore[override]
+    def validate_mapping(cls, values: Mapping[str, Any], where: str) -> ControllerConfig:  # type: ignore[override]
         """Build the parameters of the law. Raises ParameterError."""
         name = values.get("law", DEFAULT)
         try:
@@ -64,7 +64,7 @@ class AnyLaw(ControllerParameters):
         except ParameterError as error:
             raise ParameterError(f"{where}.{error}") from None
         of_default = {} if name == DEFAULT else schema(DEFAULT).model_fields
-        own = [key for key in chosen.model_fields if key not in ControllerParameters.model_fields]
+        own = [key for key in chosen.model_fields if key not in ControllerConfig.model_fields]
         for key in values:
             foreign = key in of_default and key not in chosen.model_fields
             require(not foreign, f"{where}.{key}", f"a parameter of {DEFAULT}", f"those of {name}: {', '.join(own) or 'none'}")

@@ -21,7 +21,7 @@ from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 BEHIND_NS = 1_000_000
 """From the instants of y and y_m at 500 Hz, whole 2 ms of the system clock, to a tick: both have arrived, and their nodes have
@@ -29,7 +29,7 @@ finished their ticks of up to 1 ms. Ticks at a random part of the period delay u
 of y and y_m wait for a processor of two."""
 
 
-class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
+class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     """At each tick it takes the received y and y_m, steps the law and publishes u with the stamp of y.
 
     In lockstep the number of samples of y gives the time. A tick waits for the y and the y_m of its instant. It publishes
@@ -84,7 +84,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerParameters]):
 
     on_shutdown = on_deactivate
 
-    def on_parameters(self, parameters: ControllerParameters) -> None:
+    def on_parameters(self, parameters: ControllerConfig) -> None:
         """Replace the parameters between two ticks, all at once and without a jump of u."""
         self._controller.retune(parameters)
 

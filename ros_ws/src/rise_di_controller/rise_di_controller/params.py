@@ -6,6 +6,7 @@ The parameters of a law are a subclass; `AnyLaw.validate_mapping` finds it by th
 """
 
 import json
+import warnings
 from collections.abc import Sequence
 from hashlib import blake2b
 from typing import Annotated, Any, ClassVar, Literal
@@ -14,12 +15,12 @@ import numpy as np
 
 from flight_core.fields import Field
 from flight_core.parameters import (
-    KeyedParameters,
+    Config,
+    KeyedConfig,
     Names,
     NonNegatives,
     Numbers,
     ParameterError,
-    Parameters,
     Positive,
     Positives,
     Signs,
@@ -44,7 +45,7 @@ MAX_STABLE_STEP = 2.5
 """Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78; dt is the longest that the law takes."""
 
 
-class FeedforwardParameters(Parameters):
+class FeedforwardConfig(Config):
     """The nominal model of the feedforward, an extension of the paper. SI units, matrices row by row."""
 
     states: Names = Field(description="the states of the nominal model, the outputs among them")
@@ -74,7 +75,7 @@ class FeedforwardParameters(Parameters):
         return nominal_model(A, B, C, gravity, np.array(self.lead))
 
 
-class ObserverParameters(Parameters):
+class ObserverConfig(Config):
     """An observer of the nominal model, an extension of the paper, with its matrices as designed; SI, row by row."""
 
     rate: Positive = Field(description="the rate of the law for which the matrices hold, Hz")
@@ -105,7 +106,7 @@ class ObserverParameters(Parameters):
         return Phi, Gamma, H, L, np.reshape(self.F, (m, s))
 
 
-class ControllerParameters(KeyedParameters):
+class ControllerConfig(KeyedConfig):
     """Parameters of the controller node that every control law has. A subclass has those of one law, as fields."""
 
     needs: ClassVar[str] = ""
@@ -136,10 +137,10 @@ class ControllerParameters(KeyedParameters):
         default=True,
         description="whether autostart also activates it; if not, u is at trim until another node does, as a bridge",
     )
-    feedforward: FeedforwardParameters | None = Field(
+    feedforward: FeedforwardConfig | None = Field(
         default=None, description="an extension of the paper: adds the input of a nominal model along y_m; off where absent"
     )
-    observer: ObserverParameters | None = Field(
+    observer: ObserverConfig | None = Field(
         default=None,
         description="an extension of the paper: corrects the trim by estimates of wind and model error; off where absent",
     )
@@ -148,7 +149,7 @@ class ControllerParameters(KeyedParameters):
     def tunable(cls) -> frozenset[str]:
         """Parameters that may change in flight: those of the law and the guard. Those that name channels or signs may not."""
         common = {"lag", "delay", "max_age", "hold", "ramp", "lower", "upper", "slew"}
-        return frozenset(common | (set(cls.model_fields) - set(ControllerParameters.model_fields)))
+        return frozenset(common | (set(cls.model_fields) - set(ControllerConfig.model_fields)))
 
     def _check(self) -> None:
         period = period_ns(self.rate, "rate")
@@ -197,7 +198,7 @@ class ControllerParameters(KeyedParameters):
         slow = f"at most {limit:.3g} 1/s, which ticks of {self.rate:g} Hz can follow"
         require(fastest <= limit, "feedforward.A", f"zero dynamics as fast as {fastest:.3g} 1/s", slow)
 
-    def _check_observer(self, observer: ObserverParameters, nominal: Nominal) -> None:
+    def _check_observer(self, observer: ObserverConfig, nominal: Nominal) -> None:
         """Sizes, stable filter and feedback, and the delay margin of the nominal loop, which certifies what flies."""
         expected = tuple(f"x.{name}" for name in self.feedforward.states) if self.feedforward else ()
         require(
@@ -283,3 +284,11 @@ class ControllerParameters(KeyedParameters):
             ),
             nominal=self.nominal(),
         )
+
+
+def __getattr__(name: str) -> Any:
+    """Keep the name that laws of packages outside the stack import, for one minor version."""
+    if name == "ControllerParameters":
+        warnings.warn("rise_di_controller.params.ControllerParameters is now ControllerConfig", FutureWarning, stacklevel=2)
+        return ControllerConfig
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -8,14 +8,14 @@ from typing import Annotated, Literal
 import numpy as np
 
 from flight_core.fields import Field
-from flight_core.parameters import Parameters, Positive, Positives, require, require_length
+from flight_core.parameters import Config, Positive, Positives, require, require_length
 from rise_di_controller.control_law import ControlLaw, TunedLaw
 from rise_di_controller.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.schedule import ScheduleParams, with_schedule
 
 
-class ScheduleParameters(Parameters):
+class ScheduleConfig(Config):
     """The schedule of input_scale over dynamic pressure, an extension of the paper."""
 
     speed: Positive = Field(description="the trim speed V0 at which input_scale holds, m/s: airspeed is speed + V of y")
@@ -28,7 +28,7 @@ class ScheduleParameters(Parameters):
         return TunedLaw(with_schedule(law.control_law), params)
 
 
-class RiseDiParameters(ControllerParameters):
+class RiseDiConfig(ControllerConfig):
     """The controller under RISE dynamic inversion, the paper's law."""
 
     k_g: Positive = Field(description="k_g of equation (22), 1/s")
@@ -45,7 +45,7 @@ class RiseDiParameters(ControllerParameters):
         description="width of the softened sign in total lags, one or one per channel; stable above 1, 3 is usual"
     )
 
-    schedule: ScheduleParameters | None = Field(
+    schedule: ScheduleConfig | None = Field(
         default=None, description="an extension of the paper: input_scale follows the dynamic pressure; off where absent"
     )
 

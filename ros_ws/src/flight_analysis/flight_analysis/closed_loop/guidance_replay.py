@@ -13,7 +13,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.tape import Tape
 from flight_guidance import guidance, modes
 from flight_guidance.modes import Begin, GuidanceState
-from flight_guidance.params import GuidanceParameters
+from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route
 from flight_guidance.route_file import Waypoint
 
@@ -32,7 +32,7 @@ class GuidanceReplay(NamedTuple):
         return self.differing == 0
 
 
-def known_routes(tape: Tape, parameters: GuidanceParameters) -> dict[int, Route]:
+def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
     """The route of the section and those that arrived in flight on the topic `route`, by digest, as `guidance` logs it."""
     lists = [list(parameters.waypoints())]
     if "route" in tape:
@@ -46,7 +46,7 @@ def known_routes(tape: Tape, parameters: GuidanceParameters) -> dict[int, Route]
     return {guidance.digest(route): route for route in routes}
 
 
-def replay_guidance(tape: Tape, parameters: GuidanceParameters | None) -> GuidanceReplay:
+def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceReplay:
     """Compute every step of the topic `guidance` again, and the u_m that was published at its instant.
 
     Steps on a route that the log does not hold are not checked. Raises ParameterError for a log without the scenario's section

@@ -20,7 +20,7 @@ from rise_di_controller import feedforward, guard, internals
 from rise_di_controller.control_law import TunedLaw, restored
 from rise_di_controller.guard import ControllerState, GuardParams
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.params import ControllerParameters
+from rise_di_controller.params import ControllerConfig
 
 COPIED_CHANNELS = ("y_m_offset", "number", "parameters")
 """Channels of `internals` that are copied, for a tick does not compute them."""
@@ -85,7 +85,7 @@ class ReplayResult(NamedTuple):
         return Signal(np.round(self.t * NANOSECONDS).astype(np.int64), self.names, values).group(prefix)
 
 
-def recorded_parameters(scenario: StoredFile) -> ControllerParameters:
+def recorded_parameters(scenario: StoredFile) -> ControllerConfig:
     """The controller's section of the scenario in a log; other sections are not validated. Raises ParameterError."""
     sections = parse_scenario_sections(scenario.content, Path(scenario.name))
     return AnyLaw.validate_mapping(sections["controller"], "controller")
@@ -96,7 +96,7 @@ def recorded_scenario(stored: StoredFile) -> Scenario:
     return parse_scenario(stored.content, Path(stored.name))
 
 
-def vary(parameters: ControllerParameters, changes: Mapping[str, Any]) -> ControllerParameters:
+def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
     """Parameters with some changed by dotted name, validated; None removes one. Raises ParameterError."""
     flat = dict(flatten(parameters.model_dump()))
     for name in changes:
@@ -105,7 +105,7 @@ def vary(parameters: ControllerParameters, changes: Mapping[str, Any]) -> Contro
 
 
 def replay(
-    tape: Tape, parameters: ControllerParameters, others: ControllerParameters | None = None, changes: Sequence[Change] = ()
+    tape: Tape, parameters: ControllerConfig, others: ControllerConfig | None = None, changes: Sequence[Change] = ()
 ) -> ReplayResult:
     """Compute every tick of `internals` again: (state, now, y, y_m) -> (state, u) by `guard.tick`.
 
@@ -156,7 +156,7 @@ def replay(
 class _ParametersInForce:
     """The parameters in force at a tick, and the changes after it."""
 
-    def __init__(self, parameters: ControllerParameters, changes: Sequence[Change]) -> None:
+    def __init__(self, parameters: ControllerConfig, changes: Sequence[Change]) -> None:
         self.notes: list[str] = []
         self._first, self._changes = parameters, list(changes)
         self.begin()
@@ -166,7 +166,7 @@ class _ParametersInForce:
         self._unmatched: set[int] = set()
         self._apply(self._first)
 
-    def _apply(self, parameters: ControllerParameters) -> None:
+    def _apply(self, parameters: ControllerConfig) -> None:
         self._parameters, self.digest = parameters, parameters.digest()
         self.law, self.limits = parameters.tuned_law(), parameters.guard()
 
@@ -200,7 +200,7 @@ class _ParametersInForce:
 class _Ticks:
     """`internals` of a log in order of the controller's ticks, and the inputs of each tick."""
 
-    def __init__(self, tape: Tape, parameters: ControllerParameters) -> None:
+    def __init__(self, tape: Tape, parameters: ControllerConfig) -> None:
         require("internals" in tape, "the log", "no sample of internals", "a flight with a controller that engaged")
         signal = tape["internals"]
         groups = parameters.logged_groups()

@@ -9,26 +9,26 @@ from typing import Annotated, Any
 
 import yaml
 
-from aircraft_sim.params import AircraftParameters
+from aircraft_sim.params import AircraftConfig
 from aircraft_sim.pose import every
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
 from flight_core.files import read_file
-from flight_core.parameters import ParameterError, Parameters, require
+from flight_core.parameters import Config, ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario import A_SCENARIO, Sections, parse_sections
-from flight_guidance.params import GuidanceParameters
-from flight_recorder.params import RecorderParameters
-from reference_model.params import ReferenceModelParameters
+from flight_guidance.params import GuidanceConfig
+from flight_recorder.params import RecorderConfig
+from reference_model.params import ReferenceModelConfig
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.params import ControllerParameters
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di import RiseDiConfig
 
 ParameterOverrides = dict[str, str | float | bool | list[str] | list[float]]
 """Parameters of one node by name that replace those of its section in the scenario."""
 
 
-class FlightParameters(Parameters):
+class FlightConfig(Config):
     """How to run the scenario."""
 
     duration: Annotated[float, Field(gt=0, le=1e6)] = Field(description="how long to fly, s")
@@ -41,12 +41,12 @@ class Scenario:
 
     name: str
     path: Path
-    flight: FlightParameters
-    aircraft: AircraftParameters
-    reference_model: ReferenceModelParameters
-    controller: ControllerParameters
-    recorder: RecorderParameters
-    guidance: GuidanceParameters | None = None  # None: the commands are those of the reference model
+    flight: FlightConfig
+    aircraft: AircraftConfig
+    reference_model: ReferenceModelConfig
+    controller: ControllerConfig
+    recorder: RecorderConfig
+    guidance: GuidanceConfig | None = None  # None: the commands are those of the reference model
 
     def vary(self, **sections: Mapping[str, Any]) -> "Scenario":
         """A copy with some parameters replaced, as in scenario.vary(controller={"rate": 200.0}).
@@ -62,14 +62,14 @@ class Scenario:
         return varied
 
     def _values(self, name: str) -> dict[str, Any]:
-        section: Parameters | None = getattr(self, name)
+        section: Config | None = getattr(self, name)
         return (
             guidance_by_rule(self.aircraft, self.reference_model, self.controller) if section is None else section.model_dump()
         )
 
-    def rise_di(self) -> RiseDiParameters:
+    def rise_di(self) -> RiseDiConfig:
         """The parameters of a controller that flies RISE-DI. Raises ParameterError for another law."""
-        if not isinstance(self.controller, RiseDiParameters):
+        if not isinstance(self.controller, RiseDiConfig):
             expected = "rise_di, which has the gains of (20) to (22)"
             raise ParameterError(f"{self.name}: found the law {self.controller.law}, expected {expected}")
         return self.controller
@@ -80,13 +80,13 @@ class Scenario:
         return {name: (gust.start, gust.start + 2.0 * gust.length / speed) for name, gust in self.aircraft.gusts.items()}
 
 
-SCHEMAS: dict[str, type[Parameters]] = {
-    "flight": FlightParameters,
-    "aircraft": AircraftParameters,
-    "reference_model": ReferenceModelParameters,
+SCHEMAS: dict[str, type[Config]] = {
+    "flight": FlightConfig,
+    "aircraft": AircraftConfig,
+    "reference_model": ReferenceModelConfig,
     "controller": AnyLaw,
-    "recorder": RecorderParameters,
-    "guidance": GuidanceParameters,
+    "recorder": RecorderConfig,
+    "guidance": GuidanceConfig,
 }
 OPTIONAL = ("guidance",)
 
@@ -116,9 +116,7 @@ def parse_scenario_sections(content: bytes, path: Path) -> Sections:
     return parse_sections(content, path, tuple(name for name in SCHEMAS if name not in OPTIONAL), OPTIONAL)
 
 
-def guidance_by_rule(
-    aircraft: AircraftParameters, reference: ReferenceModelParameters, controller: ControllerParameters
-) -> dict[str, Any]:
+def guidance_by_rule(aircraft: AircraftConfig, reference: ReferenceModelConfig, controller: ControllerConfig) -> dict[str, Any]:
     """Parameters of guidance that follow from the other sections.
 
     The authorities of throttle and aileron are abs(Omega_ii) u of RISE-DI, Omega_ii = omega / input_scale, with the limits of
@@ -135,7 +133,7 @@ def guidance_by_rule(
         "natural_frequency": reference.second_order.natural_frequency,
         "speed": channels.speed,
     }
-    if isinstance(controller, RiseDiParameters) and controller.lower and controller.upper:
+    if isinstance(controller, RiseDiConfig) and controller.lower and controller.upper:
 
         def effect(i: int) -> float:
             return controller.omega[i] / controller.input_scale[i]
@@ -154,7 +152,7 @@ def scenario_yaml(scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]]
     """
     sections = {}
     for name, schema in SCHEMAS.items():
-        section: Parameters | None = getattr(scenario, name)
+        section: Config | None = getattr(scenario, name)
         if section is None:
             continue
         merged = schema.validate_mapping(section.model_dump() | dict((overrides or {}).get(name, {})), name)
@@ -204,7 +202,7 @@ def require_euler(scenario: Scenario) -> None:
     require(turns, "aircraft.kinematics", f"{aircraft.kinematics!r} beside guidance", "euler: a bank turns the aircraft")
 
 
-def _check_guidance(scenario: Scenario, guidance: GuidanceParameters) -> None:
+def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
     reference, aircraft = scenario.reference_model, scenario.aircraft
     rule = guidance_by_rule(aircraft, reference, scenario.controller)
     for key in ("speed", "outputs", "natural_frequency"):

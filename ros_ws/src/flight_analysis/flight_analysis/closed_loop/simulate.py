@@ -16,7 +16,7 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from flight_guidance.guidance import Guidance
-from flight_guidance.params import GuidanceParameters
+from flight_guidance.params import GuidanceConfig
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
 
@@ -41,7 +41,7 @@ class _SignalBuilder:
 def simulate(  # noqa: PLR0912 - one a node
     scenario: Scenario,
     progress: Callable[[float], None] | None = None,
-    guide: Callable[[GuidanceParameters], Guidance] = Guidance,
+    guide: Callable[[GuidanceConfig], Guidance] = Guidance,
 ) -> Tape:
     """Fly a scenario and return its tape. `progress` is called with the flight time once per simulated second.
 

@@ -16,7 +16,7 @@ from aircraft_sim.airframe import Airframe
 from aircraft_sim.jsbsim_aircraft import OUTPUTS
 from autopilot_bridge.channel_map import to_channel
 from autopilot_bridge.params import ChannelMap
-from control_laws.excitation import ExcitationParameters
+from control_laws.excitation import ExcitationConfig
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import bandwidths
 from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre
@@ -28,9 +28,9 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from reference_model.params import ReferenceModelParameters
+from reference_model.params import ReferenceModelConfig
 from rise_di_controller.linear_loop import Loop
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.rise_di import RiseDiConfig
 
 RATE = 100.0  # Hz, of law and reference model by default
 
@@ -88,7 +88,7 @@ class Experiment(NamedTuple):
 
     airframe: str  # text of the airframe file: signs alone
     scenario: str  # text of the scenario file
-    controller: ExcitationParameters
+    controller: ExcitationConfig
 
 
 def experiment(channel_map: ChannelMap, speed: float, amplitude: float, airframe_file: str, wait: float = WAIT) -> Experiment:
@@ -97,7 +97,7 @@ def experiment(channel_map: ChannelMap, speed: float, amplitude: float, airframe
     rows = [channel_map.inputs[name] for name in pairing.inputs]
     thrust = [name == "V" for name in pairing.outputs]
     m, lowest = len(rows), [SPEED_BAND[0] if one else BAND[0] for one in thrust]
-    controller = ExcitationParameters.validate_mapping(
+    controller = ExcitationConfig.validate_mapping(
         _controller(channel_map, pairing)
         | {
             "law": "excitation",
@@ -191,7 +191,7 @@ def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelMo
 class Flyable(NamedTuple):
     """A controller for an identified aircraft, and the files that fly it."""
 
-    controller: RiseDiParameters
+    controller: RiseDiConfig
     delay_margin: float | None  # s, of y_dot = Omega u with the lags and the delay; None for the literal sign
     airframe: str  # text of the airframe file
     scenario: str  # text of the scenario file
@@ -219,14 +219,14 @@ def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airf
     commands = _commands(pairing.outputs, bandwidth, speed, authority, held)
     lag = dict(zip(pairing.inputs, later.tolist(), strict=True))
     ones = [1.0] * len(pairing.inputs)
-    base = RiseDiParameters.validate_mapping(
+    base = RiseDiConfig.validate_mapping(
         _controller(channel_map, pairing)
         | dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
         | {"k_g": 1.0, "k_d": ones[1:], "D": [1] * len(ones), "sign": "auto", "softening": SOFTENING}
         | {"lag": list(lag.values()), "delay": delay},
         "controller",
     )
-    manoeuvre = Manoeuvre(ReferenceModelParameters.validate_mapping(commands, "reference_model"), {}, WAIT + 60.0)
+    manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, WAIT + 60.0)
     range_rate = np.array([min(-row.lower, row.upper) / FULL_RANGE_TIME for row in rows.values()])
 
     airframe = airframe_yaml(channel_map, pairing, found, speed, "identified in flight")
@@ -261,7 +261,7 @@ def _without_sideslip(found: Channels, pairing: ChannelPairing) -> Channels:
     )
 
 
-def _with_integrals(controller: RiseDiParameters, pairing: ChannelPairing, found: Channels, loop: Loop) -> RiseDiParameters:
+def _with_integrals(controller: RiseDiConfig, pairing: ChannelPairing, found: Channels, loop: Loop) -> RiseDiConfig:
     """The controller with integrals by which the loop of each channel's model crosses 1 where that of y_dot = Omega u does.
 
     Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals of K (s + integral) / s. For first
@@ -277,7 +277,7 @@ def _with_integrals(controller: RiseDiParameters, pairing: ChannelPairing, found
         max(float(own), _integral(found, i, float(K), float(loop.total[i])) - float(slope))
         for own, i, K, slope in zip(controller.Lambda, places, crossover, of_sign, strict=True)
     ]
-    return RiseDiParameters.validate_mapping(controller.model_dump() | {"Lambda": Lambda}, "controller")
+    return RiseDiConfig.validate_mapping(controller.model_dump() | {"Lambda": Lambda}, "controller")
 
 
 def _integral(found: Channels, i: int, crossover: float, total_lag: float) -> float:

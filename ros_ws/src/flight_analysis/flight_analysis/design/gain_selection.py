@@ -31,13 +31,13 @@ from flight_core.parameters import ParameterError, require
 from flight_core.vectors import Array, FloatArray
 from reference_model import model
 from reference_model.command import command
-from reference_model.params import ReferenceModelParameters
+from reference_model.params import ReferenceModelConfig
 from rise_di_controller.decomposition import DecompositionError, coupling, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, is_stable, linear_law
-from rise_di_controller.params import ControllerParameters, FeedforwardParameters, ObserverParameters
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig
+from rise_di_controller.rise_di import RiseDiConfig
 
 CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
 """Bandwidth of a channel times the lag of its loop, rad, by output. 0.63, 0.32 and 0.23 cost 36, 18 and 13 degrees of phase at
@@ -61,13 +61,13 @@ INPUT_LIMITS = ("lower", "upper", "slew")  # limits of the controller, one an in
 
 SPEED_STEP, MAX_SPEED_RATIO = 0.05, 3.0  # of the search for the speed up to which the delay margin lasts
 
-Controller = TypeVar("Controller", bound=ControllerParameters)
+Controller = TypeVar("Controller", bound=ControllerConfig)
 
 
 class Manoeuvre(NamedTuple):
     """The commands and gusts that the gains are selected for."""
 
-    reference: ReferenceModelParameters
+    reference: ReferenceModelConfig
     gusts: dict[str, Gust]
     duration: float  # s
 
@@ -82,7 +82,7 @@ class ChannelPairing(NamedTuple):
 class LoopSetting(NamedTuple):
     """The loop that the gains are selected for, and the settings of the selection."""
 
-    base: RiseDiParameters  # source of all parameters that are not selected: softening, max_age, limits
+    base: RiseDiConfig  # source of all parameters that are not selected: softening, max_age, limits
     rate: float  # Hz
     lag: Mapping[str, float]  # s, by input; 0 for an input without lag
     delay: float  # s
@@ -117,7 +117,7 @@ class Study(NamedTuple):
 class GainAssessment(NamedTuple):
     """A gain set, every condition on it, and its delay margins."""
 
-    controller: RiseDiParameters
+    controller: RiseDiConfig
     theorem: tuple[Condition, ...]
     loop: tuple[Condition, ...]
     bounds: Bounds
@@ -164,7 +164,7 @@ def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
         present = {turn.bank_rate, turn.turn_rate} <= set(airframe.outputs)
         values["coordinated_turn"] = turn.model_dump() | {"speed": airframe.speed} if present else None
     gusts = {name: gust for name, gust in scenario.aircraft.gusts.items() if name in airframe.gusts}
-    reference = ReferenceModelParameters.validate_mapping(values, "reference_model")
+    reference = ReferenceModelConfig.validate_mapping(values, "reference_model")
     return Manoeuvre(reference, gusts, scenario.flight.duration)
 
 
@@ -334,7 +334,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     selected = gain_conditions.engineering_gains(bandwidth[places], slew[places] / unit, setting.factor, rate_limit / unit)
     spread = np.abs(np.einsum("Nii->Ni", (study.C @ study.B)[:, places][..., columns])).max(axis=0)
 
-    def controller(gains: GainSet, response: FloatArray) -> RiseDiParameters:
+    def controller(gains: GainSet, response: FloatArray) -> RiseDiConfig:
         scale, base_inputs = unit * response, setting.base.inputs
         has_limits = set(channels.inputs) <= set(base_inputs)
         limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if has_limits else {}
@@ -356,7 +356,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
             "observer": None,
         }
         values |= {key: [row[base_inputs.index(name)] for name in channels.inputs] for key, row in limits.items() if row}
-        chosen = RiseDiParameters.validate_mapping(values, "controller")
+        chosen = RiseDiConfig.validate_mapping(values, "controller")
         return with_feedforward(chosen, airframe) if setting.feedforward else chosen
 
     ones = np.ones(len(places))
@@ -374,7 +374,7 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
     """
     _, columns = law_order(airframe, controller)
     gravity = airframe.matrix_gravity()
-    model = FeedforwardParameters(
+    model = FeedforwardConfig(
         states=tuple(airframe.states),
         A=tuple(airframe.matrix_a().ravel().tolist()),
         B=tuple(airframe.matrix_b()[:, columns].ravel().tolist()),
@@ -408,7 +408,7 @@ def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     )
 
 
-def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSetting) -> GainAssessment:
+def assess_gains(study: Study, controller: RiseDiConfig, setting: LoopSetting) -> GainAssessment:
     """Every condition on a gain set. Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
 
     Theorem: "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of (29), (30), steps 2 and
@@ -458,12 +458,12 @@ def assess_gains(study: Study, controller: RiseDiParameters, setting: LoopSettin
     return GainAssessment(controller, theorem, conditions, bounds, margin, each)
 
 
-def margins(scenario: Scenario, controller: ControllerParameters) -> dict[str, Any]:
+def margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:
     """Delay margin, s, of the nominal linear loop in all channels, by output in one alone, and the least that it should be.
 
     Empty without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the loop is unstable with its own lag.
     """
-    literal = isinstance(controller, RiseDiParameters) and controller.sampled_sign()[0] is Sign.LITERAL
+    literal = isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.LITERAL
     if scenario.aircraft.is_jsbsim or literal:
         return {}
     airframe = load_airframe(scenario.aircraft.airframe)
@@ -475,7 +475,7 @@ def margins(scenario: Scenario, controller: ControllerParameters) -> dict[str, A
     return {"delay_margin": delay_margin(plant, linear, loop), "channels": each, "least": loop.period}
 
 
-def stable_speed_ratio(study: Study, controller: RiseDiParameters) -> float:
+def stable_speed_ratio(study: Study, controller: RiseDiConfig) -> float:
     """Airspeed over that of the trim up to which the delay margin lasts with fixed gains; 0 without one at trim.
 
     The response to every input but that of V grows with V^2, all else is that of the trim. The answer is rounded down to
@@ -492,7 +492,7 @@ def stable_speed_ratio(study: Study, controller: RiseDiParameters) -> float:
     return math.inf
 
 
-def loop_of(controller: ControllerParameters) -> Loop:
+def loop_of(controller: ControllerConfig) -> Loop:
     """The loop of a controller."""
     return Loop(np.array(controller.lag, dtype=np.float64), controller.delay, 1.0 / controller.rate)
 
@@ -524,7 +524,7 @@ def _has_signs(Omega: FloatArray, D: FloatArray) -> bool:
         return False
 
 
-def law_order(airframe: Airframe, controller: ControllerParameters) -> tuple[list[int], list[int]]:
+def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:
     """Indices of the law's outputs and inputs among those of an airframe."""
     columns = [list(airframe.inputs).index(name) for name in controller.inputs]
     return [airframe.outputs.index(name) for name in controller.outputs], columns
@@ -624,7 +624,7 @@ def as_yaml(selection: Selection) -> str:
     )
 
 
-def _sections(controller: RiseDiParameters, airframe: Airframe) -> dict[str, tuple[str, dict[str, str | list[str]]]]:
+def _sections(controller: RiseDiConfig, airframe: Airframe) -> dict[str, tuple[str, dict[str, str | list[str]]]]:
     """The sections feedforward and observer where there are any: a comment, and each parameter in flow style."""
     along = f"the input of {airframe.name} along y_m is added; SI, a line a state, lead in s"
     corrects = "estimates correct the trim; SI, a line an estimate, of F a line an input; within, fade, margin in s"
@@ -636,7 +636,7 @@ def _sections(controller: RiseDiParameters, airframe: Airframe) -> dict[str, tup
     }
 
 
-def _matrix_rows(section: FeedforwardParameters | ObserverParameters, m: int) -> dict[str, str | list[str]]:
+def _matrix_rows(section: FeedforwardConfig | ObserverConfig, m: int) -> dict[str, str | list[str]]:
     """Entries of each parameter in flow style, a matrix in rows. A matrix of the observer has ten digits."""
     rows: dict[str, str | list[str]] = {}
     for key, value in section.model_dump(exclude_none=True).items():
@@ -644,6 +644,6 @@ def _matrix_rows(section: FeedforwardParameters | ObserverParameters, m: int) ->
             rows[key] = yaml_flow(value)
             continue
         columns = len(value) if key in {"states", "lead"} else len(value) // (m if key == "F" else len(section.states))
-        digits = 10 if isinstance(section, ObserverParameters) else 6
+        digits = 10 if isinstance(section, ObserverConfig) else 6
         rows[key] = [yaml_flow(value[i : i + columns], digits)[1:-1] for i in range(0, len(value), columns)]
     return rows

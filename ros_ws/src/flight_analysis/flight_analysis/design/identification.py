@@ -33,10 +33,10 @@ from flight_core.rates import divide, nanoseconds
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from reference_model.params import ReferenceModelParameters
+from reference_model.params import ReferenceModelConfig
 from rise_di_controller.decomposition import coupling
 from rise_di_controller.law import total_lag
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.rise_di import RiseDiConfig
 
 # The step tests
 
@@ -375,7 +375,7 @@ def _study(condition: FlightCondition, Omega: FloatArray, commands: Mapping[str,
         },
         f"airframe {condition.title}",
     )
-    manoeuvre = Manoeuvre(ReferenceModelParameters.validate_mapping(commands, "reference_model"), {}, DURATION)
+    manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, DURATION)
     return gain_selection.study_airframe(airframe, manoeuvre, samples=SAMPLES)
 
 
@@ -392,7 +392,7 @@ def _setting(trim: Trim, lag: FloatArray, V_bandwidth: float) -> LoopSetting:
     """The loop that the gains are selected for. The parameters to be selected are 1."""
     inputs = list(INPUTS)
     ones = [1.0] * len(inputs)
-    base = RiseDiParameters.validate_mapping(
+    base = RiseDiConfig.validate_mapping(
         dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
         | {"rate": CONTROL_RATE, "outputs": list(OUTPUTS), "inputs": inputs, "k_g": 1.0, "k_d": ones[1:]}
         | {"D": [1] * len(inputs), "sign": "auto", "lag": lag.tolist(), "delay": DELAY, "softening": SOFTENING}

@@ -31,8 +31,8 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.law import gain
 from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law, spectral_radius
-from rise_di_controller.params import ControllerParameters, FeedforwardParameters, ObserverParameters
-from rise_di_controller.rise_di import RiseDiParameters
+from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig
+from rise_di_controller.rise_di import RiseDiConfig
 
 RELAXATION = 1.05
 """Factor by which `effort` rises, and K falls, in a step of the search for the delay margin."""
@@ -87,13 +87,13 @@ def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> Observer
     return ObserverGains(K, SHARE * Lambda, K / T, 1.0 / ((1.0 - SHARE) * Lambda * T), weights)
 
 
-def model_for(airframe: Airframe, controller: ControllerParameters, noise: FloatArray) -> NominalModel:
+def model_for(airframe: Airframe, controller: ControllerConfig, noise: FloatArray) -> NominalModel:
     """The model of an airframe for a controller, in the law's order. `noise` of the measured outputs, (m,), rms per sample."""
     model = nominal_model(airframe, controller.outputs, controller.inputs, noise, loop_of(controller))
     return _limited(model, controller)
 
 
-def _limited(model: NominalModel, controller: ControllerParameters) -> NominalModel:
+def _limited(model: NominalModel, controller: ControllerConfig) -> NominalModel:
     """A model with the limits and D of a controller."""
     limits = controller.guard().limits
     return model._replace(D=np.array(controller.D, dtype=np.float64), lower=limits.lower, upper=limits.upper)
@@ -102,13 +102,13 @@ def _limited(model: NominalModel, controller: ControllerParameters) -> NominalMo
 class SelectedObserver(NamedTuple):
     """A controller with an observer, and what it tolerates."""
 
-    controller: RiseDiParameters
+    controller: RiseDiConfig
     delay_margin: float  # s, of the nominal linear loop, the declared delay included
     relaxation: FloatArray  # (m,) factors by which the search for the margin raised `effort` and lowered K; 1: not at all
 
 
 def with_aircraft_observer(
-    controller: RiseDiParameters,
+    controller: RiseDiConfig,
     airframe: Airframe,
     gains: ObserverGains,
     noise: FloatArray,
@@ -152,9 +152,9 @@ def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedS
     return ExtendedStateWeights(products[0] * T, *(products[1:] / T))
 
 
-def integrator_model(controller: ControllerParameters, Omega: FloatArray) -> FeedforwardParameters:
+def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> FeedforwardConfig:
     """The model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order; lead = lag + delay + half a period."""
-    return FeedforwardParameters(
+    return FeedforwardConfig(
         states=controller.outputs,
         A=(0.0,) * Omega.size,
         B=tuple(Omega.ravel().tolist()),
@@ -163,7 +163,7 @@ def integrator_model(controller: ControllerParameters, Omega: FloatArray) -> Fee
 
 
 def with_extended_state_observer(
-    controller: RiseDiParameters, Omega: FloatArray, noise: FloatArray, size: FloatArray, margin: float
+    controller: RiseDiConfig, Omega: FloatArray, noise: FloatArray, size: FloatArray, margin: float
 ) -> SelectedObserver:
     """The controller with an observer from Omega and lags alone: no A, no f, no wind. Its gains stay, but for the margin.
 
@@ -174,7 +174,7 @@ def with_extended_state_observer(
     m = len(controller.outputs)
     _require_signs(Omega, controller, "Omega")
     values = controller.model_dump() | {"observer": None, "feedforward": integrator_model(controller, Omega).model_dump()}
-    base = RiseDiParameters.validate_mapping(values, "controller")
+    base = RiseDiConfig.validate_mapping(values, "controller")
     none, eye, loop, one, effects = np.zeros((m, m)), np.eye(m), loop_of(controller), np.ones(m), np.diag(Omega)
     model = NominalModel(
         A=none,
@@ -209,7 +209,7 @@ def with_extended_state_observer(
     return _within_margin(base, model, LinearPlant(none, Omega, eye), gains, design, margin)
 
 
-def _require_signs(Omega: FloatArray, controller: ControllerParameters, where: str) -> None:
+def _require_signs(Omega: FloatArray, controller: ControllerConfig, where: str) -> None:
     try:
         D = [int(sign) for sign in signs(Omega)]
     except DecompositionError as error:
@@ -218,7 +218,7 @@ def _require_signs(Omega: FloatArray, controller: ControllerParameters, where: s
 
 
 def _within_margin(
-    base: RiseDiParameters,
+    base: RiseDiConfig,
     model: NominalModel,
     plant: LinearPlant,
     gains: ObserverGains,
@@ -244,12 +244,12 @@ def _within_margin(
         selected = best if best.delay_margin > selected.delay_margin else relaxed(selected.relaxation * RELAXATION)
     checked = selected.controller.model_dump()
     checked["observer"]["margin"] = margin
-    return selected._replace(controller=RiseDiParameters.validate_mapping(checked, "controller"))
+    return selected._replace(controller=RiseDiConfig.validate_mapping(checked, "controller"))
 
 
 def _parameters(
-    base: RiseDiParameters, model: NominalModel, gains: ObserverGains, design: ObserverDesign, relaxation: FloatArray
-) -> RiseDiParameters:
+    base: RiseDiConfig, model: NominalModel, gains: ObserverGains, design: ObserverDesign, relaxation: FloatArray
+) -> RiseDiConfig:
     """The parameters with gains and matrices. A K below MIN_K is MIN_K with a smaller input scale: the same loop."""
     K = gains.K / relaxation
     whole = np.maximum(K, MIN_K + MIN_GAIN)
@@ -258,7 +258,7 @@ def _parameters(
     k_g = MIN_K - 1.0
     Phi, Gamma, L, F = (tuple(one.ravel().tolist()) for one in (design.Phi, design.Gamma, design.L, design.F))
     require(spectral_radius(design.Phi - design.Gamma @ design.F) < 1.0, "observer.F", "an unstable feedback", "a stable one")
-    observer = ObserverParameters(rate=base.rate, states=design.states, Phi=Phi, Gamma=Gamma, L=L, F=F, margin=0.0)
+    observer = ObserverConfig(rate=base.rate, states=design.states, Phi=Phi, Gamma=Gamma, L=L, F=F, margin=0.0)
     changes: dict[str, Any] = {
         "k_g": k_g,
         "k_d": tuple((whole[:-1] - gain(np.array(k_g), np.zeros(len(K) - 1))[:-1]).tolist()),
