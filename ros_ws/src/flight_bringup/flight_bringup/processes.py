@@ -72,7 +72,7 @@ class NodeProcess:
         command = [*end_with_parent(), sys.executable, "-m", node.module, "--ros-args", "--params-file", str(scenario_file)]
         for name, value in overrides.items():
             command += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, and quotes what needs quotes
-        self._log = log.open("w", encoding="utf-8")
+        self._log = log.open("x", encoding="utf-8")
         self.popen = subprocess.Popen(  # noqa: S603 - our own interpreter and modules
             command,
             stdin=subprocess.DEVNULL,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
-from flight_core.files import is_file, writing
+from flight_core.files import is_file, write_file, writing
 from flight_core.parameters import require
 from flight_guidance.feasibility import speeds
 from flight_guidance.route_file import Waypoint
@@ -46,5 +46,5 @@ def with_route(scenario: Scenario, waypoints: Sequence[Waypoint]) -> Scenario:
 def written(scenario: Scenario, path: Path) -> Scenario:
     """A scenario that differs from its file, as a file of its own. Raises ParameterError where it cannot be written."""
     with writing("", path, "a folder that can"):
-        path.write_text(scenario_yaml(scenario), encoding="utf-8")
+        write_file(path, scenario_yaml(scenario))
     return load_scenario(path)

@@ -19,7 +19,7 @@ from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
-from flight_core.files import replace_text, writing
+from flight_core.files import write_file, writing
 from flight_core.parameters import Config, ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import TunedLaw
@@ -245,4 +245,4 @@ class Campaign:
 
 def _write(path: Path, text: str) -> None:
     with writing("", path, "a folder and a disk that can"):
-        replace_text(path, text)
+        write_file(path, text)

@@ -19,6 +19,7 @@ from flight_analysis.report.summary import NO_UNIT, QUANTITY_UNITS, Column, Disp
 from flight_analysis.report.tables import Table
 from flight_campaign.campaign import Definition
 from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
+from flight_core.files import write_file
 from flight_core.vectors import FloatArray
 
 COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, 5 % wide
@@ -52,7 +53,7 @@ def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cas
         Section("Sweep", "score over the factor", _sweep(definition, tallies), over_time=False),
     ]
     page = Page(title, [Line(text)], [TableGroup(tables)], sections, SampleStore())
-    path.write_text(page_html(page), encoding="utf-8")
+    write_file(path, page_html(page))
 
 
 def score_meaning(scenario: Scenario) -> str:

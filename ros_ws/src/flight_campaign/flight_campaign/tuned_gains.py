@@ -10,7 +10,7 @@ import yaml
 
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_core.files import read_yaml, writing
+from flight_core.files import read_yaml, write_file, writing
 from flight_core.parameters import ParameterError
 
 TUNED = Path(__file__).parent / "tuned"  # folder of the tuned gains, one file a scenario
@@ -72,4 +72,4 @@ def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Seq
     text = yaml.dump({"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160)
     with writing("", path, "a file of tuned gains that can"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(head + text, encoding="utf-8")
+        write_file(path, head + text)

@@ -33,7 +33,7 @@ from flight_analysis.report.run_folder import link_latest, new_run
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
 from flight_cli.output import display_path, flight_progress, new_table, print_json
-from flight_core.files import writing
+from flight_core.files import write_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Tape
 from flight_log.tape_reader import read_run
@@ -99,7 +99,7 @@ def _write(folder: Path, files: Mapping[str, str]) -> None:
     with writing("--write", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
-            (folder / f"{name}.yaml").write_text(content, encoding="utf-8")
+            write_file(folder / f"{name}.yaml", content)
 
 
 def _announce(console: Console, planned: Experiment, duration: float) -> None:

@@ -32,7 +32,7 @@ from flight_cli.output import (
     print_json,
     progress_bar,
 )
-from flight_core.files import writing
+from flight_core.files import write_file, writing
 from flight_core.parameters import require
 
 CHUNK = 1000  # aircraft computed at once
@@ -157,7 +157,7 @@ def _write_results(monte_carlo: Campaign) -> dict[str, Any]:
         "sweep": None if definition.sweep is None else definition.sweep.parameter,
         "cases": cases,
     }
-    (monte_carlo.folder / SUMMARY).write_text(json.dumps(figures, indent=1), encoding="utf-8")
+    write_file(monte_carlo.folder / SUMMARY, json.dumps(figures, indent=1))
     write_page(monte_carlo.folder / REPORT, definition, tallies, cases)
     return figures
 
@@ -168,7 +168,7 @@ def _write_worst(monte_carlo: Campaign, case: int, tally: Tally) -> list[dict[st
     for one in tally.worst[:RERUN]:
         suffix = "" if monte_carlo.definition.sweep is None else f"_{monte_carlo.definition.factor(case):g}"
         path = monte_carlo.folder / f"{monte_carlo.definition.name}{suffix}_{one.number}.yaml"
-        path.write_text(scenario_yaml(monte_carlo.definition.aircraft_scenario(one.number, case)), encoding="utf-8")
+        write_file(path, scenario_yaml(monte_carlo.definition.aircraft_scenario(one.number, case)))
         command = f"rise-di fly {shlex.quote(display_path(path))} --in-process"
         again.append({"number": one.number, "score": one.score, "command": command})
     return again

@@ -9,7 +9,7 @@ import typer
 
 from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler
 from flight_bringup.scenarios import find_scenario
-from flight_core.files import writing
+from flight_core.files import write_file, writing
 
 
 def layouts(
@@ -23,5 +23,5 @@ def layouts(
         path = folder / f"{chosen.name}.{suffix}"
         with writing("folder", folder, "a folder that can"):
             folder.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, encoding="utf-8")
+            write_file(path, text)
         print(path)

@@ -28,7 +28,7 @@ from flight_analysis.report.summary import (
     parts_legend,
     table_rows,
 )
-from flight_core.files import writing
+from flight_core.files import write_file, writing
 
 ENDED_EARLY, INTERRUPTED = 3, 130  # exit statuses; bad input is 2 (`flight_cli.cli`)
 LATEST = Path("runs/latest")  # the run of a command that is given none
@@ -142,7 +142,7 @@ def print_json(value: Any) -> None:
 def write_text(option: str, path: Path, text: str) -> None:
     """Write a file that an option names. Raises ParameterError where it cannot be written."""
     with writing(option, path, "the path of a file"):
-        path.write_text(text, encoding="utf-8")
+        write_file(path, text)
 
 
 def display_path(path: Path) -> str:

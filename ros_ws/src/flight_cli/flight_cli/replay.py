@@ -3,6 +3,7 @@
 """`rise-di replay`: compute a recorded flight again and compare it bit by bit, or with other gains in open loop."""
 
 import csv
+import io
 import math
 from collections import Counter
 from pathlib import Path
@@ -16,8 +17,8 @@ from flight_analysis.closed_loop.guidance_replay import GuidanceReplay, replay_g
 from flight_analysis.closed_loop.replay import Difference, ReplayResult, recorded_parameters, recorded_scenario, vary
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
-from flight_cli.output import LATEST, new_table, print_json
-from flight_core.files import parse_yaml, writing
+from flight_cli.output import LATEST, new_table, print_json, write_text
+from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError, require
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
@@ -171,9 +172,10 @@ def _as_json(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ..
 def _write_csv(path: Path, result: ReplayResult, inputs: tuple[str, ...]) -> None:
     """One row a tick: number, t, then each input as recorded and as computed, in digits that restore every bit."""
     columns = [result.names.index(f"u.{name}") for name in inputs]
-    with writing("--csv", path, "the path of a file"), path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow(["number", "t", *(f"u.{name}.{what}" for name in inputs for what in ("recorded", "computed"))])
-        pairs = np.dstack([result.recorded[:, columns], result.computed[:, columns]]).reshape(len(result.number), -1)
-        rows = zip(result.number.tolist(), result.t.tolist(), pairs.tolist(), strict=True)
-        writer.writerows([number, t, *values] for number, t, values in rows)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["number", "t", *(f"u.{name}.{what}" for name in inputs for what in ("recorded", "computed"))])
+    pairs = np.dstack([result.recorded[:, columns], result.computed[:, columns]]).reshape(len(result.number), -1)
+    rows = zip(result.number.tolist(), result.t.tolist(), pairs.tolist(), strict=True)
+    writer.writerows([number, t, *values] for number, t, values in rows)
+    write_text("--csv", path, text.getvalue())

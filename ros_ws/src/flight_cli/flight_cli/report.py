@@ -16,6 +16,7 @@ from flight_analysis.report.run_folder import read_flight, write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
 from flight_cli.output import LATEST, display_path, new_table, print_json, show_flight
 from flight_core.files import writing
+from flight_core.parameters import require
 
 
 def report(
@@ -23,6 +24,9 @@ def report(
         list[Path] | None, typer.Argument(help="Folder of a run, by default runs/latest; several are compared with the first.")
     ] = None,
     html: Annotated[Path | None, typer.Option(help="Page of a comparison; by default comparison.html beside run 1.")] = None,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder for the report of one run, by default that of its log: for archives.")
+    ] = None,
     png: Annotated[Path | None, typer.Option(help="Write y over y_m, e and u as one PNG figure.")] = None,
     csv: Annotated[
         Path | None, typer.Option(help="Write all signals as CSV, one row an instant, one column a channel.")
@@ -36,8 +40,9 @@ def report(
     """
     runs = runs or [LATEST]
     outputs = [("--png", png, write_png), ("--csv", csv, write_csv), ("--parquet", parquet, write_parquet)]
+    require(output is None or (len(runs) == 1 and html is None), "--output", "a comparison", "one run; --html for several")
     if len(runs) == 1 and html is None:
-        result = write_report(runs[0])
+        result = write_report(runs[0], output=output)
         flights, page = [result.flight], result.report
     else:
         flights, page = [read_flight(run) for run in runs], html or runs[0].absolute().parent / "comparison.html"

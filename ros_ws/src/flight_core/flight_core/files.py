@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Input and output files: existence checks, YAML, atomic replacement, sentences for files that cannot be read or written."""
 
+import errno
 import math
 import os
+import stat
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -129,11 +132,44 @@ def parse_yaml(content: bytes | str, key: str, expected: str) -> Any:
         raise ParameterError(f"{key}: not valid YAML ({what}), expected {expected}") from None
 
 
-def replace_text(path: Path, text: str) -> None:
-    """Write a text file atomically: after a crash the file has either its new or its old content."""
-    fresh = path.with_name(f"{path.name}.new")
-    with fresh.open("w", encoding="utf-8") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    fresh.replace(path)
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Write a file atomically: the stream becomes the file at `path` once the block ends, and is removed after an error.
+
+    After a crash, a kill or a full disk the file has either the new or the old content. The stream is a fresh file in the same
+    folder, so nothing is written through a link at `path`: the file replaces the link. Raises OSError, also for a `path` that
+    exists and is no regular file, such as a folder or a device.
+    """
+    with suppress(FileNotFoundError):  # also of a link to nothing
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            raise (
+                OSError(errno.EISDIR, os.strerror(errno.EISDIR))
+                if stat.S_ISDIR(mode)
+                else OSError(errno.EINVAL, "No regular file")
+            )
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=".new-")
+    fresh = Path(name)
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            yield stream
+            stream.flush()
+            os.fchmod(descriptor, 0o666 & ~_umask())
+            os.fsync(descriptor)
+        fresh.replace(path)
+    except BaseException:
+        fresh.unlink(missing_ok=True)
+        raise
+
+
+def _umask() -> int:
+    """The permissions that new files of this process lack; the only way to read them is to set them."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
+
+
+def write_file(path: Path, content: str | bytes) -> None:
+    """Write a file atomically, text as UTF-8, as `replacing` does. Raises OSError."""
+    with replacing(path) as stream:
+        stream.write(content.encode() if isinstance(content, str) else content)

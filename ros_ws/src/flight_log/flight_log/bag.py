@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Message, MessageIndex
 from mcap.writer import CompressionType, Writer
 
-from flight_core.files import read_yaml, replace_text
+from flight_core.files import read_yaml, write_file
 from flight_core.parameters import require
 from flight_log.disk import ReservedFile
 from flight_log.message_definitions import Definition, definition
@@ -200,7 +200,7 @@ class BagWriter:
             self._writer.finish()
         finally:
             self._file.close()
-        replace_text(self.directory / METADATA, metadata)
+        write_file(self.directory / METADATA, metadata)
 
 
 def read_metadata_records(path: Path) -> dict[str, dict[str, str]]:

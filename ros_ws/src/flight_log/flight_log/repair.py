@@ -14,7 +14,7 @@ from typing import NamedTuple
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from flight_core.files import is_file, replace_text
+from flight_core.files import is_file, replacing, write_file
 from flight_core.parameters import ParameterError, require
 from flight_log.bag import CHUNK_BYTES
 from flight_log.disk import try_lock
@@ -60,7 +60,7 @@ def repair(run: Path) -> Repair:
         repaired = [scan.rebuild() if scan.faults else scan.unchanged() for scan in scans]
         write = not lists_all_files or any(one.damaged for one in repaired)
         if write:
-            replace_text(directory / METADATA, bag_metadata_yaml([scan.contents() for scan in scans], previous))
+            write_file(directory / METADATA, bag_metadata_yaml([scan.contents() for scan in scans], previous))
     except OSError as error:
         raise ParameterError(f"{run}: cannot be repaired ({error.strerror}), expected a folder that can be written") from None
     *others, last = repaired
@@ -107,18 +107,11 @@ class _FileScan:
         """Write a file with all readable records, then replace the damaged file."""
         known = {identity: count for identity, count in self.messages.items() if identity in self.channels}
         require(bool(known), str(self.path), "no message that could be read", "any")
-        fresh = self.path.with_name(f"{self.path.name}.new")
-        try:
-            with fresh.open("wb") as stream:
-                writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-                self._copy(writer)
-                stream.flush()
-                os.fsync(stream.fileno())
+        with replacing(self.path) as stream:
+            self._copy(Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD))
+            stream.flush()
+            os.fsync(stream.fileno())  # a full disk shows here at the latest: the damaged file gets no second name then
             damaged = _keep_damaged(self.path)
-            fresh.replace(self.path)
-        except OSError:
-            fresh.unlink(missing_ok=True)
-            raise
         return FileRepair(self.path, sum(known.values()), self.last_ns, self.known_end_ns, self.faults, damaged)
 
     def _copy(self, writer: Writer) -> None:

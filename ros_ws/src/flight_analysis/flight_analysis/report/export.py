@@ -11,6 +11,7 @@ from flight_analysis.report import comparison
 from flight_analysis.report.data_frame import data_frame
 from flight_analysis.report.figures import GUST, REFERENCE, flight_end, gust_intervals
 from flight_analysis.report.summary import NO_UNIT, RecordedFlight, channel_label
+from flight_core.files import replacing
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 
@@ -38,12 +39,14 @@ def _joined_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
 
 def write_csv(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write the wide table as CSV. Numbers read back to the last bit; a null is an empty cell."""
-    _joined_table(flights).write_csv(path)
+    with replacing(path) as stream:
+        _joined_table(flights).write_csv(stream)
 
 
 def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write the wide table as Parquet (zstd)."""
-    _joined_table(flights).write_parquet(path)
+    with replacing(path) as stream:
+        _joined_table(flights).write_parquet(stream)
 
 
 class _PlotColumn(NamedTuple):
@@ -81,7 +84,8 @@ def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
             axis.set_axis_off()
     grid[0, 0].set_xlim(0.0, max(flight_end(flight.tape) for flight in flights) or 1.0)
     figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4, frameon=False)
-    figure.savefig(path, dpi=DPI, format="png")
+    with replacing(path) as stream:
+        figure.savefig(stream, dpi=DPI, format="png")
 
 
 def _channels(flights: Sequence[RecordedFlight], topic: str) -> list[str]:

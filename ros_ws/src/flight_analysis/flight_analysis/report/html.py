@@ -24,6 +24,7 @@ from flight_analysis.report.summary import (
     format_value,
     parts_legend,
 )
+from flight_core.files import write_file
 from flight_core.outcome import COMPLETED
 from flight_core.vectors import FloatArray
 
@@ -72,7 +73,7 @@ class Page(NamedTuple):
 def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write the page of a flight, or the comparison of several."""
     page = _flight_page(flights[0]) if len(flights) == 1 else _comparison_page(flights)
-    path.write_text(page_html(page), encoding="utf-8")
+    write_file(path, page_html(page))
 
 
 def _flight_page(flight: RecordedFlight) -> Page:

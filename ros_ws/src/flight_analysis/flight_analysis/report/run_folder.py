@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 import yaml
 
 from aircraft_sim.uncertainty import as_yaml
-from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, load_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_scenario, scenario_yaml
 from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise
-from flight_core.files import writing
+from flight_core.files import read_file, write_file, writing
 from flight_core.outcome import COMPLETED
-from flight_core.parameters import ParameterError, printable
+from flight_core.parameters import ParameterError, printable, require
 from flight_core.rates import NANOSECONDS
+from flight_core.scenario import A_SCENARIO
 from flight_core.tape import Tape
 from flight_log.bag import LogAttachments
 from flight_log.engagements import Engagement
@@ -68,18 +69,21 @@ def attachments_for(
 
 def _write(path: Path, text: str) -> Path:
     with writing("", path, "a folder and a disk that can"):
-        path.write_text(text, encoding="utf-8")
+        write_file(path, text)
     return path
 
 
 def read_flight(run: Path, outcome: str | None = None) -> RecordedFlight:
-    """Read a recorded flight, summarise it, and write its scenario beside the log.
+    """Read a recorded flight and summarise it. No file is written.
 
     Without an outcome, that of the run's summary is kept. Raises ParameterError where the log cannot be read, or holds no
     scenario.
     """
-    recorded = read_run(run)
-    folder, scenario = _folder(run), _extract_scenario(recorded, run)
+    return _flight(read_run(run), run, outcome)
+
+
+def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFlight:
+    folder, scenario = _folder(run), _scenario_in(recorded, run)
     signals = recorded.tape.signals if recorded.latency is None else {**recorded.tape.signals, "latency": recorded.latency}
     tape = _until_last_input(replace(recorded.tape, signals=signals))
     flown = recorded.engagements
@@ -111,34 +115,49 @@ def _engagement(tape: Tape, flown: Engagement) -> dict[str, Any]:
 
 def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
     """The scenario in a log, which is written beside the log. Raises ParameterError where the log holds none."""
-    return _extract_scenario(read_run(run, namespace), run)
+    recorded = read_run(run, namespace)
+    scenario = _scenario_in(recorded, run)
+    _write_scenario(recorded, scenario.path)
+    return scenario
 
 
-def _extract_scenario(recorded: RecordedRun, run: Path) -> Scenario:
+def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
+    """The scenario in a log, with its path beside the log. Raises ParameterError."""
     if recorded.scenario is None:
         raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
-    path, content = _folder(run) / recorded.scenario.name, recorded.scenario.content
-    if path.exists() and path.read_bytes() != content:
-        raise ParameterError(
-            f"{path}: found another file than the scenario that the log holds by this name, expected it elsewhere: "
-            "the scenario is written there"
-        )
-    with writing("", path.parent, "a folder that can"):
-        path.write_bytes(content)
-    return load_scenario(path)
+    return parse_scenario(recorded.scenario.content, _folder(run) / recorded.scenario.name)
 
 
-def write_report(run: Path, outcome: str | None = None) -> FlightResult:
-    """Read the bag back, write its scenario, summary.json and report.html beside it, and link runs/latest to the run.
+def _write_scenario(recorded: RecordedRun, path: Path) -> None:
+    """Write the scenario of a log, once. Raises ParameterError where a file with other content has its name."""
+    if recorded.scenario is None:
+        return
+    if path.is_symlink() or not path.exists():
+        with writing("", path.parent, "a folder that can"):
+            write_file(path, recorded.scenario.content)
+        return
+    require(
+        read_file(path, str(path), A_SCENARIO) == recorded.scenario.content,
+        str(path),
+        "another file than the scenario that the log holds by this name",
+        "it elsewhere: the scenario is written there",
+    )
 
-    Without an outcome the report of an old run is written again and runs/latest stays. Raises ParameterError as `read_flight`
-    does.
+
+def write_report(run: Path, outcome: str | None = None, output: Path | None = None) -> FlightResult:
+    """Read the bag back, write its scenario, summary.json and report.html, and link runs/latest to the run.
+
+    The files go beside the log, or into the folder `output`, which is created. Without an outcome the report of an old run is
+    written again and runs/latest stays. Raises ParameterError as `read_flight` does, before any file is written.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
-    flight, folder = read_flight(run, outcome), _folder(run)
+    recorded = read_run(run)
+    flight, folder = _flight(recorded, run, outcome), output or _folder(run)
     with writing("", folder, "a folder that can"):
-        (folder / SUMMARY).write_text(json.dumps(flight.summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_scenario(recorded, folder / flight.scenario.path.name)
+        write_file(folder / SUMMARY, json.dumps(flight.summary, indent=2, allow_nan=False) + "\n")
         write_page(folder / REPORT, [flight])
     if outcome is not None:
         link_latest(folder)
@@ -148,7 +167,7 @@ def write_report(run: Path, outcome: str | None = None) -> FlightResult:
 def write_empty_summary(run: Path, scenario: Scenario, outcome: str) -> None:
     """Write summary.json of a flight that ended before its first sample. The log stays as it is. Raises ParameterError."""
     with writing("", run, "a folder that can"):
-        (run / SUMMARY).write_text(json.dumps(empty_summary(scenario, outcome), indent=2) + "\n", encoding="utf-8")
+        write_file(run / SUMMARY, json.dumps(empty_summary(scenario, outcome), indent=2) + "\n")
     link_latest(run)
 
 
