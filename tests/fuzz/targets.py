@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 from tests.joint_states import JOINT_STATE, STORE, vector
+from tests.maps import MAP_FILES
 from tests.view_link import NodesInMemory
 
 from aircraft_sim.airframe import LIBRARY as AIRFRAMES
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
 from autopilot_bridge.bridge import Bridge
-from autopilot_bridge.params import LIBRARY as MAPS
 from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.replay import recorded_parameters, replay
 from flight_analysis.closed_loop.scenario import load_scenario
@@ -411,7 +411,7 @@ SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "metadata": _metadata,
     "scenario": lambda: _files(share() / "config"),
     "airframe": lambda: _files(AIRFRAMES),
-    "map": lambda: _files(MAPS),
+    "map": lambda: [path.read_bytes() for path in MAP_FILES.values()],
     "message": lambda: [_SAMPLE, _event(), vector(1, (), ())],
     "route": lambda: _ROUTES,
     "targets": _numbers,

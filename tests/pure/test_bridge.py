@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
+from tests.maps import named_map
 
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import to_raw
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from flight_bringup.clients import FlightMonitor
     from flight_bringup.processes import FlightProcesses
 
-CHANNEL_MAP = load_map("ardupilot_2024")
+CHANNEL_MAP = named_map("ardupilot_2024")
 OUTPUTS = tuple(CHANNEL_MAP.outputs)
 
 
@@ -176,7 +177,7 @@ def test_a_pilot_override_disengages_at_once_and_blocks_engagement() -> None:
 
 def test_an_override_of_a_bit_field_counts_its_masked_bits() -> None:
     """ROSflight's rc_override: 0x01 to 0x20 are switches and sticks, 0x40 to 0x200 flag missing commands."""
-    bridge = new_bridge(load_map("rosflight"))
+    bridge = new_bridge(named_map("rosflight"))
     bridge.take_override("transmitter", float(0x40 | 0x80 | 0x100 | 0x200), at(0.0))
     assert not bridge.refusal(at(0.0)).startswith("pilot override")
     for bit in (0x01, 0x02, 0x04, 0x08, 0x10, 0x20):
@@ -261,7 +262,7 @@ def test_a_low_pass_answers_a_step_as_first_order_does_at_any_spacing_of_samples
 
 
 def test_stamps_of_another_clock_and_samples_out_of_order_are_refused() -> None:
-    bridge = new_bridge(load_map("mavros"))
+    bridge = new_bridge(named_map("mavros"))
     with pytest.raises(ChannelError, match="stamp: arrival") as refused:
         bridge.take_output("q", 0.0, nanoseconds(12.0), at(0.0))  # time since boot
     assert refused.value.reason == "stamp"

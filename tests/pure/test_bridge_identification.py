@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy.signal import cont2discrete, dlsim
+from tests.maps import MAP_FILES
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
@@ -317,7 +318,7 @@ def test_a_refused_experiment_leaves_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     new, below_file = tmp_path / "found", tmp_path / "file" / "found"
     for name, folder, sentence in (
-        ("rosflight", new, "map rosflight: envelope: found none of"),
+        (str(MAP_FILES["rosflight"]), new, "map rosflight: envelope: found none of"),
         ("ardupilot", below_file, f"--write: {below_file} cannot be written (Not a directory)"),
     ):
         arguments = ["identify", "--bridge", name, "--speed", "25", "--write", str(folder)]

@@ -9,7 +9,6 @@ test_published_messages.py.
 
 import math
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace as Message
 from typing import Any
 
@@ -19,16 +18,18 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tests.conftest import REPOSITORY
+from tests.maps import MAP_FILES, named_map
 from tests.published_messages import FOREIGN_MAPS, PACKAGES, PUBLISHED, blank, kind
 
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.channel_map import STEP, Line, get_field, message_type, read_raw, set_field, to_channel, to_raw
-from autopilot_bridge.params import LIBRARY, BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
+from autopilot_bridge.params import MOVED, BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
-MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "autopilots.md"
+MAPS = sorted(MAP_FILES)
+PAGE = REPOSITORY / "docs" / "autopilots.md"
 LINES = st.builds(Line, st.sampled_from((-1, 1)), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
 FLU = Message(x=0.3, y=-0.2, z=-0.1)  # roll right at 0.3 rad/s, nose up at 0.2, nose right at 0.1
 FRD = np.array([0.3, 0.2, 0.1], dtype=np.float32)  # the same motion as a fixed array of a message
@@ -60,7 +61,7 @@ RELEASED = {"ardupilot": math.nan, "ardupilot_2024": math.nan, "px4": None, "mav
 @pytest.mark.parametrize("name", MAPS)
 @pytest.mark.parametrize("channel", ["q", "V", "p", "r"])
 def test_each_output_comes_in_si_and_frd(name: str, channel: str) -> None:
-    row = load_map(name).outputs[channel]
+    row = named_map(name).outputs[channel]
     message = AIRSPEED[name] if channel == "V" else RATES[name]
     value = to_channel(read_raw(message, row.field, row.function), row.line)
     assert value == pytest.approx(2.0 if channel == "V" else MOTION[channel], abs=1e-6)  # float32 in a message of PX4
@@ -68,7 +69,7 @@ def test_each_output_comes_in_si_and_frd(name: str, channel: str) -> None:
 
 @pytest.mark.parametrize("name", MAPS)
 def test_each_input_is_sent_in_the_autopilots_unit_and_sign(name: str) -> None:
-    for (path, expected), row in zip(SENT[name].items(), load_map(name).inputs.values(), strict=True):
+    for (path, expected), row in zip(SENT[name].items(), named_map(name).inputs.values(), strict=True):
         assert path in (row.field, f"{row.message}.{row.field}")
         assert to_raw(row.trim + 0.1, row.line) == pytest.approx(expected, abs=1e-3)  # the fields in us are integers
 
@@ -76,7 +77,7 @@ def test_each_input_is_sent_in_the_autopilots_unit_and_sign(name: str) -> None:
 @pytest.mark.parametrize("name", FOREIGN_MAPS)
 def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name: str) -> None:
     """A float32 has 24 bits, so a value is kept to 1e-7 of its size; an integer field rounds to half a unit."""
-    channel_map = load_map(name)
+    channel_map = named_map(name)
     foreign = {key: kind_ for key, _, kind_ in channel_map.used_topics() if kind_ in PUBLISHED}
     messages = {key: blank(kind_) for key, kind_ in foreign.items()}
     assert {kind_.split("/")[0] for kind_ in foreign.values()} <= {"px4_msgs", "mavros_msgs", "rosflight_msgs", "rosplane_msgs"}
@@ -111,8 +112,8 @@ def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name
 @pytest.mark.parametrize("name", MAPS)
 def test_each_input_of_a_map_states_its_own_trim_and_sign(name: str) -> None:
     """A merged row would hand a changed trim or sign of the elevator to the other inputs."""
-    inputs = (LIBRARY / f"{name}.yaml").read_text(encoding="utf-8").split("\ninputs:\n")[1].split("\n\n")[0]
-    assert [inputs.count(f"\n    {key}: ") for key in ("trim", "sign")] == 2 * [len(load_map(name).inputs)]
+    inputs = MAP_FILES[name].read_text(encoding="utf-8").split("\ninputs:\n")[1].split("\n\n")[0]
+    assert [inputs.count(f"\n    {key}: ") for key in ("trim", "sign")] == 2 * [len(named_map(name).inputs)]
 
 
 MEASURED = {  # Hz, as the stack receives them from PX4 1.16.0 and ArduPlane 4.8.0-dev in SITL
@@ -124,7 +125,7 @@ MEASURED = {  # Hz, as the stack receives them from PX4 1.16.0 and ArduPlane 4.8
 @pytest.mark.parametrize("name", MEASURED)
 def test_a_lost_message_does_not_end_an_engagement(name: str) -> None:
     """Each age limit is longer than two periods at the measured rate."""
-    channel_map = load_map(name)
+    channel_map = named_map(name)
     rows = (*channel_map.outputs.values(), *channel_map.pose.values(), *channel_map.trims.values())
     ages = [(row.topic, row.max_age) for row in rows] + [(row.topic, row.max_age) for row in channel_map.conditions.values()]
     for topic, rate in MEASURED[name].items():
@@ -138,13 +139,13 @@ def test_a_lost_message_does_not_end_an_engagement(name: str) -> None:
 )
 def test_a_map_and_its_page_name_the_release_of_the_definitions(name: str, package: str) -> None:
     release = PACKAGES[package].partition(",")[0]
-    assert release in load_map(name).source
+    assert release in named_map(name).source
     assert release in PAGE.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", MAPS)
 def test_each_map_is_a_dry_run_by_default_and_names_the_source_of_each_row(name: str) -> None:
-    channel_map = load_map(name)
+    channel_map = named_map(name)
     assert channel_map.dry_run
     assert list(channel_map.outputs) == ["q", "V", "p", "r"]
     assert list(channel_map.inputs) == ["elevator", "thrust", "aileron", "rudder"]
@@ -156,12 +157,12 @@ def test_each_map_is_a_dry_run_by_default_and_names_the_source_of_each_row(name:
 
 
 def test_the_map_of_older_sources_of_ardupilot_needs_only_message_types_of_common_interfaces() -> None:
-    types = {kind for _, _, kind in load_map("ardupilot_2024").used_topics()}
+    types = {kind for _, _, kind in named_map("ardupilot_2024").used_topics()}
     stamped = {f"geometry_msgs/msg/{kind}Stamped" for kind in ("Pose", "Twist", "Vector3")}
     assert types == {*stamped, "sensor_msgs/msg/Joy"}
 
 
-shipped = cache(load_map)  # parsed once, not for each example
+shipped = cache(named_map)  # parsed once, not for each example
 ANGLE = st.floats(-math.pi, math.pi)
 TURN_NED_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # x east, y north, z up
 TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
@@ -198,7 +199,7 @@ POSES["rosflight"] = Message(p_n=40.0, p_e=30.0, p_d=-20.0)
 
 @pytest.mark.parametrize("name", POSES)
 def test_position_and_velocity_are_north_east_and_up(name: str) -> None:
-    rows = load_map(name).pose
+    rows = named_map(name).pose
     expected = {"north": 40.0, "east": 30.0, "altitude": 20.0, "v_north": 4.0, "v_east": 3.0, "climb": 2.0}
     missing = {"v_north", "v_east", "climb"} if name == "rosflight" else set()  # it publishes the velocity in body axes
     assert expected.keys() - rows.keys() == missing
@@ -210,7 +211,7 @@ def test_position_and_velocity_are_north_east_and_up(name: str) -> None:
 @pytest.mark.parametrize("name", ["mavros", "rosflight"])
 def test_an_override_that_is_offered_reliably_is_not_lost(name: str) -> None:
     """Publishers of rc_io.cpp:47 and rosflight_io.cpp:534, with ROS 2's default reliability."""
-    channel_map = load_map(name)
+    channel_map = named_map(name)
     assert {channel_map.topics[row.topic].reliability for row in channel_map.overrides.values()} == {"reliable"}
 
 
@@ -313,7 +314,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
     ("place", "value", "sentence"), REFUSALS, ids=lambda one: ".".join(one) if isinstance(one, tuple) else ""
 )
 def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], value: object, sentence: str) -> None:
-    content = yaml.safe_load((LIBRARY / "ardupilot_2024.yaml").read_text(encoding="utf-8"))
+    content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text(encoding="utf-8"))
     part = content
     for key in place[:-1]:
         part[key] = dict(part[key])  # merged keys share one object
@@ -324,8 +325,17 @@ def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], va
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("name", MOVED)
+def test_a_moved_map_is_named_with_its_file(name: str) -> None:
+    with pytest.raises(ParameterError) as refused:
+        BridgeConfig.validate_mapping({"map": name}, "bridge")
+    moved = f"examples/maps/{name}.yaml"
+    assert str(refused.value) == f"bridge.map: found {name!r}, expected the path of its file, in the repository {moved}"
+    assert MAP_FILES[name] == REPOSITORY / moved
+
+
 def test_a_missing_map_is_one_sentence() -> None:
-    sentence = r"bridge\.map: found 'nowhere', expected one of ardupilot, ardupilot_2024, mavros, px4, rosflight"
+    sentence = r"bridge\.map: found 'nowhere', expected one of ardupilot, px4, or the path of a channel map"
     with pytest.raises(ParameterError, match=sentence):
         BridgeConfig.validate_mapping({"map": "nowhere"}, "bridge")
     with pytest.raises(ParameterError, match="lockstep"):

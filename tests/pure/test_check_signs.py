@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from tests.maps import MAP_FILES, named_map
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
-from autopilot_bridge.params import LIBRARY, ChannelMap, load_map
+from autopilot_bridge.params import ChannelMap, load_map
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.response_identification import MIN_RATIO, Response, identify_response
 from flight_analysis.design.sign_check import SignCheck, check, recorded_response, through
@@ -28,7 +29,7 @@ from flight_log.tape_writer import write_run
 from rise_di_controller.laws import AnyLaw
 
 app = application([*COMMANDS])
-MAPS = sorted(path.stem for path in LIBRARY.glob("*.yaml"))
+MAPS = sorted(MAP_FILES)
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
 AIRFRAME = load_airframe("osprey")
 OMEGA: FloatArray = AIRFRAME.matrix_c() @ AIRFRAME.matrix_b()
@@ -46,7 +47,7 @@ def changed(original: ChannelMap, kind: str, channel: str, **values: Any) -> Cha
 
 @pytest.mark.parametrize("name", MAPS)
 def test_the_shipped_maps_fit_the_controller_of_the_osprey(name: str) -> None:
-    result = CliRunner().invoke(app, ["check-signs", name, "--json"])
+    result = CliRunner().invoke(app, ["check-signs", str(MAP_FILES[name]), "--json"])
     assert result.exit_code == 0
     channels = [(one["output"], one["input"], one["D"]) for one in json.loads(result.stdout)["channels"]]
     assert channels == [("q", "elevator", 1), ("p", "aileron", 1), ("r", "rudder", 1), ("V", "thrust", 1)]
@@ -55,13 +56,13 @@ def test_the_shipped_maps_fit_the_controller_of_the_osprey(name: str) -> None:
 def test_through_a_map_of_the_right_signs_omega_is_that_of_the_airframe() -> None:
     assert AIRFRAME.outputs == ("q", "V", "p", "r")  # as in the maps
     for name in MAPS:
-        assert through(load_map(name), OMEGA) == pytest.approx(OMEGA)
+        assert through(named_map(name), OMEGA) == pytest.approx(OMEGA)
 
 
 @pytest.mark.parametrize("channel", INPUTS)
 @pytest.mark.parametrize("name", MAPS)
 def test_an_input_with_the_wrong_sign_changes_its_own_d_only(name: str, channel: str) -> None:
-    original, k = load_map(name), INPUTS.index(channel)
+    original, k = named_map(name), INPUTS.index(channel)
     row = original.inputs[channel]
     span = sum(row.range)  # the sign changes about the middle, so that trim stays inside the range
     flipped = changed(original, "inputs", channel, sign=-row.sign, offset=row.offset + row.sign * row.scale * span)

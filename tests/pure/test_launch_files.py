@@ -20,6 +20,7 @@ from diagnostic_msgs.msg import KeyValue
 from tests import launch_stand_in as stand_in
 from tests.conftest import REPOSITORY
 from tests.launch_stand_in import ExecuteProcess, LaunchContext, Node, OpaqueFunction, ProcessExited, TimerAction
+from tests.maps import MAP_FILES
 
 from autopilot_bridge.params import LIBRARY, BridgeConfig, load_map
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, parse_scenario_sections
@@ -297,7 +298,7 @@ def test_a_bridge_is_a_dry_run_by_default_and_its_topics_are_recorded(tmp_path: 
     assert "bridge/would_send" in recorder["topics"]
     assert bridge["map"] in recorder["attach"]
     slow = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
-    follow = all_ready(*started("bridge", map="ardupilot_2024", scenario=slow, dry_run="false", runs=tmp_path))
+    follow = all_ready(*started("bridge", map=str(MAP_FILES["ardupilot_2024"]), scenario=slow, dry_run="false", runs=tmp_path))
     assert overrides(nodes(follow)["bridge"])["dry_run"] is False
     assert not every(TimerAction, follow)  # until Ctrl-C
     follow = all_ready(*started("bridge", map="ardupilot", duration=5, runs=tmp_path))

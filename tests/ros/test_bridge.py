@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The bridge, over DDS: the unchanged controller flies a simulated autopilot through the shipped map `ardupilot_2024`.
+"""The bridge, over DDS: the unchanged controller flies a simulated autopilot through the map examples/maps/ardupilot_2024.yaml.
 
 tests/ros/autopilot.py is no autopilot. These tests show that frames, signs, rates, quality of service and engagement agree with
 the map, not that the map agrees with ArduPilot.
@@ -28,13 +28,14 @@ from sensor_msgs.msg import FluidPressure, Imu, Joy
 from std_msgs.msg import UInt8
 from std_srvs.srv import SetBool
 from tests.conftest import REPOSITORY
+from tests.maps import MAP_FILES, named_map
 from tests.ros.conftest import Process, Start, settable_clock
 from tests.ros.peer import HANG, Peer, peer, stamp_ns
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.channel_map import message_type, read_raw, set_field, to_channel, to_raw
-from autopilot_bridge.params import LIBRARY, load_map
+from autopilot_bridge.params import LIBRARY
 from flight_bringup import processes
 from flight_bringup.clients import ControlClient
 from flight_cli.cli import COMMANDS, application
@@ -61,7 +62,7 @@ class BridgeSetup:
     def __init__(self, start: Start, peer_node: Peer, folder: Path) -> None:
         self._start = start
         self.map = str(folder / "ardupilot.yaml")
-        Path(self.map).write_bytes((LIBRARY / "ardupilot_2024.yaml").read_bytes())
+        Path(self.map).write_bytes(MAP_FILES["ardupilot_2024"].read_bytes())
         self.change_age_limits(MAX_AGE)
         self.peer = peer_node
         self.joys: list[Joy] = []
@@ -557,7 +558,7 @@ def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeS
 
 
 def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Start) -> None:
-    bridge = start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot_2024")
+    bridge = start("autopilot_bridge.main", "--ros-args", "-p", f"map:={MAP_FILES['ardupilot_2024']}")
     with peer(topics=()) as other:
         other.node.create_publisher(TwistStamped, "/ap/airspeed", 10)  # as an AP_DDS would whose type has changed
         other.node.create_subscription(Imu, "/ap/joy", lambda _: None, 10)
@@ -598,7 +599,7 @@ AIRSPEED = Vector3Stamped(vector=Vector3(x=-18.0, y=18.0, z=-9.0))  # of length 
 def test_outputs_are_read_from_real_messages(name: str, message: Any, expected: dict[str, float]) -> None:
     message = serialised(message)
     for channel, value in expected.items():
-        row = load_map(name).outputs[channel]
+        row = named_map(name).outputs[channel]
         assert message_type(row.type) is type(message)
         assert to_channel(read_raw(message, row.field, row.function), row.line) == pytest.approx(value)
 
@@ -609,7 +610,7 @@ def test_a_real_pressure_gives_the_speed() -> None:
 
 
 def test_inputs_are_written_into_a_real_joy() -> None:
-    channel_map = load_map("ardupilot_2024")
+    channel_map = named_map("ardupilot_2024")
     message = Joy()
     for path, value in channel_map.messages["joy"].values.items():
         set_field(message, path, value)

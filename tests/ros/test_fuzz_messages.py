@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message
 from tests.conftest import REPOSITORY, few
 from tests.joint_states import vector
+from tests.maps import named_map
 
 from autopilot_bridge.channel_map import message_type, read_raw
-from autopilot_bridge.params import load_map
 from flight_core.authentication import MessageAuthenticator
 from flight_core.vectors import ChannelError
 from flight_ros.messages import Decoder, Encoder
@@ -79,7 +79,7 @@ def test_any_payload_is_decoded_or_rejected_without_effect_on_the_next_one(raw: 
 @many
 @given(st.data())
 def test_any_payload_of_an_autopilots_topic_is_a_value_or_rejected(data: st.DataObject) -> None:
-    channel_map = load_map("ardupilot_2024")  # its message types are installed
+    channel_map = named_map("ardupilot_2024")  # its message types are installed
     row = data.draw(st.sampled_from([*channel_map.outputs.values()]))
     kind: Any = message_type(row.type)
     raw = data.draw(payloads() | st.binary(max_size=200))

@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 
 import pytest
 from tests.conftest import REPOSITORY
+from tests.maps import MAP_FILES, named_map
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer
 
-from autopilot_bridge.params import LIBRARY, load_map
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.clients import FlightMonitor
 from flight_bringup.graph import GUIDANCE, parameter_overrides
@@ -121,12 +121,12 @@ def test_the_policy_allows_exactly_those_of_the_flight_monitor(osprey_gust: Scen
 
 
 def test_the_policy_allows_exactly_those_of_the_bridge_with_every_map(start: Start, peer_node: Peer) -> None:
-    maps = [load_map(path.stem) for path in sorted(LIBRARY.glob("*.yaml"))]
+    maps = [named_map(name) for name in MAP_FILES]
     used = [row for channel_map in maps for row in channel_map.used_topics()]
     published = {topic for key, topic, _ in used if key.startswith("messages.")}
     subscribed = {topic for key, topic, _ in used if not key.startswith("messages.")}
     policy = allowed()["bridge"]
-    start("autopilot_bridge.main", "--ros-args", "-p", "map:=ardupilot_2024").wait_for("dry run")
+    start("autopilot_bridge.main", "--ros-args", "-p", f"map:={MAP_FILES['ardupilot_2024']}").wait_for("dry run")
     own = discovered(peer_node, ("bridge",))["bridge"]
     assert own.publish | published == policy.publish
     assert own.subscribe | subscribed == policy.subscribe

@@ -15,13 +15,14 @@ import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from std_srvs.srv import SetBool
+from tests.maps import named_map
 from tests.published_messages import PACKAGES, PUBLISHED, kind
 from tests.pure.test_channel_map import AIRSPEED, MAPS, MOTION, RATES, SENT
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer, peer
 
 from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field, to_channel, to_raw
-from autopilot_bridge.params import ChannelMap, load_map
+from autopilot_bridge.params import ChannelMap
 
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 STORED = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -65,7 +66,7 @@ def fill(message: Any, like: SimpleNamespace) -> Any:
 @pytest.mark.parametrize("channels", ["qpr", "V"])
 @pytest.mark.parametrize("name", MAPS)
 def test_outputs_are_read_from_real_messages(name: str, channels: str) -> None:
-    channel_map = load_map(name)
+    channel_map = named_map(name)
     needs_packages_of(channel_map)
     for channel in channels:
         row = channel_map.outputs[channel]
@@ -77,7 +78,7 @@ def test_outputs_are_read_from_real_messages(name: str, channels: str) -> None:
 
 @pytest.mark.parametrize("name", MAPS)
 def test_inputs_are_written_into_real_messages(name: str) -> None:
-    channel_map = load_map(name)
+    channel_map = named_map(name)
     needs_packages_of(channel_map)
     for (path, expected), row in zip(SENT[name].items(), channel_map.inputs.values(), strict=True):
         message = message_type(channel_map.messages[row.message].type)()

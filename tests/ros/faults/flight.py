@@ -28,10 +28,10 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
 from tests.conftest import REPOSITORY
+from tests.maps import MAP_FILES
 from tests.ros.conftest import Process, logged
 from tests.ros.peer import peer
 
-from autopilot_bridge.params import LIBRARY
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
@@ -270,7 +270,7 @@ RELEASE_AFTER = 3.0  # s without a message: RC_OVERRIDE_TIME of ArduPilot
 
 def fast_map(folder: Path) -> Path:
     """The map of the simulated autopilot with 200 messages a second, as an observer's loop with a small delay needs them."""
-    content = yaml.safe_load((LIBRARY / "ardupilot_2024.yaml").read_text(encoding="utf-8"))
+    content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text(encoding="utf-8"))
     content["messages"]["joy"]["rate"] = 200.0
     path = folder / "map.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")

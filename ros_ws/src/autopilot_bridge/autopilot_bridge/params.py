@@ -16,6 +16,7 @@ from flight_core.files import is_file, read_yaml
 from flight_core.parameters import Config, KeyedConfig, NonNegative, Numbers, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
+MOVED = ("ardupilot_2024", "mavros", "rosflight")  # to examples/maps: these maps have not flown
 
 Motion = Literal[
     "nose up",
@@ -292,6 +293,7 @@ def maps() -> list[str]:
 
 def find_map(name: str) -> Path:
     """The file of a channel map, by its name in the library or by its path, which ends in .yaml. Raises ParameterError."""
+    require(name not in MOVED, "map", f"{name!r}", f"the path of its file, in the repository examples/maps/{name}.yaml")
     path = Path(name) if name.endswith(".yaml") else LIBRARY / f"{name}.yaml"
     require(is_file(path), "map", f"{name!r}", f"one of {', '.join(maps())}, or the path of a channel map ending in .yaml")
     return path.absolute()
