@@ -10,7 +10,7 @@ SOURCES = Path(__file__).resolve().parent
 TESTS = SOURCES.parents[1] / "tests"
 
 MODULES = {
-    "flight_core": "pure: authentication fields file_writing parameters publisher_lock scheduling vectors",
+    "flight_core": "pure: authentication fields file_writing parameters publisher_lock scheduling text vectors",
     "flight_log": "pure: bag follow full_disk log_contents playback recorded_before repair",
     "flight_ros": "pure: lockstep_inputs ticker; ros: fuzz_messages health messages rclpy_private security",
     "reference_model": "pure: live_commands reference_model; ros: live_commands",

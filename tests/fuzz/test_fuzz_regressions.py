@@ -18,9 +18,10 @@ from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.html import script_json
-from flight_analysis.report.run_folder import read_flight
+from flight_analysis.report.run_folder import read_flight, recorded_scenario
 from flight_core.files import parse_yaml
-from flight_core.parameters import MAX_SENTENCE_LENGTH, ParameterError
+from flight_core.parameters import ParameterError
+from flight_core.text import MAX_LENGTH
 from flight_log.playback import read_playback
 from flight_log.repair import repair
 from flight_log.rosbag2_metadata import METADATA, read_bag_metadata
@@ -93,7 +94,7 @@ def test_a_channel_with_an_invalid_quality_of_service_is_repaired(tmp_path: Path
 def test_a_scenario_in_a_log_is_extracted_without_overwriting_the_log(name: str, tmp_path: Path, osprey_gust: Scenario) -> None:
     log_before = constant_flight(osprey_gust, name=name)
     run = write_run(tmp_path, log_before)
-    read_flight(run)
+    recorded_scenario(run)
     assert (run / "run_0.mcap").read_bytes() == log_before
     kept = "x.yaml" if name == "../../x.yaml" else "scenario.yaml"
     assert {path.name for path in run.iterdir()} == {"run_0.mcap", kept}
@@ -153,7 +154,7 @@ def test_an_error_is_one_printable_sentence() -> None:
     message = str(ParameterError("found \x1b[2J\r\na" + "x" * 5000))
     assert message.startswith(r"found \x1b[2J\r\na")
     assert message.isprintable()
-    assert len(message) <= MAX_SENTENCE_LENGTH + 10
+    assert len(message) <= MAX_LENGTH + 10
 
 
 def test_text_of_a_log_cannot_end_the_script_of_the_page() -> None:

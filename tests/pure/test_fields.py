@@ -12,6 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from flight_core.fields import Field, Kind, Problems, kind_of
+from flight_core.files import dump_yaml, parse_yaml
 from flight_core.parameters import Config, ParameterError
 
 # Each with the declaration of rules as its argument: the stack's Field or pydantic's.
@@ -117,3 +118,38 @@ def test_a_set_is_frozen_and_comes_back_from_its_dump_and_its_json() -> None:
 def test_a_rule_or_a_type_that_no_parameter_has_is_an_error_of_the_declaration(annotation: Any) -> None:
     with pytest.raises(TypeError):
         kind_of(annotation)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 1e-3),
+        ("6e1", 60.0),
+        ("1.0e12", 1e12),
+        (".5", 0.5),
+        ("-2", -2),
+        ("0x1F", 31),
+        ("0o17", 15),
+        ("-.inf", -math.inf),
+    ],
+)
+def test_numbers_are_those_of_yaml_1_2(text: str, value: float) -> None:
+    """Values by hand, from the core schema of YAML 1.2.2, section 10.3.2."""
+    read = parse_yaml(f"a: {text}", "file", "a mapping")["a"]
+    assert (type(read), read) == (type(value), value)
+
+
+@pytest.mark.parametrize("text", ["060", "1:00", "1_000", "0b11", "1e", "-"])
+def test_ambiguous_numbers_are_no_numbers(text: str) -> None:
+    """YAML 1.1 reads 060 as 48 and 1:00 as 60. Such text stays text, so a number field refuses it."""
+    assert parse_yaml(f"a: '{text}'\nb: {text if text != '-' else repr(text)}", "file", "a mapping") == {"a": text, "b": text}
+
+
+@given(st.recursive(st.text() | st.floats(allow_nan=False) | st.integers() | st.booleans(), st.lists))
+def test_dumped_yaml_reads_back(value: object) -> None:
+    assert parse_yaml(dump_yaml({"a": value}), "file", "a mapping") == {"a": value}
+
+
+@pytest.mark.parametrize("text", ["1e3", "0o17", "1.0e5", "12e45", ".5"])
+def test_text_like_a_number_is_quoted(text: str) -> None:
+    assert parse_yaml(dump_yaml({"a": text}), "file", "a mapping") == {"a": text}

@@ -51,7 +51,7 @@ BAD = {
     ("/**/recorder:\n  ros__parameters:", "/**/recorder:\n  parameters:"): "recorder: found no parameters under",
     ("duration: 60.0", "duration: [60.0"): "bad.yaml: not valid YAML",
     ("duration: 60.0", "duration: 2001-99-99"): "bad.yaml: not valid YAML",
-    ("duration: 60.0", "duration: 0b_"): "bad.yaml: not valid YAML",
+    ("duration: 60.0", "duration: 060"): "flight.duration: found '060', expected a number",
     ("duration: 60.0", "duration: " + 5000 * "["): "bad.yaml: not valid YAML",
     ("duration: 60.0", "duration: 60.0\n    duration: 50.0"): "bad.yaml: not valid YAML (found the key duration twice",
     ("duration: 60.0", "duration: 1.0e+7"): "flight.duration: found 10000000.0, expected less than or equal to 1000000",
@@ -201,7 +201,6 @@ def test_an_airframe_file_with_invalid_yaml_or_a_duplicate_key_is_one_sentence(t
     whole = (LIBRARY / "osprey.yaml").read_text(encoding="utf-8")
     for text, what in (
         ("speed: 2001-99-99", "month must be in"),
-        ("speed: 0b_", "invalid literal"),
         (5000 * "[", "recursion"),
         (whole + "\nname: other\n", "found the key name twice"),
     ):

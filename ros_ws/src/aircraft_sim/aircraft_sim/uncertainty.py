@@ -5,11 +5,11 @@
 from typing import Literal
 
 import numpy as np
-import yaml
 
 from aircraft_sim import random_streams
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import AIR_STATE
+from flight_core.files import dump_yaml
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
@@ -88,4 +88,4 @@ def sampled_matrices(
 
 def as_yaml(airframe: Airframe) -> str:
     """An airframe as the text of an airframe file, whose numbers read back as they are to the last bit."""
-    return yaml.safe_dump(airframe.model_dump(mode="json"), sort_keys=False, default_flow_style=None, width=128)
+    return dump_yaml(airframe.model_dump(mode="json"))

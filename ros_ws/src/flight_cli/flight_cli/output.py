@@ -29,6 +29,7 @@ from flight_analysis.report.summary import (
     table_rows,
 )
 from flight_core.files import write_file, writing
+from flight_core.text import printable
 
 ENDED_EARLY, INTERRUPTED = 3, 130  # exit statuses; bad input is 2 (`flight_cli.cli`)
 LATEST = Path("runs/latest")  # the run of a command that is given none
@@ -146,5 +147,5 @@ def write_text(option: str, path: Path, text: str) -> None:
 
 
 def display_path(path: Path) -> str:
-    """A path relative to the working folder if it is below it, else as it is."""
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+    """A path relative to the working folder if it is below it, else as it is; unprintable characters as escapes."""
+    return printable(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from flight_analysis.report.run_folder import PARAMETERS
+from flight_cli.output import display_path
 from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError
 from flight_core.rates import seconds
@@ -29,7 +30,7 @@ def repair(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> Non
     if repaired.wrote_metadata:
         print(f"{METADATA} written; {_missing_at_end(run, repaired.files[-1])}")
     else:
-        print(f"{run} is intact: nothing to repair")
+        print(f"{display_path(run)} is intact: nothing to repair")
 
 
 def _missing_at_end(run: Path, last: FileRepair) -> str:

@@ -104,6 +104,8 @@ def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) 
 
 def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
     def content(value: str, key: str, problems: Problems) -> Any:
+        if not value.isprintable():
+            return problems.refuse(key, value, "printable characters")
         if len(value) < min_length:
             return problems.refuse(key, value, f"at least {min_length} character{'s' * (min_length > 1)}")
         if pattern and not re.fullmatch(pattern, value):

@@ -5,6 +5,7 @@
 import errno
 import math
 import os
+import re
 import stat
 import tempfile
 from collections.abc import Iterator
@@ -22,6 +23,8 @@ from flight_core.parameters import ParameterError, require
 # or for nesting that is too deep.
 NOT_YAML = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
+INT_TAG, FLOAT_TAG = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+
 MAX_FILE_BYTES = 1 << 19
 """Bytes. A scenario has 4 kB, metadata.yaml of 500 topics less than this. PyYAML needs up to 0.2 kB and 5 us a byte."""
 
@@ -29,10 +32,17 @@ MAX_YAML_NODES = 100_000
 """Values of a file after expansion of its aliases. A few lines of nested aliases can expand to billions of values."""
 
 
-class _Loader(Composer, yaml.CSafeLoader):
-    """Rejects duplicate keys, of which PyYAML keeps the last, and aliases that expand to more than MAX_YAML_NODES values.
+INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)|0o[0-7]+|0x[0-9a-fA-F]+")
+FLOAT = re.compile(r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
+"""Numbers of the core schema of YAML 1.2.2, section 10.3.2, without leading zeros: 060 is 48 by YAML 1.1 and 60 by YAML 1.2.
+The same section has no 1:00, which is 60 by YAML 1.1, and no 1_000. All three are strings here, so no number is guessed."""
 
-    libyaml parses, nine times as fast as Python. Python composes: where nesting is deep, libyaml's binding exhausts the stack.
+
+class _Loader(Composer, yaml.CSafeLoader):
+    """Reads numbers as YAML 1.2, rejects duplicate keys and aliases that expand to more than MAX_YAML_NODES values.
+
+    PyYAML keeps the last of duplicate keys. libyaml parses, nine times as fast as Python. Python composes: where nesting is
+    deep, libyaml's binding exhausts the stack.
     """
 
     def __init__(self, stream: str) -> None:
@@ -54,6 +64,29 @@ class _Loader(Composer, yaml.CSafeLoader):
                     raise yaml.composer.ComposerError(None, None, f"found the key {key.value} twice", key.start_mark)
                 keys.add((key.tag, key.value))
         return node
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes each string that `_Loader` would read as a number."""
+
+
+def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
+    return int(loader.construct_scalar(node), 0)
+
+
+for _class in (_Loader, _Dumper):
+    _class.yaml_implicit_resolvers = {
+        first: [resolver for resolver in resolvers if _class is _Dumper or resolver[0] not in {INT_TAG, FLOAT_TAG}]
+        for first, resolvers in _class.yaml_implicit_resolvers.items()
+    }
+    for _tag, _pattern in ((INT_TAG, INTEGER), (FLOAT_TAG, FLOAT)):
+        _class.add_implicit_resolver(_tag, re.compile(rf"(?:{_pattern.pattern})\Z"), list("-+.0123456789"))
+_Loader.add_constructor(INT_TAG, _integer)
+
+
+def dump_yaml(value: object, *, flow: bool | None = None) -> str:
+    """A value as YAML text that `parse_yaml` reads back: lists of scalars in one line, everything in blocks with flow False."""
+    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=flow, width=128)
 
 
 def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:

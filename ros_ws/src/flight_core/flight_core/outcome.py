@@ -2,10 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Outcomes of a flight."""
 
+from flight_core.text import bounded
+
 COMPLETED = "completed"
 INTERRUPTED = "interrupted"
 LOST_CONTACT = "lost contact with"  # before the name of another node: the end of a node that is not the cause
 
 
 class FlightEnded(RuntimeError):  # noqa: N818 - the end of a flight is not a program error
-    """A flight cannot continue. The message is one sentence for the user."""
+    """A flight cannot continue. The message is one sentence for the user, printable and bounded."""
+
+    def __init__(self, sentence: str) -> None:
+        super().__init__(bounded(sentence))

@@ -17,25 +17,14 @@ from collections.abc import Iterator, Mapping, Sequence, Set
 from typing import Annotated, Any, ClassVar, Literal, Self, dataclass_transform, get_origin
 
 from flight_core.fields import REQUIRED, Field, FieldInfo, Problems, short_repr
-
-MAX_SENTENCE_LENGTH = 1000  # characters of an error sentence, however long the bad input is
-
-
-def printable(text: str) -> str:
-    """A text with unprintable characters, such as line ends and terminal control codes, written as escapes."""
-    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+from flight_core.text import bounded
 
 
 class ParameterError(ValueError):
-    """An invalid parameter or parameter set. The message is one sentence for the user.
-
-    Unprintable characters are written as escapes; the middle of a long sentence is left out.
-    """
+    """An invalid parameter or parameter set. The message is one sentence for the user, printable and bounded."""
 
     def __init__(self, sentence: str) -> None:
-        if len(sentence) > MAX_SENTENCE_LENGTH:
-            sentence = f"{sentence[: MAX_SENTENCE_LENGTH // 2]} ... {sentence[5 - MAX_SENTENCE_LENGTH // 2 :]}"
-        super().__init__(printable(sentence))
+        super().__init__(bounded(sentence))
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(Field,))

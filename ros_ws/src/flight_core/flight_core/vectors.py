@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_core.rates import seconds
+from flight_core.text import bounded
 
 FloatArray = NDArray[np.float64]
 Array = Any  # an array of NumPy or of JAX
@@ -61,10 +62,10 @@ class StampedVector(NamedTuple):
 
 
 class ChannelError(ValueError):
-    """An invalid sample. `reason` is a short word for counters; the message is a sentence."""
+    """An invalid sample. `reason` is a short word for counters; the message is a sentence, printable and bounded."""
 
     def __init__(self, reason: str, sentence: str) -> None:
-        super().__init__(sentence)
+        super().__init__(bounded(sentence))
         self.reason = reason
 
 

@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
-from flight_core.files import is_file, is_folder, parse_yaml, read_yaml
+from flight_core.files import dump_yaml, is_file, is_folder, parse_yaml, read_yaml
 from flight_core.parameters import ParameterError, require
 
 ROSBAG2_VERSION = 9
@@ -109,7 +107,7 @@ def bag_metadata_yaml(files: Sequence[FileContents], previous: Mapping[str, Any]
         "custom_data": kept.get("custom_data"),
         "ros_distro": kept.get("ros_distro", "jazzy"),
     }
-    return yaml.safe_dump({INFORMATION: information}, sort_keys=False)
+    return dump_yaml({INFORMATION: information}, flow=False)
 
 
 def _profiles(qos: str) -> list[Any]:

@@ -14,9 +14,10 @@ from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from numpy.typing import NDArray
 
 from flight_core.files import is_file, is_folder
-from flight_core.parameters import ParameterError, printable, require
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
+from flight_core.text import printable
 from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
 from flight_log.latency import TOPICS as TIMED_TOPICS
@@ -75,7 +76,7 @@ def read_run(run: Path, namespace: str | None = None) -> RecordedRun:
     aircraft = _namespace_of_one_aircraft(filled, namespace, str(run))
     names = _names_within(aircraft, filled)
     require(bool(names), str(run), f"topics that begin with no slash: {', '.join(filled)}", "a recorded flight")
-    signals = {name: filled[topic] for topic, name in names.items()}
+    signals = {printable(name): filled[topic] for topic, name in names.items()}
     start_ns = _start_ns(signals)
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
     told = [log.topics[topic].note(name) for topic, name in names.items()]
@@ -195,7 +196,7 @@ class _TopicSamples:
         if np.any(stamps[1:] < stamps[:-1]):
             order = np.argsort(stamps, kind="stable")
             stamps, values = stamps[order], values[order]
-        return Signal(stamps, names, values)
+        return Signal(stamps, tuple(map(printable, names)), values)
 
     def _names(self) -> tuple[str, ...]:
         """The names of the first sample, or of more samples that have further names beside these."""

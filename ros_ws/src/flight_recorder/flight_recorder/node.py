@@ -12,7 +12,6 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
-import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Log, ParameterEvent
 from rclpy.exceptions import InvalidTopicNameException
@@ -20,7 +19,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_topic_name import validate_topic_name
 
 from flight_core.authentication import LENGTH_PLACE, mac_slice
-from flight_core.files import is_file, writing
+from flight_core.files import dump_yaml, is_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_log.bag import LOST_MESSAGES, BagChannel, BagWriter, LogAttachments
@@ -125,7 +124,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return PolledSubscription(self, topic, qos, raw=True)
 
     def _record(self, subscription: PolledSubscription, offered: Sequence[QoSProfile]) -> _RecordedTopic:
-        qos = yaml.safe_dump(rosbag2_profiles(offered), sort_keys=False)
+        qos = dump_yaml(rosbag2_profiles(offered), flow=False)
         channel = self._bag.add_topic(subscription.name, type_name(subscription.topic.type), qos)
         return _RecordedTopic(subscription, channel)
 

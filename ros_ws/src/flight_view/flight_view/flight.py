@@ -19,9 +19,10 @@ from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.metrics import settling_bands
 from flight_analysis.report.summary import display_units, pulse_edges
 from flight_core.modes import Mode
-from flight_core.parameters import ParameterError, printable
+from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
+from flight_core.text import printable
 from flight_guidance import modes as guidance
 from flight_guidance.odometry import ROUTE_FRAMES
 from flight_guidance.path import route_outline
@@ -81,7 +82,7 @@ class Flight:
 
     def __init__(self, run: Path, now: Callable[[], float] = time.monotonic) -> None:
         self.run = run
-        self.name = run.stem if run.is_file() else run.resolve().name
+        self.name = printable(run.stem if run.is_file() else run.resolve().name)
         self.samples: dict[str, Series] = {}  # by topic
         self.events: list[Event] = []
         modes = {"": Mode, "mode": guidance.Mode, "mode.lateral": guidance.Lateral, "mode.vertical": guidance.Vertical}

@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import yaml
-
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.pose import every
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
-from flight_core.files import read_file
+from flight_core.files import dump_yaml, read_file
 from flight_core.parameters import Config, ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario import A_SCENARIO, Sections, parse_sections
@@ -158,7 +156,7 @@ def scenario_yaml(scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]]
         merged = schema.validate_mapping(section.model_dump() | dict((overrides or {}).get(name, {})), name)
         # The start time is known only once all nodes run; `truth` holds it.
         sections[f"/**/{name}"] = {"ros__parameters": _yaml_values(merged.model_dump(exclude={"start_time"}))}
-    return yaml.safe_dump(sections, sort_keys=False, default_flow_style=None, width=128)
+    return dump_yaml(sections)
 
 
 def _yaml_values(values: Any) -> Any:

@@ -23,6 +23,7 @@ from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, M
 from flight_analysis.design.identification import SOFTENING, reference_parameters
 from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
 from flight_analysis.design.response_identification import MIN_RATIO, Response, Spans
+from flight_core.files import dump_yaml
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
@@ -391,7 +392,7 @@ def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Chann
         "B": [[float(f"{value:.4g}") for value in row] for row in B],
     }
     Airframe.validate_mapping(values, "airframe")
-    return yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=128)
+    return dump_yaml(values)
 
 
 def signs_alone(sign: FloatArray) -> Channels:
@@ -412,7 +413,7 @@ def scenario_text(
         "recorder": {"rate": 100.0},
     }
     body = {f"/**/{name}": {"ros__parameters": values} for name, values in sections.items()}
-    return f"# {heading}\n" + yaml.safe_dump(body, sort_keys=False, default_flow_style=None, width=128)
+    return f"# {heading}\n" + dump_yaml(body)
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,17 +11,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_scenario, scenario_yaml
 from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise
-from flight_core.files import read_file, write_file, writing
+from flight_core.files import dump_yaml, read_file, write_file, writing
 from flight_core.outcome import COMPLETED
-from flight_core.parameters import ParameterError, printable, require
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.scenario import A_SCENARIO
 from flight_core.tape import Tape
+from flight_core.text import printable
 from flight_log.bag import LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.provenance import provenance
@@ -63,7 +62,7 @@ def attachments_for(
     attached = [_write(run / PARAMETERS, scenario_yaml(scenario, overrides)), *further]
     if not scenario.aircraft.is_jsbsim:
         attached.append(_write(run / AIRFRAME, as_yaml(scenario.aircraft.sampled_airframe())))
-    notes = _write(run / PROVENANCE, yaml.safe_dump(provenance(), sort_keys=False))
+    notes = _write(run / PROVENANCE, dump_yaml(provenance(), flow=False))
     return LogAttachments(scenario.path, tuple(attached), notes)
 
 
@@ -89,7 +88,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     flown = recorded.engagements
     if outcome == COMPLETED and "internals" not in tape and flown is None:
         outcome = "the controller never engaged"
-    name = folder.name if run.is_dir() else run.stem
+    name = printable(folder.name if run.is_dir() else run.stem)
     engaged = _engaged(tape, flown or [])
     has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample
     summary = summarise(scenario, engaged if has_figures else tape, outcome or _previous_outcome(folder / SUMMARY))
