@@ -29,6 +29,7 @@ MODULES = {
     "flight_bringup": "pure: launch_files; ros: flight real_time_flight lockstep node_state nodes own_aircraft policy"
     " faults/faults faults/lockstep_faults",
     "flight_view": "pure: view view_control view_foxglove view_page; ros: control",
+    "rise_di": "pure: rise_di",
     "flight_cli": "pure: cli report_command; ros: play; fuzz: fuzz_command_line",
 }
 """Packages with the modules of their tests by folder: "ros: recorder" is tests/ros/test_recorder.py."""

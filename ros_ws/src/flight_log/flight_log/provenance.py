@@ -30,6 +30,7 @@ STACK = (
     "flight_view",
     "flight_guidance",
     "reference_model",
+    "rise_di",
     "rise_di_controller",
 )
 # The dependencies that the numbers and the bytes of a flight depend on; the middleware by the names of its wheels.
