@@ -29,7 +29,7 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
 MAPS = sorted(MAP_FILES)
-PAGE = REPOSITORY / "docs" / "autopilots.md"
+PAGE = REPOSITORY / "docs" / "autopilots-reference.md"
 LINES = st.builds(Line, st.sampled_from((-1, 1)), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))
 FLU = Message(x=0.3, y=-0.2, z=-0.1)  # roll right at 0.3 rad/s, nose up at 0.2, nose right at 0.1
 FRD = np.array([0.3, 0.2, 0.1], dtype=np.float32)  # the same motion as a fixed array of a message

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The maps of PX4, MAVROS and ROSflight with the real message packages, where these are installed.
 
-None of them is on PyPI; `make messages` builds each from its sources (docs/autopilots.md). Without them
+None of them is on PyPI; `make messages` builds each from its sources (docs/autopilots-reference.md). Without them
 tests/pure/test_channel_map.py tests each row with the published fields.
 """
 
