@@ -3,6 +3,7 @@
 """Writing and reading bags: with independent readers, truncated and damaged files, bags of other recorders."""
 
 import struct
+import sys
 import tracemalloc
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import get_types_from_msg
 from tests.joint_states import JOINT_STATE, STORE, vector
 from tests.recordings import summary_of, truncate
 
@@ -270,6 +272,17 @@ def test_definitions_include_all_referenced_types() -> None:
     assert [line for line in lines if line.startswith("MSG: ")] == ["MSG: builtin_interfaces/Time", "MSG: std_msgs/Header"]
     with pytest.raises(ParameterError, match="install the package no_such_msgs"):
         definition("no_such_msgs/msg/Thing")
+
+
+@pytest.mark.parametrize("type_name", [JOINT_STATE, "nav_msgs/msg/Path", "diagnostic_msgs/msg/DiagnosticArray"])
+def test_definitions_need_no_ros_package(type_name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Rosbags has the fields and the hash of the installed definition, without comments."""
+    installed = definition(type_name)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    alone = definition.__wrapped__(type_name)
+    assert alone.type_hash == installed.type_hash
+    assert get_types_from_msg(alone.text, type_name) == get_types_from_msg(installed.text, type_name)
 
 
 def test_stamps_of_signals_may_differ_in_number(recorded: Path) -> None:

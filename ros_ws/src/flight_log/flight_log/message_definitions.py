@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Message definitions of the installed packages, for MCAP and rosbag2. Reads share folders; needs no ROS at run time."""
+"""Message definitions for MCAP and rosbag2: of the installed packages, else of rosbags. Needs no ROS at run time."""
 
 import json
 import os
@@ -22,12 +22,21 @@ class Definition(NamedTuple):
 
 @cache
 def definition(name: str) -> Definition:
-    """Definition of "pkg/msg/Type". Raises ParameterError when its package is not installed.
+    """Definition of "pkg/msg/Type". Raises ParameterError when neither an installed package nor rosbags has the type.
 
     The text is the main definition, then for each referenced type a line of 80 "=", "MSG: pkg/Type" and its definition (MCAP
     registry, schema encoding ros2msg). The hash is that of REP 2016, read from the JSON of the package.
+    rosbags knows the common types of ROS 2 Jazzy: the same fields and the same hash, without comments.
     """
-    description = json.loads(_read(name, "json"))
+    try:
+        description = json.loads(_read(name, "json"))
+    except ParameterError:
+        from flight_log.named_vectors import typestore  # noqa: PLC0415 - loads rosbags, which a recorder lacks
+
+        store = typestore()
+        if name not in store.fielddefs:
+            raise
+        return Definition(name, store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name))
     parts = [_read(name, "msg")]
     for referenced in description["type_description_msg"]["referenced_type_descriptions"]:
         package, _, kind = referenced["type_name"].partition("/msg/")
