@@ -20,7 +20,7 @@ SHELL := /bin/bash
 BIN := $(CURDIR)/.venv/bin
 PACKAGES := $(notdir $(patsubst %/package.xml,%,$(wildcard ros_ws/src/*/package.xml)))
 # With symlinks in place only these need another build; Python sources are live.
-BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/config/*.yaml ros_ws/src/*/launch/*.py)
+BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/*/config/*.yaml ros_ws/src/*/launch/*.py)
 
 FLY_GROUPS := --group ros --group core --group report --group build
 ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group docs --group dev
@@ -94,6 +94,7 @@ setup-all: .venv/.all .venv/.workspace
 	@touch .venv/.fly .venv/.messages $@
 
 .venv/.workspace: $(BUILD_INPUTS) | .venv/.fly
+	@mkdir -p ros_ws/build ros_ws/install && find ros_ws/build ros_ws/install -xtype l -delete # colcon keeps links to files that moved, and fails
 	cd ros_ws && PATH="$(BIN):$$PATH" colcon build --symlink-install --event-handlers console_cohesion- status-
 	@printf '%s\n' $(PACKAGES:%=$(CURDIR)/ros_ws/build/%) \
 	  > "$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/rise_di_workspace.pth"

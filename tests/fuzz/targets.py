@@ -35,7 +35,7 @@ from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.params import load_map
 from flight_analysis.closed_loop.replay import recorded_parameters, replay
 from flight_analysis.closed_loop.scenario import load_scenario
-from flight_bringup.scenarios import find_scenario, share
+from flight_bringup.scenarios import LIBRARY, find_scenario
 from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError, StampedVector
@@ -409,7 +409,7 @@ def _numbers() -> list[bytes]:
 SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "mcap": _mcaps,
     "metadata": _metadata,
-    "scenario": lambda: _files(share() / "config"),
+    "scenario": lambda: _files(LIBRARY),
     "airframe": lambda: _files(AIRFRAMES),
     "map": lambda: [path.read_bytes() for path in MAP_FILES.values()],
     "message": lambda: [_SAMPLE, _event(), vector(1, (), ())],

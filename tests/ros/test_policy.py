@@ -18,7 +18,7 @@ from flight_bringup.clients import FlightMonitor
 from flight_bringup.graph import GUIDANCE, parameter_overrides
 from flight_bringup.scenarios import find_scenario
 
-POLICY = REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "security" / "flight.policy.xml"
+POLICY = REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "flight_bringup" / "security" / "flight.policy.xml"
 
 
 class Access(NamedTuple):

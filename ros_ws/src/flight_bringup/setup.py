@@ -12,11 +12,12 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_bringup", "flight_bringup.launch"],
+    package_data={"flight_bringup": ["config/*.yaml", "security/*.xml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_bringup"]),
         ("share/flight_bringup", ["package.xml"]),
         ("share/flight_bringup/launch", sorted(glob("launch/*.launch.py"))),
-        ("share/flight_bringup/config", sorted(glob("config/*.yaml"))),
-        ("share/flight_bringup/security", sorted(glob("security/*"))),
+        ("share/flight_bringup/config", sorted(glob("flight_bringup/config/*.yaml"))),
+        ("share/flight_bringup/security", sorted(glob("flight_bringup/security/*.xml"))),
     ],
 )

@@ -3,6 +3,7 @@
 """The scenarios of the stack, the file of a scenario's name, and scenarios with a route."""
 
 from collections.abc import Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +13,17 @@ from flight_core.parameters import require
 from flight_guidance.feasibility import speeds
 from flight_guidance.route_file import Waypoint
 
-
-def share() -> Path:
-    """The folder with `config/` and `launch/`: share/flight_bringup of an installed workspace, else the source tree."""
-    package = Path(__file__).resolve().parent
-    installed = package.parents[3] / "share" / "flight_bringup"
-    return installed if installed.is_dir() else package.parent
+LIBRARY = Path(str(files("flight_bringup"))) / "config"
 
 
 def scenarios() -> list[str]:
-    """Names of the scenarios in `config/`."""
-    return sorted(path.stem for path in (share() / "config").glob("*.yaml"))
+    """Names of the scenarios in LIBRARY."""
+    return sorted(path.stem for path in LIBRARY.glob("*.yaml"))
 
 
 def find_scenario(name: str, duration: Any = None) -> Scenario:
-    """A scenario by its name in `config/`, or by the path of a file (.yaml), of a `duration` in s. Raises ParameterError."""
-    path = Path(name) if name.endswith(".yaml") else share() / "config" / f"{name}.yaml"
+    """A scenario by its name in LIBRARY, or by the path of a file (.yaml), of a `duration` in s. Raises ParameterError."""
+    path = Path(name) if name.endswith(".yaml") else LIBRARY / f"{name}.yaml"
     require(is_file(path), "scenario", f"{name!r}", f"one of {', '.join(scenarios())}, or the path of a scenario file (.yaml)")
     scenario = load_scenario(path.absolute())
     return scenario if duration is None else scenario.vary(flight={"duration": duration})
