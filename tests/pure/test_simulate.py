@@ -2,16 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The closed loop in one process: its tracking error, and the order of the error in the sampling period."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, partial
+from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.closed_loop.simulate import fly, simulate
 from flight_analysis.metrics import tracking_error
+from flight_analysis.report.run_folder import attachments_for
+from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
+from flight_log.tape_writer import TapeWriter, write_run
 
 DISPLAY_FACTORS = np.array([1e3, 1.0, 1e3, 1e3])  # q, V, p, r in mrad/s and m/s
 ABOVE_SLEW = [29.4, 22.5, 10.2, 7.8]  # 30 deg/s, 15, 60, 130 %/s: above the slew of the ideal control in the gusts
@@ -27,7 +32,7 @@ def rms(osprey_gust: Scenario) -> Rms:
     """
 
     @cache
-    def fly(
+    def fly_once(
         *,
         rate: float = 100.0,
         sign: str = "implicit",
@@ -47,7 +52,7 @@ def rms(osprey_gust: Scenario) -> Rms:
         errors: FloatArray = np.sqrt(np.mean(error.values**2, axis=0)) * DISPLAY_FACTORS
         return errors
 
-    return fly
+    return fly_once
 
 
 def test_error_in_the_gusts_with_beta_above_the_slew_of_the_ideal_control(rms: Rms) -> None:
@@ -86,3 +91,39 @@ def test_progress_is_reported_once_per_second(osprey_gust: Scenario) -> None:
     reported: list[float] = []
     simulate(osprey_gust.vary(flight={"duration": 3.0}), reported.append)
     assert reported == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_flight_records_one_second_at_a_time(osprey_gust: Scenario) -> None:
+    """Memory of a flight does not grow with its duration: no part is longer than a second."""
+    scenario = osprey_gust.vary(flight={"duration": 3.0})
+    parts: list[Mapping[str, Signal]] = []
+    assert fly(scenario, parts.append) == "completed"
+    assert max(len(part["y"].stamp_ns) for part in parts) <= scenario.aircraft.rate + 1
+    tape = simulate(scenario)
+    for topic, signal in tape.signals.items():
+        assert sum(len(part[topic].stamp_ns) for part in parts if topic in part) == len(signal.stamp_ns)
+        assert (np.diff(signal.stamp_ns) > 0).all()
+
+
+def test_log_in_parts_equals_log_at_once(osprey_gust: Scenario, tmp_path: Path) -> None:
+    """Message by message, for samples of y that are 0.1 s late, so that parts overlap."""
+    scenario = osprey_gust.vary(flight={"duration": 3.0}, aircraft={"sensors": {"delay": 0.1}})
+    attachments = attachments_for(scenario, tmp_path)
+    tape = simulate(scenario)
+    once = write_run(tape, tmp_path / "once", attachments)
+    with TapeWriter(tmp_path / "parts", attachments) as writer:
+        for second in range(4):
+            writer.write({topic: part_of(signal, second) for topic, signal in tape.signals.items()})
+    assert messages_of(once) == messages_of(writer.path)
+
+
+def part_of(signal: Signal, second: int) -> Signal:
+    return signal.where(signal.stamp_ns // 1_000_000_000 == second)
+
+
+def messages_of(path: Path) -> list[tuple[object, ...]]:
+    with path.open("rb") as stream:
+        return [
+            (channel.topic, message.log_time, message.sequence, message.data)
+            for _, channel, message in make_reader(stream).iter_messages(log_time_order=False)
+        ]

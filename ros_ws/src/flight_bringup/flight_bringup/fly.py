@@ -8,20 +8,23 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.run_folder import attachments_for
 from flight_analysis.report.summary import display_units
 from flight_bringup.graph import Autopilot
 from flight_bringup.processes import FlightProcesses, handle_signals
+from flight_core.files import writing
 from flight_core.outcome import COMPLETED, INTERRUPTED
 from flight_core.signals import handle_shutdown
-from flight_log.tape_writer import write_run
+from flight_core.tape import Signal
+from flight_log.tape_writer import EXPECTED, TapeWriter
 
 if TYPE_CHECKING:
     from flight_bringup.clients import FlightMonitor
@@ -141,7 +144,36 @@ def _follow_lockstep(scenario: Scenario, processes: FlightProcesses, monitor: "F
 
 def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
     """Fly in one process without ROS, as fast as the machine allows, and write the bag into `run`. Returns the outcome."""
-    with handle_signals(_interrupt):
-        tape = simulate(scenario, lambda t: progress(t, "in one process"))
-    write_run(tape, run, attachments_for(scenario, run))
-    return tape.outcome
+    interrupt = _DeferredInterrupt()
+
+    def record(signals: Mapping[str, Signal]) -> None:
+        with interrupt.deferred():
+            writer.write(signals)
+
+    with writing("", run, EXPECTED), TapeWriter(run, attachments_for(scenario, run)) as writer, handle_signals(interrupt):
+        return fly(scenario, record, lambda t: progress(t, "in one process"))
+
+
+class _DeferredInterrupt:
+    """A signal handler that interrupts the flight between two writes of the log, not within a write."""
+
+    def __init__(self) -> None:
+        self._deferred = False
+        self._pending: tuple[int, FrameType | None] | None = None
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        if self._deferred:
+            self._pending = number, frame
+        else:
+            _interrupt(number, frame)
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Within the block a signal waits for its end."""
+        self._deferred = True
+        try:
+            yield
+        finally:
+            self._deferred = False
+        if self._pending is not None:
+            _interrupt(*self._pending)

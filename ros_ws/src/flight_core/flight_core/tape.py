@@ -37,11 +37,22 @@ class Signal:
         count = int(np.searchsorted(self.stamp_ns, end_ns, side="right"))
         return Signal(self.stamp_ns[:count], self.names, self.values[:count])
 
+    def where(self, keep: NDArray[np.bool_]) -> "Signal":
+        """The samples of a mask, shape (N,)."""
+        return Signal(self.stamp_ns[keep], self.names, self.values[keep])
+
+    def after(self, earlier: "Signal | None") -> "Signal":
+        """The samples of an earlier part, if there is one, then these; both have the same channels."""
+        if earlier is None:
+            return self
+        stamp_ns = np.concatenate([earlier.stamp_ns, self.stamp_ns])
+        return Signal(stamp_ns, self.names, np.concatenate([earlier.values, self.values]))
+
     def within(self, windows: Sequence[tuple[int, int]]) -> "Signal":
         """The samples inside windows (first, last instant), ns."""
         inside = [(self.stamp_ns >= first) & (self.stamp_ns <= last) for first, last in windows]
         keep = np.logical_or.reduce(inside, axis=0) if inside else np.zeros(len(self.stamp_ns), dtype=bool)
-        return Signal(self.stamp_ns[keep], self.names, self.values[keep])
+        return self.where(keep)
 
     def group(self, prefix: str) -> "Signal":
         """The channels "prefix.name", as a signal with channels "name"."""

@@ -2,32 +2,79 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes a Tape as an MCAP bag, without ROS. A flight in one process and one over topics leave the same kind of log."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
 from flight_core.files import writing
-from flight_core.tape import Tape
-from flight_log.bag import BagWriter, LogAttachments
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal, Tape
+from flight_log.bag import BagChannel, BagWriter, LogAttachments
 from flight_log.named_vectors import JOINT_STATE, Samples, encoded
+
+EXPECTED = "a folder and a disk that can"
+
+DELAY_NS = NANOSECONDS
+"""The longest delay of a sample for which messages of successive parts of a flight are in the order of their stamps."""
 
 
 def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
     """Write the tape and the attachments as a bag into a folder; return the path of the MCAP file.
 
-    Each sample becomes a message. Its log time is its stamp. Messages are in the order of time. Raises ParameterError when the
-    bag cannot be written.
+    Raises ParameterError where the bag cannot be written.
     """
-    signals = list(tape.signals.values())
-    messages = [encoded(Samples(one.names, one.stamp_ns, one.values, "in_process")) for one in signals]
-    stamps = np.concatenate([one.stamp_ns for one in signals])
-    columns = np.repeat(np.arange(len(signals)), [len(one.stamp_ns) for one in signals])
-    indexes = np.concatenate([np.arange(len(one.stamp_ns)) for one in signals])
-    order = np.argsort(stamps, kind="stable")
-    rows = zip(*(values[order].tolist() for values in (stamps, columns, indexes)), strict=True)
-    with writing("", directory, "a folder and a disk that can"), BagWriter(directory) as bag:
-        bag.add_attachments(attachments, tape.start_ns)
-        channels = [bag.add_topic(f"/{name}", JOINT_STATE, "") for name in tape.signals]
-        for stamp_ns, column, index in rows:
-            bag.write(channels[column], stamp_ns, stamp_ns, index + 1, messages[column][index].tobytes())
-    return bag.path
+    with writing("", directory, EXPECTED), TapeWriter(directory, attachments, tape.start_ns) as writer:
+        writer.write(tape.signals)
+    return writer.path
+
+
+class TapeWriter:
+    """Writes a flight part by part as a bag. Each sample becomes a message, whose log time is the stamp.
+
+    Messages are in the order of time: the samples of the last DELAY_NS wait for the next part. Raises OSError where the bag
+    cannot be written.
+    """
+
+    def __init__(self, directory: Path, attachments: LogAttachments, start_ns: int = 0) -> None:
+        self._bag = BagWriter(directory)
+        try:
+            self._bag.add_attachments(attachments, start_ns)
+        except BaseException:
+            self._bag.close()
+            raise
+        self._channels: dict[str, BagChannel] = {}
+        self._waiting: dict[str, Signal] = {}
+        self.path = self._bag.path
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self._write(self._waiting)
+        finally:
+            self._bag.close()
+
+    def write(self, signals: Mapping[str, Signal]) -> None:
+        """Write the samples of a part of a flight, by topic."""
+        joined = {topic: signal.after(self._waiting.get(topic)) for topic, signal in signals.items()}
+        newest_ns = max((int(signal.stamp_ns.max()) for signal in joined.values() if len(signal.stamp_ns)), default=0)
+        due = {topic: signal.stamp_ns <= newest_ns - DELAY_NS for topic, signal in joined.items()}
+        self._waiting = {topic: signal.where(~due[topic]) for topic, signal in joined.items()}
+        self._write({topic: signal.where(due[topic]) for topic, signal in joined.items()})
+
+    def _write(self, signals: Mapping[str, Signal]) -> None:
+        for topic in signals:
+            if topic not in self._channels:
+                self._channels[topic] = self._bag.add_topic(f"/{topic}", JOINT_STATE, "")
+        messages = [encoded(Samples(part.names, part.stamp_ns, part.values, "in_process")) for part in signals.values()]
+        channels = [self._channels[topic] for topic in signals]
+        counts = [len(signal.stamp_ns) for signal in signals.values()]
+        stamps = np.concatenate([signal.stamp_ns for signal in signals.values()])
+        columns, indexes = np.repeat(np.arange(len(counts)), counts), np.concatenate([np.arange(count) for count in counts])
+        order = np.argsort(stamps, kind="stable")
+        for stamp_ns, column, index in zip(*(values[order].tolist() for values in (stamps, columns, indexes)), strict=True):
+            channel = channels[column]
+            self._bag.write(channel, stamp_ns, stamp_ns, channel.messages + 1, messages[column][index].tobytes())

@@ -3,7 +3,7 @@
 """The closed loop in one process, without ROS: the code of the nodes, called in the order of the data flow."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
@@ -12,7 +12,7 @@ from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario, require_euler
 from flight_core.channels import ATTITUDE, POSE
 from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
-from flight_core.rates import nanoseconds, seconds
+from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from flight_guidance.guidance import Guidance
@@ -20,9 +20,12 @@ from flight_guidance.params import GuidanceConfig
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
 
+Record = Callable[[Mapping[str, Signal]], None]
+"""Takes the samples of a part of a flight, by topic."""
+
 
 class _SignalBuilder:
-    """Collects the samples of one signal of a tape."""
+    """Collects the samples of one topic."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = tuple(names)
@@ -33,23 +36,44 @@ class _SignalBuilder:
         self.stamps.append(stamp_ns)  # first: an interrupt before the next line leaves a stamp without a row
         self.rows.append(row)
 
-    def build(self) -> Signal:
+    def take(self) -> Signal:
+        """The samples since the last call."""
         values = np.array(self.rows) if self.rows else np.zeros((0, len(self.names)))
-        return Signal(np.array(self.stamps[: len(values)], dtype=np.int64), self.names, values)
+        signal = Signal(np.array(self.stamps[: len(values)], dtype=np.int64), self.names, values)
+        self.stamps, self.rows = [], []
+        return signal
 
 
-def simulate(  # noqa: PLR0912 - one a node
+def simulate(
     scenario: Scenario,
     progress: Callable[[float], None] | None = None,
     guide: Callable[[GuidanceConfig], Guidance] = Guidance,
 ) -> Tape:
-    """Fly a scenario and return its tape. `progress` is called with the flight time once per simulated second.
+    """Fly a scenario and return its tape; `outcome` of the tape has the reason of an early end. The rest is as `fly` says."""
+    parts: list[Mapping[str, Signal]] = []
+    outcome = fly(scenario, parts.append, progress, guide)
+    signals = {}
+    for topic, last in parts[-1].items():
+        samples = [part[topic] for part in parts if topic in part]
+        stamp_ns = np.concatenate([signal.stamp_ns for signal in samples])
+        signals[topic] = Signal(stamp_ns, last.names, np.concatenate([signal.values for signal in samples]))
+    return Tape(signals, outcome=outcome)
 
-    `guide` makes the guidance of a scenario that has it: another one may receive another pose than the true one.
+
+def fly(  # noqa: PLR0912, PLR0915 - a part a node
+    scenario: Scenario,
+    record: Record,
+    progress: Callable[[float], None] | None = None,
+    guide: Callable[[GuidanceConfig], Guidance] = Guidance,
+) -> str:
+    """Fly a scenario and return the outcome. `record` takes the samples once per simulated second and at the end.
+
+    `progress` is called with the flight time after `record`. `guide` makes the guidance of a scenario that has a section for
+    it; the default receives the true pose.
 
     Order at each instant: y of the aircraft, y_m of the reference model, u_m of guidance, u of the controller. The aircraft
-    holds u until the next one. A lost sample of y is not on the tape; a delayed one has its own stamp. A flight that diverges
-    or is interrupted (Ctrl-C) ends early: the tape holds the samples so far, and its `outcome` the reason.
+    holds u until the next u. A lost sample of y is not recorded; a delayed sample has its own stamp. A flight that diverges
+    or is interrupted (Ctrl-C) ends early.
     """
     require_euler(scenario)
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
@@ -82,10 +106,11 @@ def simulate(  # noqa: PLR0912 - one a node
                         with suppress(ChannelError):  # refused, as by the node
                             guidance.take_y(StampedVector(sample.stamp_ns, y), t_ns)
                 if t_ns % (aircraft.pose_every * aircraft.period_ns) == 0:
-                    signals["pose"].add(t_ns, aircraft.pose())
+                    pose = aircraft.pose()
+                    signals["pose"].add(t_ns, pose)
                     if guidance is not None:
                         with suppress(ChannelError):
-                            guidance.take_pose(StampedVector(t_ns, signals["pose"].rows[-1]), t_ns)
+                            guidance.take_pose(StampedVector(t_ns, pose), t_ns)
                 signals["truth"].add(t_ns, aircraft.truth())
             if t_ns % reference.period_ns == 0:
                 y_m = reference.sample(t_ns // reference.period_ns)
@@ -101,12 +126,15 @@ def simulate(  # noqa: PLR0912 - one a node
                 u = select(aircraft.inputs, inputs, output.u)
                 signals["u"].add(output.stamp_ns, output.u)
                 signals["internals"].add(output.stamp_ns, output.internals)
-            if progress is not None and t_ns % 1_000_000_000 == 0:
-                progress(seconds(t_ns))
+            if t_ns % NANOSECONDS == 0:
+                record({topic: builder.take() for topic, builder in signals.items()})
+                if progress is not None:
+                    progress(seconds(t_ns))
     except KeyboardInterrupt:
         outcome = INTERRUPTED
     except FlightEnded as error:
         outcome = str(error)
     except ChannelError as error:  # commands or noise overflow
         outcome = f"ended at t = {seconds(t_ns):.2f} s: {error}"
-    return Tape({name: signal.build() for name, signal in signals.items()}, outcome=outcome)
+    record({topic: builder.take() for topic, builder in signals.items()})
+    return outcome
