@@ -6,7 +6,7 @@
 # make test-fast   the quick tests without ROS, for the inner loop
 # make test-sitl   fly a real autopilot in software: docs/autopilots.md
 # make docs   write the site of docs/ to site/; make docs ARGS=serve shows it while it is written
-# make evidence   measure what has not been measured yet, write docs/evidence.md     make evidence ARGS="--again speed"
+# make evidence   measure what has no file in docs/evidence/, write docs/evidence.md     make evidence ARGS="--again speed"
 # make foxglove   what `rise-di watch --foxglove` needs
 # make messages PACKAGE=... SOURCE=...   build a message package of an autopilot for the stack: docs/autopilots.md
 # make setup   what flying and its report need: .venv/, the workspace built, .venv/bin/rise-di; make setup-all: campaigns and tests too

@@ -1,22 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes docs/evidence.md from measurements: runs the missing ones, stores each result, renders the page from the results.
+"""Measures: each measurement writes its figures to docs/evidence/NAME.csv, and docs/evidence.md is written from these files.
 
-    make evidence                              # the missing measurements, then the page
-    make evidence ARGS="--again faults"        # measure this one again; "speed" is all that begin so; repeatable
-    make evidence ARGS="--again long"          # those of up to 80 min each, which nothing else runs: "long-faults" is one
-    make evidence ARGS=--quick                 # short versions; the page marks them
-    make evidence ARGS=--render                # only the page, from the stored results
+    make evidence                              # what has no file yet, or failed
+    make evidence ARGS="--again faults"        # measure this again; "speed" is all that begin so; repeatable
+    make evidence ARGS="--again long"          # those of up to 80 min each, which run by name alone: "long-faults" is one
+    make evidence ARGS=--quick                 # short versions, to build/evidence: for a look, not to be quoted
 
-build/evidence/ holds one file for each result, with its command, date, host, and the load of the host before. A failed
-measurement is stored as failed and marked on the page. A section of the page without any result here stays as it is. The text
-around the figures is in evidence.md.jinja.
+A measurement that fails leaves its exit status as a goal that is not met. build/evidence/ has the logs.
 """
 
 import argparse
 import json
 import os
-import platform
 import re
 import signal
 import subprocess
@@ -25,20 +21,20 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 from xml.etree import ElementTree
 
 import psutil
-from benchmarks.evidence_page import LONG_FLIGHTS, SPEED, Measurement, Result, render
+from benchmarks import evidence_rows
+from benchmarks.evidence_data import BUSY, FOLDER, REPOSITORY, Measured, Row, origin, read, row, write
+from benchmarks.evidence_page import TITLES, write_page
 from benchmarks.processes import RISE_DI
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-RESULTS = REPOSITORY / "build" / "evidence"
-PAGE = REPOSITORY / "docs" / "evidence.md"
-
-LOAD_INTERVAL = 2.0  # s before a measurement, over which the load of the host is measured
+BUILD = REPOSITORY / "build" / "evidence"
+EXIT_STATUS = "exit status"  # name of a row
+BUSY_SHARE = 0.1  # of the processors, in use just before or after a measurement
+LOAD_INTERVAL = 2.0  # s before and after a measurement, over which the load of the host is measured
 
 FILE, PYTHON = "FILE", "python"  # placeholders in commands
 PYTEST = (PYTHON, "-m", "pytest", "-q", f"--junitxml={FILE}")
@@ -46,10 +42,43 @@ QUICK_SECONDS = 2.0
 FUZZ_LOG = 10_000  # characters of the output of a fuzzer that ended early
 
 
+class Measurement(NamedTuple):
+    """A program that measures."""
+
+    name: str
+    command: tuple[str, ...]  # FILE stands for the file with the result; without FILE, the result is the output
+    quick: tuple[str, ...]
+    rows: evidence_rows.Rows
+    takes: str  # about, on two cores
+    timed: bool = False  # whether a busy host spoils the figures
+    long: bool = False  # whether it is measured by name alone
+
+
+SPEED = {
+    "law": (10.0, "10 s"),
+    "node": (10.0, "1 min"),
+    "latency": (10.0, "4 min"),
+    "ticks": (60.0, "8 min"),
+    "flight": (10.0, "1 min"),
+    "start": (10.0, "1 min"),
+    "lockstep": (30.0, "1 min"),
+    "recorder": (30.0, "1 min"),
+}
+"""Of each group of benchmarks/speed.py: s a figure, and the time it takes."""
+
+LONG_FLIGHTS = {
+    "lockstep": (("--observer", "--one-process", "--rate", "100", "--minutes", "360"), "80 min"),
+    "real-time": (("--observer", "--real-time"), "65 min"),
+    "jsbsim": (("--one-process",), "25 min"),
+}
+"""Of each long flight: the options of benchmarks/long_flight.py, and the time it takes."""
+
+
 def _speed(group: str) -> Measurement:
-    what, seconds, takes = SPEED[group]
+    seconds, takes = SPEED[group]
     command = (PYTHON, "-m", "benchmarks.speed", "--only", group, "--json", FILE, "--seconds")
-    return Measurement(f"speed-{group}", (*command, f"{seconds:g}"), (*command, f"{QUICK_SECONDS:g}"), what, takes, timed=True)
+    full, quick = ((*command, f"{each:g}") for each in (seconds, QUICK_SECONDS))
+    return Measurement(f"speed-{group}", full, quick, evidence_rows.speed, takes, timed=True)
 
 
 FAULTS = (PYTHON, "-m", "benchmarks.faults", "--json", FILE, "--times")
@@ -63,88 +92,86 @@ VIEW = (PYTHON, "-m", "benchmarks.view", "--json", FILE)
 QUICK_VIEW = (*VIEW, "--hours", "0.05", "--seconds", "20", "--count", "2")
 SECURITY = (*PYTEST, "tests/ros/test_security.py")
 HYPOTHESIS = (*PYTEST, "-n", "auto", "tests/fuzz")
-READERS = "readers of files and messages, coverage-guided fuzzing"
 CAMPAIGN_OF = ("rise-di", "campaign", "--uncertainty", "0.3", "--seed", "7", "--json")
 FLEET, MISSIONS = ((*CAMPAIGN_OF, name, "--aircraft") for name in ("osprey_servo", "osprey_route"))
 COMPARE = ("rise-di", "compare", "osprey_servo", "--tuning", "gust,gust_turbulence,delay", "--json", FILE, "--aircraft")
 
 MEASUREMENTS = (
     *(_speed(group) for group in SPEED),
-    Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), "faults injected into a flight over DDS", "30 min", timed=True),
+    Measurement("faults", (*FAULTS, "10"), (*FAULTS, "1"), evidence_rows.faults, "30 min", timed=True),
     Measurement(
         "random-faults",
         (*RANDOM_FAULTS, "20", "--lockstep", "2"),
         (*RANDOM_FAULTS, "5", "--lockstep", "1"),
-        "random faults, also two at a time and in lockstep",
+        evidence_rows.random_faults,
         "3 min",
         timed=True,
     ),
-    Measurement("security", (*SECURITY, "tests/ros/test_policy.py"), SECURITY, "who can receive y and command u", "2 min"),
-    Measurement("fuzz", HYPOTHESIS, HYPOTHESIS, "external input, fuzzed by hypothesis", "1 min"),
-    Measurement("fuzz-coverage", (*FUZZ, "--seconds", "30"), (*FUZZ, "--seconds", "5"), READERS, "3 min"),
-    Measurement("campaign", CAMPAIGN, QUICK_CAMPAIGN, "speed and accuracy of campaigns", "3 min", timed=True),
-    Measurement("campaign-fleet", (*FLEET, "10000"), (*FLEET, "1000"), "uncertain aircraft flown by the same law", "1 min"),
-    Measurement("campaign-missions", (*MISSIONS, "5000"), (*MISSIONS, "200"), "uncertain aircraft on a route", "3 min"),
-    Measurement("cluster", CLUSTER, (*CLUSTER, "--aircraft", "1000"), "a campaign on a cluster of dask with faults", "1 min"),
-    Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), "other laws on the same aircraft and course", "5 min"),
-    Measurement("view", VIEW, QUICK_VIEW, "the page beside a flight, and a log of one hour on it", "15 min", timed=True),
-    Measurement("replay", REPLAY, (*REPLAY, "--seconds", "5"), "every scenario flown and replayed", "2 min"),
+    Measurement("security", (*SECURITY, "tests/ros/test_policy.py"), SECURITY, evidence_rows.tests, "2 min"),
+    Measurement("fuzz", HYPOTHESIS, HYPOTHESIS, evidence_rows.tests, "1 min"),
+    Measurement("fuzz-coverage", (*FUZZ, "--seconds", "30"), (*FUZZ, "--seconds", "5"), evidence_rows.fuzz, "3 min"),
+    Measurement("campaign", CAMPAIGN, QUICK_CAMPAIGN, evidence_rows.campaign, "3 min", timed=True),
+    Measurement("campaign-fleet", (*FLEET, "10000"), (*FLEET, "1000"), evidence_rows.fleet, "1 min"),
+    Measurement("campaign-missions", (*MISSIONS, "5000"), (*MISSIONS, "200"), evidence_rows.fleet, "3 min"),
+    Measurement("cluster", CLUSTER, (*CLUSTER, "--aircraft", "1000"), evidence_rows.cluster, "1 min"),
+    Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), evidence_rows.compare, "5 min"),
+    Measurement("view", VIEW, QUICK_VIEW, evidence_rows.view, "15 min", timed=True),
+    Measurement("replay", REPLAY, (*REPLAY, "--seconds", "5"), evidence_rows.replay, "2 min"),
     Measurement(
         "long-faults",
         (*RANDOM_FAULTS, "1000", "--lockstep", "100"),
         (*RANDOM_FAULTS, "5", "--lockstep", "1"),
-        "a thousand random faults",
+        evidence_rows.random_faults,
         "75 min",
         timed=True,
         long=True,
     ),
-    Measurement("long-fuzz", (*FUZZ, "--seconds", "600"), (*FUZZ, "--seconds", "5"), READERS, "55 min", long=True),
+    Measurement("long-fuzz", (*FUZZ, "--seconds", "600"), (*FUZZ, "--seconds", "5"), evidence_rows.fuzz, "55 min", long=True),
     *(
         Measurement(
             f"long-{name}",
             (*LONG_FLIGHT, *options),
             (*LONG_FLIGHT, *options, "--minutes", "1"),
-            f"a guided flight: {what}",
+            evidence_rows.long_flight,
             takes,
             timed=name == "real-time",
             long=True,
         )
-        for name, (what, options, takes) in LONG_FLIGHTS.items()
+        for name, (options, takes) in LONG_FLIGHTS.items()
     ),
 )
+"""All but guidance and real autopilots, which benchmarks/guidance.py and benchmarks/autopilots.py measure."""
 
 
 # Measuring
 
 
-def measure(one: Measurement, *, quick: bool) -> Result:
-    """Run a measurement; its result with command, date, revision, host and status."""
-    parts = one.quick if quick else one.command
+def measure(measurement: Measurement, folder: Path, *, quick: bool) -> int:
+    """Run a measurement and write the rows to a folder; the exit status, 1 also where the program left no result."""
+    parts = measurement.quick if quick else measurement.command
     busy = psutil.cpu_percent(interval=LOAD_INTERVAL) / 100.0
-    begin, date = time.monotonic(), datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    measured = revision()  # before it: a commit meanwhile is not what runs
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / ("result.xml" if "--junitxml=FILE" in parts else "result.json")
+    begun = origin(" ".join(parts))  # before the run: a commit meanwhile is not what runs
+    with tempfile.TemporaryDirectory() as place:
+        file = Path(place) / ("result.xml" if "--junitxml=FILE" in parts else "result.json")
         programs = {PYTHON: sys.executable, "rise-di": RISE_DI}
         command = [programs.get(part, part.replace(FILE, str(file))) for part in parts]
         if parts[:2] == FLEET[:2]:
-            command += ["--runs", folder]
-        with (RESULTS / f"{one.name}.log").open("w", encoding="utf-8") as log:
+            command += ["--runs", place]
+        with (BUILD / f"{measurement.name}.log").open("w", encoding="utf-8") as log:
             status, output = run_to_its_end(command, log)
             log.write(output)
-        result = read(file, output)
-    return {
-        "name": one.name,
-        "command": " ".join(parts),
-        "quick": quick,
-        "date": date,
-        "revision": measured,
-        "machine": host_details(),
-        "busy": busy,
-        "seconds": time.monotonic() - begin,
-        "status": status,
-        "result": result,
-    }
+        result = read_result(file, output)
+    busy = max(busy, psutil.cpu_percent(interval=LOAD_INTERVAL) / 100.0)
+    if measurement.timed and busy > BUSY_SHARE:
+        begun = begun._replace(host=f"{begun.host}, {100 * busy:.0f} % {BUSY}")
+    write(measurement.name, rows_of(measurement, result, status), begun, folder)
+    return status or int(result is None)
+
+
+def rows_of(measurement: Measurement, result: Any, status: int) -> list[Row]:
+    """The rows of a result, None where the program left none; an exit status other than 0 is a goal that is not met."""
+    failed = [row(EXIT_STATUS, status or "no result", at_most=0)] if status or result is None else []
+    return [*failed, *(() if result is None else measurement.rows(result))]
 
 
 def run_to_its_end(command: Sequence[str], log: IO[str]) -> tuple[int, str]:
@@ -160,7 +187,7 @@ def run_to_its_end(command: Sequence[str], log: IO[str]) -> tuple[int, str]:
     return running.returncode, output
 
 
-def read(file: Path, output: str) -> Any:
+def read_result(file: Path, output: str) -> Any:
     """The result of a program: its JSON file, the cases of its JUnit file, else its output as JSON; None if none is valid."""
     try:
         if file.suffix == ".xml":
@@ -178,26 +205,6 @@ def cases(junit: str) -> list[dict[str, Any]]:
         outcome = "failed" if kinds & {"failure", "error"} else "skipped" if "skipped" in kinds else "passed"
         outcomes.append({"name": case.get("name", ""), "outcome": outcome, "seconds": float(case.get("time", "0"))})
     return outcomes
-
-
-def host_details() -> dict[str, Any]:
-    """The host of the measurement."""
-    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
-    model = re.search(r"^model name\s*: (.+)$", cpuinfo, re.MULTILINE)
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return {
-        "processor": model.group(1) if model else platform.machine(),
-        "cores": os.cpu_count(),
-        "memory": round(memory),  # GiB
-        "system": f"{platform.system()} {platform.release()}",
-        "python": platform.python_version(),
-    }
-
-
-def revision() -> str:
-    """The commit, with -dirty if any file but a page of evidence differs from it."""
-    changed = _run("git", "status", "--porcelain", "--", ".", ":(exclude)docs/evidence*.md").stdout.strip()
-    return _run("git", "describe", "--always").stdout.strip() + ("-dirty" if changed else "")
 
 
 def _run(*command: str) -> subprocess.CompletedProcess[str]:
@@ -247,37 +254,24 @@ def exit_on_sigterm() -> None:
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
 
 
-def load() -> dict[str, Result]:
-    """The stored results, by name."""
-    paths = {one.name: RESULTS / f"{one.name}.json" for one in MEASUREMENTS}
-    return {name: json.loads(path.read_text(encoding="utf-8")) for name, path in paths.items() if path.exists()}
+def wanted(names: Sequence[str], measured: Mapping[str, Measured]) -> list[Measurement]:
+    """Measurements to run: those whose names begin with one of `names`; without names, what has no file or failed.
 
-
-def write_page(results: Mapping[str, Result]) -> None:
-    """Write the page from the results; sections without any stay."""
-    before = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
-    PAGE.write_text(render(MEASUREMENTS, results, before), encoding="utf-8")
-
-
-def wanted(names: Sequence[str], stored: Mapping[str, Result], *, quick: bool) -> list[Measurement]:
-    """Measurements to run: missing, failed, short (unless `quick`), and those whose names begin with one of `names`.
-
-    Of the long ones, only those whose names do.
+    The long ones run by name alone.
     """
 
-    def stale(one: Measurement) -> bool:
-        result = stored.get(one.name)
-        return not one.long and (result is None or result["result"] is None or (result["quick"] and not quick))
+    def stale(measurement: Measurement) -> bool:
+        known = measured.get(measurement.name)
+        return not measurement.long and (known is None or [figure.name for figure in known.rows] == [EXIT_STATUS])
 
-    return [one for one in MEASUREMENTS if stale(one) or one.name.startswith(tuple(names))]
+    return [each for each in MEASUREMENTS if (each.name.startswith(tuple(names)) if names else stale(each))]
 
 
 def main() -> int:
-    """Measure, store, render the page."""
+    """Measure, write the rows, write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--again", action="append", default=[], metavar="NAME", help="only measure again what begins so")
-    parser.add_argument("--quick", action="store_true", help="short versions")
-    parser.add_argument("--render", action="store_true", help="write the page from the stored results")
+    parser.add_argument("--quick", action="store_true", help="short versions, to build/evidence")
     parser.add_argument("--do", choices=("replay", "fuzz"), help=argparse.SUPPRESS)
     parser.add_argument("--json", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--seconds", type=float, help=argparse.SUPPRESS)
@@ -286,27 +280,24 @@ def main() -> int:
         result = replays(options.seconds) if options.do == "replay" else fuzz(options.seconds or 60.0)
         options.json.write_text(json.dumps(result, indent=1), encoding="utf-8")
         return 0
-    if unknown := [name for name in options.again if not any(one.name.startswith(name) for one in MEASUREMENTS)]:
-        parser.error(f"--again: found {unknown[0]!r}, expected one of {', '.join(one.name for one in MEASUREMENTS)}")
-    RESULTS.mkdir(parents=True, exist_ok=True)
+    if unknown := [name for name in options.again if not any(each.name.startswith(name) for each in MEASUREMENTS)]:
+        parser.error(f"--again: found {unknown[0]!r}, expected one of {', '.join(each.name for each in MEASUREMENTS)}")
+    BUILD.mkdir(parents=True, exist_ok=True)
     exit_on_sigterm()
-    results = load()
-    chosen = tuple(options.again) or ("",)
-    todo = [] if options.render else wanted(options.again, results, quick=options.quick)
-    todo = [one for one in todo if one.name.startswith(chosen)]
+    folder = BUILD if options.quick else FOLDER
+    todo = wanted(options.again, read(folder))
     failed = False
-    for number, one in enumerate(todo, 1):
-        takes = "" if options.quick else f" (about {one.takes})"
-        print(f"[{number} of {len(todo)}] {one.name}: {one.what}{takes} ...", end=" ", flush=True)
-        result = measure(one, quick=options.quick)
-        (RESULTS / f"{one.name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-        results[one.name] = result
-        write_page(results)  # after each result: a long run may be interrupted
-        ended = "done" if result["status"] == 0 else f"exit status {result['status']}, see build/evidence/{one.name}.log"
-        failed = failed or result["status"] != 0
-        print(f"{ended}, {result['seconds']:.0f} s", flush=True)
-    write_page(results)
-    print(f"page: {PAGE.relative_to(REPOSITORY)}")
+    for number, measurement in enumerate(todo, 1):
+        takes = "" if options.quick else f" (about {measurement.takes})"
+        print(f"[{number} of {len(todo)}] {measurement.name}: {TITLES[measurement.name]}{takes} ...", end=" ", flush=True)
+        begin = time.monotonic()
+        status = measure(measurement, folder, quick=options.quick)
+        write_page()  # after each measurement: a long run may be interrupted
+        ended = "done" if status == 0 else f"exit status {status}, see build/evidence/{measurement.name}.log"
+        failed = failed or status != 0
+        print(f"{ended}, {time.monotonic() - begin:.0f} s", flush=True)
+    write_page()
+    print(f"figures: {folder.relative_to(REPOSITORY)}; page: docs/evidence.md")
     return int(failed)
 
 

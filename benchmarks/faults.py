@@ -16,12 +16,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from benchmarks.evidence_page import milliseconds
 from benchmarks.sampling import new_table
 from rich.console import Console
 from rich.table import Table
@@ -86,6 +85,11 @@ def _summary(case: str, rows: Sequence[Row]) -> Row:
         values = [row[key] for row in passed if row.get(key) is not None]
         summary[key] = {"median": statistics.median(values), "worst": max(values)} if values else None
     return summary
+
+
+def milliseconds(times: Mapping[str, float] | None) -> str:
+    """Median / worst of times in s."""
+    return "-" if times is None else f"{1e3 * times['median']:.0f} / {1e3 * times['worst']:.0f}"
 
 
 def to_table(summaries: Sequence[Row]) -> Table:

@@ -6,8 +6,8 @@
     .venv/bin/python -m benchmarks.guidance --grid [--only c172p 737 f16]    # off the design point
     .venv/bin/python -m benchmarks.guidance --route    # another route, on aircraft that guidance was not built with
 
-Results are stored in build/guidance, and docs/evidence_guidance.md is written from them. Flights in one process. Each row is a
-figure with its limit; in turbulence it is the worst of all seeds. The rectangle is flown without wind and with a wind of a
+The figures go to docs/evidence/guidance-*.csv, and docs/evidence.md is written from them. Flights in one process. Each row is
+a figure with its limit; in turbulence it is the worst of all seeds. The rectangle is flown without wind and with a wind of a
 fifth of the airspeed across its first leg. No number is tuned to an aircraft. The 737 is identified first, which takes some
 minutes.
 """
@@ -26,8 +26,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from benchmarks import guidance_page
-from benchmarks.guidance_grid import GRIDS, places, point
+from benchmarks import evidence_data
+from benchmarks.evidence_data import row
+from benchmarks.evidence_page import write_page
+from benchmarks.evidence_rows import split
+from benchmarks.guidance_grid import GRIDS, Point, places, point
 from benchmarks.sampling import new_table
 from rich.console import Console
 
@@ -78,6 +81,11 @@ class Figure(NamedTuple):
     name: str
     value: float
     limit: float
+
+    @property
+    def missed(self) -> bool:
+        """Whether the value is beyond the limit."""
+        return self.value > self.limit
 
 
 class Pose(NamedTuple):
@@ -476,7 +484,7 @@ def jobs(manoeuvres: Mapping[str, Manoeuvre], seeds: int) -> Iterator[Job]:
             wind = f", wind {across:g} V" if across else ""
             yield Job(title, f"calm{wind}", Air("calm", None, across))
             for seed in range(seeds if manoeuvre.turbulent else 0):
-                yield Job(title, f"turbulence{wind}", Air("turbulence", seed + 1, across))
+                yield Job(title, f"turbulence{wind}, {seeds} seeds", Air("turbulence", seed + 1, across))
 
 
 def fly(scenario: Scenario, job: Job) -> list[Figure]:
@@ -511,67 +519,89 @@ def main() -> None:
     if options.rates:
         sys.exit(compare_rates(options.only, options.seeds) > 0)
     if options.route:
-        flown = [one for name in OTHERS for one in fly_manoeuvres(name, OTHER_ROUTE, options.seeds)]
-        guidance_page.store("route", flown)
-        sys.exit(any(missed(*one) for one in flown))
+        begun = origin(f"--route --seeds {options.seeds}")
+        flown = [kept for name in OTHERS for kept in fly_manoeuvres(name, OTHER_ROUTE, options.seeds)]
+        store("route", (figure_row(kept.aircraft, kept) for kept in flown), begun)
+        sys.exit(any(kept.figure.missed for kept in flown))
     failed = 0
     for name in options.only:
         if options.grid:
             failed += fly_grid(name) if name in GRIDS else 0
             continue
+        begun = origin(f"--only {name} --seeds {options.seeds}")
         flown = fly_manoeuvres(name, {title: MANOEUVRES[title] for title in options.manoeuvres}, options.seeds)
         if len(options.manoeuvres) == len(MANOEUVRES):
-            guidance_page.store(f"flights {name}", [one[1:] for one in flown])
-        failed += any(missed(*one) for one in flown)
+            store(name, (figure_row(kept.manoeuvre, kept) for kept in flown), begun)
+        failed += any(kept.figure.missed for kept in flown)
     sys.exit(failed > 0)
 
 
-Kept = tuple[str, str, str, str, float, float, int]
-"""Aircraft, manoeuvre, air, figure, its worst value, its limit, seeds."""
+def origin(options: str) -> evidence_data.Origin:
+    """The origin of figures that this program begins to measure with these options."""
+    return evidence_data.origin(f"python -m benchmarks.guidance {options}")
 
 
-def missed(*row: Any) -> bool:
-    """Whether a row of `Kept` is beyond its limit."""
-    value, limit = row[4:6]
-    return bool(value > limit)
+def store(name: str, figures: Iterable[evidence_data.Row], begun: evidence_data.Origin) -> None:
+    """Write the rows of evidence of a measurement, and the page."""
+    evidence_data.write(f"guidance-{name}", figures, begun)
+    write_page()
 
 
-def fly_manoeuvres(name: str, manoeuvres: Mapping[str, Manoeuvre], seeds: int) -> list[Kept]:
+def figure_row(about: str, flown: Row) -> evidence_data.Row:
+    """The row of evidence of a figure; a limit that is infinite is none."""
+    name, unit = split(flown.figure.name)
+    limit = None if flown.figure.limit == math.inf else flown.figure.limit
+    return row(f"{about}, {flown.air}: {name}", float(flown.figure.value), unit, at_most=limit)
+
+
+def fly_manoeuvres(name: str, manoeuvres: Mapping[str, Manoeuvre], seeds: int) -> list[Row]:
     """Fly the manoeuvres of an aircraft and print the table."""
     table = new_table(f"Guidance by rule, {name}", ("manoeuvre", "air", "figure", "worst", "limit", ""), texts=3)
-    kept: list[Kept] = []
+    kept = []
     with ProcessPoolExecutor() as pool:
-        for row in rows(name, manoeuvres, seeds, pool.map):
-            figure = (row.figure.name, float(row.figure.value), float(row.figure.limit))
-            kept.append((name, row.manoeuvre, row.air, *figure, 0 if row.air.startswith("calm") else seeds))
-            cells = (*row[1:3], figure[0], f"{figure[1]:.3g}", f"{figure[2]:.3g}", "missed" if missed(*kept[-1]) else "")
+        for flown in rows(name, manoeuvres, seeds, pool.map):
+            figure = flown.figure
+            verdict = "missed" if figure.missed else ""
+            cells = (flown.manoeuvre, flown.air, figure.name, f"{figure.value:.3g}", f"{figure.limit:.3g}", verdict)
             print(name, *cells, sep="\t", file=sys.stderr, flush=True)
             table.add_row(*cells)
+            kept.append(flown)
     Console().print(table)
     return kept
 
 
 def compare_rates(names: Sequence[str], seeds: int) -> int:
     """The ratios of `rate_ratios`, the worst over the seeds, stored. Returns how many are beyond their limit."""
-    rows: list[tuple[str, str, dict[str, float], float]] = []
+    compared: list[tuple[str, str, str, float, float]] = []
+    begun = origin(f"--rates --only {' '.join(names)} --seeds {seeds}")
     for name in names:
         for air, numbers, limit in (("calm", [None], 1.5), (f"turbulence, {seeds} seeds", range(1, seeds + 1), 1.2)):
             ratios = [rate_ratios(name, seed) for seed in numbers]
-            rows.append((name, air, {rate: max(one[rate] for one in ratios) for rate in RATES}, limit))
-            print(*rows[-1], sep="\t", file=sys.stderr, flush=True)
-    guidance_page.store("rates", rows)
-    return sum(ratio > limit for name, _, ratios, limit in rows for rate, ratio in ratios.items() if (name, rate) != AT_STOP)
+            compared += [(name, air, rate, max(ratio[rate] for ratio in ratios), limit) for rate in RATES]
+            print(*compared[-len(RATES) :], sep="\t", file=sys.stderr, flush=True)
+    store("rates", (row(f"{name}, {air}: {rate}", ratio, at_most=limit) for name, air, rate, ratio, limit in compared), begun)
+    return sum(ratio > limit for name, _, rate, ratio, limit in compared if (name, rate) != AT_STOP)
 
 
 def fly_grid(name: str) -> int:
     """Fly the grid of an aircraft, a core for each flight at a time, and store it. Returns how many points are lost."""
-    scenario = aircraft_of(name)
+    scenario, begun = aircraft_of(name), origin(f"--grid --only {name}")
     with ProcessPoolExecutor() as pool:
         flown = list(pool.map(partial(point, name, scenario), places(name)))
     for one in flown:
         print(*one, sep="\t", file=sys.stderr)
-    guidance_page.store(f"grid {name}", flown)
+    store(f"grid-{name}", grid_rows(flown), begun)
     return sum(one.result == "lost" for one in flown)
+
+
+def grid_rows(points: Sequence[Point]) -> Iterator[evidence_data.Row]:
+    """The rows of evidence of the points of a grid."""
+    results = [flown.result for flown in points]
+    yield row("points flown", results.count("ok"))
+    yield row("points lost", results.count("lost"), at_most=0)
+    for flown in points:
+        reason = f": {flown.reason}" if flown.result == "lost" else ""
+        yield row(f"altitude {flown.altitude:g} m, airspeed {flown.speed:g} m/s", flown.result + reason)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ MODULES = {
 """Packages with the modules of their tests by folder: "ros: recorder" is tests/ros/test_recorder.py."""
 
 WHOLE_TREE = (
-    "pure: containers docs evidence guidance_benchmark guidance_page host_delays import_rule packages symbols;"
+    "pure: containers docs evidence guidance_benchmark host_delays import_rule packages symbols;"
     " ros: message_packages; docs: commands pages; fuzz: fuzz_files fuzz_regressions"
 )
 """Modules that test pages, tools, measuring programs or the packages together; `make test` runs them."""

@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The evidence page: every figure comes from a result, and missing, short, failed and unreliable measurements are marked."""
+"""Evidence: the rows of every result, their goals, and the page, which is a function of the stored rows alone."""
 
 import json
-import re
 import signal
 import subprocess
 import sys
@@ -13,26 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from benchmarks.evidence import MEASUREMENTS, REPOSITORY, cases, read, wanted
-from benchmarks.evidence_page import BUSY, SPEED, WIDTH, Result, render
+from benchmarks import autopilots
+from benchmarks.evidence import EXIT_STATUS, MEASUREMENTS, SPEED, cases, read_result, rows_of, wanted
+from benchmarks.evidence_data import BUSY, FOLDER, REPOSITORY, Measured, Origin, Row, read, row, used, write
+from benchmarks.evidence_page import PAGE, TITLES, page
 
-MACHINE = {"processor": "a processor", "cores": 2, "memory": 8, "system": "Linux 6", "python": "3.11.7"}
-RUN = {"date": "2020-01-02 03:04 UTC", "revision": "abc1234", "machine": MACHINE, "busy": 0.0, "seconds": 1.0, "status": 0}
-
-
-def result(name: str, measured: Any, **changes: Any) -> Result:
-    return RUN | {"name": name, "command": f"measure {name}", "quick": False, "result": measured} | changes
-
-
-def row(what: str, figures: dict[str, float], floor: str = "", goals: tuple[dict[str, Any], ...] = ()) -> dict[str, Any]:
-    return {"group": "node", "what": what, "figures": figures, "floor": floor, "goals": goals}
-
-
+ORIGIN = Origin("measure", "abc1234", "a processor, 2 cores", "2020-01-02 03:04 UTC")
 TWICE = {"column": "p50 (us)", "at_most": 2.0, "of_floor": True}
+
+
+def of_speed(what: str, figures: dict[str, float], floor: str = "", goals: tuple[dict[str, Any], ...] = ()) -> dict[str, Any]:
+    return {"what": what, "figures": figures, "floor": floor, "goals": goals}
+
+
 NODE = [
-    row("bare echo, single", {"p50 (us)": 40.0, "p99 (us)": 80.0}, "bare echo, single"),
-    row("bare echo, events", {"p50 (us)": 20.0, "p99 (us)": 60.0}, "bare echo, single"),
-    row("controller, u alone", {"p50 (us)": 50.0, "p99 (us)": 320.0}, "bare echo, single", (TWICE,)),
+    of_speed("bare echo, single", {"p50 (us)": 40.0, "p99 (us)": 80.0}, "bare echo, single"),
+    of_speed("bare echo, events", {"p50 (us)": 20.0, "missed": 60.0}, "bare echo, single"),
+    of_speed("controller, u alone", {"p50 (us)": 50.0, "p99 (us)": 320.0}, "bare echo, single", (TWICE,)),
 ]
 TIMES = {"median": 0.1234, "worst": 0.2341}
 FAULT = {
@@ -54,322 +50,296 @@ LAW: dict[str, Any] = {"law": "rise", "sees": "y", "knows": "Omega", "tuned_on":
 LAW |= {"score": {"gust": 1.61, "turbulence": 2.61}}
 LAW |= {"levels": [LEVEL], "late": [{"delay": 0.02, "lost": 0.26}], "slew": {"elevator": 0.077}, "cost": 7.25, "spread": 0.5}
 COMPARED = {"aircraft": 200, "seed": 1, "wind": "air_relative", "turbulence_seed": 3}
-PI = LAW | {"law": "pi", "score": {"gust": 1.72, "turbulence": 2.51}}
+PI = LAW | {"law": "pi", "levels": [LEVEL | {"gust": UNCERTAIN | {"mean": None}}]}
 FIGURE = {"mean": 1.31, "q50": 1.21, "q95": 2.31, "q99": 2.71, "worst": 3.01, "deviation": 0.1}
 COVERAGE = {"status": 0, "covered": 1234, "number_of_executed_units": 98765, "peak_rss_mb": 321}
 CAMPAIGN: dict[str, Any] = {"whole": 120_000.0, "flown": 150_000.0, "memory_early": 900.0, "memory": 905.0, "aircraft": 10_000}
 CAMPAIGN |= {"plain": 50.0, "exact": 4, "integration": {"q": 0.0021, "V": 0.0005}}
 SHARE = {"count": 3, "share": 3e-4, "low": 1e-4, "high": 9e-4}
-DELAYS = {"p50": 0.052, "p99": 0.26}
+DELAYS = {"p50": 0.052, "p99": 0.24}
 BESIDE = {"processor": 0.027, "memory": 76.0, "traffic": 22_000.0, "flight": 30.0}
 PAIRS = {"missed ticks": [3, 0], "late p99 (ms)": [0.5, 1.23]}
 VIEW: dict[str, Any] = {"live": BESIDE, "live with a browser": {"to the screen": DELAYS}}
 VIEW |= {"frozen": {"frozen": 10.0, "recovered after": 0.4}}
 VIEW |= {"opened": {"flight": 3600.0, "first samples": 0.4, "whole log": 5.0, "processor": 4.6, "memory": 157.0, "log": 626.0}}
-VIEW |= {
-    "flights": {
-        "without": PAIRS,
-        "with": PAIRS,
-        "start included": PAIRS,
-        "starting": [1.25, 1.5],
-        "more with": dict.fromkeys(PAIRS, 0.05),
-        "more start included": dict.fromkeys(PAIRS, 0.15),
-        "interval with": {name: [-1.5, 2.5] for name in PAIRS},
-        "interval start included": {name: [-1.5, 2.5] for name in PAIRS},
-        "probability with": dict.fromkeys(PAIRS, 0.5),
-        "probability start included": dict.fromkeys(PAIRS, 0.5),
-    }
-}
+WATCHED: dict[str, Any] = dict.fromkeys(("without", "with", "start included"), PAIRS) | {"starting": [1.25, 1.5]}
+for kind, more in (("with", 0.05), ("start included", 0.15)):
+    WATCHED |= {f"more {kind}": dict.fromkeys(PAIRS, more), f"interval {kind}": {key: [-1.5, 2.5] for key in PAIRS}}
+    WATCHED |= {f"probability {kind}": dict.fromkeys(PAIRS, 0.5)}
+VIEW |= {"flights": WATCHED}
 LONG_FLIGHT: dict[str, Any] = {"flight": "the c172p, in lockstep", "took": 1500.0, "outcome": "completed", "minutes": 60.0}
 LONG_FLIGHT |= {
     "legs": 62,
     "missing": {"missing samples": {"y": 3, "u": 1}},
     "lost": 0,
-    "guidance": {"steps": 180_001, "differing": 0},
-}
-LONG_FLIGHT |= {
     "xtrack": 6.5,
     "bank_deg": 30.5,
     "V": 40.5,
-    "memory": {"recorder.main": [100e6, 103e6], "rise-di fly": [90e6, 91e6]},
 }
+LONG_FLIGHT |= {"guidance": {"steps": 180_001, "differing": 0}, "memory": {"recorder.main": [100e6, 103e6]}}
 LONG_FLIGHT |= {"ticks": {"missed ticks": 3, "missed ticks, excluding host delays": 0}}
 LONG_FLIGHT |= {"longest skips": [{"topic": "y", "t": 12.34, "length": 0.004}, {"topic": "u", "t": 50.0, "length": 0.01}]}
 LONG_FLIGHT |= {
     "report": {"size": 48.1e6, "memory": 900e6, "written": 12.5, "opened": {"figures in view": 1.2, "all figures": 2.6}}
 }
 FLEET = {"flights": 10_000, "figures": {"score": FIGURE}, "diverged": SHARE, "lost": SHARE}
-RESULTS = {
-    "speed-node": result("speed-node", {"seconds": 10.0, "rows": NODE}),
-    "faults": result("faults", [FAULT]),
-    "random-faults": result("random-faults", {"draws": 110, "two": 9, "lockstep": 10, "passed": 110, "failed": []}),
-    "security": result("security", [{"name": "test_an_attacker_receives_nothing", "outcome": "passed", "seconds": 1.0}]),
-    "fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE}),
-    "long-fuzz": result("long-fuzz", {"mcap": COVERAGE}),
-    "long-jsbsim": result("long-jsbsim", LONG_FLIGHT),
-    "campaign": result("campaign", CAMPAIGN),
-    "campaign-fleet": result("campaign-fleet", {"cases": [FLEET]}),
-    "cluster": result("cluster", {"faults": "worker killed", "workers": 4, "aircraft": 2000, "chunks": 40, "same": 39}),
-    "compare": result("compare", COMPARED | {"laws": [LAW, PI]}),
-    "view": result("view", VIEW),
-    "replay": result("replay", {"osprey_gust": {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": True}}),
+FAILED = {"seed": 417, "case": "storm on y", "error": "not within 3 s: detected"}
+RESULTS: dict[str, Any] = {
+    "speed-node": {"rows": NODE},
+    "faults": [FAULT],
+    "random-faults": {"draws": 110, "two": 9, "lockstep": 10, "passed": 109, "failed": [FAILED]},
+    "security": [{"name": "test_an_attacker_receives_nothing", "outcome": "passed", "seconds": 1.0}],
+    "fuzz-coverage": {"mcap": COVERAGE},
+    "long-fuzz": {"mcap": COVERAGE},
+    "long-jsbsim": LONG_FLIGHT,
+    "campaign": CAMPAIGN,
+    "campaign-fleet": {"cases": [FLEET]},
+    "cluster": {"faults": "worker killed", "workers": 4, "aircraft": 2000, "chunks": 40, "same": 39},
+    "compare": COMPARED | {"laws": [LAW, PI]},
+    "view": VIEW,
+    "replay": {"osprey_gust": {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": True}},
 }
 
 
-def page(**changes: Result) -> str:
-    """The page, each paragraph on one line."""
-    return re.sub(r"(?<=[^\n|])\n *(?=[^\s|#-])", " ", render(MEASUREMENTS, RESULTS | changes))
+MEASUREMENT = {measurement.name: measurement for measurement in MEASUREMENTS}
 
 
-def test_no_line_of_prose_is_longer_than_the_width_and_no_command_is_broken() -> None:
-    for line in render(MEASUREMENTS, RESULTS).splitlines():
-        assert len(line) <= WIDTH or line.startswith(("|", "    ")), line
-        assert line.count("`") % 2 == 0, line
+def rows(name: str, result: Any) -> dict[str, Row]:
+    """The rows of a result by name."""
+    return {figure.name: figure for figure in MEASUREMENT[name].rows(result)}
 
 
-def test_the_page_has_every_section() -> None:
-    titles = re.findall(r"^## (.+)$", page(), re.MULTILINE)
-    assert titles == ["Faults", "Speed", "Security", "Long flights", "Campaign", "Other laws", "Live view", "Log"]
+def missed(figures: dict[str, Row]) -> list[str]:
+    return [name for name, figure in figures.items() if (used(figure, figures) or 0.0) > 1.0]
 
 
-def test_without_results_the_page_holds_no_figure_but_the_command_for_each() -> None:
-    empty = render(MEASUREMENTS, {})
-    assert "Nothing has been measured yet." in empty
-    for one in MEASUREMENTS:
-        assert f'`make evidence ARGS="--again {one.name}"`' in empty
-    assert not [line for line in empty.splitlines() if line.startswith("|")]
+def measured(*figures: Row, **changes: str) -> Measured:
+    return Measured(figures, ORIGIN._replace(**changes))
 
 
-def test_sections_that_another_machine_measured_stay_and_their_goals_that_are_not_met_are_said_first() -> None:
-    other = {"faults": RESULTS["faults"] | {"machine": MACHINE | {"processor": "another processor"}}}
-    before = render(MEASUREMENTS, other)
-    after = render(MEASUREMENTS, {"view": RESULTS["view"]}, before)
-    for part in ("    measure faults    #", "    measure view    #", "- another processor, ", "- a processor, "):
-        assert part in after
-    assert "- Faults: a killed node is back" in after.partition("## ")[0]
-    assert render(MEASUREMENTS, {"view": RESULTS["view"]}, after) == after
-    assert "0.41 s" in render(MEASUREMENTS, {"faults": changed_fault(0.41)}, after)
+def test_page_is_function_of_data() -> None:
+    assert PAGE.read_text(encoding="utf-8") == page(read())
 
 
-def changed_fault(worst: float) -> Result:
-    return result("faults", [FAULT | {"exec_to_traffic": {"median": 0.4, "worst": worst}}])
+def test_page_stays_short() -> None:
+    """The sections have a line for each measurement. The goals that are missed stand above: no test limits their number."""
+    lines = page(read()).splitlines()
+    assert len(lines) - lines.index("## Faults") <= 100
 
 
-def test_each_table_stands_below_its_command() -> None:
-    for name in RESULTS:
-        assert f"\n    measure {name}    # 2020-01-02 03:04 UTC, abc1234\n" in page()
+def test_data_is_stable_and_complete(tmp_path: Path) -> None:
+    """Each file is what `write` makes of its own rows, has a title, and each baseline is a row of the same file."""
+    offenders = []
+    for name, measurement in read().items():
+        write(name, measurement.rows, measurement.origin, tmp_path)
+        names = {figure.name for figure in measurement.rows}
+        if (tmp_path / f"{name}.csv").read_bytes() != (FOLDER / f"{name}.csv").read_bytes() or name not in TITLES:
+            offenders.append(name)
+        offenders += [f"{name}: {figure.name}" for figure in measurement.rows if figure.baseline not in {"", *names}]
+    assert offenders == []
 
 
-def test_long_measurements_run_only_by_their_name() -> None:
-    missing = {one.name for one in wanted((), {}, quick=False)}
-    assert not {name for name in missing if name.startswith("long-")}
-    assert [one.name for one in wanted(("long-f",), {}, quick=False) if one.name not in missing] == ["long-faults", "long-fuzz"]
+def test_ambiguous_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="found a name twice"):
+        write("speed-law", [Row("a", "1"), Row("a", "2")], ORIGIN, tmp_path)
+    write("speed-law", [Row("a", "1"), Row("b", "2")], ORIGIN, tmp_path)
+    file = tmp_path / "speed-law.csv"
+    file.write_text(file.read_text(encoding="utf-8").replace("abc1234", "def5678", 1), encoding="utf-8")
+    with pytest.raises(ValueError, match="2 origins"):
+        read(tmp_path)
 
 
-def test_a_long_flight_states_its_goals_and_those_that_it_misses() -> None:
-    for line in (
-        "memory of recorder.main at most 2 % larger at the end of the flight than in the middle. Measured: 3 %, **not met**.",
-        "- Goal: memory of rise-di fly at most 2 % larger at the end of the flight than in the middle. Measured: 1.11 %, met.",
-        "- Goal: no missing sample. Measured: 4, **not met**.\n- Missing samples: y 3, u 1.",
-        "- The longest skips, excluding host delays: y 4 ms at 12.3 s, u 10 ms at 50.0 s.",
-        "- Goal: no missed tick, excluding host delays. Measured: 0, met.",
-        "- Goal: the report is written within 10 s. Measured: 12.5 s, **not met**.",
-        "- Goal: all figures of the report (48 MB) drawn within 3 s. Measured: 2.6 s, met.",
-    ):
-        assert line in page(), line
+@pytest.mark.parametrize(
+    ("value", "goal", "met"),
+    [
+        ("2", "<= 2", True),
+        ("2.01", "<= 2", False),
+        ("0", "<= 0", True),
+        ("-43.3", "<= 0", True),
+        ("1", "<= 0", False),
+        ("0.05", ">= 0.05", True),
+        ("0.04", ">= 0.05", False),
+        ("0", ">= 10", False),
+        ("nan", "<= 2", False),
+        ("inf", "<= 2", False),
+        ("not measured", "<= 2", False),
+    ],
+)
+def test_goal_is_met_up_to_its_limit(value: str, goal: str, met: bool) -> None:
+    assert ((used(Row("time", value, goal=goal), {}) or 0.0) <= 1.0) is met
 
 
-def test_a_lockstep_flight_has_no_late_ticks_to_state() -> None:
-    text = page(**{"long-jsbsim": result("long-jsbsim", LONG_FLIGHT | {"ticks": {}})})
-    assert "- In lockstep a tick waits for its inputs: none is missed or late." in text
-    assert "Goal: no missed tick" not in text
+@pytest.mark.parametrize(("p50", "verdict"), [("80", "| 1 of 1 | controller: p50 2 times"), ("80.1", "| **0 of 1** |")])
+def test_goal_on_a_ratio(p50: str, verdict: str) -> None:
+    """The baseline has 40 us, the limit is twice."""
+    goal = Row("controller: p50", p50, "us", "echo: p50", "<= 2 x baseline")
+    assert verdict in page({"speed-node": measured(goal, Row("echo: p50", "40", "us"))})
 
 
-def test_a_figure_that_depends_on_the_host_is_a_ratio_to_its_baseline_with_the_figure_in_parentheses() -> None:
-    assert "| controller, u alone | 1.25 (50) | 4 (320) |" in page()  # 50 / 40 and 320 / 80
-    assert "| *bare echo, single* | 1 (40) | 1 (80) |" in page()
+def test_page_begins_with_missed_goals() -> None:
+    """The worst of the figures with the same goal, with their number."""
+    figures = [Row(f"{name}: time", value, "s", goal="<= 2") for name, value in (("a", "2.5"), ("b", "3"), ("c", "1"))]
+    text = page({"faults": measured(*figures), "view": measured(Row("d", "1", goal="<= 1"))})
+    top, _, sections = text.partition("## Faults")
+    assert "| b: time, 2 of 3 miss | **3 s** | at most 2 |" in top
+    assert "evidence/view.csv" not in top
+    assert "| **1 of 3** | time **3 s** (at most 2) | abc1234, 2020-01-02 |" in sections
+    assert "| 1 of 1 | d 1 (at most 1) |" in sections
 
 
-def test_a_count_is_not_a_ratio() -> None:
-    rows = [row("timer", {"missed": 4}, "timer"), row("loop", {"missed": 2}, "timer")]
-    assert "| loop | 2 |" in page(**{"speed-node": result("speed-node", {"rows": rows})})
+def test_page_names_what_is_not_measured() -> None:
+    assert f"| {TITLES['compare']} | - | not measured | - |" in page({})
 
 
-@pytest.mark.parametrize(("p50", "verdict"), [(80.0, " times, met."), (80.1, " times, **not met**.")])
-def test_a_goal_is_met_up_to_its_limit(p50: float, verdict: str) -> None:
-    rows = [NODE[0], row("controller", {"p50 (us)": p50}, "bare echo, single", (TWICE,))]
-    text = page(**{"speed-node": result("speed-node", {"rows": rows})})
-    (line,) = [line for line in text.splitlines() if line.startswith("- Goal: controller: p50 at most 2 times")]
-    assert line.endswith(verdict)
+def test_page_names_busy_host_and_missing_revision() -> None:
+    text = page({"faults": measured(Row("a", "1"), host=f"a processor, 50 % {BUSY}", revision="")})
+    assert "| - | no goal | not recorded, 2020-01-02, busy host |" in text
 
 
-def test_the_page_begins_with_the_goals_that_are_not_met() -> None:
-    top = page().partition("## ")[0]
-    assert "Goals that are not met: - Faults: a killed node is back" in top.replace("\n\n-", " -").replace("\n", " ")
-    rows = [NODE[0], row("controller", {"p50 (us)": 80.1}, "bare echo, single", (TWICE,))]
-    top = page(**{"speed-node": result("speed-node", {"rows": rows})}).partition("## ")[0]
-    assert "\n- The controller's tick compared with an echo's callback: controller: p50 at most 2 times" in top
-    met = render(MEASUREMENTS, {"speed-node": RESULTS["speed-node"]})
-    assert "Every goal on this page is met." in met
+def test_failed_measurement_misses_a_goal() -> None:
+    """Also where it left a result."""
+    failed = rows_of(MEASUREMENT["faults"], None, 2)
+    assert failed == [Row(EXIT_STATUS, "2", goal="<= 0")]
+    assert f"| {EXIT_STATUS} | **2** | at most 0 |" in page({"faults": measured(*failed)})
+    assert rows_of(MEASUREMENT["faults"], None, 0)[0].value == "no result"
+    assert rows_of(MEASUREMENT["faults"], [FAULT], 1)[0] == Row(EXIT_STATUS, "1", goal="<= 0")
+    assert EXIT_STATUS not in {figure.name for figure in rows_of(MEASUREMENT["faults"], [FAULT], 0)}
 
 
-def test_the_controller_is_also_compared_with_the_fastest_echo() -> None:
-    assert "Ratios of p50 to that of the fastest echo (bare echo, events): controller, u alone 2.5." in page()  # 50 / 20
-
-
-def test_the_page_depends_on_every_figure_of_every_result() -> None:
-    """Except those that the page omits."""
-    before, hidden = page(), {"seconds", "deviation", "status"}
-    for name, whole in RESULTS.items():
-        for path in leaves(whole["result"]):
+def test_rows_depend_on_every_figure() -> None:
+    """Except those that the rows omit."""
+    hidden = {"seconds", "deviation"}
+    for name, result in RESULTS.items():
+        before = rows(name, result)
+        for path in leaves(result):
             if path[-1] in hidden or path[-2:] == ("turbulence", "lost"):
                 continue
-            changed = deepcopy(whole)
-            inside = changed["result"]
+            changed = deepcopy(result)
+            inside = changed
             for key in path[:-1]:
                 inside = inside[key]
             inside[path[-1]] = 3 * inside[path[-1]] + 0.5
-            assert page(**{name: changed}) != before, f"{name}: {path}"
+            assert rows(name, changed) != before, f"{name}: {path}"
 
 
 def leaves(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The paths of all numbers in a tree."""
     if isinstance(tree, dict | list | tuple):
         pairs = tree.items() if isinstance(tree, dict) else enumerate(tree)
-        return [found for key, value in pairs for found in leaves(value, (*path, key))]
+        return [leaf for key, value in pairs for leaf in leaves(value, (*path, key))]
     return [path] if isinstance(tree, int | float) and not isinstance(tree, bool) else []
 
 
 @pytest.mark.parametrize(
-    ("changes", "expected"),
+    ("name", "expected"),
     [
-        ({"quick": True}, "**A short version**, not to be quoted"),
-        ({"busy": BUSY + 0.4}, "**The host was busy** at the start, 50 % of its processors in use"),
-        ({"result": None, "status": 2}, "**Failed**, with exit status 2: its goals are **not met**"),
-        ({"status": 1}, "- Goal: the measurement ends with exit status 0. Measured: 1, **not met**."),
+        ("speed-node", Row("controller, u alone: p50", "50", "us", "bare echo, single: p50", "<= 2 x baseline")),
+        ("speed-node", Row("controller, u alone: p50 over that of the fastest echo", "2.5")),  # 50 / 20
+        ("speed-node", Row("bare echo, events: missed", "60")),  # a count has no baseline
+        ("faults", Row("controller killed: traffic from its start, worst", "510", "ms", goal="<= 500")),
+        ("faults", Row("controller killed: passed", "10", goal=">= 10")),
+        ("faults", Row("controller killed: start to ready, main thread runs, median", "310", "ms")),
+        ("security", Row("an attacker receives nothing: passed", "1", "cases")),
+        ("fuzz-coverage", Row("mcap: exit status of the fuzzer", "0", goal="<= 0")),
+        ("long-jsbsim", Row("recorder.main: growth of the memory from the middle to the end", "3", "%", goal="<= 2")),
+        ("long-jsbsim", Row("y: missing samples", "3", goal="<= 0")),
+        ("long-jsbsim", Row("y at 12.3 s: skip, excluding host delays", "4", "ms")),
+        ("long-jsbsim", Row("missed ticks", "3")),
+        ("long-jsbsim", Row("missed ticks, excluding host delays", "0", goal="<= 0")),
+        ("long-jsbsim", Row("report: all figures drawn", "2.6", "s", goal="<= 3")),
+        ("campaign", Row("campaign with compilation: speed", "120000", "aircraft-s/s", "loop in one process: speed")),
+        ("campaign", Row("memory at the end over that after a third", "1.00556", goal="<= 1.1")),
+        ("campaign", Row("1,000,000 aircraft of 60 s with gusts on a GPU", "not measured", "s", goal="<= 10")),
+        ("cluster", Row("chunks with other bytes than in one process", "1", goal="<= 0")),
+        ("compare", Row("rise, tuned on gust: score, gust, +-30 %, worst", "2.48")),
+        ("compare", Row("pi, tuned on gust: score, gust, +-30 %, mean", "diverged")),
+        ("compare", Row("rise, tuned on gust: lost, +-30 %, u late by 20 ms", "26", "%")),
+        ("view", Row("log of 1 h: read whole after the start of rise-di watch", "5", "s", goal="<= 3")),
+        ("view", Row("flight 2, with a client: late p99", "1.23", "ms")),
+        ("view", Row("with a client: late p99, median of the differences", "0.05", "ms", goal="<= 0.1")),
+        ("replay", Row("osprey_gust: ticks that replay differently", "0", goal="<= 0")),
+        ("random-faults", Row("seed 417: failure", "storm on y: not within 3 s: detected")),
     ],
+)  # fmt: skip
+def test_row_of_a_result(name: str, expected: Row) -> None:
+    assert rows(name, RESULTS[name])[expected.name] == expected
+
+
+PAGE_TIMES = FAULT | {"exec_to_traffic": TIMES, "page": {"median": 1.0, "worst": 1.6}}
+LIVE_PAGE = "recorder killed under a live page"
+WITHOUT_BROWSER = {name: part for name, part in VIEW.items() if name not in {"live with a browser", "frozen"}}
+ON_A_SCREEN = {"to the screen: p50", "to the screen: p99", "page frozen for 10 s: less than 300 ms behind after"}
+BY_CHANCE = {"probability with": dict.fromkeys(PAIRS, 0.04), "probability start included": dict.fromkeys(PAIRS, 0.05)}
+LATE = "with a client and the start of its server: late p99, median of the differences"  # 0.15 ms of 0.1
+READ = "log of 1 h: read whole after the start of rise-di watch"  # 5 s of 3
+CHANCE = "with a client: missed ticks, probability of as large a mean difference by chance"
+DIFFERS = {"outcome": "completed", "ticks": 9, "checked": 9, "equal": False, "differing": 1}
+MISSES: tuple[tuple[str, Any, set[str]], ...] = (
+    ("faults", [PAGE_TIMES | {"passed": 9}], {"controller killed: passed"}),
+    ("faults", [PAGE_TIMES | {"case": LIVE_PAGE}], {f"{LIVE_PAGE}: page answers and says so, worst"}),
+    ("random-faults", {"draws": 9, "two": 1, "lockstep": 0, "passed": 7, "failed": []}, {"draws that fail"}),
+    ("security", [{"name": "test_a[x]", "outcome": "failed"}], {"cases that failed", "a: failed"}),
+    ("fuzz", [{"name": "test_a", "outcome": "skipped"}], set()),
+    ("fuzz-coverage", {"mcap": COVERAGE | {"status": 77}}, {"mcap: exit status of the fuzzer"}),
+    ("replay", {"a": {"outcome": ["error: no aircraft"]}}, {"a: ticks that replay differently"}),
+    ("replay", {"a": DIFFERS}, {"a: ticks that replay differently"}),
+    ("view", WITHOUT_BROWSER, {LATE, READ} | ON_A_SCREEN),  # not measured
+    ("view", VIEW | {"flights": VIEW["flights"] | BY_CHANCE}, {LATE, READ, CHANCE}),
 )
-def test_a_measurement_with_reduced_validity_is_marked(changes: dict[str, Any], expected: str) -> None:
-    assert expected not in page()
-    marked = page(faults=RESULTS["faults"] | changes)
-    assert expected in marked
-    assert ("- Faults: " + expected.removeprefix("- Goal: ") in marked.partition("## ")[0]) == ("status" in changes)
 
 
-def test_a_killed_node_is_timed_from_its_start_and_from_its_being_ready() -> None:
-    assert "traffic within 0.5 s of its start. Measured: 0.51 s at worst, **not met**." in page()
-    assert "traffic within 0.5 s of being ready. Measured: 0.234 s at worst, met." in page()
-    assert "| controller killed | 380 / 470 | 310 / 330 | 20 / 50 |" in page()  # of its start: all, running, waiting
-    assert "which publishers keep, 400 / 620 ms after being ready." in page()
+@pytest.mark.parametrize(("name", "result", "goals"), MISSES)
+def test_results_that_miss_their_goals(name: str, result: Any, goals: set[str]) -> None:
+    assert set(missed(rows(name, result))) == goals
 
 
-@pytest.mark.parametrize(("case", "limit"), [("recorder killed under a live page", "1.5"), ("storm on the live page", "2")])
-def test_the_page_of_a_flight_has_the_limit_of_its_fault(case: str, limit: str) -> None:
-    text = page(faults=result("faults", [FAULT | {"case": case, "page": {"median": 1.0, "worst": 1.6}}]))
-    assert f"- Goal: {case}: the page answers, and says so, within {limit} s. Measured: 1.6 s at worst, " in text
+FLOWN: dict[str, Any] = {"rms": {"q": 0.011, "V": 0.04}, "behind": {"q": 0.0, "V": 0.02}, "limited": {"elevator": 0.5}}
+FLOWN |= {"engaged": [{"start": 1.0, "stop": 60.0, "reason": "y too old"}], "delay_margin": 0.05, "replayed": True}
+FLOWN |= {"controller": {"outputs": ["q", "V"], "k_g": 1.1, "k_d": [3.2], "lag": [0.06, 0.05], "delay": 0.04}}
 
 
-def test_the_page_says_that_nothing_was_measured_on_a_screen_without_a_browser() -> None:
-    without = {name: part for name, part in VIEW.items() if name not in {"live with a browser", "frozen"}}
-    sentence = "not measured, this host has no Chromium."
-    assert sentence in page(view=result("view", without))
-    assert sentence not in page(view=result("view", VIEW))
+def of_autopilot(name: str, result: Any) -> dict[str, Row]:
+    return {figure.name: figure for figure in autopilots.ROWS[name](result)}
 
 
-@pytest.mark.parametrize(("probability", "verdict"), [(0.05, "0.05, met."), (0.04, "0.04, **not met**.")])
-def test_missed_ticks_of_a_watched_flight_are_told_from_chance(probability: float, verdict: str) -> None:
-    flights = VIEW["flights"] | {"probability with": dict.fromkeys(PAIRS, probability)}
-    text = page(view=result("view", VIEW | {"flights": flights}))
-    assert f"with a client than without, beyond chance (3 to 3): probability at least 0.05. Measured: {verdict}" in text
-    assert "| with a client and the start of its server | 3, 0 | 0.5, 1.23 |" in text
-    assert "| with a client: median of the differences, 95 % interval | 0.05 (-1.5 to 2.5) | " in text
-    assert "late p99, with a client and the start of its server within 0.1 ms of that without, " in text
-    assert "Measured: 0.15 ms more, **not met**." in text
-    assert "- The start of the server takes 1.25 to 1.5 s." in text
+def test_rows_of_identified_gains() -> None:
+    figures = of_autopilot("arduplane", FLOWN)
+    assert figures["q: rms of e while commanded"] == Row("q: rms of e while commanded", "11", "mrad/s", goal="<= 10")
+    assert figures["V: rms of e while commanded"] == Row("V: rms of e while commanded", "0.04", "m/s", goal="<= 0.05")
+    assert figures["engaged until"].value == "60 s: y too old"
+    assert missed(figures) == ["q: rms of e while commanded"]
+    assert missed(of_autopilot("px4", {"refused": "error: no sign of the elevator\n"})) == ["flight with identified gains"]
 
 
-def test_a_busy_host_is_marked_only_for_timed_measurements() -> None:
-    assert "host was busy" not in page(replay=RESULTS["replay"] | {"busy": 1.0})
+def test_rows_of_signs() -> None:
+    """One of two experiments calls a right sign wrong, and so finds no flipped sign for sure."""
+    right = {"turbulence": 0.5, "as flown": {"a": "right", "b": "right"}}
+    right |= {"flipped": {"a": {"a": "wrong", "b": "right"}, "b": {"a": "right", "b": "wrong"}}}
+    figures = of_autopilot("signs", {"experiments": [right, right | {"as flown": {"a": "wrong", "b": "right"}}]})
+    assert figures["SIM_WIND_TURB 0.5: right signs, called wrong"].value == "1"
+    assert figures["SIM_WIND_TURB 0.5: flipped signs, found"].value == "4"
+    assert missed(figures) == [
+        "experiments that call a right sign wrong",
+        "experiments up to SIM_WIND_TURB 0.5 that miss a sign or a flipped one",
+    ]
 
 
-def test_a_timed_measurement_names_those_that_ran_at_the_same_time() -> None:
-    hour = {"seconds": 3600.0}
-    fuzz = RESULTS["long-fuzz"] | hour | {"date": "2020-01-02 04:00 UTC"}  # the others began at 03:04
-    assert "long-fuzz ran at the same time" in page(**{"faults": RESULTS["faults"] | hour, "long-fuzz": fuzz})
-    assert "at the same time" not in page(**{"replay": RESULTS["replay"] | hour, "long-fuzz": fuzz})  # it has no times
-    later = fuzz | {"date": "2020-01-02 04:04 UTC"}
-    assert "at the same time" not in page(**{"faults": RESULTS["faults"] | hour, "long-fuzz": later})
+def test_release_without_a_time_misses() -> None:
+    suite = {"tests": 2, "failures": 0, "errors": 0, "skipped": 0, "failed": []}
+    times = dict.fromkeys(autopilots.RELEASE_GOALS, 0.1) | {"PX4, disarmed": 0.5}
+    assert missed(of_autopilot("releases", suite | {"times": times})) == []
+    del times["PX4, release"]
+    (name,) = missed(of_autopilot("releases", suite | {"times": times}))
+    assert name == "PX4, release: until the sticks or PX4's own law act"
 
 
-def test_a_random_fault_that_failed_is_named_with_its_seed() -> None:
-    failed = {"seed": 417, "case": "storm on y, recorder killed", "error": "not within 3 s: detected"}
-    drawn = {"draws": 9, "two": 1, "lockstep": 0, "passed": 7, "failed": [failed]}  # and one that was not injected
-    text = page(**{"random-faults": result("random-faults", drawn)})
-    assert "- Seed 417, storm on y, recorder killed: not within 3 s: detected" in text
-    assert "no draw fails. Measured: 2 of 9, **not met**" in text
-
-
-def test_a_fault_that_did_not_pass_each_time_is_bold() -> None:
-    assert "1 of 1 cases passed every time." in page()
-    text = page(faults=result("faults", [FAULT | {"passed": 9}], status=1))
-    assert "0 of 1 cases passed every time." in text
-    assert "- Goal: every fault ends as expected. Measured: 1 of 10 do not, **not met**." in text
-    assert "| **9** |" in text
-
-
-def test_an_input_that_fuzzing_found_is_a_goal_that_is_not_met() -> None:
-    text = page(**{"fuzz-coverage": result("fuzz-coverage", {"mcap": COVERAGE | {"status": 77}})})
-    assert "- Goal: no fuzzer ends with a finding or an error. Measured: 1 of 1 readers, **not met**." in text
-    assert "| **ended with status 77** |" in text
-
-
-def test_a_failed_test_is_bold() -> None:
-    failed = [{"name": "test_an_attacker_receives_nothing[far]", "outcome": "failed", "seconds": 1.0}]
-    assert "| an attacker receives nothing | passed |" in page()
-    text = page(security=result("security", failed, status=1))
-    assert "| an attacker receives nothing | **failed** |" in text
-    assert "- Goal: no test fails. Measured: 1 of 1, **not met**." in text
-
-
-def test_a_scenario_that_replays_differently_is_bold() -> None:
-    differing = {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": False, "differing": 17}
-    for replay, cell in ((differing, "**17 ticks differ**"), ({"outcome": ["error: no aircraft"]}, "**no flight**")):
-        text = page(replay=result("replay", {"osprey_gust": replay}))
-        assert cell in text
-        assert "- Goal: every scenario replays to the bit. Measured: 1 of 1 do not, **not met**." in text
-
-
-def test_the_lowest_score_among_laws_with_the_same_measurements_and_knowledge_is_bold() -> None:
-    assert "| rise | y | Omega | **1.61** | **1.75** (**2.48**) | 2.61 |" in page()
-    assert "| pi | y | Omega | 1.72 | **1.75** (**2.48**) | **2.51** |" in page()
-    model = LAW | {"law": "lqg", "knows": "A, B", "score": {"gust": 9.0, "turbulence": 9.0}}
-    assert "| lqg | y | A, B | **9.00** |" in page(compare=result("compare", COMPARED | {"laws": [LAW, model]}))
-
-
-def test_the_share_of_lost_aircraft_is_shown_by_the_delay_of_u_and_the_cost_with_its_spread() -> None:
-    assert "lost at +-30 %, %, u late by 0 / 20 ms |" in page()
-    assert "| 0 / 26 | 0.077 | 7.25 +0.50 |" in page()
-
-
-def test_the_score_of_a_diverged_law_is_a_word() -> None:
-    lost = LAW | {"law": "di", "levels": [LEVEL | {"gust": UNCERTAIN | {"mean": None, "worst": None}}]}
-    compared = result("compare", COMPARED | {"laws": [LAW, lost]})
-    assert "| di | y | Omega | **1.61** | diverged (diverged) |" in page(compare=compared)
-
-
-def test_each_table_has_as_many_cells_as_headings() -> None:
-    for table in re.findall(r"(?:^\|.*\n)+", page(), re.MULTILINE):
-        assert len({line.replace("\\|", "").count("|") for line in table.splitlines()}) == 1, table
-
-
-def test_a_program_that_measures_ends_before_the_terminated_evidence(tmp_path: Path) -> None:
+def test_terminated_evidence_ends_its_program(tmp_path: Path) -> None:
     begun, ended = tmp_path / "begun", tmp_path / "ended"
     child = f"import pathlib, time\ntry:\n pathlib.Path({str(begun)!r}).touch()\n time.sleep(60)\n"
     child += f"except KeyboardInterrupt:\n pathlib.Path({str(ended)!r}).touch()"
-    program = (
-        f"from benchmarks import evidence\nevidence.RESULTS = evidence.Path({str(tmp_path)!r})\nevidence.exit_on_sigterm()\n"
-    )
-    program += f"evidence.measure(evidence.Measurement('one', ('python', '-c', {child!r}), (), '', ''), quick=False)"
+    program = f"from benchmarks import evidence\nfolder = evidence.BUILD = evidence.Path({str(tmp_path)!r})\n"
+    program += "evidence.exit_on_sigterm()\n"
+    program += f"evidence.measure(evidence.Measurement('a', ('python', '-c', {child!r}), (), list, ''), folder, quick=False)"
     with subprocess.Popen([sys.executable, "-c", program], cwd=REPOSITORY) as running:
         while running.poll() is None and not begun.exists():
             time.sleep(0.01)
@@ -377,34 +347,33 @@ def test_a_program_that_measures_ends_before_the_terminated_evidence(tmp_path: P
     assert (running.returncode, ended.exists()) == (128 + signal.SIGTERM, True)
 
 
-def test_exactly_the_missing_failed_and_short_measurements_run() -> None:
-    stored = {one.name: result(one.name, []) for one in MEASUREMENTS}
-    assert wanted([], stored, quick=False) == []
-    assert [one.name for one in wanted(["speed-"], stored, quick=False)] == [f"speed-{group}" for group in SPEED]
+def test_missing_and_failed_measurements_run() -> None:
+    """By name, those that begin so: the long ones run by name alone."""
+    stored = {measurement.name: measured(Row("a", "1")) for measurement in MEASUREMENTS}
+    assert wanted([], stored) == []
+    assert [each.name for each in wanted(["speed-"], stored)] == [f"speed-{group}" for group in SPEED]
+    assert [each.name for each in wanted(["long-f"], {})] == ["long-faults", "long-fuzz"]
+    assert not [each.name for each in wanted([], {}) if each.name.startswith("long-")]
     del stored["faults"]
-    stored |= {"compare": result("compare", None, status=1), "security": result("security", [], quick=True)}
-    assert [one.name for one in wanted([], stored, quick=False)] == ["faults", "security", "compare"]
-    assert [one.name for one in wanted([], stored, quick=True)] == ["faults", "compare"]
+    stored |= {"compare": measured(row(EXIT_STATUS, 1, at_most=0)), "view": measured(row(EXIT_STATUS, 1), Row("a", "1"))}
+    assert [each.name for each in wanted([], stored)] == ["faults", "compare"]
 
 
-def test_every_measuring_program_exists() -> None:
-    repository = Path(__file__).parents[2]
-    for one in MEASUREMENTS:
-        for command in (one.command, one.quick):
-            if "-m" in command and command[2].startswith("benchmarks."):
-                assert (repository / f"{command[2].replace('.', '/')}.py").exists(), command
-            for part in command:
-                assert not part.startswith("tests/") or (repository / part).exists(), part
+def test_measuring_programs_exist() -> None:
+    commands = [command for measurement in MEASUREMENTS for command in (measurement.command, measurement.quick)]
+    files = [f"{part.replace('.', '/')}.py" for command in commands for part in command if part.startswith("benchmarks.")]
+    files += [part for command in commands for part in command if part.startswith("tests/")]
+    assert [file for file in files if not (REPOSITORY / file).exists()] == []
 
 
-def test_outcomes_of_tests_are_read_from_the_junit_file() -> None:
+def test_outcomes_are_read_from_junit() -> None:
     junit = """<testsuites><testsuite>
         <testcase name="test_a" time="0.5"/>
         <testcase name="test_b[x]" time="1"><failure>no</failure></testcase>
         <testcase name="test_c" time="0"><skipped/></testcase>
         <testcase name="test_d" time="0"><error/></testcase>
     </testsuite></testsuites>"""
-    assert [tuple(one.values()) for one in cases(junit)] == [
+    assert [tuple(case.values()) for case in cases(junit)] == [
         ("test_a", "passed", 0.5),
         ("test_b[x]", "failed", 1.0),
         ("test_c", "skipped", 0.0),
@@ -412,10 +381,10 @@ def test_outcomes_of_tests_are_read_from_the_junit_file() -> None:
     ]
 
 
-def test_a_result_is_the_file_of_a_program_else_its_output_else_none(tmp_path: Path) -> None:
+def test_result_of_a_program(tmp_path: Path) -> None:
     left = tmp_path / "left.json"
-    assert read(left, '{"a": 1}') == {"a": 1}
-    assert read(left, "Traceback") is None
+    assert read_result(left, '{"a": 1}') == {"a": 1}
+    assert read_result(left, "Traceback") is None
     left.write_text(json.dumps([2]), encoding="utf-8")
-    assert read(left, '{"a": 1}') == [2]
-    assert read(tmp_path / "left.xml", "") is None
+    assert read_result(left, '{"a": 1}') == [2]
+    assert read_result(tmp_path / "left.xml", "") is None

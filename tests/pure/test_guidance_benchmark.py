@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 from benchmarks import guidance as benchmark
+from benchmarks.evidence_data import Row
+from benchmarks.guidance_grid import Point
 
 from flight_core.channels import POSE
 from flight_core.tape import Signal, Tape
@@ -55,3 +57,18 @@ def test_a_delayed_pose_keeps_its_stamp_and_one_that_comes_late_is_stale() -> No
     assert made.pose()["north"] == 4.0
     made.take_y(StampedVector(380_000_000, np.zeros(4)), 380_000_000)
     assert made.step(380_000_000, 380_000_000) is None  # it does not begin with a pose older than 0.2 s
+
+
+def test_rows_of_evidence() -> None:
+    """A limit that is infinite is no goal, and what was lost is named."""
+    flown = benchmark.Row("c172p", "heading", "turbulence, 5 seeds", benchmark.Figure("V (m/s)", 7.6, 5.0))
+    assert benchmark.figure_row("heading", flown) == Row("heading, turbulence, 5 seeds: V", "7.6", "m/s", goal="<= 5")
+    stale = benchmark.Row("c172p", "pose: jump", "calm", benchmark.Figure("pose stale (s)", 0.0, math.inf))
+    assert benchmark.figure_row("pose: jump", stale) == Row("pose: jump, calm: pose stale", "0", "s")
+    lost = Point("c172p", 300.0, 36.0, "lost", "diverged at t = 3.00 s")
+    assert list(benchmark.grid_rows([Point("c172p", 300.0, 30.0, "ok", "altitude off by 1.0 m"), lost])) == [
+        Row("points flown", "1"),
+        Row("points lost", "1", goal="<= 0"),
+        Row("altitude 300 m, airspeed 30 m/s", "ok"),
+        Row("altitude 300 m, airspeed 36 m/s", "lost: diverged at t = 3.00 s"),
+    ]
