@@ -23,7 +23,7 @@ MODULES = {
     "flight_recorder": "ros: recorder killed_recorder",
     "control_laws": "pure: excitation laws observer_design rival_laws; ros: laws",
     "flight_analysis": "pure: bridge_identification check_signs export gains guided_report identification layouts lyapunov"
-    " metrics model_identification observer_selection observer_theory replay report report_page response_identification"
+    " margins metrics model_identification observer_selection observer_theory replay report report_page response_identification"
     " servo_world simulate; ros: replay",
     "flight_campaign": "pure: campaign compare fleet",
     "flight_bringup": "pure: launch_files; ros: flight real_time_flight lockstep node_state nodes own_aircraft policy"

@@ -105,39 +105,57 @@ def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
     return exponential
 
 
-def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:
-    """One period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the unit circle.
+class SampledPlant(NamedTuple):
+    """Aircraft, actuators and delay from tick to tick: x+ = A x + B u, y = C x; leading axes are batches."""
 
-    u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,). The state is x, the
-    actuators, the law's state, and the delayed inputs. Source: K. J. Astrom, B. Wittenmark, "Computer-Controlled Systems",
-    section 2.3, for the sampling of a plant with delay.
+    A: FloatArray  # (..., k, k)
+    B: FloatArray  # (..., k, m)
+    C: FloatArray  # (..., m, k)
+
+
+def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledPlant:
+    """The exact motion over one period, with k = n + m + held m states: x, the actuators, u of earlier ticks.
+
+    u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,). Source: K. J. Astrom,
+    B. Wittenmark, "Computer-Controlled Systems", section 2.3, for the sampling of a plant with delay.
     """
-    (n, m), k = plant.B.shape, len(law.A)
+    n, m = plant.B.shape[-2:]
+    batch = np.broadcast_shapes(plant.A.shape[:-2], plant.B.shape[:-2])
     has_lag = loop.lag > 0.0
     rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)  # without an actuator: any, it drives nothing
-    motion = np.block([[plant.A, plant.B * has_lag], [np.zeros((m, n)), -np.diag(rate)]])
-    drive = np.vstack([plant.B * ~has_lag, np.diag(rate * has_lag)])
+    motion, drive = np.zeros((*batch, n + m, n + m)), np.zeros((*batch, n + m, m))
+    motion[..., :n, :n], motion[..., :n, n:], motion[..., n:, n:] = plant.A, plant.B * has_lag, -np.diag(rate)
+    drive[..., :n, :], drive[..., n:, :] = plant.B * ~has_lag, np.diag(rate * has_lag)
     whole = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
     part = np.maximum(loop.delay + extra - whole * loop.period, 0.0)
-    held = int(whole.max()) + 1  # delayed inputs, the newest first
+    held = int(whole.max()) + 1  # earlier ticks whose u still acts, the newest first
 
-    free, _ = zero_order_hold(motion, drive, loop.period)
-    size = n + m + k + held * m
-    of_law, delayed = slice(n + m, n + m + k), slice(n + m + k, size)
-    eye, output = np.eye(size), np.zeros((m, size))
-    output[:, :n] = plant.C
-    u = law.C @ eye[of_law] + law.D @ output
-    inputs = np.vstack([u, eye[delayed]])  # of this tick, then of earlier ones
-
-    matrix = np.zeros((size, size))
-    matrix[: n + m, : n + m] = free
+    size = n + m + held * m
+    A, B, C = np.zeros((*batch, size, size)), np.zeros((*batch, size, m)), np.zeros((*batch, m, size))
+    C[..., :n] = plant.C
+    A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
+    inputs = np.zeros((*batch, n + m, m + held * m))  # effect of u of this tick, then of earlier ticks
     for i in range(m):
         rest, new = zero_order_hold(motion, drive, loop.period - part[i])
         _, old = zero_order_hold(motion, drive, part[i])
-        matrix[: n + m] += np.outer(new[:, i], inputs[whole[i] * m + i])
-        matrix[: n + m] += np.outer(rest @ old[:, i], inputs[(whole[i] + 1) * m + i])
-    matrix[of_law] = law.A @ eye[of_law] + law.B @ output
-    matrix[delayed] = inputs[: held * m]
+        inputs[..., whole[i] * m + i] += new[..., i]
+        inputs[..., (whole[i] + 1) * m + i] += (rest @ old)[..., i]
+    B[..., : n + m, :], A[..., : n + m, n + m :] = inputs[..., :m], inputs[..., m:]
+    B[..., n + m : n + 2 * m, :] = np.eye(m)
+    A[..., n + 2 * m :, n + m : -m] = np.eye((held - 1) * m)
+    return SampledPlant(A, B, C)
+
+
+def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:
+    """One period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the unit circle.
+
+    The state is that of `sampled_plant`, then the law's. Leading axes of the plant are batches.
+    """
+    A, B, C = sampled_plant(plant, loop, extra)
+    k, size = A.shape[-1], A.shape[-1] + len(law.A)
+    matrix = np.zeros((*A.shape[:-2], size, size))
+    matrix[..., :k, :k], matrix[..., :k, k:] = A + B @ law.D @ C, B @ law.C
+    matrix[..., k:, :k], matrix[..., k:, k:] = law.B @ C, law.A
     return matrix
 
 
