@@ -168,23 +168,6 @@ def test_an_inactive_controller_commands_trim_before_its_first_engagement_once_i
     assert not state.u.any()
 
 
-@given(instants=st.lists(st.tuples(st.integers(1, 400), st.booleans(), st.floats(-1, 1)), min_size=2, max_size=40))
-def test_the_input_changes_only_by_a_step_of_the_law_or_by_the_ramp(instants: list[tuple[int, bool, float]]) -> None:
-    # Fresh and stale samples at random: between two ticks u changes by a step of the law, by the ramp, or not at all.
-    state, ms = guard.initial_state(4), 0
-    y, y_m = sample(0), [sample(0)]
-    for wait_ms, fresh, value in instants:
-        ms += wait_ms
-        if fresh:
-            y, y_m = sample(ms, value), [sample(ms)]
-        before = state
-        state, _ = tick(state, ms, y, y_m)
-        if state.mode is Mode.ENGAGED and before.mode is not Mode.ENGAGED:
-            assert (state.u == before.u).all()
-        elif state.mode in {Mode.HOLD, Mode.RAMP, Mode.TRIM}:
-            assert (np.abs(state.u) <= np.abs(before.u)).all()
-
-
 def limits_of(bound: float, rate: float = np.inf) -> Limits:
     return Limits(np.full(2, -bound), np.full(2, bound), np.full(2, rate))
 
@@ -219,9 +202,11 @@ def test_saturation_keeps_the_limits_and_leaves_an_input_inside_them_unchanged(
     assert (limited[inside] == u[inside]).all()
 
 
-def test_saturation_clips_an_input_that_starts_outside_its_limits() -> None:
-    limited = saturate(np.array([5.0, -5.0]), np.array([3.0, -3.0]), np.array(0.01), limits_of(1.0, 10.0))
-    assert limited.tolist() == [1.0, -1.0]
+def test_saturation_moves_to_new_limits_at_its_rate() -> None:
+    """Without a limit of the rate u is inside at once."""
+    u, before = np.array([5.0, -5.0]), np.array([3.0, -3.0])
+    for rate, limited in ((10.0, [2.9, -2.9]), (1000.0, [1.0, -1.0]), (np.inf, [1.0, -1.0])):
+        assert saturate(u, before, np.array(0.01), limits_of(1.0, rate)).tolist() == limited
 
 
 @given(state=STATES, y=PAIRS, trim=PAIRS)

@@ -52,8 +52,9 @@ class Controller:
         return self._state.law is not None
 
     def restart(self) -> None:
-        """Reset the state and keep u (bumpless transfer)."""
-        self._state = guard.initial_state(len(self._state.u))._replace(u=self._state.u)
+        """Engage the law anew with the next fresh y and y_m, from the u of then (bumpless transfer); a failsafe goes on."""
+        if self._state.mode is Mode.ENGAGED:
+            self._state = self._state._replace(mode=Mode.WAITING)
 
     def retune(self, parameters: ControllerConfig) -> None:
         """Replace all parameters between two ticks without a jump of u (bumpless transfer). Equal parameters change nothing.
@@ -102,6 +103,15 @@ class Controller:
         limits, digest = self._guard.limits, self._digest
         log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest)
         return ControlOutput(inputs.stamp_ns, self._state.u, log)
+
+    def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
+        """Instants of further ticks before the one at `now_ns`, where the last one is longer ago than the age limit.
+
+        The aircraft has started its own failsafe for u meanwhile. Two ticks without fresh inputs bring u of the controller to
+        where the aircraft has it, so that the re-engagement is bumpless.
+        """
+        begin_ns = last_ns + self._guard.max_age_ns
+        return (begin_ns + self.period_ns, now_ns) if now_ns > begin_ns else ()
 
     def _newest_paired_y(self) -> StampedVector | None:
         """The newest y at whose stamp y_m is known. Where y_m is late, an earlier y is used, so that no failsafe starts."""

@@ -63,6 +63,8 @@ class ControllerState(NamedTuple):
     u_failsafe: FloatArray  # u at that instant
     u_ff: FloatArray  # the feedforward, 0 where there is none
     feedforward: FeedforwardState | None = None
+    hold_ns: int = 0  # times of the present failsafe: new parameters count from the next failsafe on, so that u does not jump
+    ramp_ns: int = 0
 
 
 class TickInputs(NamedTuple):
@@ -205,10 +207,12 @@ def _failsafe(
     if y is None or y_m is None:
         return state._replace(mode=Mode.WAITING if active else Mode.INACTIVE), None
     was_active = state.mode is not Mode.INACTIVE
-    if state.mode is Mode.ENGAGED or was_active != active:
-        state = state._replace(failsafe_start_ns=now_ns, u_failsafe=state.u)
-    elapsed_ns, hold_ns = now_ns - state.failsafe_start_ns, guard.hold_ns if active else 0
-    scale = 1.0 if not active and guard.deactivation_holds else failsafe_scale(elapsed_ns, hold_ns, guard.ramp_ns)
+    if state.mode in {Mode.ENGAGED, Mode.WAITING} or was_active != active:
+        hold_ns = guard.hold_ns if active else 0
+        state = state._replace(failsafe_start_ns=now_ns, u_failsafe=state.u, hold_ns=hold_ns, ramp_ns=guard.ramp_ns)
+    elapsed_ns = now_ns - state.failsafe_start_ns
+    held = not active and guard.deactivation_holds
+    scale = 1.0 if held else failsafe_scale(elapsed_ns, state.hold_ns, state.ramp_ns)
     if not active:
         mode = Mode.INACTIVE
     elif scale == 1.0:

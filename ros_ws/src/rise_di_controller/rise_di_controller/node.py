@@ -97,8 +97,10 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         now_ns += tick.late_ns
-        if self._last_ns and now_ns - self._last_ns > self._max_age_ns:
-            self._recover_from_overrun(now_ns)
+        if self._last_ns and (instants := self._controller.overrun(self._last_ns, now_ns)):
+            self.get_logger().warning(f"overrun of {seconds(now_ns - self._last_ns):.3f} s: re-engaging")
+            for instant_ns in instants:
+                self._step(instant_ns, 0)
         self._last_ns = now_ns
         for subscription, decoder, take, lock in (
             (self._y_subscription, self._y_decoder, self._controller.take_y, self._y_publisher_lock),
@@ -114,16 +116,6 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     @property
     def _max_age_ns(self) -> int:
         return nanoseconds(self.parameters.max_age)
-
-    def _recover_from_overrun(self, now_ns: int) -> None:
-        """Re-engage after an overrun longer than the age limit.
-
-        The aircraft has started its own failsafe for u meanwhile. Two ticks without fresh inputs bring u of the controller to
-        where the aircraft has it, so that the re-engagement is bumpless.
-        """
-        self.get_logger().warning(f"overrun of {seconds(now_ns - self._last_ns):.3f} s: re-engaging")
-        self._step(self._last_ns + self._max_age_ns + self.period_ns(), 0)
-        self._step(now_ns, 0)
 
     def _ages_ns(self) -> tuple[int, int]:
         """Ages above which a publisher has timed out: for the same node in another process, and for another node.

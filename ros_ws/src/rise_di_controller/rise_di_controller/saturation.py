@@ -16,11 +16,14 @@ class Limits(NamedTuple):
 
 
 def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
-    """Saturation of u, shape (m,): clipped to [lower, upper] and to u_before +- rate dt. Inside, u returns to the last bit."""
+    """Saturation of u, shape (m,): clipped to [lower, upper] and to u_before +- rate dt. Inside, u returns to the last bit.
+
+    Where u_before is outside of new limits, u moves to them at its rate.
+    """
     xp = array_namespace(u)
     reach = limits.rate * dt
-    low = xp.minimum(xp.maximum(limits.lower, u_before - reach), limits.upper)
-    high = xp.maximum(xp.minimum(limits.upper, u_before + reach), limits.lower)
+    low = xp.maximum(xp.minimum(limits.lower, u_before + reach), u_before - reach)
+    high = xp.minimum(xp.maximum(limits.upper, u_before - reach), u_before + reach)
     return xp.minimum(xp.maximum(u, low), high)
 
 
