@@ -29,19 +29,6 @@ few = settings(
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
-SLOW = {
-    "actuators", "any_plant", "bridge_identification", "campaign", "check_signs", "cli", "compare", "engagement",
-    "evidence", "excitation", "feedforward", "fleet", "gains", "guidance_benchmark", "guided_flight", "guided_report",
-    "identification", "jsbsim", "live_commands", "lyapunov", "model_identification", "observer_selection",
-    "observer_theory", "paper_identities", "repair", "replay", "report", "report_command", "report_page", "rival_laws",
-    "saturation", "schedule", "sensors", "servo_world", "signs", "simulate", "turbulence", "uncertainty", "view",
-    "view_control", "view_page",
-}  # fmt: skip
-"""Modules of tests/pure with seconds of processor time, which `make test-fast` leaves out."""
-
-ALONE = {"faults", "killed_recorder", "real_time_flight"}
-"""Modules of tests/ros that fly in real time and measure it: `make test` runs them one after another, after all others."""
-
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let all processes of a session share the programs that JAX has compiled; workers inherit the environment."""
@@ -53,14 +40,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of the modules above. The quick ones come last: no worker computes long after the others have ended."""
-    for item in items:
-        folder = item.path.relative_to(REPOSITORY / "tests").parts[0]
-        name = item.path.stem.removeprefix("test_")
-        if folder == "pure" and name in SLOW:
-            item.add_marker("slow")
-        if folder == "ros" and name in ALONE:
-            item.add_marker("alone")
+    """Sort the quick tests to the end: no worker computes long after the others have ended."""
     items.sort(key=lambda item: item.path.parent.name == "pure" and item.get_closest_marker("slow") is None)
 
 

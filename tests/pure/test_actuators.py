@@ -27,6 +27,8 @@ from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.law import Sign
 
+pytestmark = [pytest.mark.package("aircraft_sim"), pytest.mark.slow]
+
 SIX = Actuators(  # ideal, lag, rate limit, lag and rate limit, end stops, all
     lag=np.array([0.0, 0.1, 0.0, 0.1, 0.0, 0.1]),
     lower=np.array([-np.inf, -np.inf, -np.inf, -np.inf, -0.5, -0.05]),

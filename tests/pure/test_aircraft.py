@@ -23,6 +23,8 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 
+pytestmark = pytest.mark.package("aircraft_sim")
+
 
 def osprey(**gusts: dict[str, float]) -> Aircraft:
     return aircraft_parameters(gusts=gusts).plant().aircraft

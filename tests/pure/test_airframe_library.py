@@ -23,6 +23,8 @@ from flight_core.units import SI_PER_UNIT
 from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import coupling
 
+pytestmark = pytest.mark.package("aircraft_sim")
+
 NAMES = tuple(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
 
 

@@ -23,6 +23,8 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import decompose, leading_minors, signs
 from rise_di_controller.law import LawParams, Sign, gain
 
+pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
+
 MIN_DAMPING = 0.5  # 1/s, of the aircraft and of its zero dynamics
 DURATION, SETTLED = 8.0, 5.0  # s, length of a flight and the time at which e has settled: ten time constants of Lambda
 DT = 0.008  # s; the tests also use half of it

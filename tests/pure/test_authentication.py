@@ -18,6 +18,8 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 from flight_log.named_vectors import decoder, tables
 
+pytestmark = pytest.mark.package("flight_core")
+
 KEY = bytes(range(KEY_BYTES))
 
 

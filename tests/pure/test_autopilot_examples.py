@@ -13,6 +13,8 @@ from flight_bringup.graph import find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 
+pytestmark = pytest.mark.package("autopilot_bridge")
+
 EXAMPLES = {"arduplane": "ardupilot", "px4_airplane": str(REPOSITORY / "examples" / "px4_airplane" / "map.yaml")}
 
 

@@ -40,6 +40,8 @@ from flight_log.tape_reader import ROSBAG2, read_run
 from flight_log.tape_writer import write_run
 from flight_view.flight import Flight
 
+pytestmark = pytest.mark.package("flight_log")
+
 
 def test_a_written_tape_is_read_back_bit_by_bit(tape: Tape, recorded: Path) -> None:
     back = read_run(recorded).tape

@@ -21,6 +21,8 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError, StampedVector
 
+pytestmark = pytest.mark.package("autopilot_bridge")
+
 if TYPE_CHECKING:
     from flight_bringup.clients import FlightMonitor
     from flight_bringup.processes import FlightProcesses

@@ -43,6 +43,8 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from flight_log.tape_writer import write_run
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 MAP, SPEED, DELAY = load_map("ardupilot"), 25.0, 0.05  # m/s; s, by which y is late
 OSPREY = load_airframe("osprey")
 

@@ -40,6 +40,8 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.laws import AnyLaw
 
+pytestmark = [pytest.mark.package("flight_campaign"), pytest.mark.slow]
+
 SHORT = find_scenario("osprey_servo").vary(flight={"duration": 5.0})
 VALUES = arrays(np.float64, st.integers(1, 60), elements=st.floats(1e-6, 1e4))
 

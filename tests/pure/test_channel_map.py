@@ -28,6 +28,8 @@ from autopilot_bridge.params import MOVED, BridgeConfig, ChannelMap, MeasuredRow
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
+pytestmark = pytest.mark.package("autopilot_bridge")
+
 MAPS = sorted(MAP_FILES)
 PAGE = REPOSITORY / "docs" / "autopilots-reference.md"
 LINES = st.builds(Line, st.sampled_from((-1, 1)), st.floats(1e-3, 1e3), st.floats(-1e3, 1e3))

@@ -28,6 +28,8 @@ from flight_core.vectors import FloatArray
 from flight_log.tape_writer import write_run
 from rise_di_controller.laws import AnyLaw
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 app = application([*COMMANDS])
 MAPS = sorted(MAP_FILES)
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")

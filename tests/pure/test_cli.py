@@ -15,6 +15,8 @@ from typer.testing import CliRunner
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_cli.cli import COMMANDS, application
 
+pytestmark = [pytest.mark.package("flight_cli"), pytest.mark.slow]
+
 
 def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "flight_cli.cli", *arguments]

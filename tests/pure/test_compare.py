@@ -24,6 +24,8 @@ from flight_campaign.tuning import GUST, OBJECTIVES, TURBULENCE, Benchmark
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 
+pytestmark = [pytest.mark.package("flight_campaign"), pytest.mark.slow]
+
 app = application([*COMMANDS])
 SHIPPED = sorted(path.stem for path in tuned_gains.TUNED.glob("*.yaml"))
 

@@ -25,6 +25,8 @@ from rise_di_controller.decomposition import (
     unit_diagonal,
 )
 
+pytestmark = pytest.mark.package("rise_di_controller")
+
 EPSILON = float(np.finfo(np.float64).eps)
 SIZES = st.integers(1, 5)
 ENTRIES = st.floats(-10.0, 10.0).filter(lambda value: abs(value) > 0.01)

@@ -24,6 +24,8 @@ from rise_di_controller.guard import ControllerState
 from rise_di_controller.law import LawParams, control, retune
 from rise_di_controller.params import ControllerConfig
 
+pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
+
 PERIOD_NS = 10_000_000
 SINES = {  # u always moves; p is small, because the bank that builds up without control loads the rudder
     "q": {"amplitude": 0.1, "frequency": 1.0},

@@ -17,6 +17,8 @@ from benchmarks.evidence import EXIT_STATUS, MEASUREMENTS, SPEED, cases, read_re
 from benchmarks.evidence_data import BUSY, FOLDER, REPOSITORY, Measured, Origin, Row, read, row, used, write
 from benchmarks.evidence_page import PAGE, TITLES, page
 
+pytestmark = pytest.mark.slow
+
 ORIGIN = Origin("measure", "abc1234", "a processor, 2 cores", "2020-01-02 03:04 UTC")
 TWICE = {"column": "p50 (us)", "at_most": 2.0, "of_floor": True}
 

@@ -17,6 +17,8 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_view.control import gains_of
 
+pytestmark = [pytest.mark.package("control_laws"), pytest.mark.slow]
+
 TIMETABLE: dict[str, Any] = {
     "amplitude": [0.02, 0.02, 0.02, 0.06],  # rad and 1
     "width": [0.25, 0.25, 0.25, 1.0],

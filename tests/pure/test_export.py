@@ -18,6 +18,8 @@ from flight_analysis.report.export import write_csv, write_parquet, write_png
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.tape import Signal, Tape
 
+pytestmark = pytest.mark.package("flight_analysis")
+
 
 @pytest.fixture(scope="module")
 def flight(osprey_gust: Scenario) -> RecordedFlight:

@@ -15,6 +15,8 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
+pytestmark = pytest.mark.package("aircraft_sim")
+
 SAMPLES, CHANGE = 400, 201  # at 500 Hz; the number of the first sample after the change
 BEGIN = (CHANGE - 1) / 500.0
 NEVER = math.inf

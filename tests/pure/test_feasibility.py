@@ -16,6 +16,8 @@ from flight_guidance.feasibility import Performance, flyable_legs, speeds
 from flight_guidance.path import Arc, Line
 from flight_guidance.route_file import Waypoint, read_route
 
+pytestmark = pytest.mark.package("flight_guidance")
+
 CAN = Performance(
     speed=40.0, stall_speed=25.0, bank=math.radians(30.0), roll_rate=0.45, climb=2.5, sink=4.0, wind=10.0
 )  # fmt: skip

@@ -31,6 +31,8 @@ from rise_di_controller.guard import ControllerState
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 
+pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
+
 app = application([*COMMANDS])
 MS = 1_000_000
 SERVO = find_scenario("osprey_servo")

@@ -15,6 +15,8 @@ from flight_core.fields import Field, Kind, Problems, kind_of
 from flight_core.files import dump_yaml, parse_yaml
 from flight_core.parameters import Config, ParameterError
 
+pytestmark = pytest.mark.package("flight_core")
+
 # Each with the declaration of rules as its argument: the stack's Field or pydantic's.
 ANNOTATIONS: list[Callable[[Any], Any]] = [
     lambda _: float,

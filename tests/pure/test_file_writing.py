@@ -20,6 +20,8 @@ from flight_cli.report import report
 from flight_core.files import replacing, write_file
 from flight_core.parameters import ParameterError
 
+pytestmark = pytest.mark.package("flight_core")
+
 SOURCES = Path(__file__).resolve().parents[2] / "ros_ws" / "src"
 
 OWN_WRITERS = {

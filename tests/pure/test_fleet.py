@@ -22,6 +22,8 @@ from flight_core.vectors import Array, FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.saturation import Limits
 
+pytestmark = [pytest.mark.package("flight_campaign"), pytest.mark.slow]
+
 SERVO = find_scenario("osprey_servo").vary(
     flight={"duration": 9.0},
     aircraft={

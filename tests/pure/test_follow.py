@@ -24,6 +24,8 @@ from flight_log.follow import Follower, Messages
 from flight_log.named_vectors import decoder, tables
 from flight_log.scan import RECORD
 
+pytestmark = pytest.mark.package("flight_log")
+
 CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())
 
 

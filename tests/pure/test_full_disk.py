@@ -21,6 +21,8 @@ from flight_log.disk import ReservedFile, free_bytes
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 
+pytestmark = pytest.mark.package("flight_log")
+
 SIZE = 2_000_000
 
 

@@ -35,6 +35,8 @@ from rise_di_controller.laws import AnyLaw
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law
 from rise_di_controller.rise_di import RiseDiConfig
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 AIRFRAME = load_airframe("osprey")
 SERVOS: LoopSetting = selection.loop_setting(find_scenario("osprey_servo"))._replace(delay=0.0, rate_limit={})
 HAND = Bounds(

@@ -21,6 +21,8 @@ from rise_di_controller.law import LawState, Sign, control, engage, retune, step
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits, saturate
 
+pytestmark = pytest.mark.package("rise_di_controller")
+
 MS = 1_000_000
 PARAMS = find_scenario("osprey_gust").controller
 

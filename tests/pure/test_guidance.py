@@ -30,6 +30,8 @@ from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Arc, Line
 from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_lag, pitch_for, slewed
 
+pytestmark = pytest.mark.package("flight_guidance")
+
 SPEED = 40.0  # m/s
 HOLD = AttitudeParams(k_phi=1.25, k_theta=1.0, roll_rate=0.3, load=0.5, n_alpha=1e9, k_beta=0.0)
 CLIMB = VerticalParams(k_h=0.2, acceleration=1.0, climb=5.0, sink=4.0, alpha_time=2.0)

@@ -14,6 +14,8 @@ from flight_core.channels import POSE
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import StampedVector
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_step_of_the_bank_is_flown_within_its_limits() -> None:
     rows = list(benchmark.rows("osprey_servo", {"phi": benchmark.MANOEUVRES["phi"]}, seeds=0))

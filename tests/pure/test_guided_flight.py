@@ -33,6 +33,8 @@ from flight_log.bag import BagWriter
 from flight_log.named_vectors import PATH, typestore
 from flight_log.tape_reader import read_run
 
+pytestmark = [pytest.mark.package("flight_guidance"), pytest.mark.slow]
+
 ROUTE = find_scenario("osprey_route")
 SECTION: dict[str, Any] = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0, "throttle_authority": [3.0, 3.0]}
 MS = 1_000_000  # ns

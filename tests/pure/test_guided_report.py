@@ -30,6 +30,8 @@ from flight_guidance.guidance import names
 from flight_guidance.modes import Lateral, Mode, Vertical
 from flight_guidance.path import Arc, Line, Route
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 T = np.arange(0.0, 40.0, 0.02)  # s
 SPEED = 40.0  # m/s, trim
 

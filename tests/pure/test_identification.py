@@ -47,6 +47,8 @@ from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 DT = 0.005
 THROTTLE = 1  # its place among the inputs of an identified aircraft
 WIDE = np.full(2, 10.0)

@@ -30,6 +30,8 @@ from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
+pytestmark = [pytest.mark.package("aircraft_sim"), pytest.mark.slow]
+
 STEP_NS = 5_000_000
 CESSNA = FlightCondition("c172p", 46.3, 1219.2, STEP_NS)
 C182 = FlightCondition("c182", 56.6, 1219.2, STEP_NS)

@@ -33,6 +33,8 @@ from flight_log.tape_writer import write_run
 from flight_ros.topics import NodeState
 from flight_ros.transport import DISCOVERY_VARIABLE, PROFILE_VARIABLE
 
+pytestmark = pytest.mark.package("flight_bringup")
+
 app = application([*COMMANDS])
 FILES = sorted((REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "launch").glob("*.launch.py"))
 INSTALLED = REPOSITORY / "ros_ws" / "install"

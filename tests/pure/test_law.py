@@ -13,6 +13,8 @@ from tests.closed_loop import law_params
 from flight_core.vectors import FloatArray
 from rise_di_controller.law import LawParams, LawState, Sign, engage, gain, step
 
+pytestmark = pytest.mark.package("rise_di_controller")
+
 DT = 0.1
 
 

@@ -39,6 +39,8 @@ from rise_di_controller.observer import ObserverParams, ObserverState, correct, 
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
+pytestmark = pytest.mark.package("control_laws")
+
 AIRFRAME = load_airframe("osprey")
 SERVO = find_scenario("osprey_servo").vary(
     flight={"duration": 2.0},

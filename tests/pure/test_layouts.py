@@ -22,6 +22,8 @@ from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import application
 from flight_core.tape import Tape
 
+pytestmark = pytest.mark.package("flight_analysis")
+
 CHANNELS = channels_of(find_scenario("osprey_gust"))
 JSON, XML = foxglove(CHANNELS), plotjuggler(CHANNELS)
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")

@@ -23,6 +23,8 @@ from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
 
+pytestmark = [pytest.mark.package("reference_model"), pytest.mark.slow]
+
 OUTPUTS = ("q", "V", "p", "r")
 RATE = 200.0  # Hz
 SECTION: dict[str, Any] = {

@@ -3,11 +3,14 @@
 """y and a second signal of a lockstep flight come together whatever the order in which they arrive."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from flight_core.vectors import StampedVector
 from flight_ros.lockstep import Instant, LockstepInputs
+
+pytestmark = pytest.mark.package("flight_ros")
 
 Y_NS, STEP_NS = 2, 10  # ns; y at five times the rate of the steps
 

@@ -30,6 +30,8 @@ from flight_log.provenance import STACK, provenance, revision
 from flight_log.tape_reader import RecordedRun, read_run
 from flight_log.tape_writer import write_run
 
+pytestmark = pytest.mark.package("flight_log")
+
 
 @pytest.fixture(scope="module")
 def recorded(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:

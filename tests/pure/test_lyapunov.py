@@ -34,6 +34,8 @@ from flight_bringup.scenarios import find_scenario
 from rise_di_controller.decomposition import decompose
 from rise_di_controller.law import LawParams, Sign
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 PERIODS = (0.02, 0.01, 0.005, 0.0025)
 TOO_SMALL = 0.05  # times beta: 0.25 and 0.15, where (29), (30) require 1.7 and 1.7
 

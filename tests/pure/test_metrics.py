@@ -17,6 +17,8 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from rise_di_controller.internals import Saturation
 
+pytestmark = pytest.mark.package("flight_analysis")
+
 
 def tape(**signals: Signal) -> Tape:
     """A flight that begins at EPOCH."""

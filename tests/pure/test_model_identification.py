@@ -30,6 +30,8 @@ from flight_core.vectors import FloatArray
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 OSPREY = load_airframe("osprey")
 ACTUATORS = Actuation(np.array([0.02, 0.1, 0.02, 0.02]), 0.0)  # those of osprey_servo; a flight in one process has no delay
 DURATION = 36.0  # s: the commands of osprey_servo end at 33 s

@@ -14,6 +14,8 @@ from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import ExtendedStateWeights, Names, ObserverDesign, Weights
 from flight_core.vectors import FloatArray
 
+pytestmark = pytest.mark.package("control_laws")
+
 AIRFRAME = load_airframe("osprey")
 NAMES = Names(tuple(AIRFRAME.states), tuple(AIRFRAME.inputs), AIRFRAME.outputs, tuple(AIRFRAME.gusts))
 M = 4

@@ -28,6 +28,8 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
 from rise_di_controller.rise_di import RiseDiConfig
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 OSPREY = load_airframe("osprey")
 SERVO = find_scenario("osprey_servo")
 NOISE = np.array([0.0017, 0.0017, 0.0017, 0.03])  # of osprey_servo in the law's order q, p, r, V

@@ -26,6 +26,8 @@ from flight_campaign.tuned_gains import TuningResult
 from flight_core.vectors import FloatArray
 from rise_di_controller.law import LawParams, Sign
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 N, M = 4, 2  # states and channels of a random plant
 ZERO_LEAK = 0.01  # 1/s, decay of angles and disturbances in a model, so that the Riccati equations have a solution
 

@@ -3,15 +3,15 @@
 """Every package is a correct ament_python package: its files agree, and it is installed."""
 
 import configparser
+import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
-import pytest
-from ros_ws.src.conftest import MODULES, SOURCES, TESTS, WHOLE_TREE, files
-from tests.conftest import ALONE, SLOW
+from ros_ws.src.conftest import SOURCES, TESTS, files_of
 from tests.pure.test_import_rule import imported
 
 INSTALLED = SOURCES.parent / "install"
@@ -25,6 +25,7 @@ EXECUTABLES = {
     "flight_recorder": "recorder",
     "flight_cli": "rise-di",
 }
+TEST_DEPENDENCIES = {"python3-hypothesis", "python3-pytest", "python3-pytest-timeout"}
 
 # The keys of rosdep (rosdep/python.yaml of ros/rosdistro); a ROS package is its own key.
 PYTHON3 = ("jinja2", "matplotlib", "numpy", "psutil", "rich", "scipy", "tornado", "typer", "yaml")
@@ -33,35 +34,49 @@ KEYS = {name: f"python3-{name}" for name in PYTHON3} | {"markupsafe": "python3-j
 WITHOUT_KEY = {"cma", "distributed", "foxglove", "jax", "jsbsim", "lz4", "mcap", "polars", "rosbags", "zstandard"}
 
 
-@pytest.mark.parametrize("package", PACKAGES, ids=lambda path: path.name)
-def test_package_files_agree_with_each_other(package: Path) -> None:
+def offenders(check: Callable[[Path], object]) -> dict[str, object]:
+    """What a check finds wrong in each package, by package."""
+    return {package.name: wrong for package in PACKAGES if (wrong := check(package))}
+
+
+def test_package_files_agree_with_each_other() -> None:
+    assert offenders(disagreements) == {}
+
+
+def disagreements(package: Path) -> list[str]:
+    """The statements about a package's files that do not hold."""
     name = package.name
     root = ElementTree.parse(package / "package.xml").getroot()
     setup = (package / "setup.py").read_text(encoding="utf-8")
-    assert root.findtext("name") == name
-    assert root.findtext("license") == "Apache-2.0"
-    assert root.findtext("export/build_type") == "ament_python"
-    assert 'version=ElementTree.parse("package.xml").findtext("version")' in setup
-    assert 'extras_require={"test": ["pytest"]}' in setup  # by which colcon test chooses pytest
-    tested_with = {node.text for node in root.findall("test_depend")}
-    assert tested_with == {"python3-hypothesis", "python3-pytest", "python3-pytest-timeout"}
-    # colcon builds a package with an e-mail it cannot parse as plain Python, with a warning only
-    maintainer = root.find("maintainer")
-    assert maintainer is not None
-    assert re.fullmatch(r"[\w.-]+@[\w-]+(\.[\w-]+)+", maintainer.attrib["email"])
+    email = root.find("maintainer[@email]")
     config = configparser.ConfigParser()
     config.read(package / "setup.cfg")
-    assert config["install"]["install_scripts"] == f"$base/lib/{name}"
-    assert (package / "resource" / name).is_file()
+    statements = {
+        "name": root.findtext("name") == name,
+        "licence": root.findtext("license") == "Apache-2.0",
+        "build type": root.findtext("export/build_type") == "ament_python",
+        "version from package.xml": 'version=ElementTree.parse("package.xml").findtext("version")' in setup,
+        "extra test, by which colcon test chooses pytest": 'extras_require={"test": ["pytest"]}' in setup,
+        "test dependencies": {node.text for node in root.findall("test_depend")} == TEST_DEPENDENCIES,
+        # colcon builds a package with an e-mail it cannot parse as plain Python, with a warning only
+        "e-mail": email is not None and re.fullmatch(r"[\w.-]+@[\w-]+(\.[\w-]+)+", email.attrib["email"]) is not None,
+        "scripts where ros2 run looks": config["install"]["install_scripts"] == f"$base/lib/{name}",
+        "resource": (package / "resource" / name).is_file(),
+    }
+    return [statement for statement, holds in statements.items() if not holds]
 
 
-@pytest.mark.parametrize("package", PACKAGES, ids=lambda path: path.name)
-def test_package_declares_all_that_it_imports(package: Path) -> None:
+def test_packages_declare_all_that_they_import() -> None:
+    assert offenders(undeclared) == {}
+
+
+def undeclared(package: Path) -> set[str]:
+    """Imported packages of others without an exec_depend."""
     root = ElementTree.parse(package / "package.xml").getroot()
     declared = {node.text for node in root.findall("exec_depend")}
     sources = [path for path in package.rglob("*.py") if path.name != "setup.py"]
     external = set().union(*map(imported, sources)) - sys.stdlib_module_names - {package.name} - WITHOUT_KEY
-    assert {KEYS.get(name, name) for name in external} <= declared
+    return {KEYS.get(name, name) for name in external} - declared
 
 
 def test_packages_citation_and_changelog_have_one_version() -> None:
@@ -75,17 +90,18 @@ def test_packages_citation_and_changelog_have_one_version() -> None:
     assert versions == {cited[1]} == {newest[1]}
 
 
-def test_every_test_is_of_one_package_or_of_the_whole_tree() -> None:
-    listed = [path for modules in (*MODULES.values(), WHOLE_TREE) for path in files(modules)]
-    assert set(MODULES) == {package.name for package in PACKAGES}
-    assert sorted(listed) == sorted(path for path in TESTS.rglob("test_*.py") if path.parts[len(TESTS.parts)] != "sitl")
+def test_each_package_has_marked_tests() -> None:
+    """No mark names a package that does not exist."""
+    text = "".join(path.read_text(encoding="utf-8") for path in TESTS.rglob("test_*.py"))
+    assert set(re.findall(r'pytest\.mark\.package\("(\w+)"\)', text)) == {package.name for package in PACKAGES}
 
 
-def test_pytest_in_the_folder_of_a_package_runs_its_tests_as_colcon_asks_for_them() -> None:
+def test_pytest_runs_the_tests_of_a_package() -> None:
+    """In its folder, with the arguments of `colcon test`."""
     command = [sys.executable, "-m", "pytest", "-o", "cache_dir=cache", "--collect-only", "-qq"]
     done = subprocess.run(command, cwd=SOURCES / "flight_core", capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
-    assert set(re.findall(r"test_\w+\.py", done.stdout)) == {path.name for path in files(MODULES["flight_core"])}
+    assert set(re.findall(r"test_\w+\.py", done.stdout)) == {path.name for path in files_of("flight_core")}
 
 
 def test_the_page_on_ros_names_what_rosdep_cannot_install() -> None:
@@ -93,34 +109,32 @@ def test_the_page_on_ros_names_what_rosdep_cannot_install() -> None:
     assert not {name for name in WITHOUT_KEY if f"`{name.replace('_', '-')}`" not in page}
 
 
-@pytest.mark.parametrize("package", PACKAGES, ids=lambda path: path.name)
-def test_package_installs_its_data_files(package: Path) -> None:
-    # A symlinked build has all files of the package folder, whether or not setup.py names them.
+def test_packages_install_their_data_files() -> None:
+    assert offenders(uninstalled_data) == {}
+
+
+def uninstalled_data(package: Path) -> set[Path]:
+    """Data files that setup.py does not name; a symlinked build has all files of the package folder."""
     setup = (package / "setup.py").read_text(encoding="utf-8")
     named = {pattern for data in re.findall(r"package_data=\{[^}]*\}", setup) for pattern in re.findall(r'"([^"]+)"', data)}
     code = package / package.name
     data = {path for path in code.rglob("*") if path.is_file() and path.suffix not in {".py", ".pyc"}}
-    assert data <= {path for pattern in named for path in code.glob(pattern)}
+    return data - {path for pattern in named for path in code.glob(pattern)}
 
 
-@pytest.mark.parametrize("package", PACKAGES, ids=lambda path: path.name)
-def test_package_is_installed_with_its_index_entry(package: Path) -> None:
+def test_packages_are_installed_with_their_index_entry() -> None:
+    assert offenders(missing_entries) == {}
+
+
+def missing_entries(package: Path) -> list[Path]:
     share = INSTALLED / package.name / "share"
-    assert (share / "ament_index" / "resource_index" / "packages" / package.name).exists()
-    assert (share / package.name / "package.xml").exists()
+    entries = [share / "ament_index" / "resource_index" / "packages" / package.name, share / package.name / "package.xml"]
+    return [path for path in entries if not path.exists()]
 
 
-@pytest.mark.parametrize(("package", "executable"), EXECUTABLES.items())
-def test_executable_is_where_ros2_run_looks(package: str, executable: str) -> None:
-    path = INSTALLED / package / "lib" / package / executable
-    assert path.is_file()
-    assert path.stat().st_mode & 0o111
-
-
-def test_the_modules_that_the_tests_mark_exist() -> None:
-    tests = SOURCES.parents[1] / "tests"
-    assert {tests / "pure" / f"test_{name}.py" for name in SLOW} <= {*tests.glob("pure/*.py")}
-    assert {path.stem.removeprefix("test_") for path in tests.glob("ros/**/test_*.py")} >= ALONE
+def test_executables_are_where_ros2_run_looks() -> None:
+    paths = [INSTALLED / package / "lib" / package / executable for package, executable in EXECUTABLES.items()]
+    assert [path for path in paths if not os.access(path, os.X_OK)] == []
 
 
 def test_every_source_file_states_its_licence() -> None:

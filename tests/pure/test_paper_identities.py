@@ -29,6 +29,8 @@ from reference_model.model import Model, second_order
 from rise_di_controller.decomposition import DecompositionError, decompose
 from rise_di_controller.law import LawParams, Sign, engage, gain, step
 
+pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
+
 EXACT = 1e-11  # rounding in sums of some hundred terms of size 1 to 100
 DIFFERENCED = 1e-5  # central differences over 1 ms of a solution with an error of 1e-10; measured below 1e-6
 

@@ -18,6 +18,8 @@ from flight_core.files import read_yaml, writing
 from flight_core.parameters import ParameterError, flatten, nest
 from flight_core.rates import divide, period_ns
 
+pytestmark = pytest.mark.package("flight_core")
+
 # Replacement in the text of the default scenario -> the sentence of the error.
 BAD = {
     ("k_g: 1.0", "k_g: -1.0"): "controller.k_g: found -1.0, expected greater than 0",

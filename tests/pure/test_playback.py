@@ -18,6 +18,8 @@ from flight_log.named_vectors import JOINT_STATE
 from flight_log.playback import begins_with_stamp, read_playback
 from flight_log.tape_writer import write_run
 
+pytestmark = pytest.mark.package("flight_log")
+
 
 @pytest.fixture(scope="module")
 def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -22,6 +22,8 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Signal
 from flight_core.units import GRAVITY
 
+pytestmark = pytest.mark.package("aircraft_sim")
+
 OSPREY = find_scenario("osprey_servo")
 C172P = find_scenario("jsbsim_c172p")
 RATE = 100.0  # Hz

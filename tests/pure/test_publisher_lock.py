@@ -12,6 +12,8 @@ from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError, StampedVector
 from rise_di_controller.controller import Controller
 
+pytestmark = pytest.mark.package("flight_core")
+
 MAX_AGE, TAKEOVER = 100, 1000
 
 

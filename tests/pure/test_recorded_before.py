@@ -20,6 +20,8 @@ from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from rise_di_controller.rise_di import RiseDiConfig
 
+pytestmark = pytest.mark.package("flight_log")
+
 TOPICS = {"y", "y_m", "u", "internals", "truth"}
 
 

@@ -19,6 +19,8 @@ from reference_model import model
 from reference_model.command import command
 from reference_model.params import ReferenceModelConfig
 
+pytestmark = pytest.mark.package("reference_model")
+
 
 def parameters(**changes: object) -> ReferenceModelConfig:
     values = {

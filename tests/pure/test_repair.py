@@ -20,6 +20,8 @@ from flight_core.parameters import ParameterError
 from flight_log.repair import repair
 from flight_log.tape_reader import read_run
 
+pytestmark = [pytest.mark.package("flight_log"), pytest.mark.slow]
+
 DURATION = 2.0  # s, of the log
 
 

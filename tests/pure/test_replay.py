@@ -39,6 +39,8 @@ from rise_di_controller.controller import Controller
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 app = application([*COMMANDS])
 GUST = find_scenario("osprey_gust").vary(
     flight={"duration": 4.0}, aircraft={"gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}}

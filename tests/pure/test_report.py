@@ -32,6 +32,8 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
 DEG = np.pi / 180.0
 

@@ -23,6 +23,8 @@ from flight_log.engagements import Engagement
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.tape_reader import read_run
 
+pytestmark = [pytest.mark.package("flight_cli"), pytest.mark.slow]
+
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:

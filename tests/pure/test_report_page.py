@@ -20,7 +20,11 @@ from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+pytestmark = [
+    pytest.mark.package("flight_analysis"),
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
+]
 DRAWN = "Number(document.body?.dataset.drawn ?? 0)"  # counts the views of all figures
 PLOTS = "[...document.querySelectorAll('figure > div')]"
 

@@ -12,6 +12,8 @@ from flight_core.rates import nanoseconds
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 
+pytestmark = pytest.mark.package("flight_analysis")
+
 OUTPUTS, INPUTS = ("p", "r"), ("aileron", "rudder")
 OMEGA: FloatArray = np.array([[40.0, 3.0], [-2.0, 8.0]])  # rad/s^2 per rad
 DAMPING = np.diag([6.0, 1.5])  # 1/s

@@ -10,6 +10,8 @@ from tests.pure.test_import_rule import modules_loaded_by
 
 import rise_di
 
+pytestmark = pytest.mark.package("rise_di")
+
 
 def test_every_name_loads() -> None:
     assert all(getattr(rise_di, name) is not None for name in rise_di.__all__)

@@ -19,6 +19,8 @@ from flight_campaign import tuning
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements
 
+pytestmark = [pytest.mark.package("control_laws"), pytest.mark.slow]
+
 DT = 0.01
 COLUMN = (1, 1)
 

@@ -14,6 +14,8 @@ from pymap3d.vincenty import vdist
 from flight_core.parameters import ParameterError
 from flight_guidance.route_file import FLATTENING, MAX_DISTANCE, SEMI_MAJOR, Origin, Waypoint, local, read_route
 
+pytestmark = pytest.mark.package("flight_guidance")
+
 ZURICH = Origin(47.4, 8.5)
 SQUARE = [(8.5, 47.4, 500.0), (8.52, 47.4, 550.0), (8.52, 47.42, 600.5)]  # longitude, latitude, altitude
 PLACES = [pymap3d.geodetic2enu(lat, lon, 0.0, *ZURICH, 0.0)[1::-1] for lon, lat, _ in SQUARE]  # north, east

@@ -22,6 +22,8 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 
+pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
+
 DEG = math.pi / 180.0
 GUSTS = find_scenario("osprey_servo").aircraft.model_dump()["gusts"]
 SERVO = CALM_SERVO.vary(reference_model={"pulses": {}})

@@ -19,6 +19,8 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import Measurements, TunedLaw
 from rise_di_controller.schedule import SCALE_RANGE, target_scale
 
+pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
+
 SPEED = 46.3  # m/s, trim of the c172p
 C172P = find_scenario("jsbsim_c172p")  # outputs of the controller: q, p, r, V
 FASTER = 16.0  # m/s: 1.81 times the dynamic pressure of the trim

@@ -14,6 +14,8 @@ from tests.conftest import with_policy
 
 from flight_core.scheduling import SLICE_NS, THREADS, TIMER_SLACK
 
+pytestmark = pytest.mark.package("flight_core")
+
 
 def output(code: str, within: Sequence[str] = ()) -> str:
     """What a Python process prints, started by `within`."""

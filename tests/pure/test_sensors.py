@@ -20,6 +20,8 @@ from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard
 
+pytestmark = [pytest.mark.package("aircraft_sim"), pytest.mark.slow]
+
 NOISE = [0.0017, 0.03, 0.0017, 0.0017]
 COUNT = 20_000  # samples
 

@@ -39,6 +39,8 @@ from flight_core.vectors import FloatArray
 from reference_model.command import Profile, command
 from rise_di_controller.linear_loop import is_stable
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 ROWS = {row.name: row for _, rows in TABLES.values() for row in rows()}
 
 

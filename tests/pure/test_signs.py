@@ -22,6 +22,8 @@ from flight_analysis.metrics import error_metrics
 from flight_core.vectors import FloatArray
 from rise_di_controller.law import LawParams
 
+pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
+
 # Trailing edge down positive. The first command of q rises at 2 s.
 
 UNLIMITED = CALM_SERVO.vary(aircraft={"actuators": {}}, controller={"lower": None, "upper": None})

@@ -18,6 +18,8 @@ from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from flight_log.tape_writer import TapeWriter, write_run
 
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
 DISPLAY_FACTORS = np.array([1e3, 1.0, 1e3, 1e3])  # q, V, p, r in mrad/s and m/s
 ABOVE_SLEW = [29.4, 22.5, 10.2, 7.8]  # 30 deg/s, 15, 60, 130 %/s: above the slew of the ideal control in the gusts
 BELOW_SLEW = [14.7, 22.5, 6.8, 3.6]  # 15 deg/s, 15, 40, 60 %/s: below it

@@ -15,6 +15,8 @@ from flight_core.vectors import ChannelError
 from flight_log.bag import BagWriter
 from flight_log.tape_reader import read_run
 
+pytestmark = pytest.mark.package("flight_core")
+
 ESCAPES = "\x1b[2J\x1b]0;PWNED\x07\nall is well"
 
 

@@ -8,6 +8,8 @@ import pytest
 
 from flight_ros.ticker import MAX_SPIN_FRACTION, SPIN_TIME, Ticker
 
+pytestmark = pytest.mark.package("flight_ros")
+
 PERIOD_NS = 10_000_000
 
 

@@ -21,6 +21,8 @@ from aircraft_sim.simulator import Simulator
 from aircraft_sim.turbulence import Dryden, Turbulence, dryden, filters
 from flight_core.vectors import FloatArray
 
+pytestmark = [pytest.mark.package("aircraft_sim"), pytest.mark.slow]
+
 FEET, KNOTS = 0.3048, 0.514444  # m, m/s
 V0 = 25.0
 SMALL = Dryden(np.array([60.0, 60.0, 25.0]), np.array([1.1, 1.1, 0.8]))  # about 60 ft above the ground in 15 kt

@@ -15,6 +15,8 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.vectors import FloatArray
 
+pytestmark = [pytest.mark.package("aircraft_sim"), pytest.mark.slow]
+
 OSPREY = load_airframe("osprey")
 
 

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 
 from flight_core.vectors import ChannelError, _NumPy1, array_namespace, require_newer, require_not_future, select
 
+pytestmark = pytest.mark.package("flight_core")
+
 
 def test_values_are_matched_by_name_not_by_position() -> None:
     assert select(["q", "V"], ["V", "r", "q"], [1.0, 2.0, 3.0]).tolist() == [3.0, 1.0]

@@ -47,6 +47,8 @@ from flight_view.server import FILES, Server, answer
 from flight_view.text import picture
 from flight_view.watch import newest_run, require_log, services_note
 
+pytestmark = [pytest.mark.package("flight_view"), pytest.mark.slow]
+
 TOKEN = "a-token"  # noqa: S105 - of a test
 CORPUS = sorted((REPOSITORY / "tests" / "corpus" / "mcap").iterdir())
 INTACT = {"zstd_of_fifty_thousand_messages"}  # valid, and too large for a reader that allocates as it is told

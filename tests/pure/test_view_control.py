@@ -21,6 +21,8 @@ from flight_view.control import BURST, LEASE, Control, RefusedError, gains_of, n
 from flight_view.server import Server
 from rise_di_controller.params import ControllerConfig
 
+pytestmark = [pytest.mark.package("flight_view"), pytest.mark.slow]
+
 KEY, TOKEN = "ABCD-EFGH", "a-token"
 ALL = ("aircraft", "controller", "guidance")
 

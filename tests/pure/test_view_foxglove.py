@@ -22,6 +22,8 @@ from tornado.websocket import websocket_connect
 
 from flight_core.tape import Tape
 
+pytestmark = pytest.mark.package("flight_view")
+
 needs_extra = pytest.mark.skipif(find_spec("foxglove") is None, reason="needs foxglove-sdk: make foxglove")
 PROTOCOL = "foxglove.sdk.v1"
 SUBSCRIBE, MESSAGE_DATA = "subscribe", 1

@@ -3,10 +3,13 @@
 """The watchdog and failsafe of the aircraft's node when u times out, and its refusal of a conflicting publisher of u."""
 
 import numpy as np
+import pytest
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer, stamp_ns
 
 from flight_core.rates import NANOSECONDS
+
+pytestmark = pytest.mark.package("aircraft_sim")
 
 PEER_TOPICS = ("truth", "/diagnostics")
 

@@ -44,6 +44,8 @@ from flight_core.rates import NANOSECONDS
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
 
+pytestmark = pytest.mark.package("autopilot_bridge")
+
 app = application([*COMMANDS])
 
 SCENARIO = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"

@@ -25,6 +25,8 @@ from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
 from flight_view.flight import Flight
 
+pytestmark = pytest.mark.package("flight_view")
+
 PEER_TOPICS = ("target",)
 
 

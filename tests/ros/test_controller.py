@@ -29,6 +29,8 @@ from flight_core.vectors import FloatArray
 from flight_ros.messages import to_message
 from flight_ros.topics import RECORD
 
+pytestmark = pytest.mark.package("rise_di_controller")
+
 Instants = np.ndarray[Any, np.dtype[np.int64]]
 
 PERIOD_NS = NANOSECONDS // 100  # of the ticks, as in the default scenario

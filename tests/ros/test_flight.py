@@ -20,6 +20,8 @@ from tests.ros.peer import HANG
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_log.tape_reader import read_run
 
+pytestmark = pytest.mark.package("flight_bringup")
+
 ENDED = 10.0  # s, until no process of a flight is left: about one on an idle host
 
 Engaged = tuple[Process, list[psutil.Process]]

@@ -5,6 +5,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message
@@ -17,6 +18,8 @@ from flight_core.authentication import MessageAuthenticator
 from flight_core.vectors import ChannelError
 from flight_ros.messages import Decoder, Encoder
 from flight_ros.rclpy_private import DeserializationError
+
+pytestmark = pytest.mark.package("flight_ros")
 
 NAMES = ("q", "V", "p", "r")
 REASONS = {"finite", "length", "mac", "malformed", "name", "order"}

@@ -32,6 +32,8 @@ from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
 
+pytestmark = pytest.mark.package("flight_guidance")
+
 PEER_TOPICS = ("u_m", "guidance", "pose", "/diagnostics")
 LEVEL = {"altitude": 50.0, "v_north": 25.0}
 

@@ -5,9 +5,12 @@
 import subprocess
 import sys
 
+import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Start
 from tests.ros.peer import HANG
+
+pytestmark = pytest.mark.package("flight_ros")
 
 HEALTH = REPOSITORY / "docker" / "health.py"
 

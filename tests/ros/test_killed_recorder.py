@@ -21,6 +21,8 @@ from flight_ros.messages import stamp_of
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import NEWEST_SAMPLES, Y
 
+pytestmark = [pytest.mark.package("flight_recorder"), pytest.mark.alone]
+
 SIGNALS = ("/y", "/y_m", "/u", "/internals", "/truth")
 
 

@@ -26,6 +26,8 @@ from flight_cli.cli import COMMANDS, application
 from flight_log.tape_reader import read_run
 from rise_di_controller import laws
 
+pytestmark = pytest.mark.package("control_laws")
+
 PEER_TOPICS = ("u", "internals")
 OPTIONS = ["--lockstep", "--one-process"]
 PULSES = {"q": {"start": [0.2], "stop": [1.0], "value": [0.1]}, "p": {"start": [0.4], "stop": [1.4], "value": [0.4]}}

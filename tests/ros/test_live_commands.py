@@ -21,6 +21,8 @@ from flight_ros.messages import instant, to_message
 from flight_ros.topics import LOCKSTEP
 from reference_model.reference import Reference
 
+pytestmark = pytest.mark.package("reference_model")
+
 PEER_TOPICS = ("pose", "y_m", "/diagnostics")
 SPEED = 25.0  # m/s, the osprey's trim
 BANK = math.radians(35.0)

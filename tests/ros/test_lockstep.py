@@ -23,6 +23,8 @@ from flight_bringup.fly import fly_over_topics
 from flight_bringup.scenarios import find_scenario
 from flight_log.tape_reader import read_run
 
+pytestmark = pytest.mark.package("flight_bringup")
+
 TOPICS = ("/y", "/y_m", "/u", "/internals", "/truth")
 
 # All random inputs of a scenario, and late or lost samples: at their instants a message has no channels.

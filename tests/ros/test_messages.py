@@ -15,6 +15,8 @@ from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.messages import NO_CHANNELS, Decoder, Encoder, instant, stamp_of, to_message
 
+pytestmark = pytest.mark.package("flight_ros")
+
 NAMES = st.lists(st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=12), max_size=6, unique=True)
 STAMPS = st.integers(0, 2**31 * 10**9 - 1)
 

@@ -19,6 +19,8 @@ from flight_bringup.processes import FlightProcesses
 from flight_core.parameters import ParameterError
 from flight_ros.topics import NODE_STATE, STATES
 
+pytestmark = pytest.mark.package("flight_bringup")
+
 
 def received_states(peer_node: Peer, topic: str = NODE_STATE.name) -> dict[str, str]:
     """The newest state by process, filled while the peer spins."""

@@ -17,6 +17,8 @@ from tests.conftest import REPOSITORY, with_policy
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer
 
+pytestmark = pytest.mark.package("flight_bringup")
+
 PEER_TOPICS = ("/diagnostics",)
 NODES = {
     "aircraft_sim": "aircraft",

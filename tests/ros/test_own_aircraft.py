@@ -5,10 +5,13 @@
 import re
 from pathlib import Path
 
+import pytest
 from sensor_msgs.msg import JointState
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer
+
+pytestmark = pytest.mark.package("flight_bringup")
 
 PEER_TOPICS = ("y", "y_m")
 

@@ -18,6 +18,8 @@ from flight_ros.messages import stamp_of, to_message
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import CLOCK, INTERNALS, LOCKSTEP, Y_M, Topic, U, Y
 
+pytestmark = pytest.mark.package("flight_cli")
+
 MS = 1_000_000
 
 

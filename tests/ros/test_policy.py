@@ -18,6 +18,8 @@ from flight_bringup.clients import FlightMonitor
 from flight_bringup.graph import GUIDANCE, parameter_overrides
 from flight_bringup.scenarios import find_scenario
 
+pytestmark = pytest.mark.package("flight_bringup")
+
 POLICY = REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "flight_bringup" / "security" / "flight.policy.xml"
 
 

@@ -24,6 +24,8 @@ from tests.ros.peer import Peer, peer
 from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field, to_channel, to_raw
 from autopilot_bridge.params import ChannelMap
 
+pytestmark = pytest.mark.package("autopilot_bridge")
+
 BEST_EFFORT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 STORED = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 DO_SET_MODE = 176  # MAVLink's MAV_CMD_DO_SET_MODE, as PX4's VEHICLE_CMD_DO_SET_MODE

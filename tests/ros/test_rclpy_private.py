@@ -17,6 +17,8 @@ from tests.ros.peer import Peer
 
 from flight_ros import rclpy_private
 
+pytestmark = pytest.mark.package("flight_ros")
+
 SOURCES = REPOSITORY / "ros_ws" / "src"
 FILES = sorted(path for path in SOURCES.glob("*/**/*.py") if path.name != "rclpy_private.py")
 

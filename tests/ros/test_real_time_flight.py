@@ -18,6 +18,8 @@ from flight_core.modes import Mode
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
 
+pytestmark = [pytest.mark.package("flight_bringup"), pytest.mark.alone]
+
 DURATION = 12.0
 
 

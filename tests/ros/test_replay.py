@@ -23,6 +23,8 @@ from flight_core.rates import period_ns
 from flight_log.tape_reader import read_run
 from flight_ros.topics import publisher_qos
 
+pytestmark = pytest.mark.package("flight_analysis")
+
 PEER_TOPICS = ("internals",)
 
 

@@ -29,6 +29,8 @@ from flight_ros.messages import Decoder, Encoder
 from flight_ros.topics import U
 from flight_ros.transport import LOOPBACK_PROFILE, open_to_network
 
+pytestmark = pytest.mark.package("flight_ros")
+
 Keys = tuple[Path, Path]
 PEER_TOPICS = ("/diagnostics",)
 KEY, OTHER_KEY = bytes(range(32)), bytes(range(1, 33))

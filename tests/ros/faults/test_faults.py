@@ -22,6 +22,8 @@ from tests.ros.faults.foreign import JUMP
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_core.modes import Mode
 
+pytestmark = [pytest.mark.package("flight_bringup"), pytest.mark.alone]
+
 MOVES = 0.15
 """rad, 1: how far the law moves u in a steady flight with late ticks, and while u settles. One sample of a conflicting
 publisher would move it twice as far: K e scale = 18 rad/s * 1 rad/s * 0.0178 rad s^2/rad = 0.3 rad."""

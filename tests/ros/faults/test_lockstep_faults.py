@@ -23,6 +23,8 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.tape import Tape
 from flight_log.tape_reader import read_run
 
+pytestmark = pytest.mark.package("flight_bringup")
+
 MODULES = {
     "aircraft": "aircraft_sim.main",
     "reference_model": "reference_model.main",
