@@ -32,8 +32,8 @@ from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.statistics import score, score_units
-from flight_cli.gains import observed
 from flight_core.parameters import ParameterError
+from rise_di.gain_design import observed
 from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law
 from rise_di_controller.params import ControllerConfig
 

@@ -495,7 +495,7 @@ def test_a_y_that_is_slower_than_the_law_counts_as_delay_and_may_be_three_messag
         ("--y-rate", "0", "--y-rate: found 0.0, expected 1 to 1000 Hz"),
         ("--delay", "nan", "--delay: found nan, expected 0 to 0.5 s"),
         ("--gamma-2", "nan", "--gamma-2: found nan, expected 0 or more, 1/s"),
-        ("--lag", "nan", "--lag: found nan, expected seconds, 0 or more"),
+        ("--lag", "nan", "--lag: found [nan], expected seconds, 0 or more"),
         ("--lag", "fast", "--lag: found 'fast', expected seconds separated by commas"),
     ],
 )

@@ -55,12 +55,12 @@ IMPORTS: dict[str, set[str]] = {
     },
     "rise_di": {
         "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.metrics",
-        "flight_analysis.report", "flight_bringup", "flight_core", "flight_log", "rise_di_controller",
+        "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log", "rise_di_controller",
     },
     "flight_cli": {
         "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop", "flight_analysis.design",
         "flight_analysis.metrics", "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log",
-        "flight_view", "flight_guidance", "rise_di_controller",
+        "flight_view", "flight_guidance", "rise_di", "rise_di_controller",
     },
 }  # fmt: skip
 """Which units of the stack a unit imports; nodes, executables and clients import flight_ros beside these."""

@@ -147,7 +147,7 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--model", "osprey"], "error: --model: found osprey, expected --observer beside it"),
+        (["--model", "osprey"], "error: --model: found osprey, expected observer beside it"),
         (["--observer", "--check"], "error: --observer: found it beside --check"),
         (["--observer", "--margin", "0.9"], "error: --margin: found 0.9, expected 0 to 0.5 s"),
     ],

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Airframe files: published matrices with their units and signs, converted to SI here and nowhere else."""
 
+import os
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -11,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aircraft_sim.disturbance import AXES
+from flight_core.arguments import FilePath
 from flight_core.fields import Field
-from flight_core.files import is_file, parse_yaml, read_file
+from flight_core.files import find_file, names_in, parse_yaml, read_file
 from flight_core.parameters import Config, Names, Numbers, Positive, require
 from flight_core.units import SI_PER_UNIT
 from flight_core.vectors import FloatArray
@@ -149,12 +151,15 @@ class Airframe(Config):
         return direction
 
 
-def load_airframe(name: str) -> Airframe:
+def airframes() -> list[str]:
+    """Names of the airframes in the library."""
+    return names_in(LIBRARY)
+
+
+def load_airframe(name: FilePath) -> Airframe:
     """An airframe by its name in the library, or by the path of a file. Raises ParameterError."""
-    path = Path(name) if name.endswith(".yaml") else LIBRARY / f"{name}.yaml"
-    known = ", ".join(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
-    require(is_file(path), "airframe", f"{name!r}", f"one of {known}, or the path of an airframe file ending in .yaml")
-    return _parsed(name, path, read_file(path, f"airframe {path}", EXPECTED))
+    path = find_file(name, LIBRARY, "airframe", EXPECTED)
+    return _parsed(os.fspath(name), path, read_file(path, f"airframe {path}", EXPECTED))
 
 
 @lru_cache(maxsize=8)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_args
 from autopilot_bridge.channel_map import PATH, Line, to_raw
 from flight_core.channels import POSE
 from flight_core.fields import Field
-from flight_core.files import is_file, read_yaml
+from flight_core.files import find_file, names_in, read_yaml
 from flight_core.parameters import Config, KeyedConfig, NonNegative, Numbers, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
@@ -288,15 +288,13 @@ ROUNDING = 1e-6  # tolerance for limits with six digits that are the ends of a r
 
 def maps() -> list[str]:
     """Names of the channel maps of the library."""
-    return sorted(file.stem for file in LIBRARY.glob("*.yaml"))
+    return names_in(LIBRARY)
 
 
 def find_map(name: str) -> Path:
     """The file of a channel map, by its name in the library or by its path, which ends in .yaml. Raises ParameterError."""
     require(name not in MOVED, "map", f"{name!r}", f"the path of its file, in the repository examples/maps/{name}.yaml")
-    path = Path(name) if name.endswith(".yaml") else LIBRARY / f"{name}.yaml"
-    require(is_file(path), "map", f"{name!r}", f"one of {', '.join(maps())}, or the path of a channel map ending in .yaml")
-    return path.absolute()
+    return find_file(name, LIBRARY, "map", "a channel map").absolute()
 
 
 def load_map(name: str) -> ChannelMap:

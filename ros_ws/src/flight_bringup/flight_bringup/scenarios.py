@@ -5,11 +5,11 @@
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
-from flight_core.files import is_file, write_file, writing
-from flight_core.parameters import require
+from flight_core.arguments import FilePath
+from flight_core.files import find_file, names_in, write_file, writing
+from flight_core.scenario import A_SCENARIO
 from flight_guidance.feasibility import speeds
 from flight_guidance.route_file import Waypoint
 
@@ -18,14 +18,12 @@ LIBRARY = Path(str(files("flight_bringup"))) / "config"
 
 def scenarios() -> list[str]:
     """Names of the scenarios in LIBRARY."""
-    return sorted(path.stem for path in LIBRARY.glob("*.yaml"))
+    return names_in(LIBRARY)
 
 
-def find_scenario(name: str, duration: Any = None) -> Scenario:
+def find_scenario(name: FilePath, duration: float | None = None) -> Scenario:
     """A scenario by its name in LIBRARY, or by the path of a file (.yaml), of a `duration` in s. Raises ParameterError."""
-    path = Path(name) if name.endswith(".yaml") else LIBRARY / f"{name}.yaml"
-    require(is_file(path), "scenario", f"{name!r}", f"one of {', '.join(scenarios())}, or the path of a scenario file (.yaml)")
-    scenario = load_scenario(path.absolute())
+    scenario = load_scenario(find_file(name, LIBRARY, "scenario", A_SCENARIO).absolute())
     return scenario if duration is None else scenario.vary(flight={"duration": duration})
 
 

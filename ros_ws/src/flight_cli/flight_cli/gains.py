@@ -6,32 +6,19 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from rich.console import Console
 
-from aircraft_sim.airframe import Airframe, load_airframe
-from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import Condition, failing
 from flight_analysis.design.gain_selection import GainAssessment, Study
-from flight_analysis.design.nominal import sizes
-from flight_analysis.design.observer_selection import (
-    gains_by_rule,
-    gains_of_search,
-    model_for,
-    with_aircraft_observer,
-)
-from flight_bringup.scenarios import find_scenario
-from flight_campaign import tuned_gains
-from flight_cli.output import new_table, parse_numbers, print_json, write_text
-from flight_core.parameters import ParameterError, require
-from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
-from rise_di_controller.rise_di import RiseDiConfig
+from flight_cli.output import new_table, options, parse_numbers, print_json, write_text
+from flight_core.parameters import require
+from rise_di.gain_design import check_gains, select_gains
 
 CONDITION_FAILS = 1
-OBSERVER_LAWS, OBJECTIVE = ("rise_observer", "pi_observer"), "gust_turbulence"
-"""Laws and cost of a search whose gains are taken: those of the least cost. PI is RISE-DI with a sign that is an integral."""
+PARTS = ("uncertainty", "gamma_2", "samples", "seed", "model", "margin")
+"""Options of which `select_gains` says what is wrong, beside those of the loop."""
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
     "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 periods, delay), rad: times 57.3"
@@ -40,7 +27,6 @@ MEANINGS = {
     "response": "how much one unit of scaled input changes y_dot, abs(Omega_ii) input_scale; bandwidth = K x response",
 }
 """Terms of the table and their meaning."""
-MESSAGES = 3.0  # of y: the age limit of the law, at least
 HEADER = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
 
 
@@ -81,48 +67,39 @@ def gains(
 
     Exit status: 0; 1 if a condition of the loop fails with --check; 2 bad input.
     """
-    chosen, frame = find_scenario(scenario), load_airframe(airframe)
-    require(rate is None or 1.0 <= rate <= 1000.0, "--rate", rate, "1 to 1000 Hz")
-    require(delay is None or 0.0 <= delay <= MAX_DELAY_MARGIN, "--delay", delay, f"0 to {MAX_DELAY_MARGIN:g} s")
-    require(y_rate is None or 1.0 <= y_rate <= 1000.0, "--y-rate", y_rate, "1 to 1000 Hz")
-    require(0.0 <= gamma_2 < math.inf, "--gamma-2", gamma_2, "0 or more, 1/s")
-    options = {
-        "rate": rate,
-        "delay": delay if y_rate is None else _delay_with(y_rate, chosen, rate, delay),
-        "lag": None if lag is None else _parse_lags(lag, frame),
-    }
-    loop: dict[str, Any] = {name: value for name, value in options.items() if value is not None}
-    paired = tuple(inputs.split(",")) if inputs else ()
-    setting = gain_selection.loop_setting(chosen, gamma_2)._replace(inputs=paired, feedforward=feedforward, **loop)
-    age = max(setting.base.max_age, MESSAGES / (y_rate or math.inf))
-    setting = setting._replace(base=setting.base.model_copy(update={"max_age": age}))
-    if check:
-        for option, given in (("--write", write is not None), ("--feedforward", feedforward), ("--observer", observer)):
-            require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
-        own_loop = not loop and inputs is None
-        require(own_loop, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
-        known, named = chosen.controller.outputs, f"airframe {frame.name}"
-        require(sorted(known) == sorted(frame.outputs), named, ", ".join(frame.outputs), f"the outputs {', '.join(known)}")
-    require(observer or model is None, "--model", model, "--observer beside it: it is the observer's model")
-    require(0.0 <= margin <= MAX_DELAY_MARGIN, "--margin", margin, f"0 to {MAX_DELAY_MARGIN:g} s")
-    known_model = frame if model is None else load_airframe(model)
     console = Console(quiet=as_json)
-    origin = ""
-    with console.status("simulating the ideal control on uncertain airframes"):
-        found = gain_selection.study_airframe(frame, gain_selection.manoeuvre(chosen, frame), uncertainty, samples, seed)
+    loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
+    with console.status("simulating the ideal control on uncertain airframes"), options(*loop, *PARTS):
         if check:
-            answers, text = {"scenario": gain_selection.check_gains(chosen, found, gamma_2)}, None
+            for option, given in (("--write", write is not None), ("--feedforward", feedforward), ("--observer", observer)):
+                require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
+            own_loop = all(value is None for value in loop.values())
+            require(own_loop, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
+            answer = check_gains(airframe, scenario, uncertainty=uncertainty, gamma_2=gamma_2, samples=samples, seed=seed)
+            answers, origin = {"scenario": answer}, ""
         else:
-            selection = gain_selection.select_gains(found, setting)
-            if observer:
-                controller, origin = observed(selection.engineering.controller, chosen, known_model, margin)
-                selection = selection._replace(engineering=gain_selection.assess_gains(found, controller, setting))
-            answers = {"theorem": selection.theorem, "engineering": selection.engineering}
-            if observer:
-                answers = {"observer": selection.engineering}
-            text = gain_selection.as_yaml(selection)
-    if write is not None and text is not None:
-        write_text("--write", write, HEADER + text)
+            selection = select_gains(
+                airframe,
+                scenario,
+                uncertainty=uncertainty,
+                rate=rate,
+                y_rate=y_rate,
+                lag=None if lag is None else _parse_lags(lag),
+                delay=delay,
+                inputs=inputs or (),
+                gamma_2=gamma_2,
+                samples=samples,
+                seed=seed,
+                feedforward=feedforward,
+                observer=observer,
+                model=model,
+                margin=margin,
+            )
+            both = {"theorem": selection.theorem, "engineering": selection.engineering}
+            answers, origin = {"observer": selection.engineering} if observer else both, selection.origin
+            if write is not None:
+                write_text("--write", write, HEADER + gain_selection.as_yaml(selection))
+    found = next(iter(answers.values())).study
     if as_json:
         print_json(_as_json(found, answers, seed))
     else:
@@ -135,68 +112,11 @@ def gains(
         raise typer.Exit(CONDITION_FAILS)
 
 
-def _delay_with(y_rate: float, scenario: Scenario, rate: float | None, delay: float | None) -> float:
-    """The delay, s, with a y that is slower than the law.
-
-    The law steps with each y, so the lag of sampling is 1.5 periods of y. Those of the law are counted from its own rate.
-    """
-    declared = scenario.controller.delay if delay is None else delay
-    return declared + 1.5 * max(1.0 / y_rate - 1.0 / (rate or scenario.controller.rate), 0.0)
-
-
-def observed(controller: RiseDiConfig, scenario: Scenario, model: Airframe, margin: float) -> tuple[RiseDiConfig, str]:
-    """A controller with feedforward and observer of a model, and a sentence on its gains.
-
-    The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships with its airframe and lags,
-    where the model has the same states; else they follow from the lags by a rule. Of several gain sets it is the one that the
-    delay margin changes least, then the one of the least cost.
-    """
-    noises = scenario.aircraft.sensors.noise or (0.0,) * len(controller.outputs)
-    by_name = dict(zip(scenario.aircraft.channels().outputs, noises, strict=True))
-    perfect = sizes(model.states[name] for name in controller.outputs) / 100.0  # noise in place of none, of a perfect sensor
-    noise = np.array([by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)])
-    nominal = model_for(model, controller, noise)
-    tuned = _tuned_scenario(scenario)
-    results = {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
-    searched = sorted(((one.cost, law, one) for law, one in results.items() if one is not None), key=lambda one: one[0])
-    candidates = [(gains_by_rule(nominal, tuple(model.gusts), model.speed), "gains by a rule from the lags, a start")]
-    if searched and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
-        origins = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
-        of_search = (gains_of_search(one.gains, nominal.total_lag) for _, _, one in searched)
-        candidates = list(zip(of_search, origins, strict=True))
-    selected, refusal = [], None
-    for gains, origin in candidates:
-        try:
-            selected.append((with_aircraft_observer(controller, model, gains, noise, margin), origin))
-        except ParameterError as error:  # another gain set may have the margin
-            refusal = error
-    if refusal is not None and not selected:
-        raise refusal
-    # the first, of the least cost, where several need none
-    found, origin = min(selected, key=lambda one: float(np.prod(one[0].relaxation)))
-    factors = zip(found.controller.outputs, found.relaxation.tolist(), strict=True)
-    relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
-    lowered = f"; for the margin K / and effort x {relaxed}" if relaxed else ""
-    return found.controller, f"observer of {model.name}: {origin}{lowered}; delay margin {1e3 * found.delay_margin:.0f} ms"
-
-
-def _tuned_scenario(scenario: Scenario) -> Scenario:
-    """The scenario itself if it has tuned gains, else one that ships with the same airframe and actuators and has them."""
-    shipped = (find_scenario(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
-    own = scenario.aircraft.airframe, scenario.aircraft.actuators.lag
-    alike = (one for one in shipped if (one.aircraft.airframe, one.aircraft.actuators.lag) == own)
-    return next((one for one in (scenario, *alike) if tuned_gains.load(tuned_gains.tuned_file(one))), scenario)
-
-
-def _parse_lags(text: str, airframe: Airframe) -> dict[str, float]:
-    """Lags by input from "0.02,0.1", or from one value for all. Raises ParameterError."""
-    names = list(airframe.inputs)
+def _parse_lags(text: str) -> list[float]:
+    """Lags from "0.02,0.1", or from one value for all. Raises ParameterError."""
     values = parse_numbers(text)
     require(bool(values), "--lag", repr(text), "seconds separated by commas")
-    values = values * len(names) if len(values) == 1 else values
-    require(len(values) == len(names), "--lag", f"{len(values)} values", f"one for all or one for each of {', '.join(names)}")
-    require(all(0.0 <= value < math.inf for value in values), "--lag", text, "seconds, 0 or more")
-    return dict(zip(names, values, strict=True))
+    return values
 
 
 def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) -> None:

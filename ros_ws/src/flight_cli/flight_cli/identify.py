@@ -33,7 +33,7 @@ from flight_analysis.report.plotting import Curve, Interval, PlotContext, Sample
 from flight_analysis.report.summary import DisplayUnit, display_unit
 from flight_bringup.scenarios import find_scenario
 from flight_cli.bridge_experiment import identify_behind_bridge
-from flight_cli.gains import observed, speed_of_margin
+from flight_cli.gains import speed_of_margin
 from flight_cli.output import COUNT_COLUMNS, new_table, print_json, progress_bar, write_text
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require
@@ -41,6 +41,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import SI_PER_UNIT
 from flight_log.tape_reader import read_run
+from rise_di.gain_design import observed
 from rise_di_controller.params import ControllerConfig
 
 CANNOT_FLY = 3

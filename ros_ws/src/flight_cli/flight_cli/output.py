@@ -29,6 +29,7 @@ from flight_analysis.report.summary import (
     table_rows,
 )
 from flight_core.files import write_file, writing
+from flight_core.parameters import ParameterError
 from flight_core.text import printable
 
 ENDED_EARLY, INTERRUPTED = 3, 130  # exit statuses; bad input is 2 (`flight_cli.cli`)
@@ -138,6 +139,18 @@ def parse_numbers(text: str) -> list[float]:
 def print_json(value: Any) -> None:
     """Print a value as JSON, with null for NaN and infinity, which JSON does not have."""
     print(json.dumps(finite_or_null(value)))
+
+
+@contextmanager
+def options(*names: str) -> Iterator[None]:
+    """Name the options of a command in a ParameterError inside the block whose key is one of these arguments."""
+    try:
+        yield
+    except ParameterError as error:
+        key, colon, rest = str(error).partition(":")
+        if key not in names:
+            raise
+        raise ParameterError(f"--{key.replace('_', '-')}{colon}{rest}") from None
 
 
 def write_text(option: str, path: Path, text: str) -> None:

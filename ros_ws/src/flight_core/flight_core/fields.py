@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values of a parameter set: what an annotation permits, and the sentence about a value that does not fit.
 
-Types are strict. An int is accepted as a float and a sequence as a tuple; nothing else is converted. The annotations are float,
-int, bool, str, object, Literal, tuple, dict, unions of them, and parameter sets, with `Field(...)` in Annotated for the rules.
+Types are strict. An int is accepted as a float, a sequence as a tuple, an array or a scalar of NumPy as lists and numbers, and
+a path as a str; nothing else is converted. The annotations are float, int, bool, str, object, Literal, tuple, dict, unions of
+these, and parameter sets, with `Field(...)` in Annotated for the rules.
 """
 
 import math
 import operator
+import os
 import re
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
@@ -59,6 +61,8 @@ class Kind(NamedTuple):
 
     def read(self, value: object, key: str, problems: Problems) -> Any:
         """The value that the set holds; a value that does not fit is added to `problems`."""
+        if hasattr(value, "dtype") and hasattr(value, "tolist"):  # an array or a scalar of NumPy
+            value = value.tolist()
         if self.takes(value):
             return self.content(value, key, problems)
         return problems.refuse(key, value, self.expected)
@@ -103,7 +107,8 @@ def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) 
 
 
 def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
-    def content(value: str, key: str, problems: Problems) -> Any:
+    def content(given: str | os.PathLike[str], key: str, problems: Problems) -> Any:
+        value = os.fspath(given)
         if not value.isprintable():
             return problems.refuse(key, value, "printable characters")
         if len(value) < min_length:
@@ -112,7 +117,7 @@ def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
             return problems.refuse(key, value, f"a string that matches {pattern}")
         return value
 
-    return Kind("a string", lambda value: isinstance(value, str), content)
+    return Kind("a string", lambda value: isinstance(value, (str, os.PathLike)), content)
 
 
 def _choice(choices: Sequence[object], expected: str = "") -> Kind:

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 import yaml
 from yaml.composer import Composer
 
+from flight_core.arguments import FilePath, as_path
 from flight_core.parameters import ParameterError, require
 
 # Exceptions of PyYAML. It raises its own for invalid syntax, the others for an invalid scalar ("0b_", "2001-99-99", "!!bool 2")
@@ -108,6 +109,23 @@ def is_file(path: Path) -> bool:
 def is_folder(path: Path) -> bool:
     """Whether the path is a folder; False also for an invalid path."""
     return os.path.isdir(path)  # noqa: PTH112 - as above
+
+
+def names_in(library: Path) -> list[str]:
+    """Names of the YAML files in a folder, sorted."""
+    return sorted(path.stem for path in library.glob("*.yaml"))
+
+
+def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
+    """The file of a name in a library, or the path of a file that ends in .yaml. Raises ParameterError with the names.
+
+    `key` and `kind` are of the sentence: "scenario", "a scenario file".
+    """
+    expected = f"one of {', '.join(names_in(library))}, or the path of {kind} (.yaml)"
+    text = os.fspath(as_path(name, key, expected))
+    path = Path(text) if text.endswith(".yaml") else library / f"{text}.yaml"
+    require(is_file(path), key, repr(text), expected)
+    return path
 
 
 def open_nonblocking(path: str | Path) -> BinaryIO:

@@ -26,17 +26,22 @@ __all__ = [
     "ReplayResult",
     "RiseDiConfig",
     "Scenario",
+    "Selection",
     "Sign",
     "Signal",
     "StampedVector",
     "Tape",
     "TunedLaw",
+    "airframe_facts",
+    "airframes",
     "best_error",
+    "check_gains",
     "data_frame",
     "decompose",
     "engage",
     "error_metrics",
     "find_scenario",
+    "gains_yaml",
     "law_schema",
     "laws",
     "load_airframe",
@@ -46,17 +51,20 @@ __all__ = [
     "replay",
     "scenario_yaml",
     "scenarios",
+    "select_gains",
     "simulate",
     "step",
     "summarise",
 ]
 
 if TYPE_CHECKING:  # for type checkers and completion; a test compares these imports with HOMES
-    from aircraft_sim.airframe import Airframe, load_airframe
+    from aircraft_sim.airframe import Airframe, airframes, load_airframe
     from flight_analysis.closed_loop.replay import ReplayResult, recorded_scenario, replay
     from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
     from flight_analysis.closed_loop.simulate import simulate
-    from flight_analysis.design.gain_selection import margins
+    from flight_analysis.design.airframe_properties import airframe_facts
+    from flight_analysis.design.gain_selection import Selection, margins
+    from flight_analysis.design.gain_selection import as_yaml as gains_yaml
     from flight_analysis.metrics import best_error, error_metrics
     from flight_analysis.report.data_frame import data_frame
     from flight_analysis.report.summary import summarise
@@ -65,6 +73,7 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     from flight_core.tape import Signal, Tape
     from flight_core.vectors import StampedVector
     from flight_log.tape_reader import RecordedRun, read_run
+    from rise_di.gain_design import check_gains, select_gains
     from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw
     from rise_di_controller.controller import Controller
     from rise_di_controller.decomposition import decompose
@@ -76,11 +85,12 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     __version__: str
 else:  # type checkers would take a module with __getattr__ to have any name
     HOMES = {
-        "aircraft_sim.airframe": ("Airframe", "load_airframe"),
+        "aircraft_sim.airframe": ("Airframe", "airframes", "load_airframe"),
         "flight_analysis.closed_loop.replay": ("ReplayResult", "recorded_scenario", "replay"),
         "flight_analysis.closed_loop.scenario": ("Scenario", "scenario_yaml"),
         "flight_analysis.closed_loop.simulate": ("simulate",),
-        "flight_analysis.design.gain_selection": ("margins",),
+        "flight_analysis.design.airframe_properties": ("airframe_facts",),
+        "flight_analysis.design.gain_selection": ("Selection", "as_yaml as gains_yaml", "margins"),
         "flight_analysis.metrics": ("best_error", "error_metrics"),
         "flight_analysis.report.data_frame": ("data_frame",),
         "flight_analysis.report.summary": ("summarise",),
@@ -89,6 +99,7 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "flight_core.tape": ("Signal", "Tape"),
         "flight_core.vectors": ("StampedVector",),
         "flight_log.tape_reader": ("RecordedRun", "read_run"),
+        "rise_di.gain_design": ("check_gains", "select_gains"),
         "rise_di_controller.control_law": ("ControlLaw", "Measurements", "TunedLaw"),
         "rise_di_controller.controller": ("Controller",),
         "rise_di_controller.decomposition": ("decompose",),

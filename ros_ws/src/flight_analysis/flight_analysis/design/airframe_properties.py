@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eig, eigvals
 
-from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
+from aircraft_sim.airframe import Airframe, airframes, load_airframe
 from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import DecompositionError, Pairing, coupling, leading_minors, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
@@ -109,7 +109,7 @@ def airframe_facts(airframe: Airframe) -> AirframeFacts:
 
 def library() -> list[AirframeFacts]:
     """Facts of every airframe of the library, by name. Raises ParameterError for an invalid file."""
-    return [airframe_facts(load_airframe(file.stem)) for file in sorted(LIBRARY.glob("*.yaml"))]
+    return [airframe_facts(load_airframe(name)) for name in airframes()]
 
 
 def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:

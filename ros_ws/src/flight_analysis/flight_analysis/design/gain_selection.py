@@ -123,6 +123,7 @@ class GainAssessment(NamedTuple):
     bounds: Bounds
     delay_margin: float | None  # s, nominal airframe, delay in all channels; None for the literal sign
     channel_margins: tuple[float, ...]  # s, delay in one channel alone; empty with delay_margin None
+    study: Study  # of the airframe
 
     @property
     def failing(self) -> tuple[Condition, ...]:
@@ -137,6 +138,7 @@ class Selection(NamedTuple):
     setting: LoopSetting
     theorem: GainAssessment
     engineering: GainAssessment
+    origin: str = ""  # of the gains beside an observer, a sentence
 
 
 # The manoeuvre and the ideal control along it
@@ -363,7 +365,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     bounds, *_ = _bounds(study, places, columns, unit, D, ones, setting.gamma_2)
     literal = controller(gain_conditions.theorem_gains(bounds, ones), ones)
     engineering = controller(*selected)
-    return Selection(study, setting, *(assess_gains(study, one, setting) for one in (literal, engineering)))
+    return Selection(study, setting, assess_gains(study, literal, setting), assess_gains(study, engineering, setting))
 
 
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
@@ -387,8 +389,11 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
 def check_gains(scenario: Scenario, study: Study, gamma_2: float = 0.0) -> GainAssessment:
     """Every condition on the gain set of a scenario's controller, for an airframe studied along the scenario's manoeuvre.
 
-    Raises ParameterError if D or the pairing contradict the airframe.
+    Raises ParameterError for other outputs than those of the airframe, and if D or the pairing contradict the airframe.
     """
+    known, frame = scenario.controller.outputs, study.airframe
+    fits = f"the outputs {', '.join(known)}"
+    require(sorted(known) == sorted(frame.outputs), f"airframe {frame.name}", ", ".join(frame.outputs), fits)
     return assess_gains(study, scenario.rise_di(), loop_setting(scenario, gamma_2))
 
 
@@ -444,7 +449,7 @@ def assess_gains(study: Study, controller: RiseDiConfig, setting: LoopSetting) -
     if controller.observer is None:  # the engineering rules are those of a law that has no other feedback beside it
         conditions = gain_conditions.check_loop(params, loop, responses[0], responses.max(axis=0), *limits)
     if params.sign is Sign.LITERAL:
-        return GainAssessment(controller, theorem, conditions, bounds, None, ())
+        return GainAssessment(controller, theorem, conditions, bounds, None, (), study)
     plants = [LinearPlant(A + study.gravity, B, C) for A, B in zip(study.A, Bs, strict=True)]
     no_delay = np.zeros(len(rows))
     linear = linear_law(controller.tuned_law(), len(rows), loop.period)
@@ -455,7 +460,7 @@ def assess_gains(study: Study, controller: RiseDiConfig, setting: LoopSetting) -
     if params.sign is Sign.SOFT:
         least = loop.period if controller.observer is None else controller.observer.margin - controller.delay
         conditions += (Condition("delay margin", None, margin, least),)
-    return GainAssessment(controller, theorem, conditions, bounds, margin, each)
+    return GainAssessment(controller, theorem, conditions, bounds, margin, each, study)
 
 
 def margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:

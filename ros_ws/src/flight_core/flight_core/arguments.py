@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Arguments of public functions: each is converted, or refused in one sentence."""
+
+import math
+import os
+from pathlib import Path
+from typing import TypeVar
+
+from flight_core.fields import Problems, kind_of, short_repr
+from flight_core.parameters import ParameterError, require
+
+FilePath = str | os.PathLike[str]
+
+T = TypeVar("T")
+
+
+def as_path(value: FilePath, key: str, expected: str) -> Path:
+    """The path that a text or a path-like object names. Raises ParameterError for other values and for an empty text."""
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else b""
+    require(isinstance(text, str) and text != "", key, short_repr(value), expected)
+    return Path(value)
+
+
+def as_number(value: object, key: str, least: float, most: float = math.inf, unit: str = "") -> float:
+    """A finite number from `least` to `most`. Raises ParameterError for other values, with the unit."""
+    bounds = f"{least:g} or more{', ' * bool(unit)}" if most == math.inf else f"{least:g} to {most:g} "
+    return float(_bounded(float, value, key, least, most, f"{bounds}{unit}".rstrip()))
+
+
+def as_count(value: object, key: str, least: int, most: float = math.inf) -> int:
+    """An integer from `least` to `most`. Raises ParameterError for other values."""
+    bounds = f"of {least} or more" if most == math.inf else f"from {least} to {most:g}"
+    return int(_bounded(int, value, key, least, most, f"an integer {bounds}"))
+
+
+def _bounded(number: type[float], value: object, key: str, least: float, most: float, expected: str) -> float:
+    problems = Problems()
+    read: float = kind_of(number, {"ge": least, "le": most}).read(value, key, problems)
+    require(not problems.sentences(), key, short_repr(value), expected)
+    return read
+
+
+def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
+    """Finite numbers from a list, a tuple or an array, or from a single number. Raises ParameterError for other values."""
+    problems = Problems()
+    read = kind_of(float | tuple[float, ...]).read(value, key, problems)
+    require(not problems.sentences(), key, short_repr(value), expected)
+    return read if isinstance(read, tuple) else (float(read),)
+
+
+def as_instance(value: object, kind: type[T], key: str, expected: str) -> T:
+    """The value, of a class. Raises ParameterError for a value of another class."""
+    if not isinstance(value, kind):
+        raise ParameterError(f"{key}: found {short_repr(value)}, expected {expected}")
+    return value

@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Gains for an airframe in the loop of a scenario, as `rise-di gains` selects and checks them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe, load_airframe
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.design import gain_selection
+from flight_analysis.design.gain_selection import GainAssessment, LoopSetting, Selection, Study
+from flight_analysis.design.nominal import sizes
+from flight_analysis.design.observer_selection import gains_by_rule, gains_of_search, model_for, with_aircraft_observer
+from flight_bringup.scenarios import find_scenario
+from flight_campaign import tuned_gains
+from flight_core.arguments import FilePath, as_count, as_number, as_numbers
+from flight_core.parameters import ParameterError, require
+from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
+from rise_di_controller.rise_di import RiseDiConfig
+
+OBSERVER_LAWS, OBJECTIVE = ("rise_observer", "pi_observer"), "gust_turbulence"
+"""Laws and cost of a search whose gains are taken: those of the least cost. PI is RISE-DI with a sign that is an integral."""
+MESSAGES = 3.0  # of y: the age limit of the law, at least
+RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
+MAX_SAMPLES = 10_000
+
+
+def select_gains(
+    airframe: FilePath | Airframe,
+    scenario: FilePath | Scenario = "osprey_servo",
+    *,
+    uncertainty: float = 0.3,
+    rate: float | None = None,
+    y_rate: float | None = None,
+    lag: float | Sequence[float] | None = None,
+    delay: float | None = None,
+    inputs: str | Sequence[str] = (),
+    gamma_2: float = 0.0,
+    samples: int = 100,
+    seed: int = 1,
+    feedforward: bool = False,
+    observer: bool = False,
+    model: FilePath | Airframe | None = None,
+    margin: float = 0.03,
+) -> Selection:
+    """Gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on both.
+
+    The commands, the gusts and the loop are those of the scenario. `scenario.vary(controller=selection.engineering.controller)`
+    flies the engineering gains; `gains_yaml` writes them as a section of a scenario file.
+
+    Args:
+        airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
+        scenario: Name, path of a scenario file (.yaml), or a Scenario.
+        uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
+        rate: Rate of the law in Hz; None: that of the scenario.
+        y_rate: Rate of y in Hz: a period above that of the law counts as delay, and y is stale after three.
+        lag: Lags of the actuators in s, one or one an input in the airframe's order; None: those of the scenario.
+        delay: Pure delay in s; None: that of the scenario.
+        inputs: Input of each output, in the airframe's order: a list, or a text with commas. Empty: the airframe's.
+        gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
+        samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
+        seed: Seed of the uncertain airframes.
+        feedforward: Whether the engineering gains have the airframe as the model of a feedforward.
+        observer: Whether they have a feedforward and an observer, and gains beside these.
+        model: Airframe that the observer takes as its model; None: the airframe itself.
+        margin: Least delay margin of the nominal loop with the observer, s.
+
+    Raises ParameterError with one sentence, also for an airframe whose inputs cannot be paired with its outputs.
+    """
+    chosen, frame = _scenario(scenario), _airframe(airframe)
+    setting = _loop(chosen, frame, rate, y_rate, lag, delay)._replace(
+        inputs=tuple(inputs.split(",")) if isinstance(inputs, str) and inputs else tuple(inputs),
+        gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
+        feedforward=feedforward,
+    )
+    require(observer or model is None, "model", model, "observer beside it: it is the observer's model")
+    margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
+    known_model = frame if model is None else _airframe(model)
+    selection = gain_selection.select_gains(study(frame, chosen, uncertainty, samples, seed), setting)
+    if not observer:
+        return selection
+    controller, origin = observed(selection.engineering.controller, chosen, known_model, margin)
+    return selection._replace(engineering=gain_selection.assess_gains(selection.study, controller, setting), origin=origin)
+
+
+def check_gains(
+    airframe: FilePath | Airframe,
+    scenario: FilePath | Scenario = "osprey_servo",
+    *,
+    uncertainty: float = 0.3,
+    gamma_2: float = 0.0,
+    samples: int = 100,
+    seed: int = 1,
+) -> GainAssessment:
+    """Every condition on the gains of a scenario for an airframe; arguments as for `select_gains`. Raises ParameterError."""
+    chosen, frame = _scenario(scenario), _airframe(airframe)
+    gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
+    return gain_selection.check_gains(chosen, study(frame, chosen, uncertainty, samples, seed), gamma_2)
+
+
+def study(airframe: Airframe, scenario: Scenario, uncertainty: float, samples: int, seed: int) -> Study:
+    """The airframe, and uncertain airframes around it, along the commands and gusts of a scenario. Raises ParameterError."""
+    return gain_selection.study_airframe(
+        airframe,
+        gain_selection.manoeuvre(scenario, airframe),
+        as_number(uncertainty, "uncertainty", 0.0, 1.0),
+        as_count(samples, "samples", 0, MAX_SAMPLES),
+        as_count(seed, "seed", 0),
+    )
+
+
+def _scenario(scenario: FilePath | Scenario) -> Scenario:
+    return scenario if isinstance(scenario, Scenario) else find_scenario(scenario)
+
+
+def _airframe(airframe: FilePath | Airframe) -> Airframe:
+    return airframe if isinstance(airframe, Airframe) else load_airframe(airframe)
+
+
+def _loop(
+    scenario: Scenario,
+    airframe: Airframe,
+    rate: float | None,
+    y_rate: float | None,
+    lag: float | Sequence[float] | None,
+    delay: float | None,
+) -> LoopSetting:
+    """The loop of a scenario with another rate of the law or of y, Hz, lag or delay, s. Raises ParameterError.
+
+    The law steps with each y, so the lag of sampling is 1.5 periods of y. Those of the law are counted from its own rate.
+    """
+    loop = gain_selection.loop_setting(scenario)
+    if rate is not None:
+        loop = loop._replace(rate=as_number(rate, "rate", *RATES, "Hz"))
+    if delay is not None:
+        loop = loop._replace(delay=as_number(delay, "delay", 0.0, MAX_DELAY_MARGIN, "s"))
+    if lag is not None:
+        loop = loop._replace(lag=_lags(lag, airframe))
+    if y_rate is not None:
+        y_rate = as_number(y_rate, "y_rate", *RATES, "Hz")
+        age = max(loop.base.max_age, MESSAGES / y_rate)
+        loop = loop._replace(
+            delay=loop.delay + 1.5 * max(1.0 / y_rate - 1.0 / loop.rate, 0.0),
+            base=loop.base.model_copy(update={"max_age": age}),
+        )
+    return loop
+
+
+def _lags(lag: float | Sequence[float], airframe: Airframe) -> dict[str, float]:
+    """Lags by input, s. Raises ParameterError."""
+    names = list(airframe.inputs)
+    values = as_numbers(lag, "lag", expected := "seconds, 0 or more")
+    values = values * len(names) if len(values) == 1 else values
+    require(len(values) == len(names), "lag", f"{len(values)} values", f"one for all or one for each of {', '.join(names)}")
+    require(min(values) >= 0.0, "lag", lag, expected)
+    return dict(zip(names, values, strict=True))
+
+
+def observed(controller: RiseDiConfig, scenario: Scenario, model: Airframe, margin: float) -> tuple[RiseDiConfig, str]:
+    """A controller with feedforward and observer of a model, and a sentence on its gains.
+
+    The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships with its airframe and lags,
+    where the model has the same states; else they follow from the lags by a rule. Of several gain sets it is the one that the
+    delay margin changes least, then the one of the least cost.
+    """
+    noises = scenario.aircraft.sensors.noise or (0.0,) * len(controller.outputs)
+    by_name = dict(zip(scenario.aircraft.channels().outputs, noises, strict=True))
+    perfect = sizes(model.states[name] for name in controller.outputs) / 100.0  # noise in place of none, of a perfect sensor
+    noise = np.array([by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)])
+    nominal = model_for(model, controller, noise)
+    tuned = _tuned_scenario(scenario)
+    results = {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
+    searched = sorted(((one.cost, law, one) for law, one in results.items() if one is not None), key=lambda one: one[0])
+    candidates = [(gains_by_rule(nominal, tuple(model.gusts), model.speed), "gains by a rule from the lags, a start")]
+    if searched and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
+        origins = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
+        of_search = (gains_of_search(one.gains, nominal.total_lag) for _, _, one in searched)
+        candidates = list(zip(of_search, origins, strict=True))
+    selected, refusal = [], None
+    for gains, origin in candidates:
+        try:
+            selected.append((with_aircraft_observer(controller, model, gains, noise, margin), origin))
+        except ParameterError as error:  # another gain set may have the margin
+            refusal = error
+    if refusal is not None and not selected:
+        raise refusal
+    # the first, of the least cost, where several need none
+    found, origin = min(selected, key=lambda one: float(np.prod(one[0].relaxation)))
+    factors = zip(found.controller.outputs, found.relaxation.tolist(), strict=True)
+    relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
+    lowered = f"; for the margin K / and effort x {relaxed}" if relaxed else ""
+    return found.controller, f"observer of {model.name}: {origin}{lowered}; delay margin {1e3 * found.delay_margin:.0f} ms"
+
+
+def _tuned_scenario(scenario: Scenario) -> Scenario:
+    """The scenario itself if it has tuned gains, else one that ships with the same airframe and actuators and has them."""
+    shipped = (find_scenario(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
+    own = scenario.aircraft.airframe, scenario.aircraft.actuators.lag
+    alike = (one for one in shipped if (one.aircraft.airframe, one.aircraft.actuators.lag) == own)
+    return next((one for one in (scenario, *alike) if tuned_gains.load(tuned_gains.tuned_file(one))), scenario)
