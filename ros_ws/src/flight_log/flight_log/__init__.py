@@ -9,12 +9,12 @@
 | `disk` | reserves disk space for the end of a file |
 | `message_definitions` | finds the definition of a message type |
 | `provenance` | collects versions, revision, host and command |
-| `scan` | reads the records of an MCAP file that may be truncated or damaged |
-| `follow` | reads a log while it is written |
+| `scan` | reads the records of an intact, truncated or damaged MCAP file |
+| `follow` | reads a growing log |
 | `repair` | rebuilds a truncated or damaged bag |
-| `stored_messages` | lists the messages of a bag as bytes, and its parameter changes |
+| `stored_messages` | lists the messages of a bag as bytes, and the parameter changes |
 | `named_vectors` | decodes messages as named vectors |
 | `tape_reader`, `tape_writer` | convert between a bag and a `Tape` |
-| `playback` | schedules the messages of a bag to send them again |
+| `playback` | schedules the messages of a bag for sending |
 | `latency` | computes the time from y to u |
 """

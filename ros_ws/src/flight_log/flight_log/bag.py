@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a bag in the layout of rosbag2: one MCAP file of CDR messages, and metadata.yaml beside it. Needs no ROS."""
+"""Writes a bag in the layout of rosbag2: an MCAP file of CDR messages, and metadata.yaml. Needs no ROS."""
 
 import struct
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,7 +39,7 @@ INDEX_HEAD = struct.Struct("<BQHI")  # RECORD, then channel and size
 
 
 class LogAttachments(NamedTuple):
-    """What a log stores beside its messages."""
+    """Files and metadata that a log stores beside the messages."""
 
     scenario: Path | None = None
     files: tuple[Path, ...] = ()
@@ -48,7 +48,7 @@ class LogAttachments(NamedTuple):
 
 @dataclass
 class BagChannel:
-    """A topic of a bag that is being written."""
+    """A topic of an unfinished bag."""
 
     topic: str
     type: Definition
@@ -67,7 +67,7 @@ class _MessageIndex(MessageIndex):
 
 
 class _ChunkBuilder(ChunkBuilder):
-    """The same bytes as mcap's, in half the time: that one writes each field by itself, and the length afterwards."""
+    """The bytes of mcap's builder in half the time. The builder of mcap writes field by field, and the length afterwards."""
 
     def add_message(self, message: Message) -> None:
         time_ns = message.log_time
@@ -86,9 +86,9 @@ class _ChunkBuilder(ChunkBuilder):
 
 
 class _ChunkIndexes:
-    """In place of mcap's list, which grows by 1 kB with each chunk, 36 MB an hour: records on disk, written as one.
+    """Chunk indexes as records on disk, in place of mcap's list, which grows by 1 kB a chunk, 36 MB an hour.
 
-    With each of them the reserve for the end of the file grows.
+    The reserve for the end of the file grows with the number of chunks.
     """
 
     def __init__(self, file: ReservedFile, channels: Sequence[BagChannel]) -> None:
@@ -109,10 +109,10 @@ class _ChunkIndexes:
 
 
 class BagWriter:
-    """Writes one bag into a folder. `flush` closes the chunk: when the process is killed, closed chunks stay readable.
+    """Writes a bag into a folder. `flush` closes the chunk: closed chunks stay readable after a kill of the process.
 
-    Disk space for the end of the file is reserved. Once a write has used it, `full` is true, and the bag has to be closed.
-    Raises OSError when a write fails for another reason, or when the reserve does not suffice.
+    Disk space for the end of the file is reserved. Once a write has used the reserve, `full` is true and the bag has to be
+    closed. Raises OSError when a write fails for any further reason, or when the reserve does not suffice.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -145,7 +145,7 @@ class BagWriter:
         return self._file.full
 
     def add_attachments(self, attachments: LogAttachments, now_ns: int) -> None:
-        """Store the scenario and the other files as attachments, and the named sets of strings as metadata records."""
+        """Store the scenario and further files as attachments, and the named sets of strings as metadata records."""
         typed = [(path, FILE_MEDIA_TYPE) for path in attachments.files]
         if attachments.scenario is not None:
             typed.insert(0, (attachments.scenario, SCENARIO_MEDIA_TYPE))
@@ -160,9 +160,9 @@ class BagWriter:
         self._writer.add_metadata(name, dict(values))
 
     def add_topic(self, topic: str, type_name: str, qos: str) -> BagChannel:
-        """Add a topic by its full name. `qos` is rosbag2's YAML list of offered profiles.
+        """Add a topic by the full name. `qos` is rosbag2's YAML list of offered profiles.
 
-        Raises ParameterError when the package of its type is not installed.
+        Raises ParameterError when the definition of the type is unknown.
         """
         known = definition(type_name)
         schema = self._writer.register_schema(known.name, "ros2msg", known.text.encode())
@@ -172,7 +172,7 @@ class BagWriter:
         return channel
 
     def write(self, channel: BagChannel, received_ns: int, sent_ns: int, sequence: int, message: bytes) -> None:
-        """Append one serialised message."""
+        """Append a serialised message."""
         self._writer.add_message(channel.identity, received_ns, message, sent_ns, sequence)
         channel.messages += 1
         self._last_ns = max(self._last_ns, received_ns)
@@ -180,7 +180,7 @@ class BagWriter:
             self._first_ns = received_ns
 
     def flush(self) -> None:
-        """Close the chunk in progress and pass it to the operating system."""
+        """Close the chunk in progress and flush the file."""
         self._writer.flush()
 
     def contents(self) -> FileContents:
@@ -204,7 +204,7 @@ class BagWriter:
 
 
 def read_metadata_records(path: Path) -> dict[str, dict[str, str]]:
-    """Named sets of strings from a YAML file. Raises ParameterError when it holds anything else."""
+    """Named sets of strings from a YAML file. Raises ParameterError for any further content."""
     expected = "a mapping of mappings of strings"
     content = read_yaml(path, str(path), expected)
     valid = isinstance(content, dict) and all(

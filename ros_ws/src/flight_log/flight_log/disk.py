@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files on a disk that may be full: free space, a file with reserved space."""
+"""Files on a full disk: free space, a file with reserved space."""
 
 import errno
 import fcntl
@@ -20,9 +20,9 @@ def free_bytes(folder: Path) -> int:
 
 
 def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
-    """Lock a file until the stream is closed. False when another process, such as its recorder, holds the lock.
+    """Lock a file until the stream is closed. False when a second process, such as a recorder, holds the lock.
 
-    A file system without locks always grants it.
+    A file system without locks always grants the lock.
     """
     try:
         fcntl.flock(stream, kind | fcntl.LOCK_NB)
@@ -34,16 +34,16 @@ def try_lock(stream: IO[bytes] | int, kind: int = fcntl.LOCK_EX) -> bool:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether another process, such as its recorder, holds the lock of a file. Raises OSError when it cannot be opened."""
+    """Whether a second process, such as a recorder, holds the lock of a file. Raises OSError when the file cannot be opened."""
     with path.open("rb") as stream:
         return not try_lock(stream, fcntl.LOCK_SH)
 
 
 class ReservedFile:
-    """A new unbuffered file with a reserve of disk space, so that it can be finished on a full disk.
+    """A new unbuffered file with a reserve of disk space for the end of the file on a full disk.
 
-    A second, unnamed file takes up the reserve. The first write that finds no space closes that file and then succeeds. The
-    reserve also ends with the process. Until then it holds what `keep` is given, for the end of the file.
+    A second, unnamed file takes up the reserve. The first write without space closes the unnamed file and then succeeds. The
+    reserve also ends with the process. Until then the reserve holds the data of `keep`, for the end of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -61,9 +61,9 @@ class ReservedFile:
         self.full = False  # the reserve was needed
 
     def reserve(self, size: int) -> None:
-        """Reserve this many bytes in total. Without space for them `full` is set and the earlier reserve stays.
+        """Reserve this many bytes in total. Without enough space `full` is set and the earlier reserve stays.
 
-        After `release` it does nothing: the last chunk is written then.
+        A call after `release` has no effect: the last chunk is written then.
         """
         if self.full or self._reserve.closed or size <= self._reserved_bytes:
             return
@@ -74,7 +74,7 @@ class ReservedFile:
             self.full = error.errno in NO_SPACE
 
     def keep(self, data: bytes) -> None:
-        """Keep data for the end of the file: in the reserve as long as there is one, then in memory."""
+        """Keep data for the end of the file: in the reserve while a reserve exists, then in memory."""
         if not self._reserve.closed:
             try:
                 if os.pwrite(self._reserve.fileno(), data, self._kept_bytes) == len(data):
@@ -88,7 +88,7 @@ class ReservedFile:
         self._kept += data
 
     def kept(self) -> bytes:
-        """All that was kept, once the reserve is free."""
+        """The kept data, once the reserve is free."""
         return bytes(self._kept)
 
     def release(self) -> None:
@@ -98,7 +98,7 @@ class ReservedFile:
             self._reserve.close()
 
     def write(self, data: bytes | memoryview) -> int:
-        """Write all data. Raises OSError when the reserve does not suffice, or for another reason."""
+        """Write the data. Raises OSError when the reserve does not suffice, or for any further reason."""
         rest = memoryview(data)
         size = rest.nbytes
         while rest:

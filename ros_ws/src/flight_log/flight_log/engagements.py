@@ -14,7 +14,7 @@ ENGAGED = "ENGAGED"  # the key of a report
 
 
 class Engagement(NamedTuple):
-    """A time in which an autopilot was flown. Times in ns, by the clock of the stamps."""
+    """A time of engagement of an autopilot. Times in ns, by the clock of the stamps."""
 
     start_ns: int
     stop_ns: int | None  # None where the log ends before

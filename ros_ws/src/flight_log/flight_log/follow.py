@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a log while it is written: each call continues where the last one ended. A finished log is read in the same way.
+"""Reads a growing log: a call continues at the end of the last call. A finished log is read in the same way.
 
-A record is read once it is whole, so that a chunk in progress is never read. The message index behind each chunk gives the
-places of its messages: those of other topics cost nothing.
+A record is read once the record is whole, so a chunk in progress is never read. The message index behind a chunk gives the
+places of the messages: messages of unwanted topics cost nothing.
 """
 
 import math
@@ -33,7 +33,7 @@ READ_BYTES = 1 << 20  # read from the file at once
 
 
 class Messages(NamedTuple):
-    """Messages of one topic in the order of the log."""
+    """Messages of a topic in the order of the log."""
 
     topic: str  # in full
     type_name: str
@@ -51,9 +51,9 @@ class _Channel:
 
 
 class Follower:
-    """Follows the log of a run: the folder of a bag, which may still lack its file, or one MCAP file.
+    """Follows the log of a run: the folder of a bag, with or without a file yet, or an MCAP file.
 
-    `rate_of(topic, type_name)` is the highest rate at which messages of a topic are wanted, Hz: infinite for all, 0 for none.
+    `rate_of(topic, type_name)` is the highest wanted rate of the messages of a topic, Hz: infinite without a limit, 0 for none.
     """
 
     def __init__(self, run: Path, rate_of: Callable[[str, str], float]) -> None:
@@ -78,14 +78,14 @@ class Follower:
 
     @property
     def path(self) -> Path | None:
-        """The file that is read now; None while there is none. Raises ParameterError for a folder with several bags."""
+        """The present file; None before the first file. Raises ParameterError for a folder with several bags."""
         if self._path is None:
             self._path = next((file for file in bag_files(self.run) if file not in self._read_files), None)
         return self._path
 
     @property
     def backlog(self) -> int:
-        """Bytes of the file that have not been read. Raises as `path` and OSError."""
+        """Unread bytes of the file. Raises as `path` and OSError."""
         return 0 if self.path is None else self.path.stat().st_size - self._position
 
     def skip(self, topics: Container[str]) -> None:
@@ -95,7 +95,7 @@ class Follower:
                 channel.rate = 0.0
 
     def read(self) -> Iterator[Messages | Attachment | Metadata]:
-        """All that was written since the last call. A caller may stop the iteration: the next call continues.
+        """The records since the last call. A caller may stop the iteration: the next call continues.
 
         Raises OSError when the file cannot be read, ParameterError for a folder with several bags.
         """
@@ -124,12 +124,12 @@ class Follower:
             yield from self._pending_records()
 
     def _pending_records(self) -> Iterator[Messages | Attachment | Metadata]:
-        """What has been decoded; a caller that stops gets the rest with the next call."""
+        """The decoded records; a caller that stops gets the rest with the next call."""
         while self._pending:
             yield self._pending.popleft()
 
     def _records(self, stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
-        """Opcode and content of each whole record behind the position, which moves on before each."""
+        """Opcode and content of every whole record behind the position. The position moves on before a record is given."""
         if self._position == 0 and size >= len(MCAP0_MAGIC):
             if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
                 self.fault = f"{stream.name} does not begin as an MCAP file"
@@ -164,7 +164,7 @@ class Follower:
             self._chunk, self._indexed = b"", True
 
     def _take_indexed(self, content: bytes) -> None:
-        """The messages of one channel in the last chunk. Raises one of DECODE_ERRORS."""
+        """The messages of a channel in the last chunk. Raises DECODE_ERRORS."""
         identity, size = MESSAGE_INDEX.unpack_from(content)
         if len(content) != MESSAGE_INDEX.size + size or size % 16:
             raise McapError("a message index of a wrong size")
@@ -191,7 +191,7 @@ class Follower:
             self._pending.append(Messages(channel.topic, channel.type_name, *self._messages_at(places)))
 
     def _messages_at(self, places: Sequence[int]) -> tuple[list[int], list[bytes]]:
-        """Publish times in ns and data of messages of the last chunk. Raises one of DECODE_ERRORS."""
+        """Publish times in ns and data of messages of the last chunk. Raises DECODE_ERRORS."""
         chunk, sent_ns, data = self._chunk, [], []
         for place in places:
             opcode, length, sent = HEAD.unpack_from(chunk, place)
@@ -203,7 +203,7 @@ class Follower:
         return sent_ns, data
 
     def _take_unindexed(self) -> None:
-        """The messages of a chunk without a message index. Raises one of DECODE_ERRORS."""
+        """The messages of a chunk without a message index. Raises DECODE_ERRORS."""
         if not self._indexed:
             self._indexed = True
             for record in split(self._chunk):

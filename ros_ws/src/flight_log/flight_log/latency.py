@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Latency of the loop from y to u, by the times at which the log says that they were sent."""
+"""Latency of the loop from y to u, by the recorded times of sending."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -23,10 +23,10 @@ class Times(NamedTuple):
 
 
 def latency(sent: Mapping[str, Sequence[Times]]) -> Signal | None:
-    """Time from the sending of a y to the sending of the u with its stamp, s: one channel, by the stamps of u.
+    """Time from the sending of y to the sending of u with the stamp of y, s: a channel by the stamps of u.
 
-    `sent` holds the times by the full names of all topics y and u. None when the log does not hold it: it holds no y or no u,
-    or several aircraft, or all times are equal, as in a flight in one process.
+    `sent` holds the times by the full names of the topics y and u. None for a log without y or u, with several aircraft, or
+    with equal times, as of a flight in one process.
     """
     topics = {topic.rpartition("/")[2]: topic for topic in sent}
     if len(sent) != len(TOPICS) or len(topics) != len(TOPICS) or not all(sent.values()):
@@ -38,7 +38,7 @@ def latency(sent: Mapping[str, Sequence[Times]]) -> Signal | None:
 
 
 def _last_of_each(times: Sequence[Times]) -> Times:
-    """The times in the order of their stamps, the last one of each stamp."""
+    """The times in the order of the stamps, the last time of equal stamps."""
     stamp_ns, sent_ns = (np.concatenate(arrays)[::-1] for arrays in zip(*times, strict=True))
     unique_ns, place = np.unique(stamp_ns, return_index=True)
     return Times(unique_ns, sent_ns[place])

@@ -13,7 +13,7 @@ from flight_core.parameters import ParameterError
 
 
 class Definition(NamedTuple):
-    """A message type as a log stores it."""
+    """A message type as stored in a log."""
 
     name: str  # "sensor_msgs/msg/JointState"
     text: str  # its definition and those of all referenced types

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decodes the messages of a topic as named vectors. Needs no ROS.
 
-The messages of a topic usually have one sender and the same channels. They then differ in stamp and values only. The decoder
-learns the byte layout from one message and decodes all messages of that layout together.
+The messages of a topic usually have the same sender and channels, and differ in stamp and values only. The decoder learns
+the byte layout from a message and decodes the messages of equal layout together.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -60,13 +60,13 @@ Decoder = Callable[[Table], Decoded]
 
 @cache
 def typestore() -> Typestore:
-    """The message types of ROS 2 Jazzy. Made once: loading them takes 70 ms."""
+    """The message types of ROS 2 Jazzy, made once: loading takes 70 ms."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 @cache
 def joint_state_types() -> Typestore:
-    """JOINT_STATE_TYPES, all that most logs need."""
+    """JOINT_STATE_TYPES, enough for most logs."""
     store = get_typestore(Stores.EMPTY)  # which has Time
     for name, definition in JOINT_STATE_TYPES.items():
         store.register(get_types_from_msg(definition, name))
@@ -76,38 +76,38 @@ def joint_state_types() -> Typestore:
 def decoder(type_name: str) -> Decoder | None:
     """Decoder from messages of a type to named vectors; None for a type without named vectors.
 
-    A decoder serves one topic. It takes the messages in their order, several at a time.
+    A decoder serves a topic. A call takes several messages in their order.
     """
     return _JointStateDecoder() if type_name == JOINT_STATE else None
 
 
 def tables(messages: Iterable[bytes]) -> Iterator[Table]:
-    """Messages in their order, those of equal length that follow one another in a table."""
+    """Messages in their order, successive messages of equal length in a table."""
     for size, group in groupby(messages, len):
         alike = list(group)
         yield np.frombuffer(b"".join(alike), dtype=np.uint8).reshape(len(alike), size)
 
 
 def stamp_of(data: bytes) -> int:
-    """The stamp of a message that begins with it, ns."""
+    """The stamp at the begin of a message, ns."""
     return int.from_bytes(data[STAMP][:4], "little", signed=True) * NANOSECONDS + int.from_bytes(data[STAMP][4:], "little")
 
 
 def stamps_of(table: Table) -> NDArray[np.int64]:
-    """The stamps of messages that begin with them, ns, shape (N,)."""
+    """The stamps at the begin of messages, ns, shape (N,)."""
     stamps = np.ascontiguousarray(table[:, STAMP])
     return stamps.view("<i4")[:, 0].astype(np.int64) * NANOSECONDS + stamps.view("<u4")[:, 1]
 
 
 def flight_start_ns(stamp_ns: int, t: float) -> int | None:
-    """Stamp of flight time 0, from a sample of `truth` and its t in s: stamp - t. None when t is not a flight time."""
+    """Stamp of flight time 0, from a sample of `truth` with t in s: stamp - t. None when t is not a flight time."""
     return stamp_ns - nanoseconds(t) if abs(t) <= MAX_FLIGHT_TIME else None
 
 
 def encoded(samples: Samples) -> NDArray[np.uint8]:
-    """The samples as serialised sensor_msgs/JointState, one in each row, with empty velocity and effort.
+    """The samples as serialised sensor_msgs/JointState, a row a message, with empty velocity and effort.
 
-    The first is serialised by its definition. The others differ from it in stamp and values only.
+    The first message is serialised by its definition. The further messages differ in stamp and values only.
     """
     store = joint_state_types()
     types: dict[str, Any] = store.types
@@ -123,18 +123,18 @@ def encoded(samples: Samples) -> NDArray[np.uint8]:
 
 
 def _marks(k: int) -> FloatArray:
-    """Values that no string holds."""
+    """Values that occur in no string."""
     return np.asarray(-np.arange(1.0, k + 1.0) * np.pi)
 
 
 def _position(marked: bytes, marks: FloatArray) -> slice:
-    """The place of the values in a message that was serialised with marks."""
+    """The place of the values in a message with marks."""
     start = marked.index(marks.tobytes())
     return slice(start, start + marks.nbytes)
 
 
 def decode_routes(table: Table) -> Decoded:
-    """Routes of nav_msgs/Path in the frame map (east, north, up): a sample with the channels WAYPOINT for each waypoint."""
+    """Routes of nav_msgs/Path in the frame map (east, north, up): a sample with the channels WAYPOINT a waypoint."""
     samples, unreadable = [], 0
     for message in map(bytes, table):
         try:
@@ -172,21 +172,21 @@ class _JointStateDecoder:
         unreadable, rest = 0, [bytes(message) for message in table[~same]]
         for message in rest:
             try:
-                one: Any = self._store.deserialize_cdr(message, JOINT_STATE)
+                vector: Any = self._store.deserialize_cdr(message, JOINT_STATE)
             except SerdeError:
                 unreadable += 1
                 continue
-            if not one.name and not len(one.position):
+            if not vector.name and not len(vector.position):
                 continue
-            stamp = one.header.stamp
+            stamp = vector.header.stamp
             stamps = np.array([stamp.sec * NANOSECONDS + stamp.nanosec])
-            samples.append(Samples(tuple(one.name), stamps, one.position[None], instance(one.header.frame_id)))
+            samples.append(Samples(tuple(vector.name), stamps, vector.position[None], instance(vector.header.frame_id)))
         if rest:
             self._learn(rest[-1])
         return Decoded(samples, unreadable)
 
     def _same_layout(self, table: Table) -> NDArray[np.bool_]:
-        """Which messages have the learnt layout."""
+        """Mask of the messages with the learnt layout."""
         if not self._names or table.shape[1] != self._template.nbytes:
             return np.zeros(len(table), dtype=np.bool_)
         different = table.view("<u4") ^ self._template
@@ -196,18 +196,28 @@ class _JointStateDecoder:
     def _learn(self, message: bytes) -> None:
         """Learn the layout: serialise marked values with the same strings, and find the position of the marks."""
         try:
-            one: Any = self._store.deserialize_cdr(message, JOINT_STATE)
+            vector: Any = self._store.deserialize_cdr(message, JOINT_STATE)
         except SerdeError:
             return
-        k = len(one.name)
-        if k == 0 or len(one.position) != k or len(one.velocity) or len(one.effort) or message[:4] != b"\x00\x01\x00\x00":
+        k = len(vector.name)
+        if (
+            k == 0
+            or len(vector.position) != k
+            or len(vector.velocity)
+            or len(vector.effort)
+            or message[:4] != b"\x00\x01\x00\x00"
+        ):
             return
         marks = _marks(k)
-        marked = bytes(self._store.serialize_cdr(type(one)(one.header, one.name, marks, one.velocity, one.effort), JOINT_STATE))
+        marked = bytes(
+            self._store.serialize_cdr(
+                type(vector)(vector.header, vector.name, marks, vector.velocity, vector.effort), JOINT_STATE
+            )
+        )
         values = _position(marked, marks)
-        if len(marked) != len(message) or message[values] != one.position.tobytes():
+        if len(marked) != len(message) or message[values] != vector.position.tobytes():
             return
-        self._names, self._values, self._sender = tuple(one.name), values, instance(one.header.frame_id)
+        self._names, self._values, self._sender = tuple(vector.name), values, instance(vector.header.frame_id)
         self._template = np.frombuffer(message, dtype="<u4")  # a message without velocity and effort ends with their lengths
         constant = np.full(len(message), 255, dtype=np.uint8)
         constant[STAMP] = constant[self._values] = constant[mac_slice(message)] = 0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Playback schedule of a log: which messages to send, and when. Needs no ROS; `flight_ros.player` sends them."""
+"""Playback schedule of a log: the messages and the times to send. Needs no ROS; `flight_ros.player` sends."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -45,30 +45,30 @@ class Playback(NamedTuple):
 
 
 def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0) -> Playback:
-    """The messages of a log from flight time `start` in s. `topics`: full or last names; empty for all except SHARED.
+    """The messages of a log from flight time `start` in s. `topics`: full or last names; empty for every topic except SHARED.
 
-    A message is due at its time of sending. In a log of a lockstep flight the host's clock has no meaning: there a message is
-    due at its stamp, but not before the messages sent before it. Raises ParameterError when the log cannot be read, lacks a
+    A message is due at the time of sending. In a log of a lockstep flight the host's clock has no meaning: there a message is
+    due at the stamp, but not before the messages sent earlier. Raises ParameterError when the log cannot be read, lacks a
     topic, ends before the start, or holds compressed messages.
     """
     require(not is_compressed(_information(run)), str(run), "compressed messages", "plain ones: see ros2 bag convert")
-    stored = sorted((one for one in stored_messages(run) if one.topic != CLOCK), key=_sent_ns)
-    known = {one.topic: one for one in stored}
+    stored = sorted((message for message in stored_messages(run) if message.topic != CLOCK), key=_sent_ns)
+    known = {message.topic: message for message in stored}
     wanted = {full for name in topics for full in _matching(name, known, str(run))} if topics else set(known) - set(SHARED)
     require(bool(wanted), str(run), "no message", "a recorded flight")
-    begins_stamped = {topic: begins_with_stamp(one.definition) for topic, one in known.items()}
-    votes = [_is_flight_time(one) for one in stored if one.type_name == JOINT_STATE]
+    begins_stamped = {topic: begins_with_stamp(message.definition) for topic, message in known.items()}
+    votes = [_is_flight_time(message) for message in stored if message.type_name == JOINT_STATE]
     lockstep = 2 * sum(votes) > len(votes)
     messages, now_ns = [], 0
-    for one in stored:
-        # A stamp on the other time scale, or an unset one, does not give a due time. It is sent unchanged.
-        stamped = begins_stamped[one.topic] and _is_flight_time(one) is lockstep
+    for message in stored:
+        # A stamp on the second time scale, or an unset stamp, gives no due time. The message is sent unchanged.
+        stamped = begins_stamped[message.topic] and _is_flight_time(message) is lockstep
         if not lockstep:
-            now_ns = _sent_ns(one)
+            now_ns = _sent_ns(message)
         elif stamped:
-            now_ns = max(now_ns, stamp_of(one.data))
-        if one.topic in wanted:
-            messages.append(ScheduledMessage(now_ns, one.topic, one.data, stamped))
+            now_ns = max(now_ns, stamp_of(message.data))
+        if message.topic in wanted:
+            messages.append(ScheduledMessage(now_ns, message.topic, message.data, stamped))
     start_ns = _start_ns(stored, messages[0].due_ns)
     begin_ns = start_ns + nanoseconds(start)
     end = seconds(messages[-1].due_ns - start_ns)
@@ -78,13 +78,13 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0) -> 
 
 
 def begins_with_stamp(definition: str) -> bool:
-    """Whether the first field of a message type is a header or a time, by its definition as text."""
+    """Whether the first field of a message type is a header or a time, by the definition as text."""
     first = next((line for line in definition.splitlines() if not NO_FIELD.match(line)), "")
     return bool(STAMPED.match(first))
 
 
 def _information(run: Path) -> Mapping[str, Any]:
-    """The content of metadata.yaml; empty where it cannot be read."""
+    """The content of metadata.yaml; empty for an unreadable file."""
     try:
         return read_bag_metadata(run)[0]
     except ParameterError:
@@ -107,7 +107,10 @@ def _is_flight_time(stored: StoredMessage) -> bool:
 
 def _start_ns(stored: Sequence[StoredMessage], otherwise: int) -> int:
     """Stamp of flight time 0, by the first `truth` or else the first `y_m`; `otherwise` without both."""
-    truth, y_m = (next((one for one in stored if one.topic.rpartition("/")[2] == name), None) for name in ("truth", "y_m"))
+    first: dict[str, StoredMessage] = {}
+    for message in stored:
+        first.setdefault(message.topic.rpartition("/")[2], message)
+    truth, y_m = first.get("truth"), first.get("y_m")
     otherwise = otherwise if y_m is None else stamp_of(y_m.data)
     decode = None if truth is None else decoder(truth.type_name)
     if truth is None or decode is None:

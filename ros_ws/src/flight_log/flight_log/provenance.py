@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Provenance of a flight for the metadata of its log: versions, revision, host, command, as named sets of strings."""
+"""Provenance of a flight for the metadata of a log: versions, revision, host, command, as named sets of strings."""
 
 import os
 import platform
@@ -92,7 +92,7 @@ def revision(source: Path) -> dict[str, str]:
 
 
 def host() -> dict[str, str]:
-    """The host without its name: system and kernel, processor, cores, memory."""
+    """The host without the name: system and kernel, processor, cores, memory."""
     return {
         "system": platform.system(),
         "kernel": platform.release(),

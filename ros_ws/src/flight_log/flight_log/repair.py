@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Repairs a bag that is truncated, because its recorder was killed, or damaged: every rosbag2 reader accepts the result.
+"""Repairs a truncated or damaged bag, as a killed recorder leaves behind: every rosbag2 reader accepts the result.
 
 Needs no ROS.
 """
@@ -23,12 +23,12 @@ from flight_log.scan import Scan
 
 
 class FileRepair(NamedTuple):
-    """The result for one file."""
+    """The result for a file."""
 
     path: Path
     kept: int  # messages in it now
-    last_ns: int  # log time of the last one
-    known_end_ns: int  # the latest log time in any index or metadata, 0 without one
+    last_ns: int  # log time of the last message
+    known_end_ns: int  # the latest log time in any index or metadata, else 0
     faults: str  # empty for an intact file
     damaged: Path | None  # copy of the damaged file; None for an intact file
 
@@ -41,11 +41,11 @@ class Repair(NamedTuple):
 
 
 def repair(run: Path) -> Repair:
-    """Rebuild what is damaged in the folder of a bag: truncated files, files with damaged parts, and metadata.yaml.
+    """Rebuild the damaged files in the folder of a bag: truncated files, files with damaged parts, and metadata.yaml.
 
-    A rebuilt file holds all readable records and has an index. It replaces the damaged file atomically; that one stays beside
-    it as *.damaged. An intact bag stays as it is. Raises ParameterError when there is no bag, a recorder is writing it, nothing
-    in it is readable, or the folder cannot be written.
+    A rebuilt file holds every readable record and has an index. The rebuilt file replaces the damaged file atomically; the
+    damaged file stays as *.damaged. An intact bag does not change. Raises ParameterError without a bag, while a recorder writes
+    the bag, for a bag without a readable message, and for a folder that cannot be written.
     """
     directory = run.parent if is_file(run) else run
     files = bag_files(directory)
@@ -58,7 +58,7 @@ def repair(run: Path) -> Repair:
     try:
         scans = [_FileScan(file) for file in files]
         repaired = [scan.rebuild() if scan.faults else scan.unchanged() for scan in scans]
-        write = not lists_all_files or any(one.damaged for one in repaired)
+        write = not lists_all_files or any(file.damaged for file in repaired)
         if write:
             write_file(directory / METADATA, bag_metadata_yaml([scan.contents() for scan in scans], previous))
     except OSError as error:
@@ -68,7 +68,7 @@ def repair(run: Path) -> Repair:
 
 
 class _FileScan:
-    """The content of one file, except its messages' data."""
+    """The content of a file, except the data of the messages."""
 
     def __init__(self, path: Path) -> None:
         with path.open("rb") as stream:
@@ -104,7 +104,7 @@ class _FileScan:
         return FileRepair(self.path, self.messages.total(), self.last_ns, self.known_end_ns, "", None)
 
     def rebuild(self) -> FileRepair:
-        """Write a file with all readable records, then replace the damaged file."""
+        """Write a file with the readable records, then replace the damaged file."""
         known = {identity: count for identity, count in self.messages.items() if identity in self.channels}
         require(bool(known), str(self.path), "no message that could be read", "any")
         with replacing(self.path) as stream:
@@ -115,12 +115,17 @@ class _FileScan:
         return FileRepair(self.path, sum(known.values()), self.last_ns, self.known_end_ns, self.faults, damaged)
 
     def _copy(self, writer: Writer) -> None:
-        """Copy all records. Schemas and channels come first, because the index also holds those of a damaged chunk."""
+        """Copy the records. Schemas and channels come first, because the index also holds the channels of a damaged chunk."""
         writer.start(profile="ros2", library="rise-di repair")
-        schemas = {identity: writer.register_schema(one.name, one.encoding, one.data) for identity, one in self.schemas.items()}
+        schemas = {
+            identity: writer.register_schema(schema.name, schema.encoding, schema.data)
+            for identity, schema in self.schemas.items()
+        }
         channels = {
-            identity: writer.register_channel(one.topic, one.message_encoding, schemas.get(one.schema_id, 0), one.metadata)
-            for identity, one in self.channels.items()
+            identity: writer.register_channel(
+                channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0), channel.metadata
+            )
+            for identity, channel in self.channels.items()
         }
         for record in Scan(self.path).records():
             if isinstance(record, Message):
@@ -136,7 +141,7 @@ class _FileScan:
 
 
 def _keep_damaged(path: Path) -> Path:
-    """Give the damaged file a second name, which it keeps when it is replaced; a copy on a file system without hard links."""
+    """Give the damaged file a second name for the time after the replacement; a copy on a file system without hard links."""
     number = 1
     while (damaged := path.with_name(f"{path.name}.damaged{f'-{number}' if number > 1 else ''}")).exists():
         number += 1

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""metadata.yaml of a bag, version 9 of rosbag2: reading it, making its text, finding the MCAP files of a bag. Needs no ROS."""
+"""metadata.yaml of a bag, version 9 of rosbag2: reading, writing as text, finding the MCAP files of a bag. Needs no ROS."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ INFORMATION = "rosbag2_bagfile_information"  # the one key in it
 
 
 class TopicCount(NamedTuple):
-    """A topic in a file and the number of its messages."""
+    """A topic in a file and the number of messages."""
 
     topic: str
     type_name: str
@@ -26,7 +26,7 @@ class TopicCount(NamedTuple):
 
 
 class FileContents(NamedTuple):
-    """What one file of a bag holds. Log times in ns, 0 without messages."""
+    """The content of a file of a bag. Log times in ns, 0 without messages."""
 
     file: str
     first_ns: int
@@ -35,14 +35,14 @@ class FileContents(NamedTuple):
 
     @property
     def messages(self) -> int:
-        """Number of messages on all topics."""
+        """Number of messages on every topic."""
         return sum(count.messages for count in self.counts)
 
 
 def bag_files(run: Path) -> list[Path]:
-    """The MCAP files of a bag in the order of their numbers; the file itself when a file is given; empty for other storages.
+    """The MCAP files of a bag in the order of their numbers; the file itself when a file is given; empty for further storages.
 
-    Raises ParameterError when the files in the folder are not parts of one bag.
+    Raises ParameterError when the files in the folder are not parts of a single bag.
     """
     if is_file(run):
         return [run]
@@ -57,7 +57,7 @@ def bag_files(run: Path) -> list[Path]:
 def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
     """The content of metadata.yaml, and the log time of the last message in ns.
 
-    Raises ParameterError when the file is missing or is not one of rosbag2.
+    Raises ParameterError when the file is missing or is not rosbag2's.
     """
     tree = read_yaml(run / METADATA, METADATA, "that of rosbag2")
     try:
@@ -76,7 +76,7 @@ def is_compressed(information: Mapping[str, Any]) -> bool:
 
 
 def bag_metadata_yaml(files: Sequence[FileContents], previous: Mapping[str, Any] | None = None) -> str:
-    """The text of metadata.yaml. Compression, custom data and distribution are those of the `previous` content."""
+    """The text of metadata.yaml. Compression, custom data and distribution come from the `previous` content."""
     counts: dict[str, TopicCount] = {}
     for count in (count for file in files for count in file.counts):
         messages = count.messages + (counts[count.topic].messages if count.topic in counts else 0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reads all records of an MCAP file that may be truncated or damaged: up to the truncation, without the damaged parts."""
+"""Reads the records of an intact, truncated or damaged MCAP file: up to the truncation, without the damaged parts."""
 
 import os
 import struct
@@ -80,7 +80,7 @@ RECORD_READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
 
 
 class _Decompressor(threading.local):
-    """One of each thread. A new one for each chunk would take as long as the chunk."""
+    """A decompressor a thread. A new decompressor a chunk would take as long as the chunk."""
 
     def __init__(self) -> None:
         self.zstd = zstandard.ZstdDecompressor()
@@ -98,7 +98,7 @@ class Part(NamedTuple):
 
 
 class MessageBatch(NamedTuple):
-    """N messages of one channel and one length, one after the other in a chunk, or in some that follow one another."""
+    """N successive messages of equal channel and length in a chunk or in successive chunks."""
 
     channel_id: int
     data: NDArray[np.uint8]  # (N, length)
@@ -111,7 +111,7 @@ T = TypeVar("T")
 
 
 class Scan:
-    """One file, read once by `records` or `batches`. The attributes are valid afterwards."""
+    """A file, read once by `records` or `batches`. The attributes are valid afterwards."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -128,15 +128,15 @@ class Scan:
         return " and ".join(faults)
 
     def records(self) -> Iterator[McapRecord]:
-        """All schemas, channels, messages, attachments and metadata.
+        """The schemas, channels, messages, attachments and metadata.
 
-        Schemas and channels of the index come first, so that a damaged chunk does not lose them. Raises OSError when the file
-        cannot be read, and nothing when its content is damaged.
+        Schemas and channels of the index come first, so a damaged chunk loses none. Raises OSError for a file that cannot be
+        read, and nothing for damaged content.
         """
         return self._read(lambda parts: (record for part in parts for record in decode(part.opcode, part.content)), 0, map)
 
     def batches(self) -> Iterator[McapRecord | MessageBatch]:
-        """As `records`, with the messages of each channel in some chunks together, which is many times faster."""
+        """As `records`, many times faster: the messages of a channel in some chunks come together."""
         return self._read(decode_batches, JOINED_BYTES, map_ahead)
 
     def _read(
@@ -187,7 +187,7 @@ class Scan:
         return index
 
     def _frames(self, stream: IO[bytes], size: int, index: Sequence[McapRecord]) -> Iterator[tuple[int, bytes]]:
-        """Opcode and content of each record up to the index. After a damaged record the next one in the index follows."""
+        """Opcode and content of every record up to the index. After a damaged record the next record of the index follows."""
         starts = (
             record.chunk_start_offset if isinstance(record, ChunkIndex) else record.offset
             for record in index
@@ -221,7 +221,7 @@ class Scan:
 
 
 def _with_message_indexes(frames: Iterator[tuple[int, bytes]]) -> Iterator[Part]:
-    """Each record with the message indexes behind it, which only a chunk has."""
+    """Every record with the message indexes behind; only a chunk has message indexes."""
     before: Part | None = None
     for opcode, content in frames:
         if before is not None and opcode == Opcode.MESSAGE_INDEX:
@@ -235,7 +235,7 @@ def _with_message_indexes(frames: Iterator[tuple[int, bytes]]) -> Iterator[Part]
 
 
 def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
-    """Chunks that follow one another, with up to `most` bytes of records together or one alone; each other record alone."""
+    """Successive chunks with up to `most` bytes of records together, or a larger chunk alone; every further record alone."""
     chunks: list[Part] = []
     size = 0
     for part in parts:
@@ -272,11 +272,11 @@ def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
             ahead.append(pool.submit(function, item))
             if len(ahead) > AHEAD:
                 yield ahead.popleft().result()
-        yield from (one.result() for one in ahead)
+        yield from (future.result() for future in ahead)
 
 
 def split(data: bytes) -> Iterator[McapRecord]:
-    """The records in a sequence of bytes. Raises one of DECODE_ERRORS."""
+    """The records in a sequence of bytes. Raises DECODE_ERRORS."""
     position = 0
     while position < len(data):
         opcode, length = RECORD.unpack_from(data, position)
@@ -297,9 +297,9 @@ def _messages_in(record: object) -> int:
 
 
 def decode_batches(parts: Sequence[Part]) -> Iterator[McapRecord | MessageBatch]:
-    """As `decode` of chunks, or of one other record, with messages of a channel together. Raises one of DECODE_ERRORS.
+    """As `decode` of chunks or of a single record, with the messages of a channel together. Raises DECODE_ERRORS.
 
-    The message indexes of a chunk save most of the time. A wrong one changes nothing.
+    The message indexes of a chunk save most of the time. A wrong index changes nothing.
     """
     if parts[0].opcode == Opcode.CHUNK:
         yield from _split_batches([(decompress(part.content), _places(part.message_indexes)) for part in parts])
@@ -313,16 +313,16 @@ def decode_batches(parts: Sequence[Part]) -> Iterator[McapRecord | MessageBatch]
 
 
 def _places(message_indexes: Sequence[bytes]) -> NDArray[np.int64]:
-    """The places of messages in their chunk in their order, as its indexes have them; these may be damaged."""
+    """The places of messages in a chunk in their order, by the message indexes, damaged or not."""
     ends = (len(content) - (len(content) - MESSAGE_INDEX.size) % INDEX_ENTRY.itemsize for content in message_indexes)
     entries = b"".join(content[MESSAGE_INDEX.size : end] for content, end in zip(message_indexes, ends, strict=True))
     return np.sort(np.frombuffer(entries, INDEX_ENTRY)["place"])
 
 
 def _split_batches(chunks: Sequence[tuple[bytes, NDArray[np.int64]]]) -> Iterator[McapRecord | MessageBatch]:
-    """The records in chunks, and then their messages by channel. Raises one of DECODE_ERRORS.
+    """The records in chunks, and then the messages by channel. Raises DECODE_ERRORS.
 
-    A chunk has the places of its messages in their order, as the message indexes have them.
+    A chunk has the places of the messages in their order, by the message indexes.
     """
     found: list[NDArray[np.int64]] = []
     size = 0
@@ -347,14 +347,14 @@ def _split_batches(chunks: Sequence[tuple[bytes, NDArray[np.int64]]]) -> Iterato
 
 
 def _heads(data: bytes) -> NDArray[np.void]:
-    """What a message would begin with at each place of a chunk."""
+    """The head of a message at every place of a chunk."""
     return np.ndarray((max(len(data) - HEAD.itemsize + 1, 0),), HEAD, data, strides=(1,))
 
 
 def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDArray[np.int64]]:
-    """The records of a chunk that are no messages, and the places of its messages, sorted.
+    """The records of a chunk except messages, and the places of the messages, sorted.
 
-    It steps over the messages at `places`, and from record to record between them. Raises one of DECODE_ERRORS.
+    The search steps over the messages at `places`, and from record to record in between. Raises DECODE_ERRORS.
     """
     heads = _heads(data)
     if len(places) and not 0 <= places[0] <= places[-1] < len(heads):
@@ -381,14 +381,14 @@ def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDA
 
 
 def _decode_inner(opcode: int, content: bytes) -> Iterator[McapRecord]:
-    """As `decode`, of a record in a chunk, which holds no other chunk (MCAP specification, Chunk)."""
+    """As `decode`, of a record in a chunk; a chunk holds no chunk (MCAP specification, Chunk)."""
     if opcode == Opcode.CHUNK:
         raise McapError("a chunk inside a chunk")
     return decode(opcode, content)
 
 
 def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
-    """The record, or the records of a chunk. Raises one of DECODE_ERRORS."""
+    """The record, or the records of a chunk. Raises DECODE_ERRORS."""
     if opcode == Opcode.CHUNK:
         yield from split(decompress(content))
     elif opcode == Opcode.MESSAGE:
@@ -403,7 +403,7 @@ def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:
 
 
 def decompress(chunk: bytes) -> bytes:
-    """The bytes of the records in the content of a chunk, limited to the size that it gives. Raises one of DECODE_ERRORS."""
+    """The bytes of the records in the content of a chunk, limited to the stated size. Raises DECODE_ERRORS."""
     _, _, size, crc, name_length = CHUNK.unpack_from(chunk)
     (length,), start = LENGTH.unpack_from(chunk, CHUNK.size + name_length), CHUNK.size + name_length + LENGTH.size
     compression, compressed = chunk[CHUNK.size : CHUNK.size + name_length], memoryview(chunk)[start : start + length]

@@ -5,6 +5,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ PARAMETER_EVENT = "rcl_interfaces/msg/ParameterEvent"
 
 
 class StoredMessage(NamedTuple):
-    """One message. Times in ns of the recorder's clock."""
+    """A message. Times in ns of the recorder's clock."""
 
     topic: str  # in full
     type_name: str
@@ -34,9 +35,9 @@ class StoredMessage(NamedTuple):
 
 
 def stored_messages(run: Path) -> Iterator[StoredMessage]:
-    """All messages of a bag of MCAP files in the order of writing; of truncated files those that are readable.
+    """The messages of a bag of MCAP files in the order of writing; of a truncated file the readable messages.
 
-    Raises ParameterError when there is no such bag, or it cannot be read.
+    Raises ParameterError for a missing or unreadable bag.
     """
     files = bag_files(run)
     require(bool(files), str(run), "no .mcap file", "the folder of a run or an MCAP file")
@@ -58,8 +59,8 @@ def stored_messages(run: Path) -> Iterator[StoredMessage]:
 def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list[dict[str, Any]]:
     """The changes of a node's parameters on `/parameter_events`, in the order of the stamps.
 
-    `node` is the node's full name, as in "/one/controller". Each change maps dotted names to values, for `known` parameters
-    or groups of them. None stands for a deleted parameter. SI units. The bag in the folder ROSBAG2 of a run is read, too.
+    `node` is the full name of a node, as in "/one/controller". A change maps dotted names to values, for `known` parameters
+    or groups of parameters. None stands for a deleted parameter. SI units. The bag in the folder ROSBAG2 of a run is read, too.
     """
     store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []
@@ -73,16 +74,16 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
             continue
         if event.node != node:
             continue
-        changes = {one.name: parameter_value(one.value) for one in (*event.new_parameters, *event.changed_parameters)}
-        changes |= {one.name: None for one in event.deleted_parameters}
+        changes = {new.name: parameter_value(new.value) for new in (*event.new_parameters, *event.changed_parameters)}
+        changes |= {deleted.name: None for deleted in event.deleted_parameters}
         values = {name: value for name, value in changes.items() if name.split(".")[0] in known}
         if values:
             events.append((event.stamp.sec * NANOSECONDS + event.stamp.nanosec, values))
-    return [values for _, values in sorted(events, key=lambda one: one[0])]
+    return [values for _, values in sorted(events, key=itemgetter(0))]
 
 
 def parameter_value(message: Any) -> Any:
-    """The value in a rcl_interfaces/msg/ParameterValue; None where it is not set."""
+    """The value in a rcl_interfaces/msg/ParameterValue; None for an unset value."""
     # After the field "type" of rcl_interfaces/msg/ParameterValue there is one field for each type, in their order from 1 on.
     kind, names = message.type, [field.name for field in fields(message)]
     value: Any = getattr(message, names[kind]) if 0 < kind < len(names) else None

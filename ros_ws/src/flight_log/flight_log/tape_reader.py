@@ -6,6 +6,7 @@ import re
 import shlex
 from collections.abc import Callable, Collection, Mapping
 from itertools import pairwise
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -41,17 +42,17 @@ SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w .()-]{0,99}\.yaml")
 
 
 class StoredFile(NamedTuple):
-    """A file that is stored inside the log."""
+    """A file inside the log."""
 
     name: str
     content: bytes
 
 
 class RecordedRun(NamedTuple):
-    """The content of a log. `metadata` holds its named sets of strings, `attachments` all files except the scenario.
+    """The content of a log. `metadata` holds the named sets of strings, `attachments` the files except the scenario.
 
-    `latency` is that of the loop from y to u, `engagements` are those of a bridge; None for a log without them, or one that
-    is no bag of MCAP files. All are of the aircraft in `namespace`, "" for the root.
+    `latency` is the latency of the loop from y to u, `engagements` are the engagements of a bridge; None for a log without
+    samples of the kind, or no bag of MCAP files. The content is of the aircraft in `namespace`, "" for the root.
     """
 
     tape: Tape
@@ -64,11 +65,11 @@ class RecordedRun(NamedTuple):
 
 
 def read_run(run: Path, namespace: str | None = None) -> RecordedRun:
-    """Read the folder of a run, or one of its files: named vectors by topic name (without the namespace), samples by stamp.
+    """Read the folder or a file of a run: named vectors by topic name (without the namespace), samples by stamp.
 
-    The bag is one of this stack, or of `ros2 bag record`: MCAP in one or several files, or SQLite. Truncated MCAP files are
-    read up to their last complete chunk, and the tape's notes name them. Raises ParameterError when there is no bag, or no
-    sample in it, or it holds more than one aircraft, each in its namespace, and `namespace` names none of them.
+    The bag comes from this stack or from `ros2 bag record`: MCAP in one or several files, or SQLite. A truncated MCAP file is
+    read up to the last complete chunk, and a note of the tape says so. Raises ParameterError for a missing bag, for a bag
+    without a sample, and for several aircraft, in a namespace each, of which `namespace` names none.
     """
     log = _read(run)
     filled = {topic: signal for topic, samples in log.topics.items() if (signal := samples.signal()) is not None}
@@ -94,9 +95,9 @@ def _aircraft(topics: Collection[str]) -> list[str]:
 
 
 def _namespace_of_one_aircraft(topics: Collection[str], namespace: str | None, where: str) -> str:
-    """The namespace of one aircraft, "" for the root and without an aircraft; `namespace` is what the caller asks for."""
+    """The namespace of an aircraft, "" for the root and without an aircraft; `namespace` is the choice of the caller."""
     aircraft = _aircraft(topics)
-    known = ", ".join(one or "/" for one in aircraft) or "none"
+    known = ", ".join(name or "/" for name in aircraft) or "none"
     if namespace is None:
         require(len(aircraft) < 2, where, f"aircraft in the namespaces {known}", "that one of them is asked for")
         return aircraft[0] if aircraft else ""
@@ -106,8 +107,8 @@ def _namespace_of_one_aircraft(topics: Collection[str], namespace: str | None, w
 
 
 def _names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
-    """Names within the namespace of one aircraft, by full topic name, without those of aircraft nested in it."""
-    nested = [f"{other}/" for other in _aircraft(topics) if other.startswith(f"{chosen}/")]
+    """Names within the namespace of an aircraft, by full topic name, without nested aircraft."""
+    nested = [f"{name}/" for name in _aircraft(topics) if name.startswith(f"{chosen}/")]
     return {
         topic: topic.removeprefix(f"{chosen}/")
         for topic in topics
@@ -116,7 +117,7 @@ def _names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
 
 
 class _Columns(Generic[T]):
-    """Samples, one in each column of an array that grows: metrics and figures use whole channels, each contiguous in memory."""
+    """Samples as columns of a growing array: metrics and figures use whole channels, contiguous in memory."""
 
     def __init__(self, first: NDArray[T], expected: int) -> None:
         self.count = len(first)
@@ -142,7 +143,7 @@ class _Collected(NamedTuple):
 
 
 class _TopicSamples:
-    """Samples of one topic, decoded in batches. Those with the same names are its signal."""
+    """Samples of a topic, decoded in batches. The samples with equal names are the signal."""
 
     def __init__(self, decode: Decoder, expected: int) -> None:
         self._decode, self._expected = decode, expected
@@ -180,14 +181,14 @@ class _TopicSamples:
                 self._refused += len(stamp_ns)
 
     def _ordered(self, names: tuple[str, ...], values: NDArray[np.float64]) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """Names and values in the order in which these names were received first: values are matched by name."""
+        """Names and values in the order of the first sample with these names: values are matched by name."""
         for known in self._samples:
             if known != names and sorted(known) == sorted(names):
                 return known, values[:, [names.index(name) for name in known]]
         return names, values
 
     def signal(self) -> Signal | None:
-        """All samples in the order of their stamps; None without samples."""
+        """The samples in the order of the stamps; None without samples."""
         self._decode_batch()
         if not self._samples:
             return None
@@ -199,7 +200,7 @@ class _TopicSamples:
         return Signal(stamps, tuple(map(printable, names)), values)
 
     def _names(self) -> tuple[str, ...]:
-        """The names of the first sample, or of more samples that have further names beside these."""
+        """The names of the first sample, or of the majority of samples with further names beside."""
         first = next(iter(self._samples))
         return max((names for names in self._samples if set(first) <= set(names)), key=self._count)
 
@@ -207,8 +208,8 @@ class _TopicSamples:
         return self._samples[names].stamp_ns.count
 
     def conflict(self, name: str) -> str:
-        """The note on publishers at the same time, of which the nodes refuse all but one; empty for one after the other."""
-        spans = sorted(self._spans.items(), key=lambda one: one[1])
+        """The note on simultaneous publishers, of which the nodes accept the first; empty for successive publishers."""
+        spans = sorted(self._spans.items(), key=itemgetter(1))
         if all(before[1][1] < after[1][0] for before, after in pairwise(spans)):
             return ""
         return f"{name}: samples of {', '.join(sorted(self._spans))}: the figures are of all, the nodes refuse all but one"
@@ -220,7 +221,7 @@ class _TopicSamples:
 
 
 class _Log:
-    """The content of all files of a bag."""
+    """The content of the files of a bag."""
 
     def __init__(self) -> None:
         self.topics: dict[str, _TopicSamples] = {}  # by full topic name
@@ -236,7 +237,7 @@ class _Log:
         self.times: Times | None = None  # of the last y or u of a chunk
 
     def reader_of(self, topic: str, type_name: str, expected: int) -> Callable[[MessageBatch], None] | None:
-        """What takes the messages of a topic, `expected` in its file; None for a topic that plays no part."""
+        """Receiver of the messages of a topic, `expected` in the file; None for an unused topic."""
         samples = self.samples_of(topic, type_name, expected)
         if samples is not None and topic.rpartition("/")[2] in TIMED_TOPICS:
             times = self.sent.setdefault(topic, [])
@@ -267,7 +268,7 @@ class _Log:
         return int(sent_ns)
 
     def samples_of(self, topic: str, type_name: str, expected: int = 0) -> _TopicSamples | None:
-        """The samples of a topic; None for a type without named vectors that is no route."""
+        """The samples of a topic; None for a type without named vectors or waypoints."""
         is_route = topic.rpartition("/")[2] == ROUTE and type_name == PATH
         if topic not in self.topics and (decode := decode_routes if is_route else decoder(type_name)) is not None:
             self.topics[topic] = _TopicSamples(decode, expected)
@@ -315,7 +316,7 @@ def _add(run: Path, log: _Log) -> None:
 
 
 def _bag_metadata(run: Path, log: _Log) -> Mapping[str, Any]:
-    """The content of metadata.yaml; when it cannot be read, a note names the command that repairs it."""
+    """The content of metadata.yaml; for an unreadable file a note names the repair command."""
     try:
         information, log.known_end_ns = read_bag_metadata(run)
     except ParameterError:
@@ -353,7 +354,7 @@ def _read_mcap(file: Path, log: _Log) -> None:
 
 
 def _read_other(run: Path, log: _Log) -> None:
-    """A bag of another rosbag2 storage, or a compressed one."""
+    """A bag of a further rosbag2 storage, or a compressed bag."""
     from rosbags.rosbag2 import Reader  # noqa: PLC0415 - takes 70 ms, which no bag of ours needs
 
     try:
@@ -366,7 +367,7 @@ def _read_other(run: Path, log: _Log) -> None:
 
 
 def _start_ns(signals: Mapping[str, Signal]) -> int:
-    """Stamp of flight time 0: by `truth`, else the first y_m, since commands count from it; else the earliest stamp."""
+    """Stamp of flight time 0: by `truth`, else the first y_m, where commands begin; else the earliest stamp."""
     truth = signals.get("truth")
     if truth is not None and "t" in truth.names:
         start_ns = flight_start_ns(int(truth.stamp_ns[0]), float(truth["t"][0]))

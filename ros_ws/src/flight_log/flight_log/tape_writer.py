@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a Tape as an MCAP bag, without ROS. A flight in one process and one over topics leave the same kind of log."""
+"""Writes a Tape as an MCAP bag, without ROS. A flight in one process and a flight over topics leave the same kind of log."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,7 +31,7 @@ def write_run(tape: Tape, directory: Path, attachments: LogAttachments) -> Path:
 
 
 class TapeWriter:
-    """Writes a flight part by part as a bag. Each sample becomes a message, whose log time is the stamp.
+    """Writes a flight part by part as a bag. A sample becomes a message with the stamp as log time.
 
     Messages are in the order of time: the samples of the last DELAY_NS wait for the next part. Raises OSError where the bag
     cannot be written.
