@@ -12,12 +12,13 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from tests.conftest import REPOSITORY
 
-from flight_analysis.closed_loop.replay import recorded_parameters, replay
+from flight_analysis.closed_loop.replay import recorded_parameters, recorded_scenario, replay
 from flight_analysis.report.run_folder import read_flight
 from flight_core.rates import NANOSECONDS
 from flight_log.repair import repair
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
+from flight_view.flight import Flight
 from rise_di_controller.rise_di import RiseDiConfig
 
 pytestmark = pytest.mark.package("flight_log")
@@ -25,7 +26,10 @@ pytestmark = pytest.mark.package("flight_log")
 TOPICS = {"y", "y_m", "u", "internals", "truth"}
 
 
-@pytest.fixture(params=["osprey_servo", "osprey_gust"])  # a flight in lockstep, a flight in real time
+RUNS = ("osprey_servo", "osprey_gust", "osprey_keyed")  # in lockstep, in real time, in lockstep with a message key
+
+
+@pytest.fixture(params=RUNS)
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A copy of a recorded run: the log, metadata.yaml and summary.json."""
     shutil.unpack_archive(REPOSITORY / "tests" / "recorded" / f"{request.param}.tar.xz", tmp_path, filter="data")
@@ -39,11 +43,14 @@ def test_every_sample_is_that_of_an_independent_reader(run: Path) -> None:
         for _, channel, _, message in reader.iter_decoded_messages(topics=[f"/{name}" for name in TOPICS]):
             if message.name:
                 stamp_ns = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+                sender, _, code = message.header.frame_id.partition(";mac=")
+                assert (sender.startswith("/"), len(code)) == (True, 32 if run.name == "osprey_keyed" else 0)
                 samples[channel.topic[1:]].append((stamp_ns, tuple(message.name), np.array(message.position).tobytes()))
     tape = read_run(run).tape
     assert tape.notes == ()
-    assert set(tape.signals) == TOPICS
-    for name, signal in tape.signals.items():
+    assert set(tape.signals) - {"pose"} == TOPICS  # a topic that came later
+    for name in TOPICS:
+        signal = tape.signals[name]
         stamps = signal.stamp_ns.tolist()
         read = [(stamp, signal.names, row.tobytes()) for stamp, row in zip(stamps, signal.values, strict=True)]
         assert read == sorted(samples[name], key=lambda sample: sample[0]), name
@@ -65,6 +72,15 @@ def test_every_bit_is_replayed(run: Path) -> None:
     assert result.checked.all()
     assert len(result.number) == len(recorded.tape["internals"].stamp_ns) > 30  # ticks of 10 ms in the shorter flight
     assert result.notes == ()
+
+
+def test_the_page_and_the_commands_read_the_scenario(run: Path) -> None:
+    flight, recorded = Flight(run), read_run(run).scenario
+    flight.update()
+    assert recorded is not None
+    assert flight.notes == []
+    assert flight.scenario is not None
+    assert flight.scenario.controller == recorded_scenario(recorded).controller == recorded_parameters(recorded)
 
 
 def test_the_log_is_intact_and_keeps_its_attachments_and_metadata(run: Path) -> None:

@@ -28,7 +28,6 @@ from tests.joint_states import JOINT_STATE, vector
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest, HTTPResponse
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
-from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
@@ -45,7 +44,7 @@ from flight_view.flight import MAX_TEXT, ROUTE_TYPE, Flight
 from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
 from flight_view.text import picture
-from flight_view.watch import newest_run, require_log, services_note
+from flight_view.watch import newest_run, require_log
 
 pytestmark = [pytest.mark.package("flight_view"), pytest.mark.slow]
 
@@ -712,22 +711,18 @@ def test_a_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
     for words, expected in (
         (("--wait",), "error: --wait: found no RUN, expected the folder of a run that will be recorded\n"),
         ((recorded, recorded, "--text"), "error: --text: found two runs, expected one run\n"),
-        ((recorded, "--key-file", "k"), "error: --namespace, --key-file: found no --control, expected --control beside them\n"),
+        ((recorded, "--namespace", "n"), "error: --namespace: found no --control, expected --control beside it\n"),
     ):
         ended = subprocess.run(command("watch", *words), capture_output=True, text=True, check=False, cwd=recorded)
         assert (ended.returncode, ended.stderr) == (2, expected)
 
 
-def test_a_flight_with_its_page_prints_the_address_and_leaves_no_server(tmp_path: Path, osprey_gust: Scenario) -> None:
-    scenario = tmp_path / "keyed.yaml"
-    scenario.write_text(scenario_yaml(osprey_gust.vary(controller={"key_file": "flight.key"})), encoding="utf-8")
-    words = ("fly", scenario, "--in-process", "--duration", "0.5", "--watch", "--json", "--runs", tmp_path)
+def test_a_flight_with_its_page_prints_the_address_and_leaves_no_server(tmp_path: Path) -> None:
+    words = ("fly", "osprey_gust", "--in-process", "--duration", "0.5", "--watch", "--json", "--runs", tmp_path)
     ended = subprocess.run(command(*words), capture_output=True, text=True, check=True)
     assert json.loads(ended.stdout)["outcome"] == "completed"
     found = re.search(r"http://127\.0\.0\.1:(\d+)/", ended.stderr)
     assert found is not None
-    assert "key_file authenticates topics, not services" in ended.stderr
-    assert services_note(osprey_gust) == []
     with socket.socket() as client:
         assert client.connect_ex(("127.0.0.1", int(found[1]))) != 0
 

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Attacker of a flight: subscribes to y, and publishes u under the name of the controller.
 
-python -m tests.ros.attacker SECONDS [KEY_FILE]     # ends early after ENOUGH samples of y and u
+python -m tests.ros.attacker SECONDS     # ends early after ENOUGH samples of y and u
 
-The environment selects its transport. With a key it signs. It prints the number of received samples of y as JSON.
+The environment selects its transport. It prints the number of received samples of y as JSON.
 """
 
 import json
@@ -16,7 +16,6 @@ import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from tests.ros.peer import INPUTS
 
-from flight_core.authentication import MessageAuthenticator, read_key
 from flight_ros.messages import Encoder
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import NEWEST_SAMPLES, U, Y
@@ -29,13 +28,12 @@ SEND = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
 def main() -> None:
     """Attack."""
-    seconds, *keys = sys.argv[1:]
+    (seconds,) = sys.argv[1:]
     rclpy.init()
     node = rclpy.create_node("attacker")
     subscription = PolledSubscription(node, Y, NEWEST_SAMPLES, raw=True)
     publisher = node.create_publisher(U.type, U.name, SEND)
-    authenticator = MessageAuthenticator(read_key(keys[0], "key_file"), "/u", None) if keys else None
-    encoder = Encoder(INPUTS, "/controller#1", authenticator)
+    encoder = Encoder(INPUTS, "/controller#1")
     received = sent = 0
     deadline = time.monotonic() + float(seconds)
     while time.monotonic() < deadline and not (received >= ENOUGH and sent >= ENOUGH):

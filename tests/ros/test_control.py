@@ -79,11 +79,7 @@ def test_a_target_that_guidance_does_not_take_ends_at_once_when_it_is_cancelled(
 
 
 def test_a_flight_is_commanded_from_its_page_recorded_and_replayed(start: Start, tmp_path: Path) -> None:
-    key_file = tmp_path / "flight.key"
-    key_file.touch(mode=0o600)
-    key_file.write_bytes(bytes(range(32)))
-    keyed = {name: {"key_file": str(key_file)} for name in ("aircraft", "reference_model", "controller")}
-    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust", **keyed)))  # ended below
+    flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")))  # ended below
     flight.wait_for_log(tmp_path / "runs", 50_000)
     run = next(path for path in (tmp_path / "runs").iterdir() if path.is_dir() and not path.is_symlink())
     watch = start("flight_cli.cli", "watch", str(run), "--control", "--port", "0").wait_for("http://")
@@ -91,7 +87,6 @@ def test_a_flight_is_commanded_from_its_page_recorded_and_replayed(start: Start,
     page = Page(next(line for line in watch.lines if line.startswith("http://")), key)
     state = page.until(flight, nodes=["aircraft", "controller"])
     state = page.until(flight, logged=state["digest"])
-    watch.wait_for("key_file authenticates topics, not services")
     k_g = next(one["values"][0] for one in state["gains"] if one["name"] == "k_g")
 
     status, changed = page.post("gains", digest=state["digest"], values={"k_g": [1.2 * k_g], "softening": [2.5]})

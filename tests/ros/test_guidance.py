@@ -67,25 +67,6 @@ def test_guidance_alone_starts_from_the_parameters_of_a_run(start: Start, tmp_pa
     start("flight_guidance.main", "--ros-args", "--params-file", str(parameters)).wait_for("ready")
 
 
-def test_a_keyed_guidance_takes_targets_with_the_key_alone_and_no_route(start: Start, peer_node: Peer, tmp_path: Path) -> None:
-    key = tmp_path / "flight.key"
-    key.write_bytes(bytes(range(32)))
-    key.chmod(0o600)
-    sections = {node: {"key_file": str(key)} for node in ("aircraft", "reference_model", "controller", "guidance")}
-    scenario = scenario_file(tmp_path, 1e5, "osprey_route", **sections)
-    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", "runs")
-    command.wait_for_log(tmp_path / "runs", FIRST_CHUNKS)
-    forged = start("flight_cli.cli", "target", "altitude=60")
-    assert forged.end() == 1
-    assert "not in force" in forged.output
-    peer_node.until(partial(peer_node.counted, "refused target: mac"))
-    assert "in force: altitude=60" in start("flight_cli.cli", "target", "altitude=60", "--key-file", str(key)).succeed().output
-    with ControlClient("", key.read_bytes()) as client:
-        assert client.send_target({"altitude": 61.0}) == ""
-        client.send_route([[0.0, 0.0, 50.0], [900.0, 0.0, 55.0]])
-        peer_node.until(partial(peer_node.counted, "refused route: mac"))
-
-
 @pytest.fixture
 def calm(tmp_path: Path) -> Path:
     """The osprey in calm air, without a route."""

@@ -16,6 +16,7 @@ import pytest
 from mcap.reader import make_reader
 from tests import recordings
 from tests.ros.conftest import Process, Start
+from tests.ros.peer import Peer
 
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -102,7 +103,7 @@ def nodes(start: Start, scenario: Path) -> dict[str, Process]:
         "reference_model": ("reference_model", []),
         "aircraft": ("aircraft_sim", ["-p", "control_rate:=100.0", "-p", "recorded:=true"]),
     }
-    shared = ("--ros-args", "--params-file", str(scenario), "-p", "lockstep:=true")
+    shared = ("--ros-args", "--params-file", str(scenario), "-p", "lockstep:=true", "-p", "control_rate:=100.0")
     return {role: start(f"{package}.main", *shared, *words) for role, (package, words) in overrides.items()}
 
 
@@ -144,13 +145,10 @@ def test_a_diverged_aircraft_ends_the_flight_with_the_reason_and_a_log(start: St
     assert summary["duration"] > 1.0
 
 
-def test_a_flight_that_waits_for_a_refused_sample_ends_with_the_reason(start: Start, tmp_path: Path) -> None:
-    key = tmp_path / "flight.key"
-    key.write_bytes(bytes(32))
-    key.chmod(0o600)
-    scenario = scenario_file(tmp_path, 60.0, aircraft={"key_file": str(key)})  # the controller has none
-    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", "runs")
-    assert command.end() == 3, command.output  # after PEER_TIMEOUT_NS, 30 s
-    summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
-    reason = "timed out waiting for /u: a sample was refused: no message authentication code"
-    assert summary["outcome"] == f"aircraft ended with status 3: {reason}"
+def test_a_node_that_waits_for_a_refused_sample_ends_with_the_reason(start_node: Start, peer_node: Peer) -> None:
+    for sender in ("/controller", "/second"):  # for the first y and the next
+        peer_node.command(0.0, 0.0, 0.0, 0.0, sender=sender)
+    aircraft = start_node("aircraft_sim", "-p", "lockstep:=true", "-p", "control_rate:=100.0")
+    assert aircraft.end() == 3, aircraft.output  # after PEER_TIMEOUT_NS, 30 s
+    reason = "conflicting publisher /second ignored: already receiving from /controller"
+    assert f"timed out waiting for /u: a sample was refused: {reason}" in aircraft.output

@@ -13,7 +13,7 @@ from tests.joint_states import vector
 
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, StampedVector
-from flight_ros.messages import NO_CHANNELS, Decoder, Encoder, instant, stamp_of, to_message
+from flight_ros.messages import NO_CHANNELS, Decoder, Encoder, instant, sender_of, stamp_of, to_message
 
 pytestmark = pytest.mark.package("flight_ros")
 
@@ -60,6 +60,18 @@ def test_a_decoder_follows_a_change_of_channel_names_or_publisher() -> None:
     for names, frame_id in ((("q", "V"), "a"), (("V", "q"), "a"), (("q",), "b"), (("q", "V"), "a")):
         sample = decoded(decoder, Encoder(names, frame_id).encode(5, np.array([float(name == "q") for name in names])))
         assert (sample.value.tolist(), sample.sender) == ([1.0], frame_id)
+
+
+def test_a_code_of_an_earlier_version_is_no_part_of_the_sender() -> None:
+    decoder = Decoder(("q",))
+    for code in ("0" * 32, "f" * 32):  # as `rise-di play` publishes a log with codes
+        raw = Encoder(("q",), f"/aircraft#1;mac={code}").encode(5, np.array([1.0]))
+        assert decoded(decoder, raw).sender == sender_of(raw) == "/aircraft#1"
+
+
+@given(st.binary(max_size=100))
+def test_the_sender_of_any_bytes_is_a_text(raw: bytes) -> None:
+    assert isinstance(sender_of(raw), str)
 
 
 def test_a_vector_without_channels_is_no_sample() -> None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attacks from this host and from another one, with and without a key: message authentication, replay protection, transport."""
+"""Attacks from this host and from another host: reception of y, forged and replayed u, transport. Keys of earlier versions."""
 
 import json
 import shutil
@@ -15,130 +15,26 @@ from typing import Any, NamedTuple
 import numpy as np
 import psutil
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+import yaml
 from tests.conftest import REPOSITORY
-from tests.recordings import scenario_file
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import INPUTS, Peer
 
-from flight_analysis.closed_loop.scenario import Scenario
-from flight_core.authentication import MessageAuthenticator
-from flight_core.vectors import ChannelError, require_not_future
-from flight_ros.messages import Decoder, Encoder
+from autopilot_bridge.params import find_map, load_map
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError
+from flight_ros.messages import Encoder
 from flight_ros.topics import U
 from flight_ros.transport import LOOPBACK_PROFILE, open_to_network
 
 pytestmark = pytest.mark.package("flight_ros")
 
-Keys = tuple[Path, Path]
 PEER_TOPICS = ("/diagnostics",)
-KEY, OTHER_KEY = bytes(range(32)), bytes(range(1, 33))
 PATIENCE = 5.0
 """s of an attack. A successful one takes 1 s on an idle host (discovery 0.1 s, then y at 500 Hz)."""
 
 
-# Message authentication
-
-
-def make_authenticator(topic: str = "/u", key: bytes = KEY, since_ns: int | None = None) -> MessageAuthenticator:
-    return MessageAuthenticator(key, topic, since_ns)
-
-
-def u_message(stamp_ns: int, authenticator: MessageAuthenticator | None = None) -> bytes:
-    return Encoder(INPUTS, "/controller#1", authenticator).encode(stamp_ns, np.array([0.1, 0.2, 0.3, 0.4]))
-
-
-def take(decoder: Decoder, raw: bytes) -> None:
-    sample = decoder.decode(raw)
-    assert sample is not None
-    with decoder.once(sample.stamp_ns):
-        pass
-
-
-def rejection(decoder: Decoder, raw: bytes) -> str:
-    with pytest.raises(ChannelError) as rejected:
-        take(decoder, raw)
-    return rejected.value.reason
-
-
-@pytest.mark.parametrize("authenticator", [None, make_authenticator()], ids=["no key", "key"])
-def test_a_signed_sample_is_decoded_with_the_key_and_without_one(authenticator: MessageAuthenticator | None) -> None:
-    decoder = Decoder(INPUTS, authenticator)
-    for stamp_ns in (5, 6, 7):  # the later ones have a known layout
-        sample = decoder.decode(u_message(stamp_ns, make_authenticator()))
-        assert sample is not None
-        assert (sample.stamp_ns, sample.sender, sample.value.tolist()) == (stamp_ns, "/controller#1", [0.1, 0.2, 0.3, 0.4])
-
-
-@given(st.data())
-def test_a_signed_sample_with_a_changed_byte_is_rejected(data: st.DataObject) -> None:
-    raw = bytearray(u_message(5, make_authenticator()))
-    place = data.draw(st.integers(0, len(raw) - 1))
-    raw[place] ^= data.draw(st.integers(1, 255))
-    decoder = Decoder(INPUTS, make_authenticator())
-    decoder.decode(u_message(4, make_authenticator()))
-    assert rejection(decoder, bytes(raw)) == "mac"
-
-
-@given(st.binary(max_size=300))
-def test_arbitrary_bytes_are_rejected(raw: bytes) -> None:
-    assert rejection(Decoder(INPUTS, make_authenticator()), raw) == "mac"
-
-
-@pytest.mark.parametrize(
-    "authenticator",
-    [None, make_authenticator(key=OTHER_KEY), make_authenticator("/two/u"), make_authenticator("/y")],
-    ids=["no key", "another key", "another aircraft", "y"],
-)
-def test_a_sample_without_the_key_or_for_another_topic_is_rejected(authenticator: MessageAuthenticator | None) -> None:
-    assert rejection(Decoder(INPUTS, make_authenticator()), u_message(5, authenticator)) == "mac"
-
-
-def test_replay_protection_accepts_a_sample_once_and_none_from_before_the_start() -> None:
-    decoder = Decoder(INPUTS, make_authenticator(since_ns=100))
-    assert rejection(decoder, u_message(100, make_authenticator())) == "order"
-    take(decoder, u_message(101, make_authenticator()))
-    for stamp_ns in (101, 90):
-        assert rejection(decoder, u_message(stamp_ns, make_authenticator())) == "order"
-    assert rejection(decoder, u_message(2**30, make_authenticator(key=OTHER_KEY))) == "mac"  # without effect on the last stamp
-    take(decoder, u_message(102, make_authenticator()))
-
-
-def test_a_signed_sample_that_is_refused_for_another_reason_makes_no_earlier_one_stale() -> None:
-    decoder = Decoder(INPUTS, make_authenticator(since_ns=100))
-    with pytest.raises(ChannelError, match="conflicting publisher"), decoder.once(2**30):
-        raise ChannelError("sender", "conflicting publisher /controller#2 ignored")
-    take(decoder, u_message(101, make_authenticator()))
-
-
-def test_a_signed_sample_that_was_ahead_of_the_clock_cannot_be_replayed_when_its_time_comes() -> None:
-    decoder = Decoder(INPUTS, make_authenticator(since_ns=100))
-    with pytest.raises(ChannelError, match="ahead of the clock"), decoder.once(10**9):
-        require_not_future(10**9, 200, 100)
-    take(decoder, u_message(101, make_authenticator()))
-    assert rejection(decoder, u_message(10**9, make_authenticator())) == "order"
-    take(decoder, u_message(10**9 + 1, make_authenticator()))
-
-
-def test_without_a_key_a_message_has_no_code() -> None:
-    signed, plain = u_message(5, make_authenticator()), u_message(5)
-    assert plain == Encoder(INPUTS, "/controller#1").encode(5, np.array([0.1, 0.2, 0.3, 0.4]))
-    assert b";mac=" not in plain
-    assert signed == u_message(5, make_authenticator())  # signed bytes are repeatable, as lockstep requires
-
-
 # Attacks from this host
-
-
-@pytest.fixture
-def keys(tmp_path: Path) -> Keys:
-    """Two key files: the one of the flight, and another one."""
-    made = tmp_path / "key", tmp_path / "other"
-    for path, key in zip(made, (KEY, OTHER_KEY), strict=True):
-        path.write_bytes(key)
-        path.chmod(0o600)
-    return made
 
 
 def aircraft(start_node: Start, *arguments: str, within: tuple[str, ...] = ()) -> Process:
@@ -158,101 +54,78 @@ def received(attacker: Process) -> int:
     return int(json.loads(attacker.lines[-1])["received"])
 
 
-ACCEPTED, REJECTED = "receiving u from", "sample refused"
+def test_a_process_of_this_host_receives_y_and_commands_u(start: Start, start_node: Start) -> None:
+    node = aircraft(start_node)
+    assert received(start("tests.ros.attacker", "30", within=ON_LOOPBACK)) > 0
+    node.wait_for("receiving u from /controller#1")
+    assert "sample refused" not in node.output
 
 
-@pytest.mark.parametrize(
-    ("node_key", "attacker_key", "logged", "not_logged"),
-    [
-        (None, None, "receiving u from /controller#1", REJECTED),
-        (0, None, "no message authentication code", ACCEPTED),
-        (0, 1, "wrong message authentication code", ACCEPTED),
-        (0, 0, "receiving u from /controller#1", REJECTED),
-    ],
-    ids=["by default", "no key", "another key", "the key"],
-)
-def test_a_process_of_this_host_receives_y_and_commands_u_unless_it_lacks_the_key(
-    node_key: int | None, attacker_key: int | None, logged: str, not_logged: str, start: Start, start_node: Start, keys: Keys
-) -> None:
-    node = aircraft(start_node, *(() if node_key is None else ("-p", f"key_file:={keys[node_key]}")))
-    key = () if attacker_key is None else (str(keys[attacker_key]),)
-    assert received(start("tests.ros.attacker", "30", *key, within=ON_LOOPBACK)) > 0  # y is not encrypted
-    node.wait_for(logged)
-    assert not_logged not in node.output
-
-
-def test_a_replayed_u_is_rejected_also_after_a_restart(start_node: Start, keys: Keys, peer_node: Peer) -> None:
-    before = time.time_ns()
-    first = aircraft(start_node, "-p", f"key_file:={keys[0]}")
+def test_a_replayed_u_is_refused_by_its_stamp(start_node: Start, peer_node: Peer) -> None:
+    """Also by a restarted aircraft, which has no memory of the last stamp."""
+    first = aircraft(start_node, "-p", "max_age:=0.1")
     publisher = peer_node.node.create_publisher(U.type, U.name, 10)
-    encoder = Encoder(INPUTS, "/controller#1", make_authenticator())
+    encoder = Encoder(INPUTS, "/controller#1")
     recorded: list[bytes] = []
 
     def send() -> None:
         recorded.append(encoder.encode(time.time_ns(), np.zeros(4)))
         publisher.publish(recorded[-1])
 
+    def replay_beside() -> None:
+        send()
+        publisher.publish(replayed)
+
     peer_node.until(lambda: "receiving u from" in first.output, each=send)
-    replayed = recorded[-1]
-    peer_node.until(partial(peer_node.counted, "refused u: order"), each=lambda: publisher.publish(replayed))
+    replayed = recorded[0]
+    peer_node.until(partial(peer_node.counted, "refused u: order"), each=replay_beside)  # once it is older than max_age
     first.interrupt().succeed()
-    # A restarted aircraft has no memory of the last stamp, but rejects samples from before its start.
     peer_node.received["/diagnostics"].clear()
-    second = aircraft(start_node, "-p", f"key_file:={keys[0]}")
-    peer_node.until(partial(peer_node.counted, "refused u: order"), each=lambda: publisher.publish(replayed))
-    peer_node.until(partial(peer_node.counted, "refused u: mac"), each=lambda: publisher.publish(u_message(before)))
+    second = aircraft(start_node, "-p", "max_age:=0.1")
+    peer_node.until(partial(peer_node.counted, "refused u: old"), each=lambda: publisher.publish(replayed))
     assert "receiving u from" not in second.output
 
 
-def test_a_second_controller_with_the_key_and_newer_stamps_does_not_take_over(
-    start_node: Start, keys: Keys, peer_node: Peer
-) -> None:
-    node = aircraft(start_node, "-p", f"key_file:={keys[0]}")
-    publisher = peer_node.node.create_publisher(U.type, U.name, 10)
-    first, second = (Encoder(INPUTS, f"/controller#{number}", make_authenticator()) for number in (1, 2))
-    late_ns = 20_000_000  # as with a y that is 20 ms late
+# The message key of earlier versions
 
-    def send(*others: Encoder) -> None:
-        stamp_ns = time.time_ns() - late_ns
-        publisher.publish(first.encode(stamp_ns, np.zeros(4)))
-        for other in others:
-            publisher.publish(other.encode(stamp_ns, np.zeros(4)))  # of the same y
-            publisher.publish(other.encode(time.time_ns(), np.zeros(4)))
-
-    peer_node.until(lambda: "receiving u from /controller#1" in node.output, each=send)
-    # 200 of them, two at a time, last 0.5 s or more. The age limit of u, after which the same node in another process takes
-    # over, is 0.2 s.
-    peer_node.until(partial(peer_node.counted, "refused u: sender", 200), each=lambda: send(second))
-    assert not peer_node.counted("refused u: order")
-    assert "receiving u from /controller#2" not in node.output
-
-
-def test_a_keyed_flight_is_signed_and_replays_exactly(start: Start, osprey_gust: Scenario, keys: Keys, tmp_path: Path) -> None:
-    keyed = {node: {"key_file": str(keys[0])} for node in ("aircraft", "reference_model", "controller")}
-    scenario = scenario_file(tmp_path / "keyed.yaml", osprey_gust.path, **keyed)
-    flight = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--duration", "2", "--runs", str(tmp_path / "runs"))
-    flight.succeed()
-    node = start("flight_cli.cli", "replay", str(tmp_path / "runs" / "latest")).succeed()
-    assert "every bit equal" in node.output
-
-
-@pytest.mark.parametrize(
-    ("content", "mode", "sentence"),
-    [
-        (KEY, 0o640, "found {path} with mode 0640, expected a file of 32 bytes that its owner alone can read"),
-        (KEY[:31], 0o600, "found {path} of 31 bytes, expected a file of 32 bytes"),
-        (KEY + b"\n", 0o600, "found {path} of more than 32 bytes, expected"),
-        (None, 0, "{path} cannot be read (No such file or directory), expected"),
-    ],
+REFUSAL = (
+    "found a message key, expected none: messages no longer carry codes; "
+    "DDS Security (SROS2), or a tunnel between hosts, protects a flight (docs/security.md)"
 )
-def test_an_invalid_key_is_an_error(content: bytes | None, mode: int, sentence: str, start_node: Start, tmp_path: Path) -> None:
-    path = tmp_path / "bad"
-    if content is not None:
-        path.write_bytes(content)
-        path.chmod(mode)
-    node = start_node("aircraft_sim", "-p", f"key_file:={path}")
-    assert node.end() == 2
-    assert f"error: aircraft.key_file: {sentence.format(path=path)}" in node.output
+
+
+@pytest.mark.parametrize("node", ["aircraft_sim", "reference_model", "rise_di_controller"])
+def test_a_node_with_a_key_is_refused(node: str, start_node: Start) -> None:
+    process = start_node(node, "-p", "key_file:=flight.key")
+    assert process.end() == 2
+    assert process.output.startswith("error: ")
+    assert process.output.endswith(f".key_file: {REFUSAL}")
+
+
+@pytest.mark.parametrize("section", ["aircraft", "reference_model", "controller", "recorder", "guidance", "flight"])
+def test_a_scenario_with_a_key_is_refused(section: str, start: Start, tmp_path: Path) -> None:
+    sections = yaml.safe_load(find_scenario("osprey_route").path.read_text(encoding="utf-8"))
+    sections[f"/**/{section}"]["ros__parameters"]["key_file"] = "flight.key"
+    path = tmp_path / "keyed.yaml"
+    path.write_text(yaml.safe_dump(sections), encoding="utf-8")
+    flight = start("flight_cli.cli", "fly", str(path), "--in-process", "--duration", "1")
+    assert flight.end() == 2
+    assert flight.output == f"error: {section}.key_file: {REFUSAL}"
+
+
+def test_a_map_with_a_key_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "keyed.yaml"
+    path.write_text("key_file: flight.key\n" + find_map("px4").read_text(encoding="utf-8"), encoding="utf-8")
+    with pytest.raises(ParameterError) as refused:
+        load_map(str(path))
+    assert str(refused.value).endswith(f"key_file: {REFUSAL}")
+
+
+@pytest.mark.parametrize("words", [("target", "altitude=60"), ("watch", "--control")])
+def test_a_command_with_a_key_is_refused(words: tuple[str, ...], start: Start) -> None:
+    command = start("flight_cli.cli", *words, "--key-file", "flight.key")
+    assert command.end() == 2
+    assert command.output == f"error: --key-file: {REFUSAL}"
 
 
 # Sockets
@@ -371,12 +244,9 @@ def test_by_default_another_host_neither_receives_y_nor_commands_u(
     assert "sample refused" not in node.output  # no sample has arrived
 
 
-@pytest.mark.parametrize("keyed", [False, True], ids=["no key", "key"])
-def test_with_a_network_profile_another_host_receives_y_and_commands_u_unless_there_is_a_key(
-    keyed: bool, start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...], keys: Keys
+def test_with_a_network_profile_another_host_receives_y_and_commands_u(
+    start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
-    key = ("-p", f"key_file:={keys[0]}") if keyed else ()
-    node = aircraft(start_node, *key, within=(*hosts.first, *on_network))
+    node = aircraft(start_node, within=(*hosts.first, *on_network))
     assert received(start("tests.ros.attacker", "30", within=(*hosts.second, *on_network))) > 0
-    node.wait_for("no message authentication code" if keyed else "receiving u from /controller#1")
-    assert (ACCEPTED in node.output) is not keyed
+    node.wait_for("receiving u from /controller#1")

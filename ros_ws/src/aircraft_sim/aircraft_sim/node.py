@@ -15,7 +15,7 @@ from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_not_future, require_not_old
 from flight_ros.flight_node import FlightNode
-from flight_ros.messages import NO_CHANNELS, instant, stamp_of
+from flight_ros.messages import NO_CHANNELS, Decoder, instant, stamp_of
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, POSE, RECORDED, TRUTH, NodeState, U, Y
 
@@ -37,18 +37,18 @@ class AircraftNode(FlightNode[AircraftConfig]):
         (self._publisher_lock,) = self.publisher_locks = (PublisherLock(),)
         self._u_stamp_ns = 0  # of the last u
         self._timeout_logged = False
-        self._u_subscription, self._decoder = self.subscribe(U), self.decoder(U, self._simulator.inputs)
+        self._u_subscription, self._decoder = self.subscribe(U), Decoder(self._simulator.inputs)
         self._publish_y, self._publish_truth = self.advertise(Y), self.advertise(TRUTH)
-        self._publish_pose, self._pose_encoder = self.advertise(POSE), self.encoder(POSE, channels.POSE)
-        self._y_encoder = self.encoder(Y, self._simulator.outputs)
-        self._truth_encoder = self.encoder(TRUTH, self._simulator.truth_names)
+        self._publish_pose, self._pose_encoder = self.advertise(POSE), self.encoder(channels.POSE)
+        self._y_encoder = self.encoder(self._simulator.outputs)
+        self._truth_encoder = self.encoder(self._simulator.truth_names)
         if self.parameters.lockstep:
             self._number = 0  # of the next sample
             self._u_received = True
             self._recorded_ns = 0
             self._control_ns = period_ns(self.parameters.control_rate, "control_rate")
             self._end_ns = nanoseconds(self.parameters.duration) or None
-            self._empty_encoder = self.encoder(Y, ())
+            self._empty_encoder = self.encoder(())
             self._recorded_subscription = self.subscribe(RECORDED)
             self._publish_clock = self.advertise(CLOCK)
 
@@ -147,9 +147,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
     def _accept(self, sample: StampedVector, now_ns: int) -> None:
         """Take a u. Raises ChannelError where its stamp is bad or it is from a conflicting publisher."""
         self._publisher_lock.check(sample.sender, now_ns, self._max_age_ns, self._takeover_ns)
-        with self._decoder.once(sample.stamp_ns):
-            if not self.parameters.lockstep:
-                self._require_timely(sample, now_ns)
+        if not self.parameters.lockstep:
+            self._require_timely(sample, now_ns)
         self._u, self._u_stamp_ns, self._timeout_logged = sample.value, sample.stamp_ns, False
         if self._publisher_lock.refresh(sample.sender, now_ns):
             self.get_logger().info(f"receiving u from {self._publisher_lock.publisher}")

@@ -20,7 +20,7 @@ from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
 from flight_core import parameters
 from flight_core.failsafe import failsafe_scale
 from flight_core.fields import Field
-from flight_core.parameters import Config, KeyedConfig, NonNegative, Numbers, ParameterError, Positive, require
+from flight_core.parameters import Config, NodeConfig, NonNegative, Numbers, ParameterError, Positive, require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
@@ -131,7 +131,7 @@ class SensorConfig(Config):
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
 
-class AircraftConfig(KeyedConfig):
+class AircraftConfig(NodeConfig):
     """All parameters of the aircraft's node."""
 
     airframe: str = Field(

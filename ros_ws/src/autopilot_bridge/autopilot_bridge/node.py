@@ -38,7 +38,7 @@ from flight_core.vectors import ChannelError
 from flight_ros import transport
 from flight_ros.endpoints import mismatch, type_name
 from flight_ros.flight_node import FlightNode
-from flight_ros.messages import Encoder
+from flight_ros.messages import Decoder, Encoder
 from flight_ros.rclpy_private import DeserializationError
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
@@ -81,13 +81,13 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 _require_field(kind(), name, row)
             self._readers.append((self.subscribe(Topic(topic, kind, foreign=True), _qos(self._map.topics[topic])), rows))
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
-        self._u_subscription, self._decoder = self.subscribe(U), self.decoder(U, self._bridge.inputs)
+        self._u_subscription, self._decoder = self.subscribe(U), Decoder(self._bridge.inputs)
         self._publish_y, self._publish_would_send = self.advertise(Y), self.advertise(WOULD_SEND)
-        self._y_encoder = self.encoder(Y, self._bridge.outputs)
+        self._y_encoder = self.encoder(self._bridge.outputs)
         self._publish_pose = self.advertise(POSE) if self._map.pose else None
         self._pose_encoders: dict[tuple[str, ...], Encoder] = {}  # by the names of the fresh channels
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
-        self._would_send_encoder = self.encoder(WOULD_SEND, names)
+        self._would_send_encoder = self.encoder(names)
         self.create_service(SetBool, "~/engage", self._engage)
         self._engagement = self.create_publisher(ENGAGEMENT.type, ENGAGEMENT.name, PUBLISH)
         self._first_y, self._start_ns = False, 0
@@ -140,7 +140,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         if self._publish_pose is not None and (fresh := self._bridge.pose(now_ns)) is not None:
             names, pose = fresh
             if names not in self._pose_encoders:
-                self._pose_encoders[names] = self.encoder(POSE, names)
+                self._pose_encoders[names] = self.encoder(names)
             self._publish_pose(self._pose_encoders[names].encode(pose.stamp_ns, pose.value))
         if self._take_u(now_ns):
             self._publish_would_send(self._would_send_encoder.encode(now_ns, self._bridge.raw_u()))
@@ -195,8 +195,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 sample = self._decoder.decode(received.message)
                 if sample is not None:
                     self._bridge.require_sender(sample.sender, now_ns)
-                    with self._decoder.once(sample.stamp_ns):
-                        self._bridge.take_u(sample, now_ns)
+                    self._bridge.take_u(sample, now_ns)
                     accepted = True
             except ChannelError as error:
                 self.reject(self._u_subscription, error.reason, str(error))

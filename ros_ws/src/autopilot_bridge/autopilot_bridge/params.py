@@ -13,7 +13,7 @@ from autopilot_bridge.channel_map import PATH, Line, to_raw
 from flight_core.channels import POSE
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, read_yaml
-from flight_core.parameters import Config, KeyedConfig, NonNegative, Numbers, Positive, require
+from flight_core.parameters import Config, NodeConfig, NonNegative, Numbers, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 MOVED = ("ardupilot_2024", "mavros", "rosflight")  # to examples/maps: these maps have not flown
@@ -305,7 +305,7 @@ def load_map(name: str) -> ChannelMap:
     return ChannelMap.validate_mapping(content, f"map {path.stem}")
 
 
-class BridgeConfig(KeyedConfig):
+class BridgeConfig(NodeConfig):
     """All parameters of the bridge node."""
 
     map: str = Field(description="the name of a channel map of the library, or the path of a file ending in .yaml")

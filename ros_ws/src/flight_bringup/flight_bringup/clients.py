@@ -24,7 +24,6 @@ from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool, Trigger
 
-from flight_core.authentication import MessageAuthenticator
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import seconds
@@ -244,10 +243,8 @@ class EngagementClient(_Client):
 class TargetClient(_Client):
     """Commands the guidance of a running flight."""
 
-    def __init__(self, namespace: str = "", parent: _Client | None = None, key: bytes | None = None) -> None:
-        """`key`: that of guidance, None for a flight without keys."""
+    def __init__(self, namespace: str = "", parent: _Client | None = None) -> None:
         super().__init__("operator", namespace, parent)
-        self._key = key
         self._guidance, self._decoder = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True), NamedDecoder()
         self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
         self._sent = -TARGET_PERIOD  # monotonic time of the last target, s
@@ -266,9 +263,8 @@ class TargetClient(_Client):
 
     def _published(self, values: Mapping[str, float]) -> bool:
         if time.monotonic() - self._sent > TARGET_PERIOD:
-            self._sent, topic = time.monotonic(), self._publisher.topic_name
-            authenticator = None if self._key is None else MessageAuthenticator(self._key, topic, None)
-            encoder = Encoder([*values], self._node.get_fully_qualified_name(), authenticator)
+            self._sent = time.monotonic()
+            encoder = Encoder([*values], self._node.get_fully_qualified_name())
             self._publisher.publish(encoder.encode(time.time_ns(), np.array([*values.values()])))
         taken = sum(1 << TARGETS.index(name) for name in values)
         return any(
@@ -294,10 +290,8 @@ class ControlClient(_Client):
 
     NODES = ("aircraft", "bridge", "controller", "guidance")
 
-    def __init__(self, namespace: str, key: bytes | None = None) -> None:
-        """`key`: that of guidance, None for a flight without keys."""
+    def __init__(self, namespace: str) -> None:
         super().__init__("control", namespace)
-        self._key = key
         self._targets: TargetClient | None = None
         self._engagement: EngagementClient | None = None
 
@@ -330,7 +324,7 @@ class ControlClient(_Client):
 
     def send_target(self, values: Mapping[str, float]) -> str:
         """Command guidance, as `rise-di target`."""
-        self._targets = self._targets or TargetClient(parent=self, key=self._key)
+        self._targets = self._targets or TargetClient(parent=self)
         return self._targets.send(values)
 
     def send_route(self, points: Sequence[Sequence[float]]) -> str:

@@ -86,9 +86,8 @@ def fly(
         chosen = written(chosen, run / f"{chosen.name}.yaml")
     if watch:
         from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
-        from flight_view.watch import services_note  # noqa: PLC0415 - as above
 
-        print(*context.with_resource(watched(run)), *services_note(chosen), sep="\n", file=sys.stderr)
+        print(*context.with_resource(watched(run)), sep="\n", file=sys.stderr)
     with flight_progress(chosen.flight.duration, quiet=as_json) as (progress, announce):
         if in_process:
             outcome = fly_in_process(chosen, run, progress)

@@ -8,15 +8,20 @@ from typing import Annotated
 
 import typer
 
-from flight_core.authentication import read_key
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import REMOVED, ParameterError, require
 from flight_guidance.modes import TARGETS
 
-KeyFile = Annotated[
-    str, typer.Option(metavar="FILE", help="The `key_file` of guidance, where it has one: targets are refused without it.")
-]
 ANGLES = ("phi", "theta", "heading", "course")
 REFUSED = 1
+
+
+def _refuse_key(file: str | None) -> None:
+    if file is not None:
+        raise ParameterError(f"--key-file: {REMOVED['key_file']}")
+
+
+RemovedKeyFile = Annotated[str | None, typer.Option("--key-file", hidden=True, callback=_refuse_key)]
+"""An option of earlier versions, which is refused."""
 
 
 def target(
@@ -29,7 +34,7 @@ def target(
         ),
     ],
     namespace: Annotated[str, typer.Option(help="Namespace of the aircraft.")] = "",
-    key_file: KeyFile = "",
+    _: RemovedKeyFile = None,
 ) -> None:
     """Command a running guided flight, as in: rise-di target heading=90 altitude=1300. What is not named stays.
 
@@ -37,20 +42,14 @@ def target(
     """
     values = dict(map(_parse, commands))
     require(len(values) == len(commands), "target", "a command twice", "each once")
-    key = operator_key(key_file)
     from flight_bringup.clients import TargetClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
-    with TargetClient(namespace, key=key) as client:
+    with TargetClient(namespace) as client:
         refusal = client.send(values)
     if refusal:
         print(f"error: not in force: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)
     print(f"in force: {', '.join(commands)}")
-
-
-def operator_key(key_file: str) -> bytes | None:
-    """The key of guidance; None where no file is named. Raises ParameterError for an invalid one."""
-    return read_key(key_file, "--key-file") if key_file else None
 
 
 def _parse(text: str) -> tuple[str, float]:

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from flight_bringup.processes import end_with_parent
-from flight_cli.target import KeyFile, operator_key
+from flight_cli.target import RemovedKeyFile
 from flight_core.parameters import ParameterError, require
 from flight_view.flight import Flight
 from flight_view.text import show
@@ -40,7 +40,7 @@ def watch(
         bool, typer.Option("--control-real", help="As --control, and gains also while a bridge sends to an autopilot.")
     ] = False,
     namespace: Annotated[str, typer.Option(help="With --control: the namespace of the flight.")] = "",
-    key_file: KeyFile = "",
+    _: RemovedKeyFile = None,
     runs: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("runs"),
 ) -> None:
     """See a flight on a page: charts, horizon, scene and timeline, live while it is recorded, or again later.
@@ -48,12 +48,7 @@ def watch(
     The page is served on this host alone, until Ctrl-C. Exit status: 0 ended, 2 bad input, 130 interrupted in the terminal.
     """
     require(not wait or run is not None, "--wait", "no RUN", "the folder of a run that will be recorded")
-    require(
-        not (namespace or key_file) or control or control_real,
-        "--namespace, --key-file",
-        "no --control",
-        "--control beside them",
-    )
+    require(not namespace or control or control_real, "--namespace", "no --control", "--control beside it")
     chosen = [newest_run(runs) if run is None else run, *([ghost] if ghost is not None else [])]
     for one in chosen:
         if not wait:
@@ -67,7 +62,7 @@ def watch(
         require(ghost is None and not (control or control_real), "--foxglove", "a ghost or --control beside it", "RUN alone")
         _serve_foxglove(chosen[0], port)
     elif control or control_real:
-        _serve_with_control(chosen, ports, namespace, operator_key(key_file), real=control_real)
+        _serve_with_control(chosen, ports, namespace, real=control_real)
     else:
         serve(chosen, ports, _announce)
 
@@ -86,14 +81,12 @@ def _serve_foxglove(run: Path, port: int | None) -> None:
     foxglove_server.serve(run, foxglove_server.DEFAULT_PORT if port is None else port, _announce)
 
 
-def _serve_with_control(
-    runs: Sequence[Path], ports: Sequence[int], namespace: str, guidance_key: bytes | None, *, real: bool
-) -> None:
+def _serve_with_control(runs: Sequence[Path], ports: Sequence[int], namespace: str, *, real: bool) -> None:
     from flight_analysis.design.gain_selection import margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
     from flight_bringup.clients import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
     from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
 
-    with ControlClient(namespace, guidance_key) as client:
+    with ControlClient(namespace) as client:
         key, controls = new_key(), []
 
         def control(flight: Flight) -> Control:

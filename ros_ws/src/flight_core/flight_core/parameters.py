@@ -14,10 +14,19 @@ import difflib
 import inspect
 import json
 from collections.abc import Iterator, Mapping, Sequence, Set
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self, dataclass_transform, get_origin
 
 from flight_core.fields import REQUIRED, Field, FieldInfo, Problems, short_repr
 from flight_core.text import bounded
+
+REMOVED: Mapping[str, str] = MappingProxyType(
+    {
+        "key_file": "found a message key, expected none: messages no longer carry codes; "
+        "DDS Security (SROS2), or a tunnel between hosts, protects a flight (docs/security.md)"
+    }
+)
+"""Keys of earlier versions, with the rest of the sentence that refuses a key. The scenario in a log may hold the keys."""
 
 
 class ParameterError(ValueError):
@@ -93,6 +102,8 @@ class Config:
         for name in values:
             if not isinstance(name, str):
                 problems.unknown.append(f"{key}: found the key {short_repr(name)}, expected a name")
+            elif name in REMOVED and name not in cls.model_fields:
+                problems.unknown.append(f"{key}.{name}: {REMOVED[name]}")
             elif name not in cls.model_fields:
                 near = [f"{one} perhaps, or another" for one in difflib.get_close_matches(name, sorted(cls.model_fields), n=1)]
                 known = f"{(near or ['one'])[0]} of {', '.join(sorted(cls.model_fields))}"
@@ -173,14 +184,6 @@ class NodeConfig(Config):
     def tunable(cls) -> frozenset[str]:
         """Parameters that may change in flight: dotted names, or names of groups of which all members may."""
         return frozenset()
-
-
-class KeyedConfig(NodeConfig):
-    """Base of the parameters of a node whose messages can carry a message authentication code."""
-
-    key_file: str = Field(
-        default="", description="file of the key of the message authentication codes (flight_core.authentication); empty: none"
-    )
 
 
 Numbers = Annotated[tuple[float, ...], Field(min_length=1)]

@@ -8,6 +8,12 @@ A message names its publisher in `frame_id`.
 from flight_core.vectors import ChannelError
 
 SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting publisher
+CODE = ";mac="  # begins the message authentication code that earlier versions appended to the publisher in `frame_id`
+
+
+def publisher_of(frame_id: str) -> str:
+    """The publisher in `header.frame_id`, e.g. "/controller#4711", without the code of earlier versions."""
+    return frame_id.partition(CODE)[0]
 
 
 class PublisherLock:

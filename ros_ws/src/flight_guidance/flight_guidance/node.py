@@ -29,7 +29,7 @@ from flight_guidance.params import GuidanceConfig
 from flight_guidance.route_file import Waypoint
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
-from flight_ros.messages import NO_CHANNELS
+from flight_ros.messages import NO_CHANNELS, Decoder, NamedDecoder
 from flight_ros.rclpy_private import DeserializationError
 from flight_ros.ticker import Tick
 from flight_ros.topics import (
@@ -72,13 +72,13 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         super().__init__("guidance", GuidanceConfig)
         self._guidance = Guidance(self.parameters)
         outputs = self.parameters.outputs
-        self._y_subscription, self._y_decoder = self.subscribe(Y), self.decoder(Y, outputs)
-        self._pose_subscription, self._pose_decoder = self.subscribe(POSE), self.named_decoder(POSE)
-        self._target_subscription, self._target_decoder = self.subscribe(TARGET, NEWEST_SAMPLES), self.named_decoder(TARGET)
+        self._y_subscription, self._y_decoder = self.subscribe(Y), Decoder(outputs)
+        self._pose_subscription, self._pose_decoder = self.subscribe(POSE), NamedDecoder()
+        self._target_subscription, self._target_decoder = self.subscribe(TARGET, NEWEST_SAMPLES), NamedDecoder()
         self._route_subscription = self.subscribe(ROUTE, PUBLISH)
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
-        self._u_m_encoder = self.encoder(U_M, (*outputs, *channels.ATTITUDE))
-        self._log_encoder = self.encoder(GUIDANCE, self._guidance.names)
+        self._u_m_encoder = self.encoder((*outputs, *channels.ATTITUDE))
+        self._log_encoder = self.encoder(self._guidance.names)
         self._y_lock, self._pose_lock, self._mode_lock = self.publisher_locks = (
             PublisherLock(),
             PublisherLock(),
@@ -89,11 +89,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
             receive_y = partial(self.received, self._y_subscription, self._y_decoder)
             self._inputs = LockstepInputs(y_period_ns, self.period_ns(), receive_y, self._received_poses)
-            self._empty_encoder = self.encoder(U_M, ())
+            self._empty_encoder = self.encoder(())
         else:
             self._controller_mode = ControllerMode.WAITING
             self._guidance.pause(paused=True, forget=False)
-            self._internals, self._internals_decoder = self.subscribe(INTERNALS), self.decoder(INTERNALS, ["mode"])
+            self._internals, self._internals_decoder = self.subscribe(INTERNALS), Decoder(["mode"])
         self._odometry, self._path, self._markers = (
             self.create_publisher(topic.type, topic.name, publisher_qos(period))
             for topic, period in ((ODOMETRY, ODOMETRY_PERIOD_NS), (PATH, PATH_PERIOD_NS), (MARKERS, PATH_PERIOD_NS))
@@ -178,11 +178,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return samples
 
     def _accept_y(self, sample: StampedVector, now_ns: int) -> None:
-        y = self._y_subscription, self._y_decoder, self._guidance.take_y
+        y = self._y_subscription, self._guidance.take_y
         self.accept(*y, sample, now_ns, self._y_lock, *self._ages_ns())
 
     def _accept_pose(self, sample: StampedVector, now_ns: int) -> None:
-        pose = self._pose_subscription, self._pose_decoder, self._guidance.take_pose
+        pose = self._pose_subscription, self._guidance.take_pose
         self.accept(*pose, sample, now_ns, self._pose_lock, *self._ages_ns())
 
     def _ages_ns(self) -> tuple[int, int]:
@@ -194,21 +194,17 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         for received in self._target_subscription.take(MAX_TARGETS):
             try:
                 sample = self._target_decoder.decode(received.message)
-                with self._target_decoder.once(sample.stamp_ns):
-                    if not self.parameters.lockstep:  # an operator has the system clock, not the flight time of lockstep
-                        max_age_ns = nanoseconds(self.parameters.max_age)
-                        require_not_future(sample.stamp_ns, now_ns, max_age_ns)
-                        # One that waited while guidance was stopped is not wanted any more: its operator knows that it failed.
-                        require_not_old(sample.stamp_ns, now_ns, max_age_ns)
-                    self._guidance.take_target(sample.channels)
+                if not self.parameters.lockstep:  # an operator has the system clock, not the flight time of lockstep
+                    max_age_ns = nanoseconds(self.parameters.max_age)
+                    require_not_future(sample.stamp_ns, now_ns, max_age_ns)
+                    # One that waited while guidance was stopped is not wanted any more: its operator knows that it failed.
+                    require_not_old(sample.stamp_ns, now_ns, max_age_ns)
+                self._guidance.take_target(sample.channels)
             except ChannelError as error:
                 self.reject(self._target_subscription, error.reason, str(error))
 
     def _take_routes(self) -> None:
         for received in self._route_subscription.take()[-1:]:
-            if self.has_key:
-                self.reject(self._route_subscription, "mac", "a Path has no authentication code, and guidance has a key")
-                continue
             try:
                 message = deserialize_message(received.message, Path)
                 frame = message.header.frame_id
@@ -225,7 +221,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         """Fly while the controller is ENGAGED. After it was INACTIVE, hold what is measured; after a failsafe, go on."""
         for sample in self.received(self._internals, self._internals_decoder):
             if sample is not None:
-                internals = self._internals, self._internals_decoder, self._take_mode
+                internals = self._internals, self._take_mode
                 self.accept(*internals, sample, now_ns, self._mode_lock, *self._ages_ns())
 
     def _take_mode(self, sample: StampedVector, now_ns: int) -> None:

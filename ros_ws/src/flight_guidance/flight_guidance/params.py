@@ -11,8 +11,8 @@ from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
 from flight_core.parameters import (
     Config,
-    KeyedConfig,
     Names,
+    NodeConfig,
     NonNegative,
     Numbers,
     Positive,
@@ -73,7 +73,7 @@ class RouteConfig(Config):
             require_length(key, getattr(self, key), waypoints)
 
 
-class GuidanceConfig(KeyedConfig):
+class GuidanceConfig(NodeConfig):
     """All parameters of the guidance node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(default=50.0, description="the rate at which u_m is published, Hz")

@@ -18,7 +18,6 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_topic_name import validate_topic_name
 
-from flight_core.authentication import LENGTH_PLACE, mac_slice
 from flight_core.files import dump_yaml, is_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
@@ -28,7 +27,7 @@ from flight_log.message_definitions import definition
 from flight_recorder.params import RecorderConfig
 from flight_ros.endpoints import type_name
 from flight_ros.flight_node import NO_PUBLISHER_WARNING_NS, FlightNode
-from flight_ros.messages import instant, stamp_of
+from flight_ros.messages import instant, sender_of, stamp_of
 from flight_ros.qos import rosbag2_profiles, strongest_compatible
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.ticker import Tick
@@ -53,7 +52,7 @@ class _RecordedTopic:
     subscription: PolledSubscription
     channel: BagChannel
     next_sequence: int = 0  # 0 before the first message
-    publisher: bytes = b""  # of the last message, with its length
+    publisher: str = ""  # of the last message
     publishers: int = 0  # number of publishers at the last check
 
     @property
@@ -184,7 +183,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         for message, sent_ns, received_ns, sequence in received:
             write(channel, received_ns, sent_ns, sequence, message)
             if counted and sequence != topic.next_sequence:
-                publisher = message[LENGTH_PLACE : mac_slice(message).start]
+                publisher = sender_of(message)
                 if publisher == topic.publisher and sequence > topic.next_sequence:
                     count = sequence - topic.next_sequence
                     self.lost[topic.name] += count

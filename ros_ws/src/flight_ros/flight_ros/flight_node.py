@@ -20,15 +20,14 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from flight_core.authentication import MessageAuthenticator, read_key
 from flight_core.outcome import LOST_CONTACT, FlightEnded
-from flight_core.parameters import KeyedConfig, NodeConfig, ParameterError
+from flight_core.parameters import NodeConfig, ParameterError
 from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.vectors import ChannelError, StampedVector
 from flight_ros.endpoints import mismatch, type_name
 from flight_ros.liveliness import LivelinessMonitor
-from flight_ros.messages import Decoder, Encoder, NamedDecoder
+from flight_ros.messages import Decoder, Encoder
 from flight_ros.parameters import changed, read_parameters
 from flight_ros.rclpy_private import raw_publish
 from flight_ros.subscriptions import PolledSubscription
@@ -60,13 +59,6 @@ class FlightNode(Node, Generic[P]):
         # Two equal lockstep flights give equal bytes, so the process number is left out.
         process = "" if self.parameters.lockstep else f"#{os.getpid()}"
         self.instance = self.get_fully_qualified_name() + process
-        key_file = self.parameters.key_file if isinstance(self.parameters, KeyedConfig) else ""
-        self._key = read_key(key_file, f"{name}.key_file") if key_file else None
-        self.has_key = self._key is not None
-        # Replay protection: samples stamped before the start of this node are rejected. Stamps of a lockstep flight begin at 0.
-        self._since_ns = None if self.parameters.lockstep else time.time_ns()
-        if self._key is not None:
-            self.get_logger().info(f"message authentication with the key in {key_file}")
         self.rejected: Counter[str] = Counter()
         self.refusals: dict[str, tuple[int, str]] = {}  # the last one by topic: when on the monotonic clock, and why
         self._logged_ns: dict[str, int] = {}  # by message: when it was logged last
@@ -133,22 +125,9 @@ class FlightNode(Node, Generic[P]):
         self.polled_subscriptions.append(subscription)
         return subscription
 
-    def encoder(self, topic: Topic, names: Sequence[str]) -> Encoder:
-        """Encoder of the samples that this node publishes on a topic, authenticated if the node has a key."""
-        return Encoder(names, self.instance, self._authenticator(topic))
-
-    def decoder(self, topic: Topic, wanted: Sequence[str]) -> Decoder:
-        """Decoder of the messages of a topic. If the node has a key, only authentic messages are accepted, each once."""
-        return Decoder(wanted, self._authenticator(topic))
-
-    def named_decoder(self, topic: Topic) -> NamedDecoder:
-        """As `decoder`, of a topic whose channels vary."""
-        return NamedDecoder(self._authenticator(topic))
-
-    def _authenticator(self, topic: Topic) -> MessageAuthenticator | None:
-        return (
-            None if self._key is None else MessageAuthenticator(self._key, self.resolve_topic_name(topic.name), self._since_ns)
-        )
+    def encoder(self, names: Sequence[str]) -> Encoder:
+        """Encoder of samples that this node publishes."""
+        return Encoder(names, self.instance)
 
     def received(self, subscription: PolledSubscription, decoder: Decoder) -> list[StampedVector | None]:
         """The samples that were received since the last call; None for one without channels or with an error."""
@@ -164,7 +143,6 @@ class FlightNode(Node, Generic[P]):
     def accept(
         self,
         subscription: PolledSubscription,
-        decoder: Decoder | NamedDecoder,
         take: Callable[[StampedVector, int], None],
         sample: StampedVector,
         now_ns: int,
@@ -179,8 +157,7 @@ class FlightNode(Node, Generic[P]):
         try:
             if lock is not None:
                 lock.check(sample.sender, now_ns, max_age_ns, takeover_ns)
-            with decoder.once(sample.stamp_ns):
-                take(sample, now_ns)
+            take(sample, now_ns)
             if lock is not None:
                 lock.refresh(sample.sender, now_ns)
         except ChannelError as error:

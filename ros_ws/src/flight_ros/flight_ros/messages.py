@@ -10,7 +10,6 @@ middleware leaves uninitialised memory between two strings.
 import math
 import struct
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from builtin_interfaces.msg import Time
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from flight_core.authentication import BLANK, MessageAuthenticator, instance, mac_slice
+from flight_core.publisher_lock import publisher_of
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from flight_ros.rclpy_private import DeserializationError
@@ -26,9 +25,9 @@ from flight_ros.rclpy_private import DeserializationError
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
 STAMP = struct.Struct("<iI")  # seconds and nanoseconds; they follow the encapsulation
 STAMP_PLACE = len(ENCAPSULATION)
+LENGTH_PLACE = STAMP_PLACE + STAMP.size  # of header.frame_id
 COUNT = struct.Struct("<I")  # length of a sequence or a string, before its elements
 NO_CHANNELS: FloatArray = np.zeros(0)
-NO_CONTEXT = nullcontext()
 
 
 def to_message(stamp_ns: int, names: Sequence[str], values: FloatArray, frame_id: str) -> JointState:
@@ -45,7 +44,7 @@ def from_message(message: JointState, wanted: Sequence[str]) -> StampedVector:
     """The wanted channels of a message. Raises ChannelError for invalid names, lengths or values."""
     stamp = message.header.stamp
     value = select(wanted, message.name, message.position)
-    return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, instance(message.header.frame_id))
+    return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, publisher_of(message.header.frame_id))
 
 
 class Encoder:
@@ -53,14 +52,12 @@ class Encoder:
 
     Without names the message is a vector without channels: in lockstep, no sample exists at that instant. Layout: CDR (OMG
     Common Object Request Broker Architecture, 9.3). The offset of each value from the encapsulation is a multiple of its size;
-    padding bytes are 0. With an `authenticator` each message carries its authentication code behind `frame_id`.
+    padding bytes are 0.
     """
 
-    def __init__(self, names: Sequence[str], frame_id: str, authenticator: MessageAuthenticator | None = None) -> None:
-        self._authenticator = authenticator
+    def __init__(self, names: Sequence[str], frame_id: str) -> None:
         self._bytes = bytearray(ENCAPSULATION + bytes(STAMP.size))
-        self._add_string(frame_id + BLANK if authenticator is not None else frame_id)
-        self._mac = mac_slice(self._bytes)
+        self._add_string(frame_id)
         self._add_count(len(names))
         for name in names:
             self._add_string(name)
@@ -87,43 +84,22 @@ class Encoder:
         """The message of one sample; values in the order of the names."""
         STAMP.pack_into(self._bytes, STAMP_PLACE, *divmod(stamp_ns, NANOSECONDS))
         self._bytes[self._values] = values.tobytes()
-        message = bytes(self._bytes)
-        if self._authenticator is None:
-            return message
-        return message[: self._mac.start] + self._authenticator.mac(message) + message[self._mac.stop :]
+        return bytes(self._bytes)
 
 
-class _AuthenticatingDecoder:
-    """Decodes messages of one topic. An `authenticator` passes only authentic ones, and `once` each of them once."""
-
-    def __init__(self, authenticator: MessageAuthenticator | None) -> None:
-        self._authenticator = authenticator
-
-    def _check(self, raw: bytes) -> None:
-        if self._authenticator is not None:
-            self._authenticator.check(raw)
-
-    def once(self, stamp_ns: int) -> AbstractContextManager[None]:
-        """Take a decoded sample within it: `MessageAuthenticator.once`."""
-        return NO_CONTEXT if self._authenticator is None else self._authenticator.once(stamp_ns)
-
-
-class Decoder(_AuthenticatingDecoder):
+class Decoder:
     """Decodes the wanted channels of the messages of one topic."""
 
-    def __init__(self, wanted: Sequence[str], authenticator: MessageAuthenticator | None = None) -> None:
-        super().__init__(authenticator)
+    def __init__(self, wanted: Sequence[str]) -> None:
         self._wanted = list(wanted)
         self._fixed = b""  # the constant bytes of the last publisher's messages
         self._names: list[str] = []
         self._order: list[int] = []
         self._place = 0
-        self._mac = slice(0, 0)
         self._sender = ""
 
     def decode(self, raw: bytes) -> StampedVector | None:
         """The sample; None for a vector without channels. Raises ChannelError for an invalid message."""
-        self._check(raw)
         if not self._fixed or self._fixed_part(raw) != self._fixed:
             message = _message(raw)
             if not message.name and not message.position:
@@ -138,16 +114,16 @@ class Decoder(_AuthenticatingDecoder):
         return StampedVector(seconds * NANOSECONDS + nanoseconds, value, self._sender)
 
     def _fixed_part(self, raw: bytes) -> bytes:
-        mac, end = self._mac, self._place + 8 * len(self._names)
-        return raw[:STAMP_PLACE] + raw[STAMP_PLACE + STAMP.size : mac.start] + raw[mac.stop : self._place] + raw[end:]
+        end = self._place + 8 * len(self._names)
+        return raw[:STAMP_PLACE] + raw[STAMP_PLACE + STAMP.size : self._place] + raw[end:]
 
     def _learn_layout(self, message: JointState, raw: bytes) -> None:
         encoder = Encoder(message.name, message.header.frame_id)
         stamp = message.header.stamp
         if encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position)) != raw:
             return  # more than a named vector: the middleware decodes it each time
-        self._names, self._place, self._mac = list(message.name), encoder.place, mac_slice(raw)
-        self._sender = instance(message.header.frame_id)
+        self._names, self._place = list(message.name), encoder.place
+        self._sender = publisher_of(message.header.frame_id)
         self._order = [self._names.index(name) for name in self._wanted]
         self._fixed = self._fixed_part(raw)
 
@@ -160,20 +136,24 @@ class NamedSample(NamedTuple):
     sender: str
 
 
-class NamedDecoder(_AuthenticatingDecoder):
+class NamedDecoder:
     """Decodes all channels of the messages of a topic whose channels vary; several times slower than Decoder."""
-
-    def __init__(self, authenticator: MessageAuthenticator | None = None) -> None:
-        super().__init__(authenticator)
 
     def decode(self, raw: bytes) -> NamedSample:
         """The sample. Raises ChannelError for an invalid message."""
-        self._check(raw)
         message = _message(raw)
         sample, names = from_message(message, message.name), list(message.name)
         if len(set(names)) < len(names):
             raise ChannelError("name", f"each channel expected once among {', '.join(names)}")
         return NamedSample(sample.stamp_ns, dict(zip(names, sample.value.tolist(), strict=True)), sample.sender)
+
+
+def sender_of(raw: bytes) -> str:
+    """The publisher of a message that begins with a header, read without decoding the rest; empty where there is none."""
+    if len(raw) < LENGTH_PLACE + COUNT.size:
+        return ""
+    (length,) = COUNT.unpack_from(raw, LENGTH_PLACE)
+    return publisher_of(raw[LENGTH_PLACE + COUNT.size : LENGTH_PLACE + COUNT.size + length - 1].decode(errors="replace"))
 
 
 def stamp_of(raw: bytes) -> int:

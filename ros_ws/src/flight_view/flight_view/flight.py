@@ -15,7 +15,7 @@ from mcap.records import Attachment, Metadata
 from numpy.typing import NDArray
 from rosbags.serde.errors import SerdeError
 
-from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
+from flight_analysis.closed_loop.scenario import Scenario, parse_recorded_scenario, parse_scenario_sections
 from flight_analysis.metrics import settling_bands
 from flight_analysis.report.summary import display_units, pulse_edges
 from flight_core.modes import Mode
@@ -99,6 +99,7 @@ class Flight:
         self._follower = Follower(run, self._rate_of)
         self._topics: dict[str, _Topic] = {}  # by full name
         self._namespace: str | None = None
+        self._takes_routes = True  # whether guidance takes a route in flight
         self._unreadable = 0
         self._start_ns: int | None = None  # by `truth`
         self._reference_ns: int | None = None  # of the first y_m
@@ -205,7 +206,10 @@ class Flight:
                     self._note(f"{topic}: the recorder lost {count} messages")
         elif record.media_type == SCENARIO_MEDIA_TYPE and "units" not in self.description:
             try:
-                self.scenario = parse_scenario(record.data, Path("scenario.yaml"))
+                path = Path("scenario.yaml")
+                self.scenario = parse_recorded_scenario(record.data, path)
+                # Guidance of an earlier version with a key refused every route.
+                self._takes_routes = not parse_scenario_sections(record.data, path).get("guidance", {}).get("key_file")
                 self.described += 1
                 self.description |= _described(self.scenario)  # reads the airframe, maybe a file of another machine
             except ParameterError as error:
@@ -316,7 +320,7 @@ class Flight:
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
         """A route that was given in flight replaces the one before, unless guidance refuses it."""
         guided = None if self.scenario is None else self.scenario.guidance
-        if guided is None or guided.key_file:
+        if guided is None or not self._takes_routes:
             return
         try:
             self.description["route"] = route_outline(guided.plan(waypoints))

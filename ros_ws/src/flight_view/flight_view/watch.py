@@ -11,14 +11,13 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.files import is_folder
 from flight_core.parameters import ParameterError, require
 from flight_log.disk import is_locked
 from flight_log.rosbag2_metadata import bag_files
 from flight_view.control import Control
 from flight_view.flight import Flight
-from flight_view.server import ADDRESS, POLL_PERIOD, Server
+from flight_view.server import ADDRESS, Server
 
 DEFAULT_PORT = 8077
 
@@ -40,13 +39,6 @@ def require_log(run: Path) -> None:
     require(bool(bag_files(run)), str(run), "no .mcap file", "the folder of a run or an MCAP file")
 
 
-def services_note(scenario: Scenario) -> list[str]:
-    """The line for the user of a flight with message authentication, which services lack; none without it."""
-    if not scenario.controller.key_file:
-        return []
-    return ["key_file authenticates topics, not services: each program in this ROS domain can set parameters of the nodes"]
-
-
 def serve(
     runs: Sequence[Path],
     ports: Sequence[int],
@@ -55,18 +47,11 @@ def serve(
 ) -> None:
     """Serve a run, and a second one as its ghost, on the first free port, until SIGINT or SIGTERM.
 
-    `announce` gets two lines for the user. `control` lets the page command the first flight; then it gets `services_note`, too.
+    `announce` gets two lines for the user. `control` lets the page command the first flight.
 
     Raises ParameterError where all ports are taken, or a log cannot be read.
     """
     asyncio.run(_serve(runs, ports, announce, control))
-
-
-async def _announce_services(flight: Flight, announce: Callable[[str], None]) -> None:
-    while flight.scenario is None:
-        await asyncio.sleep(POLL_PERIOD)
-    for line in services_note(flight.scenario):
-        announce(line)
 
 
 async def _serve(
@@ -89,7 +74,6 @@ async def _serve(
     announce(f"http://{ADDRESS}:{server.port}/?token={server.token}")
     announce(f"from another machine first: ssh -L {server.port}:{ADDRESS}:{server.port} {socket.gethostname()}")
     follow = asyncio.ensure_future(server.follow())
-    told = None if control is None else asyncio.ensure_future(_announce_services(flights[0], announce))
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):  # also when a shell started this in the background, with SIGINT ignored
         loop.add_signal_handler(number, follow.cancel)
@@ -98,6 +82,4 @@ async def _serve(
     except asyncio.CancelledError:
         pass
     finally:
-        if told is not None:
-            told.cancel()
         await server.close()

@@ -29,9 +29,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         super().__init__("reference_model", ReferenceModelConfig)
         self._reference = Reference(self.parameters)
         self._publish_y_m = self.advertise(Y_M)
-        self._encoder = self.encoder(Y_M, self.parameters.outputs)
+        self._encoder = self.encoder(self.parameters.outputs)
         (self._publisher_lock,) = self.publisher_locks = (PublisherLock(),)
-        self._decoder = self.decoder(U_M, self.parameters.outputs)
+        self._decoder = Decoder(self.parameters.outputs)
         self._attitude_decoder = Decoder(ATTITUDE)
         rate = self.parameters.u_m_rate
         self._u_m_ns = period_ns(rate, "u_m_rate") if rate else 0
@@ -66,10 +66,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             if sample is None:
                 return
             self._publisher_lock.check(sample.sender, now_ns, max_age_ns, takeover_ns)
-            with self._decoder.once(sample.stamp_ns):
-                require_not_future(sample.stamp_ns, now_ns, max_age_ns)
-                require_not_old(sample.stamp_ns, now_ns, max_age_ns)
-                self._reference.take(sample.stamp_ns - start_ns, sample.value, self._attitude(message))
+            require_not_future(sample.stamp_ns, now_ns, max_age_ns)
+            require_not_old(sample.stamp_ns, now_ns, max_age_ns)
+            self._reference.take(sample.stamp_ns - start_ns, sample.value, self._attitude(message))
             self._publisher_lock.refresh(sample.sender, now_ns)
         except ChannelError as error:
             self.reject(self._u_m_subscription, error.reason, str(error))

@@ -11,8 +11,8 @@ from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
 from flight_core.parameters import (
     Config,
-    KeyedConfig,
     Names,
+    NodeConfig,
     Numbers,
     ParameterError,
     Positive,
@@ -85,7 +85,7 @@ class Linear(Config):
     B_m: Numbers = Field(description="B_m row by row")
 
 
-class ReferenceModelConfig(KeyedConfig):
+class ReferenceModelConfig(NodeConfig):
     """All parameters of the reference model node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y_m is published, Hz")

@@ -15,7 +15,7 @@ from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
-from flight_ros.messages import NO_CHANNELS
+from flight_ros.messages import NO_CHANNELS, Decoder
 from flight_ros.rclpy_private import answer_invalid_transitions
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
@@ -44,13 +44,13 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._publishes = self.parameters.autostart  # a standby that was never activated publishes no u beside another's
         self._controller = Controller(self.parameters)
         outputs = self.parameters.outputs
-        self._y_subscription, self._y_decoder = self.subscribe(Y), self.decoder(Y, outputs)
-        self._y_m_subscription, self._y_m_decoder = self.subscribe(Y_M), self.decoder(Y_M, outputs)
+        self._y_subscription, self._y_decoder = self.subscribe(Y), Decoder(outputs)
+        self._y_m_subscription, self._y_m_decoder = self.subscribe(Y_M), Decoder(outputs)
         self._publish_u, self._publish_internals = self.advertise(U), self.advertise(INTERNALS)
-        self._u_encoder = self.encoder(U, self.parameters.inputs)
-        self._internals_encoder = self.encoder(INTERNALS, self._controller.names)
+        self._u_encoder = self.encoder(self.parameters.inputs)
+        self._internals_encoder = self.encoder(self._controller.names)
         if self.parameters.lockstep:
-            self._empty_encoder = self.encoder(U, ())
+            self._empty_encoder = self.encoder(())
             self._inputs = LockstepInputs(
                 period_ns(self.parameters.y_rate, "y_rate"),
                 self.period_ns(),
@@ -108,7 +108,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         ):
             for sample in self.received(subscription, decoder):
                 if sample is not None:
-                    self.accept(subscription, decoder, take, sample, now_ns, lock, *self._ages_ns())
+                    self.accept(subscription, take, sample, now_ns, lock, *self._ages_ns())
         self._step(now_ns, tick.late_ns)
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._warn_stale_inputs(now_ns)
@@ -143,9 +143,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         advanced = False
         for now_ns, due, y, y_m in self._inputs.complete():
             if y is not None:
-                self.accept(self._y_subscription, self._y_decoder, self._controller.take_y, y, now_ns)
+                self.accept(self._y_subscription, self._controller.take_y, y, now_ns)
             for sample in y_m:
-                self.accept(self._y_m_subscription, self._y_m_decoder, self._controller.take_y_m, sample, now_ns)
+                self.accept(self._y_m_subscription, self._controller.take_y_m, sample, now_ns)
             if due and not self._step(now_ns, late_ns=0):
                 self._publish_u(self._empty_encoder.encode(now_ns, NO_CHANNELS))
             advanced = True

@@ -16,8 +16,8 @@ import numpy as np
 from flight_core.fields import Field
 from flight_core.parameters import (
     Config,
-    KeyedConfig,
     Names,
+    NodeConfig,
     NonNegatives,
     Numbers,
     ParameterError,
@@ -106,7 +106,7 @@ class ObserverConfig(Config):
         return Phi, Gamma, H, L, np.reshape(self.F, (m, s))
 
 
-class ControllerConfig(KeyedConfig):
+class ControllerConfig(NodeConfig):
     """Parameters of the controller node that every control law has. A subclass has those of one law, as fields."""
 
     needs: ClassVar[str] = ""
@@ -263,7 +263,7 @@ class ControllerConfig(KeyedConfig):
 
         BLAKE2b of names and values. It changes with any bit of any gain. Parameters that concern only the node are left out.
         """
-        content = self.model_dump(exclude={"lockstep", "y_rate", "autostart", "start_active", "key_file"})
+        content = self.model_dump(exclude={"lockstep", "y_rate", "autostart", "start_active"})
         if content["law"] == "rise_di":  # logs of versions that had no other law have no name either
             del content["law"]
         return int.from_bytes(blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big")

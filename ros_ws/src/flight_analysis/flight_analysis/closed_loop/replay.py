@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.closed_loop.scenario import Scenario, parse_scenario, parse_scenario_sections
+from flight_analysis.closed_loop.scenario import Scenario, parse_recorded_scenario, parse_recorded_sections
 from flight_core.modes import Mode
 from flight_core.parameters import flatten, nest, require
 from flight_core.rates import NANOSECONDS
@@ -87,13 +87,13 @@ class ReplayResult(NamedTuple):
 
 def recorded_parameters(scenario: StoredFile) -> ControllerConfig:
     """The controller's section of the scenario in a log; other sections are not validated. Raises ParameterError."""
-    sections = parse_scenario_sections(scenario.content, Path(scenario.name))
+    sections = parse_recorded_sections(scenario.content, Path(scenario.name))
     return AnyLaw.validate_mapping(sections["controller"], "controller")
 
 
 def recorded_scenario(stored: StoredFile) -> Scenario:
     """The scenario in a log, every section validated. Raises ParameterError."""
-    return parse_scenario(stored.content, Path(stored.name))
+    return parse_recorded_scenario(stored.content, Path(stored.name))
 
 
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:

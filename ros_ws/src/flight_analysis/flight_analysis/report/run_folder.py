@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from aircraft_sim.uncertainty import as_yaml
-from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_recorded_scenario, scenario_yaml
 from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise
 from flight_core.files import dump_yaml, read_file, write_file, writing
 from flight_core.outcome import COMPLETED
@@ -124,7 +124,7 @@ def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
     """The scenario in a log, with its path beside the log. Raises ParameterError."""
     if recorded.scenario is None:
         raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
-    return parse_scenario(recorded.scenario.content, _folder(run) / recorded.scenario.name)
+    return parse_recorded_scenario(recorded.scenario.content, _folder(run) / recorded.scenario.name)
 
 
 def _write_scenario(recorded: RecordedRun, path: Path) -> None:
