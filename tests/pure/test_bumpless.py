@@ -220,7 +220,7 @@ def test_no_sequence_of_events_makes_u_jump(policy: str, events: list[tuple[str,
         loop.ticks(count)
 
 
-def test_configuration_engages_the_law_anew() -> None:
+def test_configuration_engages_the_law_again() -> None:
     loop = engaged()
     loop.configure(active=True)
     loop.ticks(1)

@@ -52,7 +52,7 @@ class Controller:
         return self._state.law is not None
 
     def restart(self) -> None:
-        """Engage the law anew with the next fresh y and y_m, from the u of then (bumpless transfer); a failsafe goes on."""
+        """Engage the law again with the next fresh y and y_m, from the u of then (bumpless transfer); a failsafe goes on."""
         if self._state.mode is Mode.ENGAGED:
             self._state = self._state._replace(mode=Mode.WAITING)
 
