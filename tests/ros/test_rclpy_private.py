@@ -32,10 +32,10 @@ def test_private_names_of_rclpy_are_in_one_file(path: Path) -> None:
         assert not {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute) and node.attr == "handle"}
 
 
-def test_a_serialised_message_published_raw_is_taken_without_an_executor(peer_node: Peer) -> None:
+def test_a_serialised_message_is_taken_without_an_executor(peer_node: Peer) -> None:
     context = peer_node.node.context
     subscription = peer_node.node.create_subscription(Int64, "number", lambda _: None, QoSProfile(depth=10), raw=True)
-    publish = rclpy_private.raw_publish(peer_node.node.create_publisher(Int64, "number", QoSProfile(depth=10)))
+    publish = peer_node.node.create_publisher(Int64, "number", QoSProfile(depth=10)).publish
     wait_set = rclpy_private.WaitSet([subscription], context)
     assert not wait_set.wait(0)
     peer_node.until(lambda: peer_node.node.count_subscribers("number") == 1)

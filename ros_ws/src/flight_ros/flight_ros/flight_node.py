@@ -29,7 +29,6 @@ from flight_ros.endpoints import mismatch, type_name
 from flight_ros.liveliness import LivelinessMonitor
 from flight_ros.messages import Decoder, Encoder
 from flight_ros.parameters import changed, read_parameters
-from flight_ros.rclpy_private import raw_publish
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import DIAGNOSTICS, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, PUBLISH, STATE, NodeState, Topic, publisher_qos
@@ -116,7 +115,7 @@ class FlightNode(Node, Generic[P]):
         qos = LOCKSTEP if self.parameters.lockstep else publisher_qos(self.period_ns())
         publisher = self.create_publisher(topic.type, topic.name, qos)
         self._flight_publishers.append(publisher)
-        return raw_publish(publisher)
+        return publisher.publish
 
     def subscribe(self, topic: Topic, qos: QoSProfile | None = None) -> PolledSubscription:
         """Create a subscription that is polled at the tick, as bytes. Its publishers are checked once a second."""

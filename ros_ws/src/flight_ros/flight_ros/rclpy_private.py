@@ -10,7 +10,6 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 Participant: TypeAlias = Any  # the node of rclpy's C extension, without a Node
@@ -30,12 +29,6 @@ def create_participant(name: str, context: Context) -> Participant:
 def destroy_participant(participant: Participant) -> None:
     """Destroy it."""
     participant.destroy_when_not_in_use()
-
-
-def raw_publish(publisher: Publisher) -> Callable[[bytes], None]:
-    """The function that publishes a serialised message. Publisher.publish does two more checks for each message."""
-    publish: Callable[[bytes], None] = publisher.handle.publish_raw
-    return publish
 
 
 def take_messages(subscription: Subscription, limit: int) -> list[tuple[Any, Any]]:
