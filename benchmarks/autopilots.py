@@ -194,7 +194,7 @@ def tracking(autopilot: "Autopilot") -> dict[str, Any]:
         "engaged": summary["engagements"],
         "outcome": summary["outcome"],
         "rms": {name: error["command"]["rms"] for name, error in summary["errors"].items()},
-        "behind": {name: behind(log.tape, name, one) for one in log.engagements or [] for name in log.tape["y"].names},
+        "behind": {name: behind(log.tape, name, span) for span in log.engagements or [] for name in log.tape["y"].names},
         "limited": {name: values["limited"]["magnitude"] for name, values in summary["inputs"].items()},
         "replayed": replayed,
     }
@@ -282,7 +282,7 @@ def bumpless() -> dict[str, Any]:
         flown.end(60.0)
         log, inputs = read_run(plane.run), load_map(channel_map).inputs.values()
         ranges = {f"{row.message}.{row.field}": row.range[1] - row.range[0] for row in inputs}
-        return {"steps": [step(log.tape["bridge/would_send"], ranges, one.start_ns) for one in log.engagements or []]}
+        return {"steps": [step(log.tape["bridge/would_send"], ranges, engaged.start_ns) for engaged in log.engagements or []]}
 
 
 def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
@@ -330,7 +330,7 @@ def signs(experiments: int = 25) -> dict[str, Any]:
         plane.level()
         flown.interrupt()
         flown.end(60.0)
-    return signs_of_logs([plane.run], lambda number, one: winds[bisect(begun, one.start_ns) - 1])
+    return signs_of_logs([plane.run], lambda _, engaged: winds[bisect(begun, engaged.start_ns) - 1])
 
 
 def signs_of_logs(runs: Sequence[Path], wind_of: Callable[[int, Engagement], float]) -> dict[str, Any]:
@@ -367,14 +367,16 @@ def judged(channel_map: ChannelMap, tape: Tape, engagements: Sequence[Engagement
     Omega = np.zeros((len(rows), len(columns)))
     Omega[rows, columns] = expected
     u, end_ns = tape["u"], int(tape["y"].stamp_ns[-1])
-    spans = [(one.start_ns, one.stop_ns or end_ns) for one in engagements]
+    spans = [(engaged.start_ns, engaged.stop_ns or end_ns) for engaged in engagements]
 
     def verdicts(flipped: str) -> dict[str, str]:
         turned = Signal(u.stamp_ns, u.names, u.values * [-1.0 if name == flipped else 1.0 for name in u.names])
         response = identify_response(tape["y"], turned, pairing.outputs, pairing.inputs, engaged=spans)
-        D = tuple(int(one) for one in expected)
+        D = tuple(int(sign) for sign in expected)
         checked = check(channel_map, Omega, pairing.outputs, pairing.inputs, D, response)
-        shown = ((one.input, one.ratio or 0.0, (one.measured or 0.0) * one.effect) for one in checked.channels)
+        shown = (
+            (channel.input, channel.ratio or 0.0, (channel.measured or 0.0) * channel.effect) for channel in checked.channels
+        )
         return {name: "unsure" if ratio < MIN_RATIO else "right" if agrees > 0.0 else "wrong" for name, ratio, agrees in shown}
 
     return {
@@ -399,9 +401,9 @@ def releases() -> dict[str, Any]:
     command = [python, "-m", "pytest", "tests/sitl", "-m", "not long", f"--junitxml={report}"]
     subprocess.run(command, cwd=REPOSITORY, check=False)  # noqa: S603 - our own arguments; a failure is in the report
     suite = next(ElementTree.parse(report).getroot().iter("testsuite"))  # noqa: S314 - written by pytest just now
-    times = {one.attrib["name"]: float(one.attrib["value"]) for one in suite.iter("property")}
+    times = {timed.attrib["name"]: float(timed.attrib["value"]) for timed in suite.iter("property")}
     counts = {name: int(suite.attrib[name]) for name in ("tests", "failures", "errors", "skipped")}
-    return counts | {"failed": [one.attrib["name"] for one in suite.iter("testcase") if len(one)], "times": times}
+    return counts | {"failed": [case.attrib["name"] for case in suite.iter("testcase") if len(case)], "times": times}
 
 
 IDENTIFICATIONS: dict[str, Callable[..., dict[str, Any]]] = {
@@ -614,7 +616,7 @@ def main() -> None:
         begun = evidence_data.origin(f"python -m benchmarks.autopilots --only {name}")
         if name == "signs":
             result = (
-                signs_of_logs(arguments.log, lambda number, one: TURBULENCE[number % len(TURBULENCE)])
+                signs_of_logs(arguments.log, lambda number, _: TURBULENCE[number % len(TURBULENCE)])
                 if arguments.log
                 else signs(arguments.experiments)
             )

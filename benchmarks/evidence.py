@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measures: each measurement writes its figures to docs/evidence/NAME.csv, and docs/evidence.md is written from these files.
+"""Measures: each measurement writes figures to docs/evidence/NAME.csv, and docs/evidence.md is written from these files.
 
     make evidence                              # what has no file yet, or failed
-    make evidence ARGS="--again faults"        # measure this again; "speed" is all that begin so; repeatable
-    make evidence ARGS="--again long"          # those of up to 80 min each, which run by name alone: "long-faults" is one
+    make evidence ARGS="--again faults"        # measure this again; "speed" is every name that begins so; repeatable
+    make evidence ARGS="--again long"          # up to 80 min each, by name alone: "long-faults" and more
     make evidence ARGS=--quick                 # short versions, to build/evidence: for a look, not to be quoted
 
-A measurement that fails leaves its exit status as a goal that is not met. build/evidence/ has the logs.
+The exit status of a measurement that fails is a goal that is not met. build/evidence/ has logs and results.
 """
 
 import argparse
@@ -161,6 +161,7 @@ def measure(measurement: Measurement, folder: Path, *, quick: bool) -> int:
             status, output = run_to_its_end(command, log)
             log.write(output)
         result = read_result(file, output)
+    (BUILD / f"{measurement.name}.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
     busy = max(busy, psutil.cpu_percent(interval=LOAD_INTERVAL) / 100.0)
     if measurement.timed and busy > BUSY_SHARE:
         begun = begun._replace(host=f"{begun.host}, {100 * busy:.0f} % {BUSY}")
@@ -175,7 +176,7 @@ def rows_of(measurement: Measurement, result: Any, status: int) -> list[Row]:
 
 
 def run_to_its_end(command: Sequence[str], log: IO[str]) -> tuple[int, str]:
-    """Exit status and output of a program. Where this one is ended, the program ends first, with the flights it started."""
+    """Exit status and output of a program. A signal to end reaches the program first, which ends the flights that run."""
     with subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=log, text=True) as running:  # noqa: S603
         try:
             output, _ = running.communicate()
@@ -188,7 +189,7 @@ def run_to_its_end(command: Sequence[str], log: IO[str]) -> tuple[int, str]:
 
 
 def read_result(file: Path, output: str) -> Any:
-    """The result of a program: its JSON file, the cases of its JUnit file, else its output as JSON; None if none is valid."""
+    """The result of a program: the JSON file, the cases of the JUnit file, else the output as JSON; None if none is valid."""
     try:
         if file.suffix == ".xml":
             return cases(file.read_text(encoding="utf-8"))
@@ -212,7 +213,7 @@ def _run(*command: str) -> subprocess.CompletedProcess[str]:
 
 
 def replays(seconds: float | None) -> dict[str, Any]:
-    """Fly every scenario in lockstep over topics, recorded, and recompute its u from its log."""
+    """Fly every scenario in lockstep over topics, recorded, and recompute u from the log."""
     from flight_bringup.scenarios import scenarios  # noqa: PLC0415 - not needed to write the page
 
     results = {}
@@ -229,16 +230,16 @@ def replays(seconds: float | None) -> dict[str, Any]:
 
 
 def fuzz(seconds: float) -> dict[str, Any]:
-    """Fuzz every target of benchmarks/fuzz.py for `seconds`, one on each core: statistics of the fuzzer and its exit status."""
+    """Fuzz every target of benchmarks/fuzz.py for `seconds`, a core for a target: statistics and exit status of the fuzzer."""
     from tests.fuzz.targets import TARGETS  # noqa: PLC0415 - not needed to write the page
 
     def ran(target: str) -> dict[str, int | None]:
-        found = _run(sys.executable, "-m", "benchmarks.fuzz", target, "--seconds", f"{seconds:.0f}")
-        if found.returncode:  # the log of the measurement then says why
-            print(found.stderr[-FUZZ_LOG:], file=sys.stderr)
-        covered = re.findall(r"cov: (\d+)", found.stderr)
-        stats = re.findall(r"^stat::(\w+):\s+(\d+)", found.stderr, re.MULTILINE)
-        return {"status": found.returncode, "covered": int(covered[-1]) if covered else None} | {
+        fuzzer = _run(sys.executable, "-m", "benchmarks.fuzz", target, "--seconds", f"{seconds:.0f}")
+        if fuzzer.returncode:  # the log of the measurement then says why
+            print(fuzzer.stderr[-FUZZ_LOG:], file=sys.stderr)
+        covered = re.findall(r"cov: (\d+)", fuzzer.stderr)
+        stats = re.findall(r"^stat::(\w+):\s+(\d+)", fuzzer.stderr, re.MULTILINE)
+        return {"status": fuzzer.returncode, "covered": int(covered[-1]) if covered else None} | {
             name: int(value) for name, value in stats
         }
 
@@ -255,7 +256,7 @@ def exit_on_sigterm() -> None:
 
 
 def wanted(names: Sequence[str], measured: Mapping[str, Measured]) -> list[Measurement]:
-    """Measurements to run: those whose names begin with one of `names`; without names, what has no file or failed.
+    """Measurements to run: by the beginnings of names; without `names`, what has no file or failed.
 
     The long ones run by name alone.
     """

@@ -16,7 +16,7 @@ from typing import NamedTuple
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "docs" / "evidence"
 BASELINE = " x baseline"  # end of a goal on a ratio
-BUSY = "busy with other work"  # end of a host on which times are longer than on an idle one
+BUSY = "busy with other work"  # end of a host on which times are longer than on an idle host
 
 
 class Row(NamedTuple):

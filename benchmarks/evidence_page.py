@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""docs/evidence.md, a function of docs/evidence/*.csv alone: goals, met or not, and where and when each was measured.
+"""docs/evidence.md, a function of docs/evidence/*.csv alone: goals, met or not, with revision and date.
 
 python -m benchmarks.evidence_page    # writes the page
 """
@@ -126,7 +126,7 @@ real-time kernel. On a virtual machine the times include steal time, when its ho
 
 
 class Goal(NamedTuple):
-    """The figures of a measurement that are alike but for their subject, with the same goal."""
+    """The figures of a measurement that differ by the subject alone and have the same goal."""
 
     name: str  # of the worst figure
     figure: str  # without the subject
@@ -138,7 +138,7 @@ class Goal(NamedTuple):
 
 
 def goals(measured: Measured) -> list[Goal]:
-    """The goals of a measurement, from the one that is missed most to the one that is met most easily."""
+    """The goals of a measurement, the most missed first, the most easily met last."""
     rows = {figure.name: figure for figure in measured.rows}
     alike: dict[tuple[str, str], list[tuple[float, Row]]] = {}
     for figure in measured.rows:
@@ -162,7 +162,7 @@ def _value(figure: Row, rows: Mapping[str, Row]) -> str:
 
 
 def _number(value: float) -> str:
-    """Three digits, or all of a larger whole number."""
+    """Three digits, of a larger number the whole part."""
     return f"{value:,.0f}" if abs(value) >= 100.0 and math.isfinite(value) else f"{value:.3g}"
 
 

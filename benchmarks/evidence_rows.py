@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The rows of evidence of each result of a measuring program, with their goals."""
+"""The rows of evidence of the results of measuring programs, with goals."""
 
 import re
 from collections import Counter
@@ -26,7 +26,7 @@ FAULT_TIMES: dict[str, tuple[str, float | None]] = {
     "start_run": ("start to ready, main thread runs", None),
     "start_waited": ("start to ready, main thread waits for a processor", None),
 }
-"""Of a fault, by key of the result: what the time is, and the largest that it may be, ms."""
+"""Times of a fault, by key of the result: name and limit, ms."""
 
 BANKS = {"bank_deg": ("bank", 45.0), "last_bank_deg": ("bank ten seconds later", 5.0)}  # deg
 PAGE_LIMITS = {"recorder killed under a live page": 1500.0}  # ms, until the page answers; else PAGE_LIMIT
@@ -65,7 +65,7 @@ def speed(result: Any) -> Iterator[Row]:
 
 
 def faults(result: Any) -> Iterator[Row]:
-    """Of benchmarks/faults.py: by fault the median and the worst of each time in ms, and of each bank."""
+    """Of benchmarks/faults.py: by fault the median and the worst of times, ms, and of banks, deg."""
     for fault in result:
         case = fault["case"]
         yield row(f"{case}: injected", fault["injected"])
@@ -89,7 +89,7 @@ def random_faults(result: Any) -> Iterator[Row]:
 
 
 def tests(result: Any) -> Iterator[Row]:
-    """Of pytest: how many cases of each test passed, failed and were skipped."""
+    """Of pytest: how many cases of a test passed, failed and were skipped."""
     totals = Counter({"passed": 0, "failed": 0, "skipped": 0})
     by_test: Counter[tuple[str, str]] = Counter()
     for case in result:

@@ -443,7 +443,7 @@ def rate_ratios(name: str, seed: int | None) -> dict[str, float]:
     else:
         straight = guided.vary(flight=flight, aircraft=aircraft)
         pair = straight, replace(straight, guidance=None)
-    errors = [tracking_error(simulate(one)) for one in pair]
+    errors = [tracking_error(simulate(varied)) for varied in pair]
     return {rate: rms(errors[0][rate]) / rms(errors[1][rate]) for rate in RATES}
 
 
@@ -498,11 +498,11 @@ def rows(
     """All rows of an aircraft, as they are flown by `over`, which is `map` or that of a pool of processes."""
     several = list(jobs(manoeuvres, seeds))
     done = zip(several, over(partial(fly, aircraft_of(name)), several), strict=True)
-    for (title, shown), those in groupby(done, key=lambda one: one[0][:2]):
+    for (title, shown), those in groupby(done, key=lambda flight: flight[0][:2]):
         worst: dict[str, Figure] = {}
         for figure in (figure for _, figures in those for figure in figures):
             own = max(figure.limit, EXEMPT.get((name, title, figure.name), figure.limit))
-            worst[figure.name] = max(figure._replace(limit=own), worst.get(figure.name, figure), key=lambda one: one.value)
+            worst[figure.name] = max(figure._replace(limit=own), worst.get(figure.name, figure), key=lambda same: same.value)
         yield from (Row(name, title, shown, figure) for figure in worst.values())
 
 
@@ -588,10 +588,10 @@ def fly_grid(name: str) -> int:
     scenario, begun = aircraft_of(name), origin(f"--grid --only {name}")
     with ProcessPoolExecutor() as pool:
         flown = list(pool.map(partial(point, name, scenario), places(name)))
-    for one in flown:
-        print(*one, sep="\t", file=sys.stderr)
+    for place in flown:
+        print(*place, sep="\t", file=sys.stderr)
     store(f"grid-{name}", grid_rows(flown), begun)
-    return sum(one.result == "lost" for one in flown)
+    return sum(place.result == "lost" for place in flown)
 
 
 def grid_rows(points: Sequence[Point]) -> Iterator[evidence_data.Row]:
