@@ -24,12 +24,12 @@ class Actuators(NamedTuple):
 def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     """Actuator positions one step later, shape (m,), with the command held over the step.
 
-        input   = command - clip(command, -dead_zone, dead_zone)               dead zone: zero inside, no jump at its edge
+        input   = command - clip(command, -dead_zone, dead_zone)               dead zone: zero inside, no jump at the edge
         lagged  = input - (input - position) exp(-dt / lag)                    exact solution of lag p_dot = input - p
         limited = position + clip(lagged - position, -rate dt, rate dt)        rate limit
         p+      = clip(limited, lower, upper)                                  end stops
 
-    Each line is one property of the actuator and takes the result of the line before. An ideal actuator passes the command on
+    A line is a property of the actuator and takes the result of the line before. An ideal actuator passes the command on
     to the last bit: the difference is zero, and the limits only choose between values.
 
     Shapes: position, command (m,), dt (). Units: SI, deviations from trim; dt > 0 in s.
@@ -55,10 +55,10 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
         limited = clip(lagged, position - rate dt / 2, position + rate dt / 2)    exact mean of a motion at the rate limit
         mean    = clip(limited, min(position, new), max(position, new))           the motion is monotonic and has end stops
 
-    The one step in which a limit begins or ceases to act has an approximate mean, between both ends. An ideal actuator has
+    The step in which a limit begins or ceases to act has an approximate mean, between the two ends. An ideal actuator has
     mean = new, to the last bit.
 
-    Shapes and units as in `step`; `new` is its result.
+    Shapes and units as in `step`; `new` is the result of `step`.
     """
     if params.lag is None and params.rate is None:
         return new
@@ -73,7 +73,7 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
 
 
 def move(t: Any, position: Array, command: Array, dt: Any, params: Actuators) -> tuple[Array, Array]:
-    """Positions at the end of a step that begins at t, and mean positions over the step, with faults, each of shape (m,)."""
+    """Positions at the end of a step from t on, and mean positions over the step, with faults, shapes (m,)."""
     new = step(position, command, dt, params)
     mean = mean_position(position, command, new, dt, params)
     return apply_faults(t, position, new, params), apply_faults(t, position, mean, params)
@@ -87,13 +87,13 @@ def _beyond_dead_zone(command: Array, params: Actuators) -> Array:
 
 
 def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:
-    """Actuator positions at the end of a step that begins at t, or means over it, with faults applied, shape (m,).
+    """Actuator positions at the end of a step from t on, or means over the step, with faults applied, shape (m,).
 
-        t >= stuck_at    position    the actuator keeps its position
-        t >= lost_at     0           the surface is free: it goes to trim at once and stays there, also if stuck before
+        t >= stuck_at    position    the actuator keeps the position
+        t >= lost_at     0           the free surface goes to trim at once and stays there, also if stuck before
         else             new
 
-    Arguments: `position` at t, `new` without faults. A fault within a step acts from the next one on.
+    Arguments: `position` at t, `new` without faults. A fault within a step acts from the next step on.
     """
     xp = array_namespace(position)
     if params.stuck_at is not None:

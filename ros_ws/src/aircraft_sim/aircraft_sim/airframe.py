@@ -28,14 +28,14 @@ Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1)]
 
 
 class Input(Config):
-    """One input: the unit of its column of B, and the effect of a positive value."""
+    """An input: the unit of the column of B, and the effect of a positive value."""
 
     unit: Unit = Field(description="the unit of this column of B")
     positive: str = Field(description="what a positive value does")
 
 
 class Gravity(Config):
-    """One term f_into += gain sin(angle)."""
+    """A term f_into += gain sin(angle)."""
 
     into: str = Field(description="the state whose derivative it adds to")
     angle: str = Field(description="the angle, a state")
@@ -43,7 +43,7 @@ class Gravity(Config):
 
 
 class Product(Config):
-    """One term f_into += gain * product of two states."""
+    """A term f_into += gain * product of two states."""
 
     into: str = Field(description="the state whose derivative it adds to")
     product: Names = Field(description="two states")
@@ -51,7 +51,7 @@ class Product(Config):
 
 
 class Airframe(Config):
-    """An airframe in the units of its file. `matrix_a` to `products` give SI arrays."""
+    """An airframe in the units of the file. `matrix_a` to `products` give SI arrays."""
 
     name: str
     source: str = Field(description="where the figures come from")
@@ -125,9 +125,9 @@ class Airframe(Config):
         return gain, first, second
 
     def with_matrices(self, A: FloatArray, B: FloatArray, wind_factor: FloatArray) -> Self:
-        """The same airframe with other A, shape (n, n), and B, shape (n, m), given in SI and stored in the file's units.
+        """A copy with new A, shape (n, n), and B, shape (n, m), given in SI and stored in the units of the file.
 
-        `wind_factor`, shape (n, G), multiplies the effect of wind along each axis of `gusts`.
+        `wind_factor`, shape (n, G), multiplies the effect of wind along the axes of `gusts`.
         """
         state: FloatArray = np.array([SI_PER_UNIT[u] for u in self.states.values()])
         inputs: FloatArray = np.array([SI_PER_UNIT[i.unit] for i in self.inputs.values()])
@@ -139,7 +139,7 @@ class Airframe(Config):
         return self.validate_mapping(self.model_dump() | values | {"gusts": gusts}, f"airframe {self.name}")
 
     def matrix_gusts(self) -> FloatArray:
-        """Change of x_dot for 1 m/s of wind along each axis of `gusts`, shape (n, G)."""
+        """Change of x_dot for 1 m/s of wind along the axes of `gusts`, shape (n, G)."""
         return np.array([self.gust_direction(axis) for axis in self.gusts]).reshape(-1, len(self.states)).T
 
     def gust_direction(self, gust: str) -> FloatArray:
@@ -157,14 +157,14 @@ def airframes() -> list[str]:
 
 
 def load_airframe(name: FilePath) -> Airframe:
-    """An airframe by its name in the library, or by the path of a file. Raises ParameterError."""
+    """An airframe by name in the library, or by the path of a file. Raises ParameterError."""
     path = find_file(name, LIBRARY, "airframe", EXPECTED)
     return _parsed(os.fspath(name), path, read_file(path, f"airframe {path}", EXPECTED))
 
 
 @lru_cache(maxsize=8)
 def _parsed(name: str, path: Path, content: bytes) -> Airframe:
-    """An airframe from the content of its file. A node that checks a change in flight parses it no second time: 15 ms."""
+    """An airframe from the content of a file, cached: a node that checks a change in flight saves 15 ms."""
     parsed = parse_yaml(content, f"airframe {path}", EXPECTED)
     require(isinstance(parsed, dict), f"airframe {path}", type(parsed).__name__, "a mapping")
     return Airframe.validate_mapping(parsed, f"airframe {name}")

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Disturbances that are functions of time: 1-cosine gusts, biases and sines on x_dot.
+"""Disturbances as functions of time: 1-cosine gusts, biases and sines on x_dot.
 
 Assumption 2 requires f in C1 with f and f_dot bounded. Gusts, sines and biases with a rise meet it. A bias with rise 0 is a
-step: it does not meet it and lies outside the theorem.
+step, does not meet Assumption 2 and lies outside the theorem.
 """
 
 from typing import NamedTuple
@@ -28,7 +28,7 @@ class Gusts(NamedTuple):
 
 
 class Bias(NamedTuple):
-    """One bias per state. A value of 0 is exactly no bias."""
+    """A bias per state. A value of 0 is exactly no bias."""
 
     start: Array  # (n,) start of the rise, s
     value: Array  # (n,) final value, [x]/s
@@ -36,7 +36,7 @@ class Bias(NamedTuple):
 
 
 class Sines(NamedTuple):
-    """One sine per state. An amplitude of 0 is exactly no sine."""
+    """A sine per state. An amplitude of 0 is exactly no sine."""
 
     amplitude: Array  # (n,) [x]/s
     frequency: Array  # (n,) rad/s
@@ -44,10 +44,10 @@ class Sines(NamedTuple):
 
 
 def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
-    """Speed of each gust in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)), s = V0 (t - start) clipped to [0, 2H].
+    """Speeds of the gusts in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)), s = V0 (t - start) clipped to [0, 2H].
 
-    Zero before entry and after 2H/V0 seconds. The derivative is continuous and at most U_ds/2 pi V0/H: it meets Assumption 2.
-    Source of the form: FAR/CS 25.341(a).
+    Zero before entry and after 2H/V0 seconds. The derivative is continuous and at most U_ds/2 pi V0/H, which meets Assumption
+    2. Source of the form: FAR/CS 25.341(a).
     """
     xp = array_namespace(gusts.speed)
     # minimum and maximum are several times faster than clip, which checks the types of its limits first
@@ -58,8 +58,8 @@ def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
 def bias(t: Array, params: Bias) -> Array:
     """Biases at t, shape (n,), [x]/s: value/2 (1 - cos(pi s)), s = (t - start)/rise clipped to [0, 1].
 
-    With rise > 0 the derivative is continuous and at most value/2 pi/rise. With rise = 0 it is a step: zero up to start,
-    `value` after it. Assumption 2 does not hold at that instant.
+    With rise > 0 the derivative is continuous and at most value/2 pi/rise. With rise = 0 the bias is a step: zero up to
+    start, `value` afterwards. Assumption 2 does not hold at the instant of the step.
     """
     xp = array_namespace(params.value)
     s = xp.minimum(xp.maximum((t - params.start) / xp.maximum(params.rise, MIN_RISE), 0.0), 1.0)

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Equation (1), the aircraft: x_dot = A x + f(x, t) + B u, y = C x, in deviations from trim.
 
-f(x, t) = f_state(x) + f_time(t). `x_dot` computes both at one instant. `plant.advance` computes f_time once for all instants of
-its steps.
+f(x, t) = f_state(x) + f_time(t). `x_dot` computes the sum at an instant. `plant.advance` computes f_time once for the instants
+of the steps.
 """
 
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ class Coupling(NamedTuple):
 
 
 class EulerKinematics(NamedTuple):
-    """Nonlinear kinematics in place of the linear ones of A. Angles are those of the stability axes: 0 in trim."""
+    """Nonlinear kinematics in place of the linear kinematics of A. Angles belong to the stability axes: 0 in trim."""
 
     select: Array  # (5, n), picks phi, theta, p, q, r
     into: Array  # (n, 3), adds to alpha_dot, phi_dot, theta_dot
@@ -67,7 +67,7 @@ def x_dot_forced(x: Array, forced: Array, params: Aircraft) -> Array:
 
 
 def f_state(x: Array, params: Aircraft) -> Array:
-    """The part of f that depends on the state: gravity @ sin(x) + gain @ (x[first] x[second]) + kinematics(x), shape (n,)."""
+    """The state-dependent part of f: gravity @ sin(x) + gain @ (x[first] x[second]) + kinematics(x), shape (n,)."""
     total = params.gravity.dot(array_namespace(x).sin(x))
     if params.coupling is not None:
         gain, first, second = params.coupling
@@ -76,13 +76,13 @@ def f_state(x: Array, params: Aircraft) -> Array:
 
 
 def kinematics(x: Array, params: EulerKinematics) -> Array:
-    """What the nonlinear kinematics add to the linear ones, shape (n,):
+    """Difference of the nonlinear and the linear kinematics, shape (n,):
 
         alpha_dot += g/V0 (cos phi cos theta - 1)
         phi_dot    = p + tan theta (q sin phi + r cos phi)
         theta_dot  = q cos phi - r sin phi
 
-    The first is the loss of lift along the vertical in a bank. Source: B. L. Stevens, F. L. Lewis, Aircraft Control and
+    The first term is the loss of lift along the vertical in a bank. Source: B. L. Stevens, F. L. Lewis, Aircraft Control and
     Simulation, 2nd ed. (2003), eqs. (1.3-22), (2.4-5).
     """  # noqa: D400, D415 - what follows is an equation
     xp = array_namespace(x)
@@ -97,7 +97,7 @@ def kinematics(x: Array, params: EulerKinematics) -> Array:
 
 
 def f_time(t: Any, wind: Array, params: Aircraft) -> Array:
-    """The part of f that depends on time: gust_direction @ wind + bias(t) + sines(t), shape (n,); wind of shape (G,), m/s."""
+    """The time-dependent part of f: gust_direction @ wind + bias(t) + sines(t), shape (n,); wind of shape (G,), m/s."""
     total = params.gust_direction @ wind
     if params.bias is not None:
         total = total + bias(t, params.bias)

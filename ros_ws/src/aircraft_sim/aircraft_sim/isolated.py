@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Process isolation: foreign code that may crash or hang runs in a subprocess, with limits of its time."""
+"""Process isolation: foreign code runs in a subprocess with a time limit, since the code may crash or hang."""
 
 import json
 import math
@@ -24,12 +24,12 @@ class IsolatedCallError(RuntimeError):
 
 
 def call(function: Callable[..., Any], *arguments: Any, timeout: float) -> Any:
-    """function(*arguments) in a fresh process with an empty working folder; its return value, decoded from JSON.
+    """Return value of function(*arguments) in a fresh process with an empty working folder, decoded from JSON.
 
     The subprocess finds the function by module and name. Arguments and return value must fit JSON. A FlightEnded of the
     function is raised here too. Raises IsolatedCallError where the process crashes (a segmentation fault, an exception) or
-    returns nothing within `timeout` seconds of processor time, or WAIT times as many of any time: code that computes without
-    end is found on a busy machine too, and code that has an end is given it.
+    returns nothing within `timeout` seconds of processor time, or WAIT times as many of wall time: an endless computation is
+    found on a busy machine too, and a finite computation gets enough time.
     """
     command = [sys.executable, "-m", __name__, str(timeout), function.__module__, function.__qualname__, json.dumps(arguments)]
     with tempfile.TemporaryDirectory() as folder:

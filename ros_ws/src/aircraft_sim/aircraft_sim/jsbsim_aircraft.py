@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aircraft of JSBSim: names, channel tables, flight condition, wind. This module does not import JSBSim before it is needed.
+"""Aircraft of JSBSim: names, channel tables, flight condition, wind. The import of JSBSim waits for the first use.
 
 JSBSim uses feet and normalised commands from stop to stop. u, y and truth are deviations from trim in SI. The tables INPUTS and
-STATES alone map the one to the other, with units and signs.
+STATES alone map between the two, with units and signs.
 """
 
 import difflib
@@ -24,7 +24,7 @@ FOOT = SI_PER_UNIT["ft/s"]  # m, and m/s per ft/s
 
 
 class Command(NamedTuple):
-    """One input: a normalised command of JSBSim, unit 1."""
+    """An input: a normalised command of JSBSim, unit 1."""
 
     property: str
     trim_property: str | None  # the trim's own part of the command; JSBSim limits the sum of both
@@ -35,7 +35,7 @@ class Command(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """One state: a property of JSBSim and the SI value of its unit."""
+    """A state: a property of JSBSim and the SI value of the unit."""
 
     property: str
     si: float
@@ -108,7 +108,7 @@ class WindModel(NamedTuple):
 
 @cache
 def aircraft_names() -> tuple[str, ...]:
-    """Names of all aircraft that come with JSBSim. Raises ParameterError where it is not installed."""
+    """Names of the aircraft of JSBSim. Raises ParameterError where JSBSim is not installed."""
     try:
         import jsbsim  # noqa: PLC0415 - other aircraft fly without it
     except ModuleNotFoundError:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flight dynamics model of JSBSim: a six-degree-of-freedom aircraft, flown around a trim point like any other aircraft here."""
+"""Flight dynamics model of JSBSim: a six-degree-of-freedom aircraft, flown around a trim point like the linear aircraft."""
 
 import math
 
@@ -36,14 +36,14 @@ class JsbsimModel:
     A step of the integration, from t_k to t_k + dt:
 
         position+ = actuators.apply_faults(t_k, position, actuators.step(position, u, dt))
-        wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right of it and down
+        wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right and down
         commands  = trim + position+, then JSBSim runs
 
-    JSBSim integrates the forces of the step before, then computes those of the new commands and the new wind: both act one step
-    later. JSBSim computes forces at an instant, t_k + dt, so the position at this instant is the right one: the mean over the
-    past step would be half a step older.
+    JSBSim integrates the forces of the step before, then computes the forces of the new commands and the new wind: commands and
+    wind act a step later. JSBSim computes forces at an instant, t_k + dt, so the position at this instant is right: the mean
+    over the past step would be half a step older.
 
-    Raises FlightEnded where the aircraft does not trim, crashes or hangs. Each is tried in an isolated process first.
+    Raises FlightEnded where the aircraft does not trim, crashes or hangs. An isolated process tries the aircraft first.
     """
 
     def __init__(self, condition: FlightCondition, actuator_model: Actuators, wind_model: WindModel) -> None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Trim of an aircraft of JSBSim, found in an isolated process, and quantities that follow from it."""
+"""Trim of an aircraft of JSBSim, found in an isolated process, and quantities of the trim."""
 
 import os
 import re
@@ -44,7 +44,7 @@ TrimSolution = tuple[float, ...] | None
 
 
 class _Log(jsbsim.FGLogger):
-    """Keeps JSBSim's output off the console. `last` is its last error."""
+    """Keeps JSBSim's output off the console. `last` is the last error."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -71,7 +71,7 @@ class _Log(jsbsim.FGLogger):
 
 @cache
 def trim_solution(condition: FlightCondition) -> TrimSolution:
-    """Find the trim and make a short test flight, both in an isolated process, where JSBSim may crash or hang.
+    """Find the trim and make a short test flight in an isolated process, where JSBSim may crash or hang.
 
     Raises FlightEnded.
     """
@@ -83,7 +83,7 @@ def trim_solution(condition: FlightCondition) -> TrimSolution:
 
 
 def solve_and_probe(name: str, speed: float, altitude: float, step_ns: int) -> TrimSolution:
-    """Find the trim, apply it, and fly with each command moved by PROBE_SIZE. Raises FlightEnded."""
+    """Find and apply the trim, and fly with one command after the next moved by PROBE_SIZE. Raises FlightEnded."""
     condition = FlightCondition(name, speed, altitude, step_ns)
     solution = _solve_trim(condition)
     fdm, _ = trimmed_fdm(condition, solution)
@@ -99,7 +99,7 @@ def solve_and_probe(name: str, speed: float, altitude: float, step_ns: int) -> T
 
 
 def trimmed_fdm(condition: FlightCondition, solution: TrimSolution) -> tuple[jsbsim.FGFDMExec, Trim]:
-    """The aircraft in the trim of a solution. Raises FlightEnded where it cannot be loaded."""
+    """The aircraft in the trim of a solution. Raises FlightEnded where the aircraft cannot be loaded."""
     fdm = _load(condition)
     if solution is None:
         _jsbsim_trim(fdm)
@@ -112,13 +112,13 @@ def trimmed_fdm(condition: FlightCondition, solution: TrimSolution) -> tuple[jsb
 
 
 def sideslip_zero(condition: FlightCondition) -> float:
-    """Rate at which sideslip decays (negative) or grows while p and r are held in trim, 1/s: a zero of the aircraft.
+    """Rate of decay (negative) or growth of sideslip while p and r are held in trim, 1/s: a zero of the aircraft.
 
         beta_dot V = Y_beta beta + Y_u u,  0 = N_beta beta + N_u u  ->  beta_dot = (Y_beta - Y_u N_u^-1 N_beta) beta / V
 
     Y is the side acceleration, N are the accelerations of p and r, u is aileron and rudder. Central differences in frozen
-    flight give the derivatives. Gravity is left out: it couples bank to sideslip much more slowly. Where the rate is positive,
-    Assumption 3 does not hold. Raises FlightEnded.
+    flight give the derivatives. Gravity is left out: the coupling of bank to sideslip is much slower. Where the rate is
+    positive, Assumption 3 does not hold. Raises FlightEnded.
     """
     solution = trim_solution(condition)
 
@@ -155,28 +155,28 @@ def engine_count(fdm: jsbsim.FGFDMExec) -> int:
 
 
 def running_property(engine: int) -> str:
-    """The property that is 1 while an engine runs."""
+    """The property with the value 1 while an engine runs."""
     return f"propulsion/engine[{engine}]/set-running"
 
 
 def command_paths(command: Command, engines: int) -> list[str]:
-    """The properties of a command, one for each engine where it has one for each."""
+    """The properties of a command, a property per engine for a command of the engines."""
     return [f"{command.property}[{i}]" for i in range(engines)] if command.each_engine else [command.property]
 
 
 def error_text(error: jsbsim.BaseError) -> str:
-    """JSBSim's message on one line. Most often a property is missing that a flight simulator around JSBSim would create."""
+    """JSBSim's message on a line. Most often a property of a flight simulator around JSBSim is missing."""
     text = " ".join(str(error).split())
     missing = re.search(r"The property (\S+) does not exist", text)
     return text if missing is None else f"its model needs the property {missing[1]}, which JSBSim alone does not have"
 
 
 def _solve_trim(condition: FlightCondition) -> TrimSolution:
-    """The trim: level, straight, sideslip 0, with the bank angle that this takes.
+    """The trim: level, straight, sideslip 0, with the necessary bank angle.
 
-    JSBSim's own trim comes first. It assumes that engines and flight control systems have settled, so they get time in frozen
-    flight: everything runs but position, velocity and attitude. Where it fails, or where its result does not last, a solver
-    finds the six unknowns (alpha, throttle, pitch trim, aileron, rudder, bank) in frozen flight, where everything has settled.
+    JSBSim's own trim comes first and assumes settled engines and flight control systems, so these get time in frozen flight:
+    everything runs but position, velocity and attitude. Where JSBSim's trim fails, or does not last, a solver finds the six
+    unknowns (alpha, throttle, pitch trim, aileron, rudder, bank) in frozen flight, where everything has settled.
     Raises FlightEnded with one sentence where there is no trim.
     """
     fdm = _load(condition)
@@ -225,7 +225,7 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
 
 
 def _properties(engines: int) -> list[str]:
-    """Every property that is read or written in flight."""
+    """Every property for reading or writing in flight."""
     commands = [path for command in INPUTS.values() for path in command_paths(command, engines)]
     trims = [command.trim_property for command in INPUTS.values() if command.trim_property is not None]
     states = [quantity.property for quantity in STATES.values()]
@@ -235,7 +235,7 @@ def _properties(engines: int) -> list[str]:
 
 
 def _jsbsim_trim(fdm: jsbsim.FGFDMExec) -> bool:
-    """Apply JSBSim's own trim; whether it succeeds and lasts."""
+    """Apply JSBSim's own trim; whether the trim succeeds and lasts."""
     fdm.run_ic()
     fdm["propulsion/set-running"] = -1  # all engines
     try:
@@ -282,7 +282,7 @@ def _residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:
 
 
 def _is_trimmed(fdm: jsbsim.FGFDMExec) -> bool:
-    """Whether the accelerations are within TOLERANCE and every command is inside its stops."""
+    """Whether the accelerations are within TOLERANCE and every command is inside the stops."""
     _, lower, upper = _commands_and_limits(fdm)
     inside = bool(np.all(lower <= 0.0) and np.all(upper >= 0.0))
     return inside and bool(np.all(np.abs(_residuals(fdm)) <= TOLERANCE))
@@ -301,7 +301,7 @@ def _trim_failure(fdm: jsbsim.FGFDMExec) -> str:
 
 
 def _commands_and_limits(fdm: jsbsim.FGFDMExec) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whole commands, the trim's part included, and the distances to their lower and upper stops, all (4,)."""
+    """Whole commands, the trim's part included, and the distances to the lower and upper stops, shapes (4,)."""
     inputs = INPUTS.values()
     own = np.array([fdm[command_paths(command, 1)[0]] for command in inputs])
     trim = np.array([0.0 if command.trim_property is None else fdm[command.trim_property] for command in inputs])

@@ -72,7 +72,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
 
     def _fly_to(self, number: int, start_ns: int, u: FloatArray) -> list[bytes]:
         """Fly to a sample; the messages of y that arrive."""
-        return [self._y_encoder.encode(start_ns + one.stamp_ns, one.value) for one in self._simulator.sample(number, u)]
+        return [self._y_encoder.encode(start_ns + y.stamp_ns, y.value) for y in self._simulator.sample(number, u)]
 
     def _publish_motion(self, number: int, start_ns: int) -> None:
         stamp_ns = start_ns + number * self.period_ns()

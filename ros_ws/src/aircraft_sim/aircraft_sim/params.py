@@ -44,7 +44,7 @@ class Gust(Config):
 
 
 class TurbulenceConfig(Config):
-    """Dryden turbulence by MIL-F-8785C; `wind` gives its intensity at low altitude, `sigma` at high, both in between."""
+    """Dryden turbulence by MIL-F-8785C; `wind` gives the intensity at low altitude, `sigma` at high altitude."""
 
     altitude: float = Field(ge=LOWEST, description="the altitude above the ground, m; from 10 ft (3.048 m) on")
     wind: float | None = Field(
@@ -64,7 +64,7 @@ class TurbulenceConfig(Config):
 
 
 class BiasConfig(Config):
-    """A bias on x_dot of one state. It rises from 0 to its value along half a cosine; with rise 0 it is a step."""
+    """A bias on x_dot of a state: a rise from 0 to the value along half a cosine, or a step with rise 0."""
 
     start: float = Field(ge=0, description="the instant at which it begins, s")
     value: float = Field(description="the final value, SI unit of the state per s")
@@ -72,7 +72,7 @@ class BiasConfig(Config):
 
 
 class SineConfig(Config):
-    """A sine on x_dot of one state: amplitude sin(frequency t + phase)."""
+    """A sine on x_dot of a state: amplitude sin(frequency t + phase)."""
 
     amplitude: float = Field(description="the amplitude, SI unit of the state per s")
     frequency: Positive = Field(description="the frequency, rad/s")
@@ -80,7 +80,7 @@ class SineConfig(Config):
 
 
 class UncertaintyConfig(Config):
-    """An aircraft sampled around the airframe: each entry times 1 + d, d uniform and independent; rows of angles stay."""
+    """An aircraft sampled around the airframe: every entry times 1 + d, d uniform and independent; rows of angles stay."""
 
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
@@ -102,7 +102,7 @@ Times = Upper  # from 0 on, .inf for never
 
 
 class ActuatorConfig(Config):
-    """The actuators, one value per input in the airframe's order. A list that is left out means ideal actuators."""
+    """The actuators, a value per input in the airframe's order. A missing list means ideal actuators."""
 
     lag: NonNegativesOrNone = Field(
         default=(), description="time constants of the first-order response, s, 0 where there is none"
@@ -132,7 +132,7 @@ class SensorConfig(Config):
 
 
 class AircraftConfig(NodeConfig):
-    """All parameters of the aircraft's node."""
+    """Parameters of the aircraft's node."""
 
     airframe: str = Field(
         description="the name of an airframe of the library, the path of an airframe file, or jsbsim:NAME for one of JSBSim's"
@@ -179,7 +179,7 @@ class AircraftConfig(NodeConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Faults that may begin and end in flight: of actuators, of sensors, and gusts."""
+        """Faults that begin and end in flight: of actuators, of sensors, and gusts."""
         gusts = {f"gusts.{axis}.{key}" for axis in AXES for key in Gust.model_fields}
         return frozenset(
             gusts | {"actuators.stuck_at", "actuators.lost_at", "sensors.bias", "sensors.noise", "sensors.dropout"}
@@ -247,7 +247,7 @@ class AircraftConfig(NodeConfig):
 
     @property
     def is_jsbsim(self) -> bool:
-        """Whether the aircraft is one of JSBSim's."""
+        """Whether JSBSim flies the aircraft."""
         return self.airframe.startswith(PREFIX)
 
     @property
@@ -256,11 +256,11 @@ class AircraftConfig(NodeConfig):
         return nanoseconds(self.step)
 
     def failsafe_scale(self, age_ns: int) -> float:
-        """Failsafe: scale of the last u at an age. It is held for max_age + hold, then ramped to trim."""
+        """Failsafe: scale of the last u at an age. u is held for max_age + hold, then ramped to trim."""
         return failsafe_scale(age_ns, nanoseconds(self.max_age + self.hold), nanoseconds(self.ramp))
 
     def channels(self) -> AircraftChannels:
-        """Outputs and inputs with their units, what each input does, and the trim speed."""
+        """Outputs and inputs with their units, the effects of the inputs, and the trim speed."""
         if self.is_jsbsim:
             positive = {name: command.positive for name, command in INPUTS.items()}
             return AircraftChannels(dict(OUTPUTS), dict.fromkeys(INPUTS, "1"), positive, self.flight_condition().speed)
@@ -270,14 +270,14 @@ class AircraftConfig(NodeConfig):
         return AircraftChannels({name: airframe.states[name] for name in airframe.outputs}, inputs, positive, airframe.speed)
 
     def sampled_airframe(self) -> Airframe:
-        """The airframe in flight: the named one, or the sample of `uncertainty` around it."""
+        """The airframe in flight: the named airframe, or a sample of `uncertainty` around the named airframe."""
         chosen = self.uncertainty
         return uncertainty.sample_airframe(
             load_airframe(self.airframe), chosen.A, chosen.B, chosen.seed, chosen.number, chosen.wind
         )
 
     def load(self) -> tuple[Airframe, Aircraft]:
-        """The airframe in flight and the arrays of equation (1) with all disturbances, for the axes of the airframe's gusts."""
+        """The airframe in flight and the arrays of equation (1) with the disturbances, for the axes of the airframe's gusts."""
         airframe = self.sampled_airframe()
         gain, first, second = airframe.products()
         biases = {name: bias for name, bias in self.bias.items() if bias.value != 0.0}
@@ -309,13 +309,13 @@ class AircraftConfig(NodeConfig):
         )
 
     def flight_condition(self) -> FlightCondition:
-        """The aircraft of JSBSim and its flight condition. Raises ParameterError for another aircraft."""
+        """The aircraft of JSBSim and the flight condition. Raises ParameterError for a linear aircraft."""
         if self.speed is None or self.altitude is None:
             raise ParameterError(f"airframe: found {self.airframe!r}, expected {PREFIX}NAME with a speed and an altitude")
         return FlightCondition(self.airframe.removeprefix(PREFIX), self.speed, self.altitude, self.step_ns)
 
     def wind_model(self) -> WindModel:
-        """The wind of an aircraft of JSBSim, on all axes."""
+        """The wind of an aircraft of JSBSim, on every axis."""
         return WindModel(self.gust_arrays(AXES), self._turbulence(self.flight_condition().speed, AXES))
 
     def gust_arrays(self, axes: Sequence[str]) -> Gusts:
@@ -364,10 +364,10 @@ STILL_AIR = Gust(start=0.0, speed=0.0, length=1.0)
 
 
 def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
-    """The values as an array; None where they are left out or, with zero_is_none, where all are zero."""
+    """The values as an array; None for missing values and, with zero_is_none, for zeros alone."""
     return None if not values or (zero_is_none and not any(values)) else np.array(values, dtype=np.float64)
 
 
 def _by_state(named: Mapping[str, Config], keys: Sequence[str], airframe: Airframe) -> list[FloatArray]:
-    """An array per key, over all states, with 0 for a state that is not named."""
+    """An array per key, over the states, with 0 for an unnamed state."""
     return [np.array([float(getattr(named.get(state), key, 0.0)) for state in airframe.states]) for key in keys]

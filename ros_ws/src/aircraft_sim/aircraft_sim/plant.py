@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated plant: equation (1) behind its actuators, integrated in fixed steps, with zero-order hold of u."""
+"""The simulated plant: equation (1) behind actuators, integrated in fixed steps, with zero-order hold of u."""
 
 from typing import NamedTuple
 
@@ -53,21 +53,21 @@ def advance(
     plant: PlantParams,
     forced: Forcing | None = None,
 ) -> AircraftState:
-    """State at t + duration from that at t, with the command u held (zero-order hold).
+    """State at t + duration from the state at t, with the command u held (zero-order hold).
 
-    Each step dt, from t_k on, is
+    A step dt, from t_k on, is
 
         position+, mean = actuators.move(t_k, position, u, dt)
         x+              = Runge-Kutta step of equation (1) with the input `mean` and the turbulence at t_k
         z+              = turbulence.step(z, n_k)
 
-    The mean position over the step acts during the whole step: its error against the continuous actuator is of second order
+    The mean position over the step acts during the whole step: the error against the continuous actuator is of second order
     in dt, and an ideal actuator passes u on without delay, to the last bit. The turbulence at the beginning of the step acts
-    during the whole step: sampled at the steps it has its spectrum exactly, in between it is held. Time is counted in ns, so
-    that steps add up exactly.
+    during the whole step: the spectrum is exact at the steps, with a hold in between. Time is counted in ns, so
+    steps add up exactly.
 
-    n_k follow from the seed. `forced` is the `forcing` of these steps, if the caller has it. Raises ParameterError where the
-    step does not divide the duration.
+    n_k follow from the seed. `forced` is the `forcing` of these steps, from a caller that has computed it. Raises
+    ParameterError where the step does not divide the duration.
     """
     x, position, z = state
     aircraft, filters = plant.aircraft, plant.turbulence

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose of the aircraft: attitude, position and velocity over ground as absolute values, for guidance and the log.
 
-Position is that in a local tangent plane whose origin is below the aircraft at t = 0. A steady wind moves the air mass as a
-whole: the flight relative to the air is that in still air, and the pose alone gets the wind (Galilean invariance).
+Position is in a local tangent plane whose origin is below the aircraft at t = 0. A steady wind moves the air mass as a
+whole: the flight relative to the air is as in still air, and the pose alone gets the wind (Galilean invariance).
 """
 
 import math
@@ -19,7 +19,7 @@ RATE = 50.0
 
 
 def every(rate: float) -> int:
-    """Number k of the aircraft's instants from one pose to the next, by the aircraft's rate in Hz."""
+    """Number k of the aircraft's instants from pose to pose, by the aircraft's rate in Hz."""
     return max(1, math.ceil(rate / RATE))
 
 
@@ -47,7 +47,7 @@ def velocity(
 
 
 def over_ground(pose: FloatArray, t: float, wind: Sequence[float]) -> FloatArray:
-    """A pose relative to the air mass as that over ground after t s of a steady wind (m/s to the north, to the east)."""
+    """A pose relative to the air mass as a pose over ground after t s of a steady wind (m/s to the north, to the east)."""
     moved = pose.copy()
     for i, speed in enumerate(wind):
         moved[POSE.index("north") + i] += speed * t

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counter-based random numbers (Philox): a draw depends on seed, stream and number alone, not on earlier draws.
 
-Two flights of one scenario therefore agree, even if one of them misses samples. The generator is NumPy's. It stays outside
-the functions that run on other array types.
+Two flights of a scenario therefore agree, even if samples are missing in the second flight. NumPy's generator stays outside
+the functions on further array types.
 """
 
 import numpy as np
@@ -24,9 +24,9 @@ def generator(number: int, stream: int, seed: int) -> "np.random.Generator":  # 
 
 
 def uniform(first: int, count: int, width: int, stream: int, seed: int) -> FloatArray:
-    """Draws first, first + 1, ... of `width` numbers each, uniform in [0, 1), shape (count, width).
+    """Draws first, first + 1, ... of `width` numbers, uniform in [0, 1), shape (count, width).
 
-    Here a draw takes a whole number of counter steps of four numbers each, so that one generator gives all draws.
+    A draw takes a whole number of counter steps of four numbers, so a single generator gives every draw.
     """
     steps = -(-width // 4)
     generator = np.random.Generator(np.random.Philox(key=seed, counter=[first * steps, 0, stream, 0]))

@@ -46,11 +46,11 @@ def initial_drift(params: Sensors) -> Drift:
 
 
 def measure(number: int, y: FloatArray, drift: Drift, params: Sensors) -> Measured:
-    """Measurement of y = C x, shape (m,), at sample `number`, which is not before that of `drift`:
+    """Measurement of y = C x, shape (m,), at sample `number`, not before the sample of `drift`:
 
         measured = quantised(y + error(number))
 
-    The error of a quantised sample is its measured value less y. Ideal sensors give y to the last bit.
+    The error of a quantised sample is the measured value less y. Ideal sensors give y to the last bit.
     """  # noqa: D400, D415 - what follows is an equation
     added, drift = error(number, drift, params)
     measured = y + added
@@ -86,7 +86,7 @@ def noise(number: int, params: Sensors) -> FloatArray:
 def walk(number: int, drift: Drift, params: Sensors) -> Drift:
     """The random walk at sample `number`: w(0) = 0, w(k) = w(k-1) + drift_i n_i(k), with n standard normal and independent.
 
-    Steps of skipped samples are added too, so the walk does not depend on which samples were measured.
+    Steps of skipped samples are added too, so the walk does not depend on the measured samples.
     """
     if params.drift is None:
         return drift
@@ -105,9 +105,9 @@ def arrives(number: int, params: Sensors) -> bool:
 
 
 def transmit(delay_line: DelayLine, now_ns: int, y: FloatArray | None, params: Sensors) -> tuple[DelayLine, DelayLine]:
-    """Transport delay at one sample instant: (delay line, now, y) -> (delay line, arrived samples).
+    """Transport delay at a sample instant: (delay line, now, y) -> (delay line, arrived samples).
 
-    y enters the delay line with the stamp now; None: the sample is dropped. Samples that are as old as the delay arrive, the
+    y enters the delay line with the stamp now; None: the sample is dropped. Samples as old as the delay arrive, the
     oldest first. A stamp stays the instant of measurement.
     """
     sent = delay_line if y is None else (*delay_line, StampedVector(now_ns, y))

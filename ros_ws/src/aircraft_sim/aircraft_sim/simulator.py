@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated aircraft at its sample instants: a flight dynamics model and its sensors.
+"""The simulated aircraft at the sample instants: a flight dynamics model and sensors.
 
-The node and the loop in one process both use this simulator, for every kind of aircraft.
+The node and the loop in one process use this simulator, for every kind of aircraft.
 """
 
 from collections.abc import Sequence
@@ -52,11 +52,11 @@ class FlightDynamicsModel(Protocol):
 
 
 class StateSpaceModel:
-    """Equation (1) with the matrices of an airframe, behind its actuators.
+    """Equation (1) with the matrices of an airframe, behind actuators.
 
-    The forcing is computed for BLOCK steps together, which takes a tenth of the time. Heading, position and altitude are no
-    states of an airframe: they are integrated by the trapezoidal rule over each `advance`, from 0. States that the airframe
-    lacks are 0, as in trim.
+    The forcing is computed for BLOCK steps together, which takes a tenth of the time. Heading, position and altitude, no
+    states of an airframe, are integrated by the trapezoidal rule over `advance`, from 0. States missing in the airframe are 0,
+    as in trim.
     """
 
     def __init__(self, parameters: AircraftConfig) -> None:
@@ -132,7 +132,7 @@ class StateSpaceModel:
 
 
 class Simulator:
-    """A flight dynamics model and its sensors, sample by sample."""
+    """A flight dynamics model and sensors, sample by sample."""
 
     def __init__(self, parameters: AircraftConfig) -> None:
         channels = parameters.channels()
@@ -172,7 +172,7 @@ class Simulator:
     def sample(self, number: int, u: FloatArray) -> DelayLine:
         """Advance to sample `number`, at number periods of flight time, with u held since the last sample, and measure.
 
-        Returns the y that arrive now, the oldest first; their stamps are flight time. Raises FlightEnded where the aircraft
+        Returns the arriving y, the oldest first; their stamps are flight time. Raises FlightEnded where the aircraft
         has diverged.
         """
         t_ns, before_ns = number * self.period_ns, self._number * self.period_ns

@@ -13,7 +13,7 @@ from flight_core.vectors import FloatArray
 def names(airframe: Airframe) -> tuple[str, ...]:
     """Channels of `truth`, group by group.
 
-    "x.state", "f.state" (f of equation (1), with all disturbances), "gust.axis" (the wind along each axis of the airframe's
+    "x.state", "f.state" (f of equation (1), with the disturbances), "gust.axis" (the wind along the axes of the airframe's
     gusts, 1-cosine gust plus turbulence, m/s), "actuator.input" (the position now).
     """
     groups = (("x", airframe.states), ("f", airframe.states), ("gust", airframe.gusts), ("actuator", airframe.inputs))
@@ -21,7 +21,7 @@ def names(airframe: Airframe) -> tuple[str, ...]:
 
 
 def values(state: AircraftState, wind: FloatArray, rate: FloatArray, plant: PlantParams) -> FloatArray:
-    """Values of `truth` in the order of `names`; f and the wind are those that act from now on.
+    """Values of `truth` in the order of `names`; f and the wind act from now on.
 
     `wind` (G,) and `rate` (n,) are the `dynamics.Forcing` of this instant.
     """

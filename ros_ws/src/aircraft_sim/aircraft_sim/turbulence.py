@@ -3,12 +3,12 @@
 """Dryden turbulence of MIL-F-8785C, MIL-HDBK-1797: intensities, lengths, and shaping filters driven by white noise.
 
 Turbulence lies outside the theorem. Assumption 2 requires a bounded f with a bounded derivative. A Gaussian process has no
-bound, and none of the three winds has a derivative, because their filters have one pole more than zeros.
+bound, and none of the three winds has a derivative: the filters have a pole more than zeros.
 
-The turbulence of the angular rates (p_g, q_g, r_g of the specifications) is left out: it depends on the span and on the
-aerodynamic part of A's columns of p, q, r, which no airframe of the library states. It is not small everywhere: at 100 m, for
-a span of 3 m, the specification's p_g gives the `osprey` seven times the roll acceleration (rms) of v_g; q_g adds two fifths to
-the pitch acceleration of w_g, r_g a sixteenth in yaw. Turbulent flights here therefore roll less than real ones.
+The turbulence of the angular rates (p_g, q_g, r_g of the specifications) is left out: the rates depend on the span and on the
+aerodynamic part of A's columns of p, q, r, unstated by the airframes of the library. The effect is not small everywhere: at 100
+m, for a span of 3 m, the specification's p_g gives the `osprey` seven times the roll acceleration (rms) of v_g; q_g adds two
+fifths to the pitch acceleration of w_g, r_g a sixteenth in yaw. Turbulent flights here therefore roll less than real ones.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ class Dryden(NamedTuple):
 
 
 class Turbulence(NamedTuple):
-    """Discretised turbulence filters of one step, for the winds of G axes. The state z is (5,), of unit variance or less."""
+    """Discretised turbulence filters of a step, for the winds of G axes. The state z is (5,), of unit variance or less."""
 
     transition: Array  # (5, 5)
     spread: Array  # (5, 5), lower triangular
@@ -63,8 +63,8 @@ def dryden(altitude: float, wind: float, sigma: float) -> Dryden:
         h >= 2000 ft    L_u = L_v = L_w = 1750 ft,  sigma_u = sigma_v = sigma_w = sigma
         in between      linear interpolation of L and of sigma
 
-    Source: MIL-F-8785C, 3.7.2 and 3.7.3.4. MIL-HDBK-1797 defines L_v and L_w half as long and writes 2 L in its spectra, which
-    are the same. The axes along and across the wind are taken as along and across the trimmed flight.
+    Source: MIL-F-8785C, 3.7.2 and 3.7.3.4. MIL-HDBK-1797 defines L_v and L_w half as long and writes 2 L in the spectra, with
+    equal result. The axes along and across the wind are taken as along and across the trimmed flight.
     """
     low = min(altitude, LOW)
     c = 0.177 + 0.000823 * low / FOOT
@@ -77,21 +77,21 @@ def dryden(altitude: float, wind: float, sigma: float) -> Dryden:
 def filters(spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], seed: int) -> Turbulence:
     """The shaping filters, discretised exactly: at multiples of dt the winds are distributed as in continuous time.
 
-    With a = V0/L of each axis and white noise n of unit intensity,
+    With a = V0/L by axis and white noise n of unit intensity,
 
         u       z_dot = -a z + sqrt(2a) n,  u = sigma z
         v, w    z1_dot = -a z1 + sqrt(2a) n,  z2_dot = a (z1 - z2),  v = sigma/sqrt(2) (sqrt(3) z1 + (1 - sqrt(3)) z2)
 
-    which have the published spectra, one-sided in omega, T = L/V0:
+    have the published spectra, one-sided in omega, T = L/V0:
 
         Phi_u = sigma^2 2T/pi / (1 + (T omega)^2)
         Phi_v = sigma^2 T/pi (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2,  Phi_w alike
 
-    One step takes z to transition z and adds a covariance, h = a dt (for u the first entries alone):
+    A step takes z to transition z and adds a covariance, h = a dt (for u the first entries alone):
 
         transition = exp(-h) [[1, 0], [h, 1]],  spread spread' = [[g_1, g_2/2], [g_2/2, g_3/2]]
 
-    with g_k = gammainc(k, 2h), of the integrals of 2 s^(k-1) exp(-2s) from 0 to h; stationary stationary' is that for h = inf.
+    with g_k = gammainc(k, 2h), of the integrals of 2 s^(k-1) exp(-2s) from 0 to h; stationary stationary' belongs to h = inf.
 
     Arguments: `airspeed` V0, m/s; `dt` in s; `axes` the required ones, as indices in AXES. Source: MIL-F-8785C, 3.7.1.2.
     """
@@ -121,7 +121,7 @@ def normals(first: int, count: int, seed: int) -> FloatArray:
 
 
 def step(z: Array, normal: Array, params: Turbulence) -> Array:
-    """State one step later, shape (5,): transition z + spread n, with n standard normal, shape (5,)."""
+    """State a step later, shape (5,): transition z + spread n, with n standard normal, shape (5,)."""
     return params.transition @ z + params.spread @ normal
 
 
@@ -145,7 +145,7 @@ def _spread(h: float) -> FloatArray:
 
 
 def _axes(matrices: Sequence[FloatArray]) -> FloatArray:
-    """Block diagonal of the 2 x 2 matrices of the three axes, (5, 5). Of the first matrix it takes the first entry alone."""
+    """Block diagonal of the 2 x 2 matrices of the three axes, (5, 5). Of the first matrix the first entry counts alone."""
     whole = np.zeros((STATES, STATES))
     whole[0, 0] = matrices[0][0, 0]
     whole[1:3, 1:3], whole[3:, 3:] = matrices[1:]

@@ -23,7 +23,7 @@ AIR_RELATIVE: WindEffect = "air_relative"
 
 
 def nominal_and_sampled(airframe: Airframe, uncertainty: float, samples: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: the published ones, then numbers 0, 1, ... of the seed.
+    """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: as published, then numbers 0, 1, ... of the seed.
 
     Raises ParameterError for an uncertainty outside [0, 1).
     """
@@ -34,9 +34,9 @@ def nominal_and_sampled(airframe: Airframe, uncertainty: float, samples: int, se
 def sample_airframe(
     airframe: Airframe, of_A: float, of_B: float, seed: int, number: int = 0, wind: WindEffect = AIR_RELATIVE
 ) -> Airframe:
-    """Uncertain airframe `number` of a seed, with an uncertainty of A and one of B. 0 and 0 give the published airframe.
+    """Uncertain airframe `number` of a seed, with uncertainties of A and of B. 0 and 0 give the published airframe.
 
-    The effect of wind is that of `wind_factors`; the rest of f stays as published. Raises ParameterError for an uncertainty
+    The effect of wind comes from `wind_factors`; the rest of f stays as published. Raises ParameterError for an uncertainty
     outside [0, 1).
     """
     A, B = sampled_matrices(airframe, of_A, of_B, seed, number, 1)
@@ -46,12 +46,12 @@ def sample_airframe(
 def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
     """Factors on the published effect of wind, shape (N, n, G), of N aircraft with the matrices A, shape (N, n, n), SI.
 
-    Wind w along an axis changes the state j of AIR_STATE relative to the air, so that it acts as minus column j of A:
+    Wind w along an axis changes the state j of AIR_STATE relative to the air, so the wind acts as minus column j of A:
 
         air_relative    factor_i = A_ij / published A_ij    1 where the published A_ij is 0 or the airframe has no state j
         published       factor_i = 1
 
-    A published effect that is minus the published column, per w / V0 or w, is then minus the aircraft's own column.
+    A published effect equal to minus the published column, per w / V0 or w, then equals minus the aircraft's own column.
     """
     published, factors = airframe.matrix_a(), np.ones((len(A), len(airframe.states), len(airframe.gusts)))
     for k, axis in enumerate(airframe.gusts):
@@ -62,7 +62,7 @@ def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatAr
 
 
 def gust_directions(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
-    """Change of x_dot for 1 m/s of wind along each axis, shape (N, n, G), of N aircraft with the matrices A; `wind_factors`."""
+    """Change of x_dot for 1 m/s of wind along the axes, shape (N, n, G), of N aircraft with the matrices A; `wind_factors`."""
     return wind_factors(airframe, A, wind) * airframe.matrix_gusts()
 
 
@@ -72,7 +72,7 @@ def sampled_matrices(
     """A and B of the aircraft first, first + 1, ... of a seed, shapes (count, n, n) and (count, n, m), SI.
 
     Every entry is multiplied by 1 + d, d uniform in +-uncertainty and independent. The rows of angles stay. An aircraft
-    depends on its seed and number alone, not on `count`. Raises ParameterError for an uncertainty outside [0, 1).
+    depends on seed and number alone, not on `count`. Raises ParameterError for an uncertainty outside [0, 1).
     """
     for part in (of_A, of_B):
         require(0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1")

@@ -24,13 +24,13 @@ class Profile(NamedTuple):
 
 
 def command(t: Array, profile: Profile) -> Array:
-    """u_m(t), shape (m,), or (T, m) at T instants at once.
+    """u_m(t), shape (m,), or (T, m) at T instants together.
 
     u_m = w(t) + turn_rate sin(phi(t)),  phi(t) = bank_rate . integral_0^t w
     w_i = sum_k change_ik G(t - time_ik) + amplitude_i sin(frequency_i t + phase_i),  G(s) = clip(s / rise, 0, 1)
 
-    Both integrals have closed forms, so the function has no state: that of G is r^2 / (2 rise) + max(s - rise, 0), with r = s
-    clipped to [0, rise]. g/V0 sin(phi) is the turn rate of a coordinated turn.
+    The two integrals have closed forms, so the function has no state: the integral of G is r^2 / (2 rise) + max(s - rise, 0),
+    with r = s clipped to [0, rise]. g/V0 sin(phi) is the turn rate of a coordinated turn.
     """
     xp = array_namespace(profile.change)
     t = xp.asarray(t)[..., None]

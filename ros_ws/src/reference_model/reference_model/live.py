@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Live commands u_m of a publisher, their age limit, and their ending when the publisher is lost.
+"""Live commands u_m of a publisher, the age limit, and the ending after the loss of the publisher.
 
-Zero rates would keep the bank of that instant. So the ending levels the wings first, from the attitude that came with u_m.
+Zero rates would keep the present bank. So the ending levels the wings first, from the attitude in u_m.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from flight_core.vectors import ChannelError, FloatArray
 
 
 class LiveParams(NamedTuple):
-    """Limits of u_m and the gains of its ending."""
+    """Limits of u_m and the gains of the ending."""
 
     max_age_ns: int  # an older u_m has timed out
     levelling_ns: int  # how long the ending levels the wings before all commands are zero
@@ -36,21 +36,21 @@ class Live(NamedTuple):
 
 
 def take(t_ns: int, u_m: FloatArray, attitude: FloatArray | None, params: LiveParams) -> Live:
-    """The state after a new u_m. Raises ChannelError, reason "bounds", for a command beyond its bound."""
+    """The state after a new u_m. Raises ChannelError, reason "bounds", for a command out of bounds."""
     if (np.abs(u_m) > params.bounds).any():
         raise ChannelError("bounds", f"{u_m.tolist()} is beyond the bounds {params.bounds.tolist()}")
     return Live(t_ns, u_m, None if attitude is None else (float(attitude[0]), float(attitude[1])))
 
 
 def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> FloatArray:
-    """u_m at t, shape (m,): the last one up to its age limit, then its ending.
+    """u_m at t, shape (m,): the last u_m up to the age limit, then the ending.
 
     For `levelling_ns`, where the attitude is known, with phi and theta by dead reckoning and V = V0 + V_m,
 
         phi_dot_c = -k_phi phi, at most `roll_rate`;  theta_dot_c = -k_theta theta
 
-    p, q, r follow by the inverse of Euler's equations in a coordinated turn (`flight_core.kinematics`); all other commands ramp
-    to zero. After that, and where the attitude is not known, all commands are zero.
+    p, q, r follow by the inverse of Euler's equations in a coordinated turn (`flight_core.kinematics`); further commands ramp
+    to zero. Afterwards, and without a known attitude, every command is zero.
     """
     silent_ns = t_ns - live.t_ns - params.max_age_ns
     if silent_ns <= 0:
@@ -69,7 +69,7 @@ def commands(t_ns: int, live: Live, y_m: FloatArray, params: LiveParams) -> Floa
 
 
 def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams) -> Live:
-    """The state a period later: the attitude moves by Euler's equations with the reference rates, which the law tracks."""
+    """The state a period later: the attitude moves by Euler's equations with the reference rates, as the law tracks them."""
     if live.attitude is None or params.channels is None:
         return live
     at_q, _, at_p, at_r = params.channels

@@ -29,7 +29,7 @@ def output(x_m: Array, params: Model) -> Array:
 
 
 class Stepper(NamedTuple):
-    """Matrices of one Runge-Kutta step of equation (2), which is linear."""
+    """Matrices of a Runge-Kutta step of the linear equation (2)."""
 
     Phi: Array  # (n, n)
     Gamma: Array  # (n, 3m), for u_m at t, t + dt/2 and t + dt
@@ -52,14 +52,14 @@ def stepper(dt: float, params: Model) -> Stepper:
 
 
 def step(x_m: Array, u_m: Array, matrices: Stepper) -> Array:
-    """x_m(t + dt), shape (n,), from x_m(t) and u_m at t, t + dt/2 and t + dt in one vector of shape (3m,)."""
+    """x_m(t + dt), shape (n,), from x_m(t) and u_m at t, t + dt/2 and t + dt as a vector of shape (3m,)."""
     return matrices.Phi.dot(x_m) + matrices.Gamma.dot(u_m)
 
 
 def second_order(natural_frequency: FloatArray, damping: FloatArray) -> Model:
-    """One filter per channel: y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i, with n = 2m.
+    """A filter per channel: y_m,i'' + 2 damping_i w_i y_m,i' + w_i^2 y_m,i = w_i^2 u_m,i, with n = 2m.
 
-    The states are [y_m,1, y_m,1', y_m,2, ...]. C selects the outputs from them, as (2) requires.
+    The states are [y_m,1, y_m,1', y_m,2, ...]. C selects the outputs, as (2) requires.
     Arguments: shape (m,), rad/s and 1.
     """
     m = len(natural_frequency)

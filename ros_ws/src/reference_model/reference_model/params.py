@@ -27,7 +27,7 @@ from reference_model.model import Model, second_order, stepper
 
 
 class Pulses(Config):
-    """Pulses on one channel."""
+    """Pulses on a channel."""
 
     start: Numbers = Field(description="start times of the rising edges, s")
     stop: Numbers = Field(description="start times of the falling edges, s")
@@ -41,7 +41,7 @@ class Pulses(Config):
 
 
 class Sine(Config):
-    """A sine on one channel: amplitude sin(frequency t + phase)."""
+    """A sine on a channel: amplitude sin(frequency t + phase)."""
 
     amplitude: float = Field(description="the amplitude, in the channel's unit")
     frequency: Positive = Field(description="the frequency, rad/s")
@@ -71,7 +71,7 @@ class LiveCommands(Config):
 
 
 class SecondOrder(Config):
-    """The model as one second-order filter per channel."""
+    """The model as a second-order filter per channel."""
 
     natural_frequency: Positives = Field(description="natural frequencies, one per channel, rad/s")
     damping: Numbers = Field(description="damping ratios, one per channel")
@@ -86,7 +86,7 @@ class Linear(Config):
 
 
 class ReferenceModelConfig(NodeConfig):
-    """All parameters of the reference model node."""
+    """Parameters of the reference model node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y_m is published, Hz")
     start_time: float = Field(
@@ -160,7 +160,7 @@ class ReferenceModelConfig(NodeConfig):
         return Model(np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C)
 
     def live_params(self) -> LiveParams:
-        """Limits of u_m and the gains of its ending: a quarter of the reference's bandwidths of p and q.
+        """Limits of u_m and the gains of the ending: a quarter of the reference's bandwidths of p and q.
 
         With a second-order reference of damping 0.9 this gain gives the loop of the angle a damping of about 0.74.
         """

@@ -15,7 +15,7 @@ BLOCK = 100  # steps for which the profile is evaluated at once
 
 
 class Reference:
-    """Equation (2) and its state x_m at the instants k periods. The commands are the profile's until the first live u_m."""
+    """Equation (2) with the state x_m at the instants k periods. The commands are the profile's until the first live u_m."""
 
     def __init__(self, parameters: ReferenceModelConfig) -> None:
         self._model, self._profile = parameters.model(), parameters.profile()
@@ -28,26 +28,26 @@ class Reference:
         self._live: Live | None = None
 
     def take(self, t_ns: int, u_m: FloatArray, attitude: FloatArray | None = None) -> None:
-        """Take a live u_m, shape (m,), of flight time t; it acts from the next step on.
+        """Take a live u_m, shape (m,), of flight time t, which acts from the next step on.
 
-        `attitude` has `channels.ATTITUDE`, None where it is not known. Raises ChannelError for an old u_m or one beyond its
-        bounds.
+        `attitude` has `channels.ATTITUDE`, None for an unknown attitude. Raises ChannelError for an old u_m and for a
+        u_m out of bounds.
         """
         if self._live is not None:
             require_newer(t_ns, self._live.t_ns, "u_m")
         self._live = live.take(t_ns, u_m, attitude, self._live_params)
 
     def source(self) -> str:
-        """Where the commands come from at the last sample: "profile", "live commands", or "ending" of an u_m that timed out."""
+        """Where the commands come from at the last sample: "profile", "live commands", or "ending" of a timed-out u_m."""
         if self._live is None:
             return "profile"
         aged = self._number * self.period_ns - self._live.t_ns > self._live_params.max_age_ns
         return "ending" if aged else "live commands"
 
     def sample(self, number: int) -> FloatArray:
-        """y_m at sample `number`, shape (m,), computed in steps of one period.
+        """y_m at sample `number`, shape (m,), computed in steps of a period.
 
-        The law tracks the last sample until this one: over skipped samples the dead reckoning takes the rates of that one.
+        The law tracks the last sample until this sample: over skipped samples the dead reckoning takes the last rates.
         """
         tracked: FloatArray = model.output(self._x_m, self._model)
         while self._number < number:
