@@ -5,12 +5,22 @@
 import re
 from pathlib import Path
 
-import pytest
-
 REPOSITORY = Path(__file__).resolve().parents[2]
 TOP = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docker/README.md", "examples/pid_law/README.md")
 PAGES = [*(REPOSITORY / name for name in TOP), *sorted((REPOSITORY / "docs").rglob("*.md"))]
 MAX_LINE = 200
+LINKED = (
+    "architecture",
+    "evidence",
+    "experiments",
+    "fly-a-route",
+    "glossary",
+    "guidance",
+    "interfaces",
+    "laws",
+    "symbols",
+    "theory",
+)
 TEXTS = {".py", ".md", ".yaml", ".xml", ".jinja", ".js", ".sh", ".c"}
 FOLDERS = ("ros_ws/src", "examples", "tests", "benchmarks", "tools", "docs", "docker")
 REPLACED = {
@@ -59,50 +69,42 @@ def name(path: Path) -> str:
     return str(path.relative_to(REPOSITORY))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_no_line_of_a_page_is_longer_than_200_characters(page: Path) -> None:
-    lines = page.read_text(encoding="utf-8").splitlines()
-    written = page.name == "evidence.md"  # by a program, and a row of a table cannot go on in the next line
-    long = [number for number, line in enumerate(lines, 1) if len(line) > MAX_LINE and not (written and line.startswith("|"))]
-    assert long == []
+def test_page_lines_have_at_most_200_characters() -> None:
+    long = [
+        f"{name(page)}:{number}"
+        for page in PAGES
+        for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), 1)
+        # a program writes evidence.md, and a row of a table cannot go on in the next line
+        if len(line) > MAX_LINE and not (page.name == "evidence.md" and line.startswith("|"))
+    ]
+    assert not long, "\n".join(long)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_each_table_has_a_heading_and_each_of_its_rows_a_cell_for_each_column(page: Path) -> None:
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
-    tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)  # a | in a formula would begin a cell, on GitHub and on the site
-    assert [table for table in tables if not re.match(r".*\n\|( ?:?-+:? ?\|)+\n", table)] == []
-    assert [table for table in tables if len({len(re.split(r"(?<!\\)\|", row)) for row in table.splitlines()}) != 1] == []
+def test_rows_have_a_cell_for_each_column() -> None:
+    """Below a heading; a | in a formula would begin a cell, on GitHub and on the site."""
+    bad = []
+    for page in PAGES:
+        text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+        for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+            cells = {len(re.split(r"(?<!\\)\|", row)) for row in table.splitlines()}
+            if len(cells) != 1 or not re.match(r".*\n\|( ?:?-+:? ?\|)+\n", table):
+                bad.append(f"{name(page)}: {table}")
+    assert not bad, "\n".join(bad)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_every_relative_link_and_anchor_exists(page: Path) -> None:
+def test_relative_links_and_anchors_exist() -> None:
     broken = []
-    for link in links(page):
-        path, _, anchor = link.partition("#")
-        target = (page.parent / path).resolve() if path else page
-        if not re.match(r"[a-z]+:", link) and not (target.exists() and (not anchor or anchor in anchors(target))):
-            broken.append(link)
-    assert broken == []
+    for page in PAGES:
+        for link in links(page):
+            path, _, anchor = link.partition("#")
+            target = (page.parent / path).resolve() if path else page
+            if not re.match(r"[a-z]+:", link) and not (target.exists() and (not anchor or anchor in anchors(target))):
+                broken.append(f"{name(page)}: {link}")
+    assert not broken, "\n".join(broken)
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        "architecture",
-        "glossary",
-        "theory",
-        "symbols",
-        "interfaces",
-        "laws",
-        "guidance",
-        "fly-a-route",
-        "experiments",
-        "evidence",
-    ],
-)
-def test_the_readme_links_the_page(page: str) -> None:
-    assert f"docs/{page}.md" in links(REPOSITORY / "README.md")
+def test_the_readme_links_the_main_pages() -> None:
+    assert {f"docs/{page}.md" for page in LINKED} <= set(links(REPOSITORY / "README.md"))
 
 
 def test_sources_tests_and_pages_use_the_words_of_the_field() -> None:
@@ -115,4 +117,4 @@ def test_sources_tests_and_pages_use_the_words_of_the_field() -> None:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
         for match in WORDS.finditer(line)
     ]
-    assert occurrences == []
+    assert not occurrences, "\n".join(occurrences)

@@ -7,7 +7,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -34,13 +34,14 @@ KEYS = {name: f"python3-{name}" for name in PYTHON3} | {"markupsafe": "python3-j
 WITHOUT_KEY = {"cma", "distributed", "foxglove", "jax", "jsbsim", "lz4", "mcap", "polars", "rosbags", "zstandard"}
 
 
-def offenders(check: Callable[[Path], object]) -> dict[str, object]:
-    """What a check finds wrong in each package, by package."""
-    return {package.name: wrong for package in PACKAGES if (wrong := check(package))}
+def check_packages(mistakes: Callable[[Path], Iterable[object]]) -> None:
+    """Fail with the mistakes in all packages, one a line."""
+    lines = [f"{package.name}: {mistake}" for package in PACKAGES for mistake in mistakes(package)]
+    assert not lines, "\n".join(lines)
 
 
 def test_package_files_agree_with_each_other() -> None:
-    assert offenders(disagreements) == {}
+    check_packages(disagreements)
 
 
 def disagreements(package: Path) -> list[str]:
@@ -67,7 +68,7 @@ def disagreements(package: Path) -> list[str]:
 
 
 def test_packages_declare_all_that_they_import() -> None:
-    assert offenders(undeclared) == {}
+    check_packages(undeclared)
 
 
 def undeclared(package: Path) -> set[str]:
@@ -110,7 +111,7 @@ def test_the_page_on_ros_names_what_rosdep_cannot_install() -> None:
 
 
 def test_packages_install_their_data_files() -> None:
-    assert offenders(uninstalled_data) == {}
+    check_packages(uninstalled_data)
 
 
 def uninstalled_data(package: Path) -> set[Path]:
@@ -123,7 +124,7 @@ def uninstalled_data(package: Path) -> set[Path]:
 
 
 def test_packages_are_installed_with_their_index_entry() -> None:
-    assert offenders(missing_entries) == {}
+    check_packages(missing_entries)
 
 
 def missing_entries(package: Path) -> list[Path]:
