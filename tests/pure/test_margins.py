@@ -25,6 +25,8 @@ from rise_di_controller.margins import (
     slow_modes,
 )
 
+pytestmark = pytest.mark.package("flight_analysis")
+
 NO_LAG = Loop(np.zeros(1), 0.0, 0.01)
 INTEGRATOR = LinearPlant(np.zeros((1, 1)), np.eye(1), np.eye(1))
 
