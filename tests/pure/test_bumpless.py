@@ -16,6 +16,8 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller.controller import Controller
 
+pytestmark = pytest.mark.package("rise_di_controller")
+
 SLEW = 0.5  # limit of abs(u_dot), rad/s and 1/s
 SCENARIO = find_scenario("osprey_gust").vary(
     controller={"max_age": 0.03, "hold": 0.05, "ramp": 0.2, "slew": [SLEW] * 4, "sign": "soft"}
