@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attitude: body rates that hold or reach a bank and a pitch, in a coordinated turn."""
+"""Attitude: body rates to hold or reach a bank and a pitch, in a coordinated turn."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ class AttitudeParams(NamedTuple):
     """Gains and limits of the attitude loop."""
 
     k_phi: float  # 1/s, a quarter of the reference's bandwidth of p: damping 0.74
-    k_theta: float  # 1/s, a quarter of that of q
+    k_theta: float  # 1/s, a quarter of the bandwidth of q
     roll_rate: float  # largest phi_dot, rad/s
     load: float  # largest change of the load factor, 1
     n_alpha: Scalar  # slope of the load factor over the angle of attack, 1/rad
@@ -39,14 +39,14 @@ def body_rates(
     speed: Scalar,
     params: AttitudeParams,
 ) -> BodyRates:
-    """Rates that bring phi and theta to their commands, by the inverse of Euler's equations in a coordinated turn:
+    """Rates to bring phi and theta to their commands, by the inverse of Euler's equations in a coordinated turn:
 
         phi_dot_c   = clip(k_phi (phi_c - phi), +-roll_rate),  theta_dot_c = clip(k_theta (theta_c - theta), +-load g/V)
         r_m = psi_dot cos(phi) cos(theta) - theta_dot_c sin(phi) + k_beta beta,  psi_dot = g tan(phi) / V
         q_m = (theta_dot_c + r sin(phi)) / cos(phi) + phi_dot_c tan(phi) / (cos(phi) n_alpha)
         p_m = phi_dot_c - tan(theta) (q_m sin(phi) + r cos(phi))
 
-    with the measured r where it is not tracked exactly. The last term of q_m leads the angle of attack that the turn needs.
+    with the measured r where r is not tracked exactly. The last term of q_m leads the angle of attack of the turn.
     Arguments: angles in rad, `speed` V in m/s. Source: R. W. Beard, T. W. McLain, Small Unmanned
     Aircraft (2012), chapters 2 and 9.
     """  # noqa: D400, D415 - what follows is an equation

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Feasibility: a route that the aircraft cannot fly is refused before the flight, with the value that would do."""
+"""Feasibility: refusal of a route beyond the aircraft's performance before the flight, with the nearest feasible value."""
 
 import math
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from flight_guidance.route_file import Waypoint
 
 
 class Performance(NamedTuple):
-    """What the aircraft can do, and the wind it has to meet."""
+    """Performance of the aircraft, and the largest wind."""
 
     speed: float  # airspeed where the route names none, m/s
     stall_speed: float  # m/s
@@ -27,7 +27,7 @@ class Performance(NamedTuple):
 
 
 def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
-    """Airspeed on the leg to each waypoint, m/s: its own, or that of the leg before; `first` where none is named yet."""
+    """Airspeeds on the legs to the waypoints, m/s: of the waypoint, or of the leg before; `first` where none is named yet."""
     named = []
     for waypoint in waypoints:
         first = waypoint.speed or first
@@ -38,10 +38,9 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 def flyable_legs(waypoints: Sequence[Waypoint], radius: float, period: float, can: Performance) -> tuple[Leg, ...]:
     """The legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
-    Raises ParameterError for a waypoint that is not finite or beyond LARGEST, a speed below the floor, a period below the rule,
-    a radius below (V + W)^2 / (g tan(0.8 phi_max)), a leg too short for its fillets, and an altitude that the climb or sink
-    along the straight part of its leg, with the wind from behind, does not reach. phi_max is the bank that the stall speed
-    permits at V.
+    Raises ParameterError for a waypoint not finite or beyond LARGEST, a speed below the floor, a period below the rule, a
+    radius below (V + W)^2 / (g tan(0.8 phi_max)), a leg too short for the fillets, and an altitude out of reach of the climb or
+    sink along the straight part of the leg, with the wind from behind. phi_max is the largest bank at V for the stall speed.
     """
     for k, (north, east, altitude, _) in enumerate(waypoints):
         known = all(abs(value) <= LARGEST for value in (north, east, altitude))
@@ -70,5 +69,5 @@ def flyable_legs(waypoints: Sequence[Waypoint], radius: float, period: float, ca
 
 
 def _up(value: float, step: float) -> float:
-    """A value rounded up to a multiple of a step, which still does."""
+    """A value rounded up to a multiple of a step: still feasible."""
     return math.ceil(value / step) * step

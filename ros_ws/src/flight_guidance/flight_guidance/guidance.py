@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guidance without ROS: the step of `modes` with its state, the last samples, the program and the log.
+"""Guidance without ROS: the step of `modes` with state, the last samples, the program and the log.
 
-The node and the simulation in one process both use it.
+The node and the simulation in one process use the same class `Guidance`.
 """
 
 import zlib
@@ -36,7 +36,7 @@ STATE = ("phi", "theta", "alpha", "alpha_trim", "slip")
 
 
 class GuidanceOutput(NamedTuple):
-    """Output of one step."""
+    """Output of a step."""
 
     u_m: FloatArray  # the commands in the order of the parameters' outputs, then ATTITUDE
     log: FloatArray  # in the order of `names`
@@ -63,7 +63,7 @@ def u_m(state: GuidanceState) -> FloatArray:
 
 
 def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int) -> FloatArray:
-    """A sample of the log, in the order of `names`: inputs, state after the step, commands. `route`: its `digest`."""
+    """A sample of the log, in the order of `names`: inputs, state after the step, commands. `route`: a `digest`."""
     given = sum(1 << k for k, name in enumerate(TARGETS) if name in inputs.given)
     return np.array(
         [
@@ -82,7 +82,7 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int) ->
 
 
 def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> tuple[Inputs, GuidanceState]:
-    """The inputs of a step and the state after it, from its sample of the log."""
+    """The inputs of a step and the state after the step, from a sample of the log."""
 
     def group(prefix: str, keys: Sequence[str]) -> tuple[float, ...]:
         return tuple(logged[f"{prefix}.{key}"] for key in keys)
@@ -112,12 +112,12 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
 
 
 def digest(route: Route | None) -> int:
-    """A number that distinguishes routes; 0 for none."""
+    """A number to distinguish routes; 0 for none."""
     return 0 if route is None else zlib.crc32(repr(route).encode())
 
 
 class Guidance:
-    """`modes.step` with its state, the last pose and y, the route and the program of targets."""
+    """`modes.step` with state, the last pose and y, the route and the program of targets."""
 
     def __init__(self, parameters: GuidanceConfig) -> None:
         self._params: GuidanceParams = parameters.params()
@@ -146,8 +146,8 @@ class Guidance:
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
         """Take a pose in the order of `channels.POSE`.
 
-        Raises ChannelError for a stamp that is not newer or in the future, for a value beyond `modes.LARGEST`, and for values
-        that are all those of the last pose.
+        Raises ChannelError for a stamp not newer than the last or in the future, for a value beyond `modes.LARGEST`, and for
+        a pose equal to the last in every value.
         """
         last, newest = self._pose, self._newest(self._pose, sample, now_ns)
         if last is not None and np.array_equal(last.value, newest.value):
@@ -167,9 +167,9 @@ class Guidance:
         return sample
 
     def take_target(self, values: Mapping[str, float]) -> None:
-        """Take commands by channel of `modes.Target`; those of one instant are taken together. Raises ChannelError."""
+        """Take commands by channel of `modes.Target`; commands of the same instant come in one call. Raises ChannelError."""
         modes.read_target(values, self._params, self.route)
-        # A lateral or vertical command replaces that of another mode.
+        # A lateral or vertical command replaces the command of the mode before.
         for table in (modes.LATERAL, modes.VERTICAL):
             if any(name in table for name in values):
                 self._given = {name: value for name, value in self._given.items() if name not in table}
@@ -178,11 +178,11 @@ class Guidance:
     def take_route(self, route: Route) -> None:
         """Fly a route from its first leg on.
 
-        While guidance is off, the route waits for the engagement. Commands given before it and not taken by a step yet are
+        While guidance is off, the route waits for the engagement. Commands before the route and not taken by a step yet are
         void, and so are the legs of the program.
         """
         self.route, self._digest, self._given, self._route_waits = route, digest(route), {}, True
-        without = ((start, {name: one for name, one in step.items() if name != "leg"}) for start, step in self._program)
+        without = ((start, {name: value for name, value in step.items() if name != "leg"}) for start, step in self._program)
         self._program = deque((start, step) for start, step in without if step)
         self.take_target({"leg": 0.0})
 
@@ -220,27 +220,27 @@ class Guidance:
         self._paused = paused
 
     def _forget_commands(self) -> None:
-        """Forget what was commanded while another flew, but a route. Before the first step all commands wait for it."""
+        """Forget commands given while guidance did not fly, but a route. Before the first step commands wait."""
         if self._state is not None:
-            self._given = {name: one for name, one in self._given.items() if name == "leg" and self._route_waits}
+            self._given = {name: value for name, value in self._given.items() if name == "leg" and self._route_waits}
 
     def pose(self) -> dict[str, float]:
-        """The last pose by channel; empty before the first one."""
+        """The last pose by channel; empty before the first pose."""
         return {} if self._pose is None else dict(zip(POSE, self._pose.value.tolist(), strict=True))
 
     def y(self) -> dict[str, float]:
-        """The last y by channel; empty before the first one."""
+        """The last y by channel; empty before the first y."""
         return {} if self._y is None else dict(zip(self._params.outputs, self._y.value.tolist(), strict=True))
 
     def ages(self, now_ns: int) -> dict[str, float]:
-        """Ages of the last y and pose, s, of those that were received."""
+        """Ages of the last received y and pose, s; a channel never received is absent."""
         samples = {"y": self._y, "pose": self._pose}
-        return {name: seconds(now_ns - one.stamp_ns) for name, one in samples.items() if one is not None}
+        return {name: seconds(now_ns - sample.stamp_ns) for name, sample in samples.items() if sample is not None}
 
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
-        """One step at an instant, which is flight time t; None without fresh y, before the first pose, and while disengaged.
+        """A step at an instant and flight time t; None without fresh y, before the first pose, and while disengaged.
 
-        After such a time the filters start again at what is measured.
+        After steps of None the filters start again at the measured values.
         """
         while self._program and self._program[0][0] <= t_ns:
             self.take_target(self._program.popleft()[1])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lateral: the acceleration to the right that holds a heading or course, or follows a path, and the bank that gives it."""
+"""Lateral: the acceleration to the right to hold a heading or course, or to follow a path, and the bank for it."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from flight_core.kinematics import clip
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
 
-# Largest share of a turn that a sideslip takes; the f16 of JSBSim in an orbit, its rudder at its stop: 0.09.
+# Largest share of a turn lost to a sideslip; the f16 of JSBSim in an orbit, with the rudder at the stop: 0.09.
 LARGEST_SLIP = 0.2
 
 
@@ -30,7 +30,7 @@ class PathParams(NamedTuple):
 
 
 def turn_towards(difference: Scalar) -> Scalar:
-    """How far to turn, of at most 1, for a difference of courses: its sine up to 90 deg, +-1 beyond.
+    """Normalised turn for a difference of courses, within +-1: the sine up to 90 deg, +-1 beyond.
 
     A sine alone would leave an aircraft on the opposite course there.
     """
@@ -45,15 +45,15 @@ def course_acceleration(course_c: float, course: float, speed: float, k: float) 
 
 
 def path_acceleration(error: PathError, course: Scalar, ground_speed: Scalar, params: PathParams) -> Scalar:
-    """Acceleration to the right that follows a path, m/s^2:
+    """Acceleration to the right to follow a path, m/s^2:
 
         x       = min(abs(e) / (v_g P zeta), 1),  look-ahead angle l = pi/2 (1 - x)^2
         bearing = track - sign(e) min(pi/2 - l, capture)
         a = (4 pi zeta / P) v_g turn_towards(bearing - course) + sin(l)^2 kappa / (1 - kappa e) v_g^2 cos(course - track)
 
-    Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The velocity is that over ground, so a wind changes nothing.
-    On the inner side of an arc, e is limited to half of its radius.
-    Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp, without its adaptation to wind.
+    Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The velocity is over ground, so a wind changes nothing.
+    On the inner side of an arc, e is limited to half of the radius.
+    Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp, without the adaptation to wind.
     """  # noqa: D400, D415 - what follows is an equation
     e, track, kappa = error
     xp = array_namespace(e)
@@ -66,13 +66,13 @@ def path_acceleration(error: PathError, course: Scalar, ground_speed: Scalar, pa
 
 
 def slip_estimate(slip: Scalar, turn: Scalar, flown: Scalar, rolling: Scalar, dt: float, time: float) -> Scalar:
-    """What a sideslip takes from the turn of a bank, a step later, m/s^2; `turn` = g tan(phi), `flown` = V psi_dot:
+    """Loss of turn by a sideslip at a bank, a step later, m/s^2; `turn` = g tan(phi), `flown` = V psi_dot:
 
         slip+ = slip + (1 - exp(-dt/T)) max(1 - rolling / 0.2, 0) (turn - flown - slip) within +-LARGEST_SLIP abs(turn)
 
-    `rolling` is abs(p) / p_max: the turn lags the bank by the reference model of r, so that a roll looks like a sideslip.
-    A bias of the gyro of r looks like one too; the bound keeps it out of a straight flight, whose turn is none to take from.
-    Added to the acceleration that a path needs, the estimate keeps an aircraft on an arc whose turn is not coordinated.
+    `rolling` is abs(p) / p_max: the turn lags the bank by the reference model of r, so a roll looks like a sideslip.
+    A bias of the gyro of r looks like a sideslip too; the bound is 0 in straight flight and keeps the bias out there.
+    Added to the acceleration of a path, the estimate keeps an aircraft on an arc in a turn that is not coordinated.
     """  # noqa: D400, D415 - what follows is an equation
     steady = array_namespace(slip).maximum(1.0 - rolling / 0.2, 0.0)
     return clip(slip + (1.0 - math.exp(-dt / time)) * steady * (turn - flown - slip), LARGEST_SLIP * abs(turn))
@@ -87,11 +87,12 @@ def bank_for(acceleration: Scalar, path_angle: Scalar, limit: float) -> Scalar:
 def least_period(speed: float, bank: float, roll_rate: float) -> float:
     """Least period of path following, s: max(14, 1.5 V / (g tan(phi_max)), 11 phi_max / p_max).
 
-    A bank reversal takes 2 phi_max / p_max. With a period of 3.5 such times the osprey cycled in turbulence; 5.5 are asked for.
+    A bank reversal takes 2 phi_max / p_max. With a period of 3.5 reversal times the osprey cycled in turbulence; 5.5 are asked
+    for.
     """
     return max(14.0, 1.5 * speed / (GRAVITY * math.tan(bank)), 11.0 * bank / roll_rate)
 
 
 def least_radius(speed: float, wind: float, bank: float) -> float:
-    """Least radius of a turn that stays on its circle in a wind, m: (V + W)^2 / (g tan(0.8 phi_max))."""
+    """Least radius of a circle flown in a wind, m: (V + W)^2 / (g tan(0.8 phi_max))."""
     return (speed + wind) ** 2 / (GRAVITY * math.tan(0.8 * bank))

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Modes of guidance: one step from pose, y and target to u_m.
+"""Modes of guidance: a step from pose, y and target to u_m.
 
 Lateral: hold a bank, a heading or a course, or follow an orbit or a route. Vertical: hold a pitch, a climb rate or an altitude.
-Airspeed is held by the law; guidance limits its command. The step has no clock and no hidden state: all of its state is in the
-log, so that each sample of the log can be computed again from the one before.
+The law holds the airspeed; guidance limits the command. The step has no clock and no hidden state: the state is in the log, so
+a sample of the log can be computed again from the sample before.
 """
 
 import math
@@ -26,7 +26,7 @@ from flight_guidance.path import Arc, Leg, Point, Route
 from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
 
 LARGEST = 1e9
-"""Largest value of pose, y and target, SI. The squares of larger ones overflow; the orbit of the moon is 4e8 m away."""
+"""Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the moon is 4e8 m away."""
 
 STEEPEST = math.radians(89.0)
 """Largest bank that a mode asks for, before protection."""
@@ -60,7 +60,7 @@ class Vertical(IntEnum):
 
 
 class Target(NamedTuple):
-    """Commands of all modes, of which those of the modes in force act."""
+    """Commands by channel; the channels of the modes in force act."""
 
     phi: float = 0.0  # rad
     heading: float = 0.0  # rad from true north
@@ -94,7 +94,7 @@ class Limits(NamedTuple):
     largest_pitch: float  # rad
     floor: float  # m/s, of the airspeed
     stall_speed: float  # m/s
-    radius: float  # m, least one
+    radius: float  # m, least radius of an orbit
 
 
 class GuidanceParams(NamedTuple):
@@ -126,9 +126,9 @@ class Inputs(NamedTuple):
 
     t_ns: int
     begin: Begin
-    pose: tuple[float, ...]  # the last one, in the order of POSE
+    pose: tuple[float, ...]  # the last pose, in the order of POSE
     pose_age_ns: int
-    y: tuple[float, ...]  # the last one, in the order of u_m
+    y: tuple[float, ...]  # the last y, in the order of u_m
     given: Mapping[str, float]  # commands that are new, by channel of Target; they name the modes
 
 
@@ -152,7 +152,7 @@ class GuidanceState(NamedTuple):
 
 
 class Commands(NamedTuple):
-    """What a step computes beside its state, for the log."""
+    """Results of a step beside the state, for the log."""
 
     phi_c: float = 0.0
     theta_c: float = 0.0
@@ -166,12 +166,12 @@ class Commands(NamedTuple):
 
 
 def read_target(values: Mapping[str, float], params: GuidanceParams, route: Route | None, what: str = "target") -> None:
-    """Raise ChannelError for commands that name no mode or two, or no leg of the route, or that are beyond the limits."""
+    """Raise ChannelError for commands of no mode or two modes, of no leg of the route, or beyond the limits."""
     modes = [{table[name] for name in values if name in table} for table in (LATERAL, VERTICAL)]
     unknown = [name for name in values if name not in TARGETS]
     if unknown or not values:
         raise ChannelError("name", f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of {', '.join(TARGETS)}")
-    if any(len(one) > 1 for one in modes):
+    if any(len(named) > 1 for named in modes):
         raise ChannelError("name", f"{what}: found {', '.join(values)}, expected one lateral and one vertical command at most")
     if Lateral.ORBIT in modes[0] and not {"north", "east", "radius"} <= set(values):
         raise ChannelError("name", f"{what}: found {', '.join(values)}, expected north, east and radius of an orbit together")
@@ -198,13 +198,13 @@ def read_target(values: Mapping[str, float], params: GuidanceParams, route: Rout
 
 
 def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> dict[str, Scalar]:
-    """Commands that hold the heading, the altitude and the airspeed of now; no airspeed below the floor."""
+    """Commands to hold the heading, the altitude and the airspeed of now; no airspeed below the floor."""
     floor = array_namespace(speed).maximum(speed, params.limits.floor)
     return {"heading": pose["psi"], "altitude": pose["altitude"], "V": floor}
 
 
 def holding(t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> GuidanceState:
-    """The state before the first step, at t: it holds the heading, the altitude and the airspeed of now."""
+    """The state before the first step, at t: holds the heading, the altitude and the airspeed of now."""
     alpha = pose["theta"] - path_angle(pose["climb"], speed)
     return GuidanceState(
         t_ns - params.period_ns,
@@ -225,7 +225,7 @@ def holding(t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: Guidan
 
 
 def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -> GuidanceState:
-    """The state before a step, its filters at what is measured where they begin."""
+    """The state before a step, with filters at the measured values where the filters begin."""
     if state is not None and inputs.begin is Begin.NO:
         return state
     held = holding(inputs.t_ns, dict(zip(POSE, inputs.pose, strict=True)), airspeed(inputs.y, params), params)
@@ -234,7 +234,7 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
     again = held._replace(
         mode=state.mode, lateral=state.lateral, vertical=state.vertical, target=state.target, leg=state.leg
     )  # the mode, since after a lost pose the wings are levelled
-    # Up to its age limit the reference model still flies the last u_m.
+    # Up to the age limit of u_m the reference model still flies the last u_m.
     return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
 
 
@@ -251,7 +251,7 @@ def true_airspeed(V: Scalar, params: GuidanceParams) -> Scalar:
 def step(
     state: GuidanceState | None, inputs: Inputs, route: Route | None, params: GuidanceParams
 ) -> tuple[GuidanceState, Commands]:
-    """One step: attitude, commands, u_m.
+    """A step: attitude, commands, u_m.
 
     1. Attitude: phi and theta of pose. While pose is stale: Euler's kinematics with p, q, r of y (`Mode.DEAD_RECKONING`). After
        `hold` the attitude is unknown (`Mode.POSE_LOST`) until pose returns; then wings level and the altitude of then.
@@ -277,9 +277,9 @@ def command(
     dt: float,
     params: GuidanceParams,
 ) -> tuple[GuidanceState, Commands]:
-    """Protection and u_m of `step`, from the bank that the lateral mode asks for, rad. `t_ns` of the state stays.
+    """Protection and u_m of `step`, from the bank asked for by the lateral mode, rad. `t_ns` of the state stays.
 
-    The values may be arrays, with one for each aircraft of a fleet; the modes are those of all of them.
+    The values may be arrays with an element per aircraft of a fleet; the modes hold for the whole fleet.
     """
     speed, limits, flies = true_airspeed(y["V"], params), params.limits, state.mode is Mode.ENGAGED
     if flies:
@@ -317,7 +317,7 @@ def command(
         theta_limited=theta_c != theta_wanted,
         climb_limited=climb_limited,
         V_limited=V_wanted != state.target.V,
-        slew_limited=reduce(or_, (one != wanted[name] for name, one in zip(params.outputs, u_m, strict=True))),
+        slew_limited=reduce(or_, (value != wanted[name] for name, value in zip(params.outputs, u_m, strict=True))),
     )
     return state._replace(climb_c=climb_c, V_c=V_c, u_m=u_m), commands
 
@@ -342,9 +342,9 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
 
 
 def _with_commands(state: GuidanceState, inputs: Inputs, route: Route | None) -> GuidanceState:
-    """The modes and commands in force: those of the next leg once a leg is passed, then those given.
+    """The modes and commands in force: of the next leg once a leg is passed, then the commands given.
 
-    A lateral command ends the leg: it may come with another route, which has other legs.
+    A lateral command ends the leg: the command may come with a new route, and so with new legs.
     """
     position = (inputs.pose[POSE.index("north")], inputs.pose[POSE.index("east")])
     on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & inputs.given.keys()
@@ -373,7 +373,7 @@ def _on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
 def _bank(
     state: GuidanceState, pose: Mapping[str, float], speed: float, route: Route | None, params: GuidanceParams
 ) -> tuple[float, float, float]:
-    """Bank that the lateral mode asks for, rad; cross-track error and distance to the end of the leg, m."""
+    """Bank asked for by the lateral mode, rad; cross-track error and distance to the end of the leg, m."""
     if state.mode is not Mode.ENGAGED:
         return 0.0, 0.0, 0.0
     target, gamma = state.target, path_angle(pose["climb"], speed)
@@ -411,11 +411,10 @@ def follow(
     speed: Scalar,
     params: GuidanceParams,
 ) -> Scalar:
-    """Bank that follows a path, rad, before protection. `entry` is the curvature of the following leg at its start, 1/m.
+    """Bank to follow a path, rad, before protection. `entry` is the curvature of the following leg at the start, 1/m.
 
-    It takes the place of that of the leg as early as the bank lags its command: where `entered` says that the position then
-    lies on the following leg. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp, then
-    the loop of the bank.
+    `entry` replaces the curvature of the leg early, by the lag of the bank: as soon as `entered` holds for the position a mean
+    lag ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp, then the loop of the bank.
     """
     course, ground_speed = _over_ground(pose)
     xp = array_namespace(ground_speed)
@@ -430,9 +429,9 @@ def follow(
 def _climb(
     state: GuidanceState, pose: Mapping[str, Scalar], speed: Scalar, dt: float, params: GuidanceParams
 ) -> tuple[Scalar, Any]:
-    """Commanded climb rate, m/s, and whether protection limits it."""
+    """Commanded climb rate, m/s, and whether protection limits the rate."""
     if state.vertical is Vertical.THETA:
-        return pose["climb"], False  # from here the other modes start
+        return pose["climb"], False  # the start value for the modes CLIMB and ALTITUDE
     vertical, target = params.vertical, state.target
     wanted = target.climb if state.vertical is Vertical.CLIMB else climb_for(target.altitude - pose["altitude"], vertical)
     least, largest = protection.climb_range(vertical.climb, vertical.sink, state.V_c - speed, params.speed)

@@ -48,7 +48,7 @@ from flight_ros.topics import (
     publisher_qos,
 )
 
-MAX_TARGETS = 16  # messages of target a tick; later ones wait, so that a storm delays no u_m
+MAX_TARGETS = 16  # messages of target a tick; later messages wait, so that a storm delays no u_m
 ODOMETRY_PERIOD_NS, PATH_PERIOD_NS = NANOSECONDS // 10, NANOSECONDS
 PATH_LENGTH = 120  # poses of the flown path, one a second
 
@@ -62,10 +62,10 @@ LEVELS = {Mode.ENGAGED: DiagnosticStatus.OK, Mode.POSE_LOST: DiagnosticStatus.ER
 
 
 class GuidanceNode(FlightNode[GuidanceConfig]):
-    """At each tick it takes the received y, pose, target and route, steps `guidance.Guidance` and publishes u_m and guidance.
+    """A tick takes the received y, pose, target and route, steps `guidance.Guidance` and publishes u_m and guidance.
 
-    In real time it flies while the controller is ENGAGED. In lockstep the number of samples of y gives the time. A step waits
-    for the y and the pose of its instant. It publishes exactly one u_m, without channels where guidance has no command.
+    In real time guidance flies while the controller is ENGAGED. In lockstep the number of samples of y gives the time. A step
+    waits for the y and the pose of the instant and publishes exactly one u_m, without channels where guidance has no command.
     """
 
     def __init__(self) -> None:
@@ -186,7 +186,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self.accept(*pose, sample, now_ns, self._pose_lock, *self._ages_ns())
 
     def _ages_ns(self) -> tuple[int, int]:
-        """Ages above which a publisher has timed out: for the same node in another process, and for another node."""
+        """Timeouts of a publisher, by age: for the same node in a new process, and for a different node."""
         max_age_ns = nanoseconds(self.parameters.max_age)
         return max_age_ns, max_age_ns + nanoseconds(self.parameters.hold)
 
@@ -197,7 +197,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 if not self.parameters.lockstep:  # an operator has the system clock, not the flight time of lockstep
                     max_age_ns = nanoseconds(self.parameters.max_age)
                     require_not_future(sample.stamp_ns, now_ns, max_age_ns)
-                    # One that waited while guidance was stopped is not wanted any more: its operator knows that it failed.
+                    # A target from before a stop of guidance is void: the operator knows that the target failed.
                     require_not_old(sample.stamp_ns, now_ns, max_age_ns)
                 self._guidance.take_target(sample.channels)
             except ChannelError as error:
@@ -209,8 +209,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 message = deserialize_message(received.message, Path)
                 frame = message.header.frame_id
                 require(frame in ROUTE_FRAMES, "route", f"the frame {frame!r}", f"{MAP!r}, or none named")
-                points = [one.pose.position for one in message.poses]
-                route = self.parameters.plan([Waypoint(one.y, one.x, one.z) for one in points])
+                points = [stamped.pose.position for stamped in message.poses]
+                route = self.parameters.plan([Waypoint(point.y, point.x, point.z) for point in points])
             except (ParameterError, DeserializationError) as error:
                 self.reject(self._route_subscription, "route", " ".join(str(error).split()))
             else:
@@ -218,7 +218,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 self._guidance.take_route(route)
 
     def _follow_controller(self, now_ns: int) -> None:
-        """Fly while the controller is ENGAGED. After it was INACTIVE, hold what is measured; after a failsafe, go on."""
+        """Fly while the controller is ENGAGED. After INACTIVE, hold what is measured; after a failsafe, go on."""
         for sample in self.received(self._internals, self._internals_decoder):
             if sample is not None:
                 internals = self._internals, self._take_mode

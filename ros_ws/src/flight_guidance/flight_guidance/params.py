@@ -46,7 +46,7 @@ STEEPEST = 0.1
 
 
 class Steps(Config):
-    """Commands of one channel of `target`, one after another."""
+    """Successive commands of a channel of `target`."""
 
     start: Annotated[tuple[NonNegative, ...], Field(min_length=1)] = Field(description="times, s")
     value: Numbers = Field(description="values, in the channel's unit")
@@ -74,7 +74,7 @@ class RouteConfig(Config):
 
 
 class GuidanceConfig(NodeConfig):
-    """All parameters of the guidance node."""
+    """Parameters of the guidance node."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(default=50.0, description="the rate at which u_m is published, Hz")
     start_time: float = Field(
@@ -154,7 +154,7 @@ class GuidanceConfig(NodeConfig):
             read_target(target, params, route, f"program at {start:g} s")
 
     def by_rule(self) -> list[tuple[str, Any]]:
-        """Parameters that follow from the other sections of a scenario, in which they may be left out."""
+        """Parameters by rule from the remaining sections of a scenario, for parameters left out."""
         return [(name, getattr(self, name)) for name in BY_RULE if getattr(self, name)]
 
     def _floor(self) -> float:
@@ -224,14 +224,14 @@ class GuidanceConfig(NodeConfig):
         return VerticalParams(self.altitude_gain or gain, self.acceleration, climb, sink, time)
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """The waypoints of the section's route; none without one."""
+        """The waypoints of the section's route; none without a route."""
         route = self.route
         if route is None:
             return ()
         return tuple(starmap(Waypoint, zip(route.north, route.east, route.altitude, route.V or repeat(None), strict=False)))
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Route:
-        """Legs through waypoints. Raises ParameterError for a route that cannot be flown."""
+        """Legs through waypoints. Raises ParameterError for a route that is not feasible."""
         floor, (climb, sink) = self._floor(), self.climb_limits()
         stall, flown = floor / protection.FLOOR, speeds(waypoints, self.speed)
         can = Performance(self.speed, stall, self.bank, self.largest_roll_rate(), climb, sink, self.wind)

@@ -17,7 +17,7 @@ SHARPEST = math.radians(150.0)
 """Largest change of course at a waypoint: beyond it the fillet cuts the corner by more than 2.8 radii."""
 
 SHORTEST = 1e-3
-"""m. A fillet whose ends are nearer to its waypoint is left out: waypoints on a straight line have one by rounding alone."""
+"""m. A fillet with ends nearer to the waypoint is left out: waypoints on a straight line have a fillet by rounding alone."""
 
 
 class Line(NamedTuple):
@@ -28,7 +28,7 @@ class Line(NamedTuple):
 
 
 class Arc(NamedTuple):
-    """A leg on a circle, less than a full turn; without an end it is an orbit."""
+    """A leg on a circle, less than a full turn; without an end an orbit."""
 
     centre: Point
     radius: float  # m, positive to the right (clockwise from above), negative to the left
@@ -39,7 +39,7 @@ Leg = Line | Arc
 
 
 class Route(NamedTuple):
-    """Legs with the altitude and the airspeed of each: those of the waypoint to which it leads."""
+    """Legs, with altitudes and airspeeds per leg, taken from the waypoint at the end of the leg."""
 
     legs: tuple[Leg, ...]
     altitude: tuple[float, ...]  # m
@@ -47,12 +47,12 @@ class Route(NamedTuple):
 
 
 def course_of(start: Point, end: Point) -> float:
-    """Course from one point to another, rad from north."""
+    """Course from a start to an end, rad from north."""
     return math.atan2(end[1] - start[1], end[0] - start[0])
 
 
 def error(leg: Leg, position: Point) -> PathError:
-    """The cross-track error of a position, and course and curvature of the leg at its nearest point."""
+    """The cross-track error of a position, and course and curvature of the leg at the nearest point."""
     if isinstance(leg, Line):
         return line_error(leg.start, course_of(leg.start, leg.end), position)
     return circle_error(leg.centre, leg.radius, position)
@@ -82,7 +82,7 @@ def end_course(leg: Leg) -> float:
 
 
 def passed(leg: Leg, position: Point) -> bool:
-    """Whether a position lies beyond the half plane at the end of a leg, across its course there. Never for an orbit."""
+    """Whether a position lies beyond the half plane at the end of a leg, across the course there. Never for an orbit."""
     return leg.end is not None and bool(beyond(leg.end, end_course(leg), position))
 
 
@@ -93,12 +93,12 @@ def beyond(end: Point, course: Scalar, position: Point) -> Any:
 
 
 def entered(leg: Leg, following: Leg | None, position: Point) -> bool:
-    """Whether a position lies beyond the end of a leg, but not beyond an arc that follows it."""
+    """Whether a position lies beyond the end of a leg, but not beyond a following arc."""
     return passed(leg, position) and not (isinstance(following, Arc) and passed(following, position))
 
 
 def to_go(leg: Leg, position: Point) -> float:
-    """Distance along a leg from its point nearest to a position to its end, m; 0 for an orbit."""
+    """Distance along a leg from the point nearest to a position to the end, m; 0 for an orbit."""
     if leg.end is None:
         return 0.0
     if isinstance(leg, Line):
@@ -109,7 +109,7 @@ def to_go(leg: Leg, position: Point) -> float:
 
 
 def outline(leg: Leg, start: Point) -> list[Point]:
-    """Points along a leg from its start, for drawing: at most 10 deg apart on an arc; an orbit is a full turn."""
+    """Points along a leg from the start, for drawing: at most 10 deg apart on an arc; an orbit is a full turn."""
     if isinstance(leg, Line):
         return [leg.start, leg.end]
     side, first = math.copysign(1.0, leg.radius), course_of(leg.centre, start)
@@ -119,7 +119,7 @@ def outline(leg: Leg, start: Point) -> list[Point]:
 
 
 def route_outline(route: Route) -> list[tuple[float, float, float]]:
-    """Points along a route, for drawing: north, east and altitude, m. Each leg has its own altitude."""
+    """Points along a route, for drawing: north, east and altitude, m. The altitude is constant along a leg."""
     points: list[tuple[float, float, float]] = []
     for leg, altitude in zip(route.legs, route.altitude, strict=True):
         start = leg.start if isinstance(leg, Line) else points[-1][:2] if points else _along(leg.centre, 0.0, abs(leg.radius))
@@ -128,7 +128,7 @@ def route_outline(route: Route) -> list[tuple[float, float, float]]:
 
 
 def leads(legs: Sequence[Leg]) -> list[int]:
-    """The number of the waypoint to which each leg of a route leads; an arc at a waypoint leads to the next one."""
+    """Numbers of the waypoints at the ends of the legs of a route; an arc at a waypoint leads to the next waypoint."""
     numbers, at = [], 0
     for leg in legs:
         at += isinstance(leg, Line)
@@ -139,8 +139,8 @@ def leads(legs: Sequence[Leg]) -> list[int]:
 def route(waypoints: Sequence[Point], radius: float, least: float) -> tuple[Leg, ...]:
     """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the last waypoint.
 
-    A corner of the turn tau begins and ends radius tan(tau / 2) from its waypoint. Raises ParameterError for fewer than two
-    waypoints, a radius below `least` (`lateral.least_radius`), a corner beyond SHARPEST, and a leg too short for its fillets.
+    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint. Raises ParameterError for fewer than two
+    waypoints, a radius below `least` (`lateral.least_radius`), a corner beyond SHARPEST, and a leg too short for the fillets.
     Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
@@ -148,8 +148,8 @@ def route(waypoints: Sequence[Point], radius: float, least: float) -> tuple[Leg,
     turns = [0.0]
     for k, (before, at, after) in enumerate(zip(waypoints, waypoints[1:], waypoints[2:], strict=False), 1):
         turn = math.remainder(course_of(at, after) - course_of(before, at), 2.0 * math.pi)
-        found, expected = f"a turn of {math.degrees(turn):.0f} deg", f"at most {math.degrees(SHARPEST):.0f} deg either way"
-        require(abs(turn) <= SHARPEST, f"route[{k}]", found, expected)
+        actual, expected = f"a turn of {math.degrees(turn):.0f} deg", f"at most {math.degrees(SHARPEST):.0f} deg either way"
+        require(abs(turn) <= SHARPEST, f"route[{k}]", actual, expected)
         turns.append(turn)
     turns.append(0.0)
     cut = [radius * math.tan(abs(turn) / 2.0) for turn in turns]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Protection: limits of bank, speed and climb, in that order, from the stall speed and the commanded airspeed."""
+"""Protection: limits of bank, speed and climb, in this order, from the stall speed and the commanded airspeed."""
 
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
@@ -12,7 +12,7 @@ FLOOR = 1.15
 """Speed floor over the stall speed."""
 
 SHORTFALL = 0.05
-"""How far V may be from its command, over the trim speed, before the climb or sink falls: at twice of it, it is zero."""
+"""Largest error of V over the trim speed before the climb or sink is limited; at twice the value the limit is zero."""
 
 
 def bank_limit(limit: float, stall_speed: float, speed: Scalar) -> Scalar:
@@ -29,7 +29,7 @@ def speed_floor(stall_speed: float) -> float:
 def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scalar:
     """Largest climb rate, m/s: ratio climb - (1 - ratio) sink, ratio = clip((V - 0.9 V_floor) / (0.1 V_floor), 0, 1).
 
-    Below the floor pitch flies the speed: at nine tenths of it the aircraft sinks at its largest rate.
+    Below the floor pitch flies the speed: at nine tenths of the floor the aircraft sinks at the largest rate.
     """
     xp = array_namespace(speed)
     ratio = xp.minimum(xp.maximum((speed - 0.9 * floor) / (0.1 * floor), 0.0), 1.0)
@@ -37,7 +37,7 @@ def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scala
 
 
 def climb_range(climb: float, sink: float, shortfall: Scalar, speed: float) -> tuple[Scalar, Scalar]:
-    """Least and largest climb rate, m/s, by the shortfall V_c - V of the airspeed, m/s, for a throttle at its stop leaves V:
+    """Least and largest climb rate, m/s, by the shortfall V_c - V of the airspeed, m/s, since a throttle at the stop leaves V:
 
         -sink clip(2 + shortfall / d, 0, 1),  climb clip(2 - shortfall / d, 0, 1),  d = max(0.05 V0, g climb / (0.4 V0))
 

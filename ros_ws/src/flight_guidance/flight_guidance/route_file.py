@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Route files: GeoJSON, KML and YAML as waypoints in the local tangent plane.
 
-GeoJSON (RFC 7946) and KML (OGC 12-007r2) hold longitude and latitude in degrees of WGS84, and altitude in m. Their one
+GeoJSON (RFC 7946) and KML (OGC 12-007r2) hold longitude and latitude in degrees of WGS84, and altitude in m. A single
 LineString is the route; without a LineString the Points are, in the order of the file. A YAML file holds the list `route` of
 [north, east, altitude], [north, east, altitude, V] or {latitude: ..., longitude: ..., altitude: ..., V: ...}.
 """
@@ -53,12 +53,12 @@ Place = tuple[str, Any, Any, Any, Any]  # key in the file, latitude and longitud
 
 
 def local(latitude: float, longitude: float, origin: Origin) -> Point:
-    """North and east of a position on the ellipsoid WGS84 in the plane that touches it at the origin, m; angles in deg.
+    """North and east of a position on the ellipsoid WGS84 in the tangent plane at the origin, m; angles in deg.
 
         [x, y, z] = N(lat) [cos(lat) cos(lon), cos(lat) sin(lon), (1 - e^2) sin(lat)],  N = a / sqrt(1 - e^2 sin(lat)^2)
 
-    and the difference of two such vectors turned to north and east at the origin. Altitude is no part of it: that of an
-    aircraft follows the curved Earth. Source: IOGP publication 373-7-2, methods EPSG:9602 and 9836.
+    and the difference of two vectors [x, y, z] turned to north and east at the origin. Altitude takes no part: the altitude of
+    an aircraft follows the curved Earth. Source: IOGP publication 373-7-2, methods EPSG:9602 and 9836.
     """
     lat, turn = math.radians(origin.latitude), math.radians(longitude - origin.longitude)
     (out_0, up_0), (out, up) = _meridian(lat), _meridian(math.radians(latitude))
@@ -67,7 +67,7 @@ def local(latitude: float, longitude: float, origin: Origin) -> Point:
 
 
 def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
-    """Whether a position is on the half of the Earth around the origin; one on the other half has the same north and east."""
+    """Whether a position is on the half of the Earth around the origin; the antipodal half has the same north and east."""
     lat, turn = math.radians(origin.latitude), math.radians(longitude - origin.longitude)
     out, up = _meridian(math.radians(latitude))
     return out * math.cos(turn) * math.cos(lat) + up * math.sin(lat) > 0.0
@@ -81,10 +81,10 @@ def _meridian(latitude: float) -> tuple[float, float]:
 
 
 def read_route(path: Path, origin: Origin | None = None) -> tuple[Waypoint, ...]:
-    """The waypoints of a route file, by its ending: .geojson or .json, .kml, .yaml or .yml.
+    """The waypoints of a route file, by the ending: .geojson or .json, .kml, .yaml or .yml.
 
-    Latitudes and longitudes are turned to north and east of the origin. Raises ParameterError for a file that cannot be read,
-    a value that is missing or out of range, and latitudes without an origin.
+    Latitudes and longitudes are turned to north and east of the origin. Raises ParameterError for an unreadable file, a
+    value missing or out of range, and latitudes without an origin.
     """
     reader = READERS.get(path.suffix.lower())
     if reader is None:
@@ -116,13 +116,13 @@ def _read_geojson(content: bytes, key: str, origin: Origin | None) -> Iterator[W
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{key}: not valid JSON ({error}), expected a route file") from None
     features = _member(tree, "features")
-    lines: list[list[Any]] = []  # positions, each with its V
+    lines: list[list[Any]] = []  # positions with V
     points: list[Any] = []
     for feature in features if isinstance(features, list) else [tree]:
         geometry, speed = _member(feature, "geometry") or feature, _member(_member(feature, "properties"), "V")
         kind, coordinates = _member(geometry, "type"), _member(geometry, "coordinates")
         if kind == "LineString" and isinstance(coordinates, list):
-            lines.append([(one, speed) for one in coordinates])
+            lines.append([(position, speed) for position in coordinates])
         elif kind == "Point":
             points.append((coordinates, speed))
     for k, (position, speed) in enumerate(_only_line(key, lines, points)):
@@ -135,7 +135,7 @@ def _member(tree: Any, name: str) -> Any:
 
 
 class _NoDoctype(TreeBuilder):
-    """Refuses a document type, the only place that declares entities: none is ever expanded or fetched."""
+    """Refuses a document type, the only place of entity declarations: no entity is ever expanded or fetched."""
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         raise ParseError("a document type")
@@ -150,7 +150,7 @@ def _read_kml(content: bytes, key: str, origin: Origin | None) -> Iterator[Waypo
         raise ParameterError(f"{key}: found {error}, expected the XML of a KML file") from None
     lines: list[list[Any]] = []  # positions
     points: list[Any] = []
-    kinds = [(str(one.tag).rpartition("}")[2], one) for one in root.iter()]
+    kinds = [(str(element.tag).rpartition("}")[2], element) for element in root.iter()]
     used = "LineString" if any(kind == "LineString" for kind, _ in kinds) else "Point"
     for kind, geometry in kinds:
         if kind != used:
@@ -159,7 +159,7 @@ def _read_kml(content: bytes, key: str, origin: Origin | None) -> Iterator[Waypo
         mode = texts.get("altitudeMode", "clampToGround").strip()  # the default of KML
         found = f"a {kind} with the altitudeMode {short_repr(mode)}"
         require(mode == "absolute", key, found, "absolute, for the height of the ground is not known")
-        tuples = [one.split(",") for one in texts.get("coordinates", "").split()]
+        tuples = [text.split(",") for text in texts.get("coordinates", "").split()]
         if kind == "LineString":
             lines.append(tuples)
         else:

@@ -28,7 +28,7 @@ def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
 
         k_h e  near,  sign(e) sqrt(a (abs(e) - e_l / 2))  from e_l = a / (2 k_h^2) on
 
-    Both and their slopes agree at e_l. Far away the climb rate falls by a/2 a second, which the aircraft can follow.
+    The two branches and the slopes agree at e_l. Far away the climb rate falls by a/2 a second: slow enough for the aircraft.
     """  # noqa: D400, D415 - what follows is an equation
     k_h, a = params.k_h, params.acceleration
     near = a / (2.0 * k_h * k_h)
@@ -47,7 +47,7 @@ def alpha_estimate(alpha: Scalar, theta: Scalar, climb: Scalar, speed: Scalar, d
 
         alpha+ = alpha + (1 - exp(-dt/T)) (theta - gamma - alpha)
 
-    It stands in the place of an integrator: bumpless, without windup, right in any bank, speed or trim.
+    The filter replaces an integrator: bumpless, without windup, right in any bank, speed or trim.
     """
     return alpha + (1.0 - math.exp(-dt / params.alpha_time)) * (theta - path_angle(climb, speed) - alpha)
 
@@ -58,7 +58,7 @@ def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
 
 
 def path_lag(stall_speed: float, speed: float) -> float:
-    """Time constant with which the flight path follows the pitch, s.
+    """Time constant of the flight path behind the pitch, s.
 
         T_L = V alpha_1 / g,  alpha_1 = 0.3 rad (V_s / V)^2
 
