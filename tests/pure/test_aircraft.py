@@ -36,6 +36,7 @@ def final_state(x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, ai
     return np.asarray(advance(0, AircraftState(x, np.zeros_like(u)), u, duration_ns, params).x)
 
 
+@pytest.mark.equation(1)
 def test_without_f_the_plant_follows_the_matrix_exponential() -> None:
     # x(t) = exp([[A, B], [0, 0]] t) [x0; u] exactly for a held u. Runge-Kutta with 2 ms and poles up to 13 rad/s leaves
     # (0.026)^5 / 120 a step, about 1e-9 over a second.
@@ -66,6 +67,7 @@ def test_the_plant_agrees_with_an_adaptive_integrator_through_a_gust() -> None:
     assert end == pytest.approx(reference.y[:, -1], abs=1e-6)
 
 
+@pytest.mark.equation("Assumption 2")
 @given(speed=st.floats(-20, 20), length=st.floats(1, 100), t=st.floats(0, 100))
 def test_gust_stays_between_zero_and_its_speed_with_bounded_derivative(speed: float, length: float, t: float) -> None:
     gusts = Gusts(np.array([10.0]), np.array([speed]), np.array([length]))
@@ -81,6 +83,7 @@ def test_a_gust_of_speed_zero_is_exactly_no_gust() -> None:
     assert (dynamics.f(0.5, x, zero) == dynamics.f(0.5, x, undisturbed)).all()
 
 
+@pytest.mark.equation(1)
 def test_gravity_and_lateral_coupling_enter_as_published() -> None:
     x = np.zeros(8)
     x[3], x[7] = 0.1, -0.2  # theta, phi

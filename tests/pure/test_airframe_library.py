@@ -94,10 +94,12 @@ def test_poles_are_the_published_ones(name: str) -> None:
     assert np.all(np.abs(found - expected) <= np.maximum(0.02 * np.abs(expected), 1e-3))
 
 
+@pytest.mark.equation("Remark 1")
 def test_d_of_the_published_signs_matches_the_table(airframe: Airframe) -> None:
     np.testing.assert_array_equal(airframe_facts(airframe).D, PUBLISHED[airframe.name].D)
 
 
+@pytest.mark.equation("Remark 1")
 def test_flipping_inputs_alone_gives_every_airframe_d_equal_to_one(airframe: Airframe) -> None:
     # Remark 1 is a statement about sign conventions.
     facts = airframe_facts(airframe)
@@ -132,6 +134,7 @@ def test_every_airframe_is_in_the_theorem_with_zero_dynamics_that_only_an_outer_
     assert list(facts.integrated) == angles
 
 
+@pytest.mark.equation(5, 6, 7, 8, 9)
 def test_zeros_of_the_osprey() -> None:
     zeros = airframe_facts(load_airframe("osprey")).zeros
     # -0.69 is Y_beta; -7.19 is Z_alpha with the elevator that holds q.
@@ -222,6 +225,7 @@ def toy(k: float) -> Airframe:
     )
 
 
+@pytest.mark.equation(5, 6, 7, 8, 9)
 @pytest.mark.parametrize(
     ("k", "zero", "kind"),
     [(3.0, -2.0, ZeroDynamics.STABLE), (1.0, 0.0, ZeroDynamics.MARGINAL), (0.5, 0.5, ZeroDynamics.UNSTABLE)],
@@ -239,6 +243,7 @@ def test_zeros_on_the_imaginary_axis_are_marginal_and_no_zeros_are_stable() -> N
     assert zero_dynamics(pair[:0]) is ZeroDynamics.STABLE
 
 
+@pytest.mark.equation("Assumption 1")
 def test_an_uncontrollable_airframe_is_outside_the_theorem() -> None:
     facts = airframe_facts(toy(0.0))  # nothing drives z
     assert not facts.controllable

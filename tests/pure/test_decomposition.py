@@ -82,6 +82,7 @@ def test_the_factors_have_the_structure_that_the_paper_requires(Omega: FloatArra
     assert np.array_equal(np.diag(U), np.ones(len(U)))
 
 
+@pytest.mark.equation(10, 11)
 @given(matrices())
 def test_the_product_of_the_factors_is_omega_to_machine_precision(Omega: FloatArray) -> None:
     sdu = decomposed(Omega)
@@ -90,6 +91,7 @@ def test_the_product_of_the_factors_is_omega_to_machine_precision(Omega: FloatAr
     assert residual <= 10.0 * len(Omega) * EPSILON * np.linalg.norm(sdu.S) * np.linalg.norm(sdu.U)
 
 
+@pytest.mark.equation(10, 11)
 @given(factors())
 def test_unique_factors_are_recovered_from_their_product(known: SDU) -> None:
     recovered = decompose(product(known))
@@ -159,6 +161,7 @@ def test_a_diagonal_omega_is_its_own_s() -> None:
     np.testing.assert_array_equal(U, np.eye(2))
 
 
+@pytest.mark.equation(10, 11)
 def test_a_positive_diagonal_does_not_make_d_one() -> None:
     # By hand: L = [[1, 0], [2, 1]], p = (1, -3), W = [[1, 2], [0, 1]]; S = L |p| L', U = D L^-T D W.
     S, D, U = decompose(np.array([[1.0, 2.0], [2.0, 1.0]]))

@@ -100,6 +100,7 @@ SMOOTH: dict[str, tuple[Disturbance, float, float]] = {  # the function, its lar
 }
 
 
+@pytest.mark.equation("Assumption 2")
 @pytest.mark.parametrize("name", SMOOTH)
 def test_gusts_sines_and_biases_with_a_rise_meet_assumption_2(name: str) -> None:
     # A derivative bounded by d1 that changes by at most d2 dt in dt is continuous. Below 2 ms second differences are rounding.
@@ -111,6 +112,7 @@ def test_gusts_sines_and_biases_with_a_rise_meet_assumption_2(name: str) -> None
         assert np.abs(np.diff(d, 2)).max() > 0.5 * second * dt**2  # the limit is tight
 
 
+@pytest.mark.equation("Assumption 2")
 def test_a_bias_without_a_rise_lies_outside_assumption_2() -> None:
     # The largest difference does not fall with dt, so the derivative is unbounded.
     step = single(Bias, 2.0, 10.0, 0.0)

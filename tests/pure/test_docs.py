@@ -103,6 +103,13 @@ def test_relative_links_and_anchors_exist() -> None:
     assert not broken, "\n".join(broken)
 
 
+def test_tests_that_pages_name_exist() -> None:
+    tests = "".join(path.read_text(encoding="utf-8") for path in (REPOSITORY / "tests").rglob("*.py"))
+    named = {(name(page), test) for page in PAGES for test in re.findall(r"`(test_\w+)`", page.read_text(encoding="utf-8"))}
+    unknown = [f"{page}: {test}" for page, test in sorted(named) if not re.search(rf"^def {test}\(", tests, re.MULTILINE)]
+    assert not unknown, "\n".join(unknown)
+
+
 def test_the_readme_links_the_main_pages() -> None:
     assert {f"docs/{page}.md" for page in LINKED} <= set(links(REPOSITORY / "README.md"))
 

@@ -68,11 +68,13 @@ def failing_in_loop(assessment: GainAssessment) -> list[str]:
     return names(gain_conditions.failing(assessment.loop), assessment.controller.outputs)
 
 
+@pytest.mark.equation(29, 30)
 def test_beta_follows_29_and_30_from_the_last_channel_up() -> None:
     # beta_3 = 3 (1 + 0/4) = 3; beta_2 = (2 + 0.5 3) (1 + 2/2) = 7; beta_1 = (1 + 2 7 + 1 3) (1 + 1/1) = 36
     assert gain_conditions.least_beta(np.array([1.0, 2.0, 4.0]), HAND).tolist() == [36.0, 7.0, 3.0]
 
 
+@pytest.mark.equation(27, "Step 2", "Step 3")
 def test_k_g_and_k_d_follow_steps_2_and_3_from_the_last_channel_up() -> None:
     found = gain_conditions.theorem_gains(HAND, np.ones(3))
     # k_g = 1.5 2^2 / 4; k_3 = 1 + k_g = 2.5; a row of step 3 may take 0.3 / 2
@@ -84,6 +86,7 @@ def test_k_g_and_k_d_follow_steps_2_and_3_from_the_last_channel_up() -> None:
     assert found.K.tolist() == pytest.approx([2.5 + found.k_d[0], k_2, 2.5])
 
 
+@pytest.mark.equation("Step 3")
 def test_the_gains_of_theorem_1_meet_its_conditions() -> None:
     conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
     assert not gain_conditions.failing(conditions)
@@ -92,6 +95,7 @@ def test_the_gains_of_theorem_1_meet_its_conditions() -> None:
     assert (conditions[4].found, conditions[4].bound) == pytest.approx((0.3, 1.0 / 3.0))  # 2 rows of 0.15; 1 - 2/3
 
 
+@pytest.mark.equation(29, 30, "Step 2")
 @pytest.mark.parametrize(
     ("change", "failing"),
     [
@@ -109,11 +113,13 @@ def test_a_condition_that_fails_is_named(change: dict[str, FloatArray | float], 
     assert names(conditions, ("a", "b", "c")) == failing
 
 
+@pytest.mark.equation(40)
 def test_what_rests_on_gamma_2_is_marked_an_estimate() -> None:
     conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
     assert [one.estimate for one in conditions] == [True, True, True, False, False]
 
 
+@pytest.mark.equation(22)
 def test_a_gain_that_22_does_not_allow_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"^k_d: found \[0\.\], expected values above 0$"):
         gain_conditions.check(GainSet(1.0, np.zeros(1), np.ones(2), np.ones(2)), HAND)
@@ -123,6 +129,7 @@ def test_a_gain_that_22_does_not_allow_is_refused() -> None:
         gain_conditions.split_gain(np.array([2.0, 0.9]))
 
 
+@pytest.mark.equation(19)
 @pytest.mark.parametrize(
     ("scaled", "Lambda", "rho", "k_g", "bandwidths", "k_d3"),
     [
@@ -150,6 +157,7 @@ def test_the_literal_conditions_need_bandwidths_of_the_osprey_beyond_any_servo(
     assert answer.k_d[2] == pytest.approx(k_d3, rel=0.01)
 
 
+@pytest.mark.equation(27)
 def test_bounds_of_U_are_those_of_the_worst_sample() -> None:
     lower, upper = np.array([[0.9, 0.0], [0.0, 0.9]]), np.array([[1.1, 0.3], [0.2, 1.1]])
     places = np.array(list(product((0.0, 0.5, 1.0), repeat=4))).reshape(-1, 2, 2)
@@ -158,6 +166,7 @@ def test_bounds_of_U_are_those_of_the_worst_sample() -> None:
     assert gain_conditions.bound_U(samples)[0, 1] == pytest.approx(0.3 / 0.9)
 
 
+@pytest.mark.equation(16, 17, 18)
 def test_n_d_is_minus_D_U_v_dot() -> None:
     # M Omega v_dot with M = S^-1, for any Omega: the disturbance that the ideal control cancels
     Omega, v_dot = np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([[0.3, -0.7], [1.0, 2.0]])
@@ -272,6 +281,7 @@ def osprey_channels(
     return (AIRFRAME.matrix_c() @ AIRFRAME.matrix_b())[:, columns] * turned, ChannelPairing(AIRFRAME.outputs, inputs)
 
 
+@pytest.mark.equation("Remark 1")
 def test_a_wrong_D_is_refused_with_the_one_that_fits() -> None:
     Omega, channels = osprey_channels(flipped=("elevator",))
     sentence = r"^controller\.D: found \[1, 1, 1, 1\], expected \[-1, 1, 1, 1\], .* or flip elevator and keep D$"

@@ -239,6 +239,7 @@ def test_an_input_reaches_its_limit_however_large_a_tick_of_the_integrals_is() -
     assert u == pytest.approx([0.01, 0.01], rel=1e-12)
 
 
+@pytest.mark.equation(23)
 @given(state=STATES, k=st.floats(0.5, 50), Lambda=st.floats(0.1, 10), scale=st.floats(0.1, 10))
 def test_new_gains_transfer_without_a_bump(state: LawState, k: float, Lambda: float, scale: float) -> None:
     new = TWO._replace(K=TWO.K * k, Lambda=TWO.Lambda * Lambda, input_scale=TWO.input_scale * scale, beta=TWO.beta * 2)

@@ -33,11 +33,13 @@ def respond(params: LawParams, errors: list[float], dt: float = DT) -> list[floa
     return inputs
 
 
+@pytest.mark.equation(22)
 def test_gain_has_the_structure_of_equation_22() -> None:
     # K = I + k_g I + diag(k_d, 0): 1 + 2 + 5, 1 + 2 + 7, 1 + 2
     assert gain(np.array(2.0), np.array([5.0, 7.0])).tolist() == [8.0, 10.0, 3.0]
 
 
+@pytest.mark.equation(3, 20, 21)
 def test_literal_sign_gives_the_hand_worked_inputs() -> None:
     # e_0 = 1; e = 1.2: integral 0.1 (1.2 + 1)/2 = 0.11, Pi applied 0: v = 2 (0.2 + 3 0.11) = 1.06
     # e = 0.9: integral 0.11 + 0.1 (0.9 + 1.2)/2 = 0.215, Pi applied 0.1 4 = 0.4: v = 2 (-0.1 + 3 0.215) + 0.4 = 1.49
@@ -51,12 +53,14 @@ def test_implicit_sign_applies_the_saturated_sign_in_the_same_tick() -> None:
     assert respond(one_channel(Sign.IMPLICIT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
 
 
+@pytest.mark.equation(21)
 def test_implicit_sign_takes_the_value_that_makes_the_predicted_error_zero() -> None:
     # From rest, e = 0.01: integral 0.0005, e_hat = 0.01 + 0.01 - 0.2 (0.01 + 3 0.0005) = 0.0177
     # s = 0.0177 / 0.04 = 0.4425, Pi = 0.1 4 0.4425 = 0.177, v = -(2 (0.01 + 0.0015) + 0.177) = -0.2
     assert respond(one_channel(Sign.IMPLICIT, D=1.0), [0.0, 0.01]) == pytest.approx([-0.1], abs=1e-15)
 
 
+@pytest.mark.equation(21)
 def test_softened_sign_is_proportional_inside_its_width_and_one_outside() -> None:
     # e = 0.05, eps = 0.1: s = 0.5, Pi = 0.1 4 0.5 = 0.2, integral 0.0025: v = 2 (0.05 + 3 0.0025) + 0.2 = 0.315
     assert respond(one_channel(Sign.SOFT), [0.0, 0.05]) == pytest.approx([0.1575], abs=1e-15)
@@ -64,6 +68,7 @@ def test_softened_sign_is_proportional_inside_its_width_and_one_outside() -> Non
     assert respond(one_channel(Sign.SOFT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
 
 
+@pytest.mark.equation(3)
 def test_input_is_zero_at_engagement_whatever_the_error() -> None:
     # (20) with t = 0: u = -D K (e(0) - e(0)) - D Pi(0) = 0; the first step adds the integrals of one tick only.
     state = engage(np.array([5.0, -3.0]), np.array([1.0, 1.0]))
@@ -72,6 +77,7 @@ def test_input_is_zero_at_engagement_whatever_the_error() -> None:
     assert state.Pi.tolist() == [0.0, 0.0]
 
 
+@pytest.mark.equation(20)
 @pytest.mark.parametrize("sign", list(Sign))
 def test_constant_error_gives_a_ramp(sign: Sign) -> None:
     # (20), (21) with e = e_0 = 2: u = -D (K Lambda e + beta) t, so v grows by 2 3 2 0.1 + 4 0.1 = 1.6 a tick, u by 0.8.

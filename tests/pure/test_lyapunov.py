@@ -67,6 +67,7 @@ def tail(signal: np.ndarray[Any, Any], t: np.ndarray[Any, Any], after: float) ->
     return float(np.max(np.abs(signal[t > after])))
 
 
+@pytest.mark.equation(48)
 def test_the_rise_of_V2_is_a_sampling_term_of_first_order() -> None:
     # Where e crosses zero between two ticks, s is wrong for one of them: V2 gains at most 2 dt sum beta_i abs(r_i) there.
     # Measured 5.4, 5.4, 2.2 and 1.4 thousandths, that is 0.27 to 0.56 times dt, of a V2 that falls by 3.
@@ -75,6 +76,7 @@ def test_the_rise_of_V2_is_a_sampling_term_of_first_order() -> None:
     assert rises[-1] < rises[0] / 2.0
 
 
+@pytest.mark.equation(4, 31, 46, 48)
 def test_V2_falls_by_the_integral_of_its_quadratic_form_up_to_sampling() -> None:
     # Measured 0.14, 0.090, 0.064 and 0.037 of a fall of 3: one derivation of V2_dot, another of V2, none of them the law's.
     worst = []
@@ -87,6 +89,7 @@ def test_V2_falls_by_the_integral_of_its_quadratic_form_up_to_sampling() -> None
     assert worst[-1] < 0.05
 
 
+@pytest.mark.equation(28)
 def test_e_and_r_settle_on_a_band_of_second_order_where_the_conditions_hold() -> None:
     # The disturbance and the reference are persistent, yet halving dt quarters both: measured 4.0 times each.
     cases = [fly_example(dt, 12.0)[2] for dt in PERIODS]
@@ -114,6 +117,7 @@ def test_the_constant_of_lemma_2_is_the_hand_worked_one() -> None:
     assert lemma_2(plant, flight, law_params(1.0, 3.0, 2.0)) == pytest.approx(3.0)
 
 
+@pytest.mark.equation(3, 47)
 def test_P_stays_positive_with_the_constant_of_lemma_2() -> None:
     case, params, found = fly_example(0.005, 12.0)
     assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() > 0.9  # measured 0.93: steps 2 and 3 of the theorem hold
@@ -124,6 +128,7 @@ def test_P_stays_positive_with_the_constant_of_lemma_2() -> None:
     assert P.min() > 0.3 * zeta_b  # measured 0.5: Lemma 2 is not tight
 
 
+@pytest.mark.equation(29)
 def test_with_beta_too_small_P_falls_below_every_constant_and_e_stays() -> None:
     case, params, good = fly_example(0.01, 60.0)
     _, weak, bad = fly_example(0.01, 60.0, beta=TOO_SMALL * params.beta)
@@ -136,6 +141,7 @@ def test_with_beta_too_small_P_falls_below_every_constant_and_e_stays() -> None:
         lemma_2(case.plant, bad, weak)
 
 
+@pytest.mark.equation(31)
 def test_with_beta_too_small_V2_still_falls_so_that_its_fall_alone_proves_nothing() -> None:
     _, params, _ = fly_example(0.01, 1.0)
     _, _, bad = fly_example(0.01, 30.0, beta=TOO_SMALL * params.beta)
@@ -143,6 +149,7 @@ def test_with_beta_too_small_V2_still_falls_so_that_its_fall_alone_proves_nothin
     assert tail(bad.V1, bad.t, 20.0) > 0.05
 
 
+@pytest.mark.equation(48)
 def test_with_K_too_small_V2_rises_at_every_period() -> None:
     # K below G in (16): Q has the eigenvalue -7.0, V2 climbs by 3.0, 3.0 and 3.1, which is no sampling term.
     for dt in (0.01, 0.005, 0.0025):
@@ -167,6 +174,7 @@ def test_along_the_osprey_V2_rises_by_a_sampling_term_only() -> None:
     assert all(before / after > 3.0 for before, after in pairwise(rises))
 
 
+@pytest.mark.equation(1)
 def test_along_the_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> None:
     # In the implicit sign's layer s = e / (dt^2 omega beta), and D U D beta s = N_d: so e = dt^2 omega (D U D)^-1 N_d.
     for rate in (100.0, 200.0):
@@ -177,6 +185,7 @@ def test_along_the_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> Non
         assert np.max(np.abs(found.e), axis=0) == pytest.approx(predicted, rel=0.05)  # 2.4e-3, 4.9e-5, 7.4e-4, 7.2e-4
 
 
+@pytest.mark.equation(16, 17, 18, 47)
 def test_along_the_osprey_P_needs_beta_above_the_largest_N_d() -> None:
     scenario, _, good = osprey(200.0)
     beta = np.array(scenario.rise_di().beta)

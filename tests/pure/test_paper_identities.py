@@ -240,11 +240,13 @@ def close(a: FloatArray | float, b: FloatArray | float, tolerance: float) -> boo
     return bool(np.max(np.abs(np.asarray(a) - b)) < tolerance * max(1.0, float(np.max(np.abs(b)))))
 
 
+@pytest.mark.equation(4)
 def test_e_dot_and_so_r_of_4_are_the_derivative_of_3(loop: Loop) -> None:
     for t in INSTANTS:
         assert close(loop.e_dot(t), differenced(loop.e, t), DIFFERENCED)
 
 
+@pytest.mark.equation(10, 11)
 def test_r_of_10_in_terms_of_the_plant_is_r_of_4(loop: Loop) -> None:
     p = loop.p
     for t in INSTANTS:
@@ -254,6 +256,7 @@ def test_r_of_10_in_terms_of_the_plant_is_r_of_4(loop: Loop) -> None:
         assert close(r, loop.r(t), EXACT)
 
 
+@pytest.mark.equation(10, 11)
 def test_decomposition_finds_the_factors_that_made_the_plant(loop: Loop) -> None:
     S, D, U = decompose(loop.p.C @ loop.p.B)
     assert close(S, loop.p.S, EXACT)
@@ -261,27 +264,32 @@ def test_decomposition_finds_the_factors_that_made_the_plant(loop: Loop) -> None
     assert close(U, loop.p.U, EXACT)
 
 
+@pytest.mark.equation(12)
 def test_r_dot_of_12_is_the_derivative_of_r(loop: Loop) -> None:
     for t in INSTANTS:
         assert close(loop.r_dot(t), differenced(loop.r, t), DIFFERENCED)
 
 
+@pytest.mark.equation(13, 14, 15)
 def test_13_to_15_put_the_input_into_the_form_D_U_u_dot(loop: Loop) -> None:
     for t in INSTANTS:
         assert close(loop.M @ loop.r_dot(t), loop.N(t) - loop.e(t) + loop.p.D * (loop.p.U @ loop.u_dot(t)), EXACT)
 
 
+@pytest.mark.equation(16, 17, 18)
 def test_16_to_18_N_is_N_d_plus_N_tilde(loop: Loop) -> None:
     for t in INSTANTS:
         N_d, N_tilde, term = loop.split(t)
         assert close(N_d + N_tilde + term, loop.N(t), EXACT)
 
 
+@pytest.mark.equation(23)
 def test_23_is_the_derivative_of_20_with_21(loop: Loop) -> None:
     for t in INSTANTS:
         assert close(loop.u_dot(t), differenced(loop.u, t), DIFFERENCED)
 
 
+@pytest.mark.equation(24)
 def test_closed_loop_24(loop: Loop) -> None:
     for t in INSTANTS:
         N_d, N_tilde, term = loop.split(t)
@@ -290,6 +298,7 @@ def test_closed_loop_24(loop: Loop) -> None:
         assert close(right, loop.M @ differenced(loop.r, t), DIFFERENCED)
 
 
+@pytest.mark.equation(25, 26)
 def test_25_and_26_give_Phi_without_its_last_entry(loop: Loop) -> None:
     p = loop.p
     for t in INSTANTS:
@@ -298,6 +307,7 @@ def test_25_and_26_give_Phi_without_its_last_entry(loop: Loop) -> None:
         assert close(np.array([*Phi, 0.0]), loop.coupled(t), EXACT)
 
 
+@pytest.mark.equation(27)
 def test_27_bounds_Phi_where_zeta_U_bounds_every_entry_of_U() -> None:
     # abs(Phi_i) <= zeta_U sum_(j>i) k_j abs(r_j); with a zeta_U below 0.9 max abs(U_ij), r along that j violates it.
     p = random_problem(4)
@@ -311,6 +321,7 @@ def test_27_bounds_Phi_where_zeta_U_bounds_every_entry_of_U() -> None:
     assert np.abs(p.D * (above @ (p.D * p.K * np.eye(3)[j])))[i] > 0.9 * zeta_U * p.K[j]
 
 
+@pytest.mark.equation(32)
 def test_V1_dot_of_32_has_the_gain_22_as_three_squares(loop: Loop) -> None:
     k_g, k_d = 1.0, np.array([3.0, 1.5, 0.0])
     for t in INSTANTS:
@@ -322,6 +333,7 @@ def test_V1_dot_of_32_has_the_gain_22_as_three_squares(loop: Loop) -> None:
         assert close(V1_dot, differenced(loop.V1, t), DIFFERENCED)
 
 
+@pytest.mark.equation(24, 32, 46, 48)
 def test_V2_dot_is_a_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> None:
     # The sum of (32) and -L (46), as in `flight_analysis.design.lyapunov.decay_matrix`, on a plant of this test.
     Q = decay_matrix(loop.p.plant(), loop.p.law())
@@ -331,6 +343,7 @@ def test_V2_dot_is_a_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> 
         assert close(differenced(loop.V1, t) - L, -loop.z(t) @ Q @ loop.z(t), DIFFERENCED)
 
 
+@pytest.mark.equation(20)
 @pytest.mark.parametrize("sign", [Sign.LITERAL, Sign.IMPLICIT])
 def test_the_sampled_law_converges_to_20_with_its_period(loop: Loop, sign: Sign) -> None:
     # First order, because u is held over a period: half of the period halves the distance (measured 1.9 to 2.1).
@@ -354,6 +367,7 @@ def at_rest() -> Loop:
     return Loop(p, np.zeros(3), lambda _: np.concatenate([x, x_m, np.zeros(6)]))
 
 
+@pytest.mark.equation(16, 17, 18)
 def test_at_rest_N_d_is_minus_D_U_times_the_slew_of_the_ideal_input() -> None:
     # u* = Omega^-1 (y_m_dot - C A x - C f) keeps e = 0; beta has to exceed its slew along the flight.
     loop = at_rest()
@@ -376,6 +390,7 @@ def test_at_rest_N_d_is_minus_D_U_times_the_slew_of_the_ideal_input() -> None:
     assert close(N_d + term, -p.D * (p.U @ differenced(u_star, 0.0)), DIFFERENCED)
 
 
+@pytest.mark.equation(19)
 def test_N_tilde_as_written_in_18_does_not_vanish_with_z_so_that_19_is_false() -> None:
     loop = at_rest()
     assert np.linalg.norm(loop.z(0.0)) < 1e-12
@@ -383,6 +398,7 @@ def test_N_tilde_as_written_in_18_does_not_vanish_with_z_so_that_19_is_false() -
     assert np.linalg.norm(N_tilde + term) > 1.0  # while rho norm(z) is 0
 
 
+@pytest.mark.equation(19)
 def test_N_tilde_vanishes_with_z_once_the_reference_term_is_moved_to_N_d(loop: Loop) -> None:
     _, N_tilde, _ = at_rest().split(0.0)
     assert np.linalg.norm(N_tilde) < 1e-12
@@ -395,6 +411,7 @@ def test_N_tilde_vanishes_with_z_once_the_reference_term_is_moved_to_N_d(loop: L
         assert np.linalg.norm(N_tilde) <= rho * np.linalg.norm(loop.z(t))
 
 
+@pytest.mark.equation(30)
 def test_the_bound_in_30_has_two_indices_for_each_row_sums_its_own_entries_of_U() -> None:
     # Psi = (D U D - I) beta Sgn(e): over all signs the maximum of its i-th entry is sum_(j>i) abs(U_ij) beta_j.
     p = random_problem(4)
@@ -416,11 +433,13 @@ def coupled_flight(beta: FloatArray) -> float:
     return float(np.max(np.abs(signals.e[signals.t > 6.0])))
 
 
+@pytest.mark.equation(30)
 def test_beta_that_counts_row_j_of_U_in_place_of_entry_ij_does_not_track() -> None:
     # The last row of U has only its diagonal entry, so with this index the condition is beta_1 >= zeta_Nd,1 only.
     assert coupled_flight(np.array([2.1, 2.1])) > 5e-3  # measured 1.3e-2 for any period
 
 
+@pytest.mark.equation(30)
 def test_beta_that_counts_entry_ij_of_U_tracks() -> None:
     assert coupled_flight(np.array([2.1 + 3.0 * 2.1, 2.1])) < 1e-3  # measured 2.4e-4, falling with dt^2
 
@@ -434,12 +453,14 @@ def lemma_1_ratio(T: float) -> float:
     return float(np.sum(np.abs(e_dot) * weight) / np.sum(np.abs(e) * weight))
 
 
+@pytest.mark.equation(40)
 def test_40_fails_for_a_bounded_e_that_tends_to_zero_with_a_bounded_derivative() -> None:
     # (40) keeps the ratio below gamma_2 + (gamma_1 + sup abs(e)) / integral abs(e), which falls with T. For e = sin(t^2)/t,
     # abs(e_dot) <= 3, the ratio grows like T / log T, so no gamma_1, gamma_2 exist.
     assert [lemma_1_ratio(T) for T in (10.0, 100.0, 1000.0)] == pytest.approx([7.3, 41.8, 283.8], rel=0.01)
 
 
+@pytest.mark.equation(40)
 def test_gamma_2_of_the_sampled_law_with_the_literal_sign_grows_as_the_period_falls() -> None:
     # Chatter decreases with dt, its slope more slowly: (29) with this gamma_2 requires a beta that grows without bound.
     ratios = []
@@ -471,6 +492,7 @@ def replayed(cycle: counterexample.Cycle, e_dot_0: float, dt: float = 2e-4, acts
     return float(np.max(np.abs(e[-round(0.5 / dt) :])))
 
 
+@pytest.mark.equation(29)
 def test_for_every_beta_some_f_within_the_same_bounds_keeps_the_error_from_zero() -> None:
     # K = 10, Lambda = 1, so Q = diag(1, 9) > 0, and abs(f_dot) <= 1. The formula is the limit of a large beta: 2.6 % at 2.
     for beta, tolerance in ((2.0, 0.03), (1000.0, 1e-3)):
@@ -497,6 +519,7 @@ def test_the_same_f_lets_the_error_vanish_from_rest_or_at_a_longer_period() -> N
     assert replayed(weak, weak.e_dot[0]) < 1e-3 * np.max(weak.e)
 
 
+@pytest.mark.equation(47)
 def test_with_U_the_identity_the_classical_condition_keeps_P_positive_without_lemma_1() -> None:
     # beta_i > sup abs(N_d,i) + sup abs(N_d,i_dot) / Lambda_i and zeta_b = sum beta_i abs(e_i(0)) - e(0)' N_d(0).
     case = example(0.005, 15.0)
@@ -529,6 +552,7 @@ def hidden_state(pole: float) -> tuple[float, float]:
     return float(np.max(np.abs(flight.x[:, 1]))), float(abs(flight.x[-1, 0] - np.sin(t[-1])))
 
 
+@pytest.mark.equation(5, 6, 7, 8, 9)
 def test_an_unstable_zero_leaves_a_state_unbounded_and_then_the_error() -> None:
     # Assumption 3 excludes it. Omega = 1 and the gains are the same; only the hidden state diverges.
     state, e = hidden_state(1.0)
@@ -536,6 +560,7 @@ def test_an_unstable_zero_leaves_a_state_unbounded_and_then_the_error() -> None:
     assert e > 1.0
 
 
+@pytest.mark.equation(5, 6, 7, 8, 9)
 def test_a_stable_zero_leaves_that_state_bounded() -> None:
     state, e = hidden_state(-1.0)
     assert state < 2.0
@@ -582,16 +607,19 @@ def gravity_slope(q: float) -> float:
     return float(dynamics.f(0.0, x, aircraft)[V] / 1e-6)
 
 
+@pytest.mark.equation("Assumption 2")
 def test_f_dot_of_gravity_grows_with_the_pitch_rate_so_that_assumption_2_presumes_a_bounded_flight() -> None:
     assert [gravity_slope(q) for q in (1.0, 10.0, 100.0)] == pytest.approx([-GRAVITY, -10.0 * GRAVITY, -100.0 * GRAVITY])
 
 
+@pytest.mark.equation("Assumption 2")
 def test_f_dot_of_gravity_is_bounded_by_z_once_the_part_with_q_minus_q_m_is_in_N_tilde() -> None:
     q_m = 0.1
     for e_q in (-10.0, -0.1, 0.1, 10.0):
         assert abs(gravity_slope(q_m + e_q) - gravity_slope(q_m)) <= GRAVITY * abs(e_q) * (1.0 + 1e-6)
 
 
+@pytest.mark.equation(5, 6, 7, 8, 9)
 def test_bound_7_cannot_hold_at_every_instant_for_alpha_leaves_trim_in_a_gust_while_e_is_zero() -> None:
     # The ideal input keeps the outputs at trim, x_m = 0: z = 0, but alpha rises to 21.1 deg, so x_u <= c1 norm(z) is false.
     aircraft = osprey(gust=10.12)

@@ -44,6 +44,7 @@ def test_a_pulse_rises_holds_and_falls_over_its_edges() -> None:
     assert at == pytest.approx([0.0, 0.0, 0.05, 0.1, 0.1, 0.05, 0.0, -0.2, 0.0], abs=1e-12)
 
 
+@pytest.mark.equation(2)
 @given(t=st.floats(0, 10), dt=st.floats(1e-6, 1e-3))
 def test_commands_have_a_bounded_derivative(t: float, dt: float) -> None:
     # Equation (2) requires a bounded u_m_dot: the slope of an edge is value / rise, and edges do not overlap here.
@@ -67,6 +68,7 @@ def simulate(params: ReferenceModelConfig, duration: float, dt: float) -> FloatA
     return reference_outputs(params.model(), params.profile(), dt, round(duration / dt))
 
 
+@pytest.mark.equation(2)
 def test_equation_2_agrees_with_an_exact_linear_simulation() -> None:
     params = parameters(pulses=PULSES)
     matrices, profile = params.model(), params.profile()

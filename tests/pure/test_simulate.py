@@ -57,6 +57,7 @@ def rms(osprey_gust: Scenario) -> Rms:
     return fly_once
 
 
+@pytest.mark.equation(28)
 def test_error_in_the_gusts_with_beta_above_the_slew_of_the_ideal_control(rms: Rms) -> None:
     # Theorem 1 requires beta above the rate of the disturbance. The gust then adds almost no error.
     assert (rms() <= [0.25, 0.0005, 0.26, 0.15]).all(), rms()
@@ -72,6 +73,7 @@ def test_error_in_calm_air(rms: Rms) -> None:
     assert (rms(gusts=False) <= [0.06, 0.0001, 0.26, 0.03]).all(), rms(gusts=False)
 
 
+@pytest.mark.equation(28)
 def test_implicit_sign_halving_dt_divides_the_error_by_four(rms: Rms) -> None:
     # Second order. The first 30 s have all commands on q, V and p, and most of those on r.
     calm = partial(rms, gusts=False, duration=30.0, aircraft=1000.0)

@@ -209,6 +209,7 @@ def test_the_expected_periodogram_is_the_aliased_published_spectrum() -> None:
     assert aliased[-1] > 1.5 * float(spectrum(omega[-1], axis, SMALL))  # aliasing matters
 
 
+@pytest.mark.equation("Assumption 2")
 def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_the_theorem() -> None:
     # With a bounded derivative the mean squares of increments are proportional to dt^2. Here they are proportional to dt: 2
     # sigma^2 dt / T along the flight, 3 sigma^2 dt / T across it. The difference quotient grows without limit.

@@ -127,7 +127,7 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:
-    """Half plane of the zeros, 1/s, shape (n - m,); within ZERO_REAL_PART they are on the imaginary axis."""
+    """Half plane of the zeros, 1/s, shape (n - m,), for (5)-(9); within ZERO_REAL_PART they are on the imaginary axis."""
     rightmost = float(np.max(zeros.real, initial=-np.inf))
     if rightmost > ZERO_REAL_PART:
         return ZeroDynamics.UNSTABLE

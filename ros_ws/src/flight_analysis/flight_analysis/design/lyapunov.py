@@ -141,7 +141,7 @@ def decay_matrix(plant: KnownPlant, params: LawParams) -> FloatArray:
 
     z' Q z = e' Lambda e - r' N~ + r' D U D K r with N~ = G (r - Lambda e) + e, G = M (C A C^+ + Lambda). Q contains
     neither beta nor N_d. Steps 2 and 3 of Theorem 1 are sufficient for Q > 0: k_g is large against N~, and k_d against the
-    off-diagonal entries of U. Source: (24), (31), (46)-(48).
+    off-diagonal entries of U. Source: (24), (31), (32), (46)-(48).
     """
     S, D, U = decompose(plant.C @ plant.B)
     m = len(D)
