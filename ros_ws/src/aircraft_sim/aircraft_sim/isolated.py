@@ -31,7 +31,16 @@ def call(function: Callable[..., Any], *arguments: Any, timeout: float) -> Any:
     returns nothing within `timeout` seconds of processor time, or WAIT times as many of wall time: an endless computation is
     found on a busy machine too, and a finite computation gets enough time.
     """
-    command = [sys.executable, "-m", __name__, str(timeout), function.__module__, function.__qualname__, json.dumps(arguments)]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        __name__,
+        str(timeout),
+        function.__module__,
+        function.__qualname__,
+        json.dumps(arguments),
+    ]
     with tempfile.TemporaryDirectory() as folder:
         try:
             process = subprocess.run(  # noqa: S603 - this interpreter and this module

@@ -69,7 +69,8 @@ class NodeProcess:
     def __init__(self, node: NodeSpec, scenario_file: Path, overrides: ParameterOverrides, log: Path) -> None:
         self.node = node
         self.lines: deque[str] = deque(maxlen=20)
-        command = [*end_with_parent(), sys.executable, "-m", node.module, "--ros-args", "--params-file", str(scenario_file)]
+        module = ["-P", "-m", node.module]  # -P: a package in the working folder must not replace a package of the stack
+        command = [*end_with_parent(), sys.executable, *module, "--ros-args", "--params-file", str(scenario_file)]
         for name, value in overrides.items():
             command += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, and quotes what needs quotes
         self._log = log.open("x", encoding="utf-8")
