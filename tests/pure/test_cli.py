@@ -109,13 +109,13 @@ def test_a_command_whose_python_package_is_missing_says_what_installs_it(tmp_pat
     (tmp_path / "jax.py").write_text("raise ModuleNotFoundError('No module named jax', name='jax')", encoding="utf-8")
     shown = rise_di("campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path)  # -m puts the working folder first
     assert shown.returncode == 2
-    sentence = "error: rise-di campaign needs the Python package jax, which `make setup-all` installs"
+    sentence = "error: rise-di campaign: found no Python package jax, expected it: make setup-all"
     assert shown.stderr.splitlines()[-1] == sentence
     assert "Traceback" not in shown.stderr
 
 
 def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
-    assert rise_di("--version", cwd=tmp_path).stdout == f"rise-di {version('flight_cli')}\n"
+    assert rise_di("--version", cwd=tmp_path).stdout == f"rise-di {version('rise-di')}\n"
 
 
 def test_every_command_of_the_help_has_a_help_of_its_own(tmp_path: Path) -> None:

@@ -105,5 +105,5 @@ def test_a_missing_extra_is_a_sentence(recorded: Path, tmp_path: Path) -> None:
     ended = subprocess.run(
         command(recorded, "--foxglove"), capture_output=True, text=True, check=False, env={"PYTHONPATH": str(tmp_path)}
     )
-    expected = "error: --foxglove: the package foxglove-sdk is not installed, expected it: make foxglove\n"
+    expected = "error: --foxglove: found no Python package foxglove, expected it: make foxglove\n"
     assert (ended.returncode, ended.stderr) == (2, expected)

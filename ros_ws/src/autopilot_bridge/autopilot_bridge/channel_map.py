@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flight_core.installation import missing
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
@@ -151,10 +152,7 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
     try:
         module = load(f"{package}.msg")
     except ModuleNotFoundError:
-        raise ParameterError(
-            f"{name}: found no Python package {package}, expected it: make messages PACKAGE={package} SOURCE=FOLDER builds it"
-            f" from its sources; on a full ROS 2 install ros-jazzy-{package.replace('_', '-')}, or source a workspace with it"
-        ) from None
+        raise ParameterError(f"{name}: {missing(package)}") from None
     message_class = getattr(module, kind, None)
     if not isinstance(message_class, type):
         raise ParameterError(f"{name}: found no {kind} in the installed {package}, expected another version of {package}")

@@ -33,6 +33,7 @@ from flight_cli.output import (
     progress_bar,
 )
 from flight_core.files import write_file, writing
+from flight_core.installation import require_package
 from flight_core.parameters import require
 
 CHUNK = 1000  # aircraft computed at once
@@ -80,6 +81,7 @@ def campaign(
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted; --resume continues it.
     """
+    require_package("jax")
     require((scenario is None) == (resume is not None), "SCENARIO", scenario, "one of a scenario and --resume")
     require(scheduler is None or engine is EngineName.DASK, "--scheduler", scheduler, "--engine dask with it")
     if resume is not None:

@@ -11,7 +11,6 @@ import gc
 import os
 import sys
 from contextlib import suppress
-from importlib.metadata import version
 from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Annotated
@@ -47,7 +46,9 @@ COMMANDS = MappingProxyType(
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        print(f"rise-di {version('flight_cli')}")
+        from importlib.metadata import version  # noqa: PLC0415 - --help does without
+
+        print(f"rise-di {version('rise-di')}")
         raise typer.Exit
 
 
@@ -101,9 +102,9 @@ def main() -> None:
             print(f"error: {error}", file=sys.stderr)
             sys.exit(BAD_INPUT)
     except ModuleNotFoundError as error:
-        print(
-            f"error: rise-di {words[0]} needs the Python package {error.name}, which `make setup-all` installs", file=sys.stderr
-        )
+        from flight_core.installation import missing  # noqa: PLC0415 - as above
+
+        print(f"error: rise-di {words[0]}: {missing(str(error.name))}", file=sys.stderr)
         sys.exit(BAD_INPUT)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)

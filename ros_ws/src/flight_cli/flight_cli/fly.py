@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from flight_analysis.closed_loop.scenario import require_euler
+from flight_analysis.closed_loop.scenario import Scenario, require_euler
 from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
-from flight_bringup.graph import find_autopilot, require_limits
+from flight_bringup.graph import Autopilot, find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.output import (
     ENDED_EARLY,
@@ -24,6 +24,7 @@ from flight_cli.output import (
     show_flight,
 )
 from flight_core import outcome as ends
+from flight_core.installation import require_package
 from flight_core.parameters import ParameterError, require
 from flight_guidance.route_file import Origin, read_route
 
@@ -68,19 +69,13 @@ def fly(
     )
     stepping = lockstep or one_process or chosen.flight.lockstep
     autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
-    if autopilot is not None:
-        from flight_analysis.design.sign_check import require_signs  # noqa: PLC0415 - loads SciPy, which few flights need
-
-        require_signs(autopilot.channel_map, chosen)
-        require_limits(autopilot, chosen)
     require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
     real_time = "a flight in real time over topics: an autopilot does not wait"
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     if route is not None:
         chosen = with_route(chosen, read_route(route, _origin(origin)))
     require(origin is None or route is not None, "--origin", "no --route", "the file of a route: --route FILE")
-    if autopilot is None:
-        require_euler(chosen)
+    _require_flyable(chosen, autopilot, in_process=in_process)
     run = new_run(chosen, runs)
     if route is not None:
         chosen = written(chosen, run / f"{chosen.name}.yaml")
@@ -119,6 +114,19 @@ def fly(
         show_flight(Console(), result.flight)
         print(f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  {display_path(result.report)}")
     raise typer.Exit(STATUS.get(outcome, ENDED_EARLY))
+
+
+def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_process: bool) -> None:
+    """Raise ParameterError where the flight would fail, before anything is written."""
+    if not in_process:
+        require_package("rclpy", "; without ROS fly with --in-process")
+    if autopilot is None:
+        require_euler(scenario)
+    else:
+        from flight_analysis.design.sign_check import require_signs  # noqa: PLC0415 - loads SciPy, which few flights need
+
+        require_signs(autopilot.channel_map, scenario)
+        require_limits(autopilot, scenario)
 
 
 def _origin(text: str | None) -> Origin | None:

@@ -13,6 +13,7 @@ import typer
 
 from flight_bringup.processes import end_with_parent
 from flight_cli.target import RemovedKeyFile
+from flight_core.installation import missing
 from flight_core.parameters import ParameterError, require
 from flight_view.flight import Flight
 from flight_view.text import show
@@ -77,7 +78,7 @@ def _serve_foxglove(run: Path, port: int | None) -> None:
     except ModuleNotFoundError as error:
         if error.name != "foxglove":
             raise
-        raise ParameterError("--foxglove: the package foxglove-sdk is not installed, expected it: make foxglove") from None
+        raise ParameterError(f"--foxglove: {missing(error.name)}") from None
     foxglove_server.serve(run, foxglove_server.DEFAULT_PORT if port is None else port, _announce)
 
 
@@ -104,7 +105,7 @@ def _serve_with_control(runs: Sequence[Path], ports: Sequence[int], namespace: s
 @contextmanager
 def watched(run: Path) -> Iterator[list[str]]:
     """Serve the page of a run that will be recorded, by another process during the block. Yields its lines for the user."""
-    command = [*end_with_parent(), sys.executable, "-m", "flight_cli.cli", "watch", str(run), "--wait"]
+    command = [*end_with_parent(), sys.executable, "-P", "-m", "flight_cli.cli", "watch", str(run), "--wait"]
     # In a process group of its own: Ctrl-C reaches the flight alone, whose end the page still shows.
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0) as server:  # noqa: S603
         try:
