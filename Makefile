@@ -9,6 +9,7 @@
 # make evidence   measure what has no file in docs/evidence/, write docs/evidence.md     make evidence ARGS="--again speed"
 # make foxglove   what `rise-di watch --foxglove` needs
 # make messages PACKAGE=... SOURCE=...   build a message package of an autopilot for the stack: docs/autopilots.md
+# make wheel   build dist/rise_di-VERSION-py3-none-any.whl and its sources, which pip installs
 # make setup   what flying and its report need: .venv/, the workspace built, .venv/bin/rise-di; make setup-all: campaigns and tests too
 
 PYTHON ?= python3
@@ -22,14 +23,14 @@ PACKAGES := $(notdir $(patsubst %/package.xml,%,$(wildcard ros_ws/src/*/package.
 # With symlinks in place only these need another build; Python sources are live.
 BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/*/config/*.yaml ros_ws/src/*/launch/*.py)
 
-FLY_GROUPS := --group ros --group core --group report --group build
-ALL_GROUPS := $(FLY_GROUPS) --group campaign --group messages --group docs --group dev
+FLY := --extra ros --group build
+ALL := $(FLY) --extra campaign --group messages --group docs --group dev
 # uv holds every package to the version and the hashes of the lock.
-INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock
+INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock --requirement pyproject.toml
 
 XDIST = $(BIN)/python -m pytest --maxprocesses 4 --dist loadfile
 
-.PHONY: fly test test-fast test-sitl check docs evidence foxglove messages setup setup-all lock clean
+.PHONY: fly test test-fast test-sitl check docs evidence foxglove messages wheel setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
@@ -51,7 +52,7 @@ test-sitl: setup-all
 	$(BIN)/python -m pytest tests/sitl -m "not long" $(ARGS)
 
 foxglove: setup
-	$(INSTALL) --group foxglove
+	$(INSTALL) --extra foxglove
 
 check: setup-all
 	$(BIN)/ruff check .
@@ -69,6 +70,9 @@ messages: .venv/.messages
 	@$(if $(and $(PACKAGE),$(SOURCE)),,echo "error: say make messages PACKAGE=px4_msgs SOURCE=FOLDER" >&2; exit 2)
 	@$(BIN)/python -m tools.messages $(PACKAGE) $(SOURCE) $(if $(MESSAGES),--messages $(MESSAGES)) $(ARGS)
 
+wheel: .venv/.fly
+	$(BIN)/uv build --quiet --no-build-isolation --python $(BIN)/python --out-dir dist
+
 setup: .venv/.workspace
 
 setup-all: .venv/.all .venv/.workspace
@@ -82,7 +86,7 @@ setup-all: .venv/.all .venv/.workspace
 	@touch $@
 
 .venv/.fly: requirements.lock | .venv/.uv
-	$(INSTALL) $(FLY_GROUPS)
+	$(INSTALL) $(FLY)
 	@touch $@
 
 .venv/.messages: requirements.lock | .venv/.fly
@@ -90,7 +94,7 @@ setup-all: .venv/.all .venv/.workspace
 	@touch $@
 
 .venv/.all: requirements.lock | .venv/.uv
-	$(INSTALL) $(ALL_GROUPS)
+	$(INSTALL) $(ALL)
 	@touch .venv/.fly .venv/.messages $@
 
 .venv/.workspace: $(BUILD_INPUTS) | .venv/.fly
@@ -105,8 +109,8 @@ setup-all: .venv/.all .venv/.workspace
 lock: | .venv/.uv
 	$(BIN)/uv pip compile --quiet --upgrade $(LOCK)
 
-LOCK := $(ALL_GROUPS) --group foxglove --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
+LOCK := pyproject.toml $(ALL) --extra foxglove --universal --python-version 3.11 --generate-hashes --no-annotate --no-emit-index-url \
   --custom-compile-command "make lock" --output-file requirements.lock
 
 clean:
-	rm -rf .venv ros_ws/build ros_ws/install ros_ws/log
+	rm -rf .venv dist ros_ws/build ros_ws/install ros_ws/log

@@ -13,6 +13,8 @@ from flight_core import installation
 from flight_core.installation import EXTRAS, TARGETS, missing, require_package
 from flight_core.parameters import ParameterError
 
+pytestmark = pytest.mark.package("flight_core")
+
 
 def test_a_checkout_names_the_target_of_make() -> None:
     assert missing("jax") == "found no Python package jax, expected it: make setup-all"

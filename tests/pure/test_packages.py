@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from xml.etree import ElementTree
@@ -78,6 +79,15 @@ def undeclared(package: Path) -> set[str]:
     sources = [path for path in package.rglob("*.py") if path.name != "setup.py"]
     external = set().union(*map(imported, sources)) - sys.stdlib_module_names - {package.name} - WITHOUT_KEY
     return {KEYS.get(name, name) for name in external} - declared
+
+
+def test_the_wheel_holds_every_package_and_law() -> None:
+    project = tomllib.loads((SOURCES.parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    held = project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    assert held == [f"ros_ws/src/{package.name}/{package.name}" for package in PACKAGES]
+    (laws,) = project["project"]["entry-points"].values()
+    setup = (SOURCES / "control_laws" / "setup.py").read_text(encoding="utf-8")
+    assert laws == dict(re.findall(r'"(\w+) = ([\w.]+:\w+)"', setup))
 
 
 def test_packages_citation_and_changelog_have_one_version() -> None:
