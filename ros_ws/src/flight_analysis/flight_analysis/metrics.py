@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight as pure functions of its tape: error, noise floor, ultimate bound, settling, saturation, ticks."""
+"""Metrics of a flight as pure functions of the tape: error, noise floor, ultimate bound, settling, saturation, ticks."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -48,7 +49,7 @@ GUIDED_LEGEND = (
 
 
 class Transient(NamedTuple):
-    """An engagement, a command, a gust, a turn or a capture, from its first to its last instant in s of flight time."""
+    """An engagement, a command, a gust, a turn or a capture, from the first to the last instant in s of flight time."""
 
     kind: str  # "engagement", "command", "gust", "turn" or "capture"
     name: str  # of the commanded channel, or of the gust
@@ -56,19 +57,19 @@ class Transient(NamedTuple):
     stop: float
 
     def excites(self, channel: str) -> bool:
-        """Whether it excites a channel: a command excites its own channel, all else excites every channel."""
+        """Whether a channel is excited: a command excites a channel, any further transient every channel."""
         return self.kind != "command" or self.name == channel
 
 
 class ErrorMetrics(NamedTuple):
-    """Tracking error of one channel over some samples, in its unit."""
+    """Tracking error of a channel over some samples, in the unit of the channel."""
 
     rms: float
     max: float
 
 
 class InputMetrics(NamedTuple):
-    """One input over some samples: deviation from trim in its unit, rate in its unit / s."""
+    """An input over some samples: deviation from trim in the unit of the input, rate per s."""
 
     rms: float
     max: float
@@ -90,7 +91,7 @@ class TickMetrics(NamedTuple):
 
 
 class LatencyMetrics(NamedTuple):
-    """Time from sending a y to sending the u computed from it, in s."""
+    """Time from sending y to sending the resulting u, in s."""
 
     median: float
     p99: float
@@ -98,18 +99,18 @@ class LatencyMetrics(NamedTuple):
 
 
 def tracking_error(tape: Tape) -> Signal:
-    """Measured error e = y - y_m at each y inside the time range of y_m, shape (N, m), channels of y.
+    """Measured error e = y - y_m at every y inside the time range of y_m, shape (N, m), channels of y.
 
-    y_m is interpolated linearly. The law sees this error: it includes the sensors' noise.
+    y_m is interpolated linearly. The law sees this error with the sensors' noise.
     """
     return _minus_reference(tape["y"], tape["y_m"])
 
 
 def true_error(tape: Tape) -> Signal | None:
-    """True error C x - y_m at each sample of `truth` inside the time range of y_m, shape (N, m), channels of y.
+    """True error C x - y_m at every sample of `truth` inside the time range of y_m, shape (N, m), channels of y.
 
-    It excludes the sensors' errors and includes samples that were lost. None unless `truth` has "x.output" for each channel of
-    y, as in a simulation.
+    Errors of the sensors are excluded, lost samples included. None unless `truth` has "x.output" for every channel of y, as in
+    a simulation.
     """
     if "truth" not in tape:
         return None
@@ -121,7 +122,7 @@ def true_error(tape: Tape) -> Signal | None:
 
 
 def best_error(tape: Tape) -> tuple[str, Signal]:
-    """Name and signal of the best error on a tape: the true error, or else the measured one."""
+    """Name and signal of the best error on a tape: the true error, or else the measured error."""
     error = true_error(tape)
     return (MEASURED_ERROR, tracking_error(tape)) if error is None else (TRUE_ERROR, error)
 
@@ -144,9 +145,9 @@ def _columns(signal: Signal, names: Sequence[str]) -> FloatArray:
 
 
 def noise_floor(tape: Tape) -> dict[str, float]:
-    """Noise floor of y by channel, in its unit: a smaller error cannot be distinguished from noise.
+    """Noise floor of y by channel, SI: a smaller error cannot be distinguished from noise.
 
-    It is the rms of "noise.channel" of `truth` where the tape holds it. Otherwise it is estimated as white noise from second
+    The floor is the rms of "noise.channel" of `truth` on the tape, else the estimate of white noise from second
     differences d_k = y_(k+1) - 2 y_k + y_(k-1): rms = median(abs(d)) / (0.6745 sqrt(6)). d has 6 times the variance of the
     noise, and half of a normal distribution lies within 0.6745 rms. The floor is at least the rounding of the largest y.
     """
@@ -164,7 +165,7 @@ def noise_floor(tape: Tape) -> dict[str, float]:
 
 
 def engagements(tape: Tape) -> list[Transient]:
-    """Instants at which the controller engaged, from the modes in `internals`."""
+    """Instants of engagement of the controller, from the modes in `internals`."""
     if "internals" not in tape:
         return []
     engaged = tape["internals"]["mode"] == Mode.ENGAGED
@@ -173,13 +174,13 @@ def engagements(tape: Tape) -> list[Transient]:
 
 
 def live_commands(tape: Tape) -> list[Transient]:
-    """Changes of a live command, from `u_m`. Changes of one channel less than SETTLING_DWELL apart are one transient."""
+    """Changes of a live command, from `u_m`. Changes of a channel less than SETTLING_DWELL apart are a single transient."""
     if "u_m" not in tape:
         return []
     t, u_m = tape.time("u_m"), tape["u_m"]
     commands: list[Transient] = []
-    others = () if "y_m" not in tape else set(u_m.names) - set(tape["y_m"].names)  # the attitude, which never rests
-    for name in [one for one in u_m.names if one not in others]:
+    attitude = () if "y_m" not in tape else set(u_m.names) - set(tape["y_m"].names)  # the attitude, which never rests
+    for name in [name for name in u_m.names if name not in attitude]:
         moved = np.concatenate([u_m[name][:1] != 0.0, np.diff(u_m[name]) != 0.0])
         instants = t[moved]
         groups = np.split(instants, np.flatnonzero(np.diff(instants) > SETTLING_DWELL) + 1)
@@ -188,9 +189,9 @@ def live_commands(tape: Tape) -> list[Transient]:
 
 
 def guided_transients(tape: Tape) -> list[Transient]:
-    """Turns and captures of a guided flight, from `guidance`, as GUIDED_LEGEND says; `u_m` itself never rests.
+    """Turns and captures of a guided flight, from `guidance`, as GUIDED_LEGEND says; `u_m` never rests.
 
-    Those of one kind less than SETTLING_DWELL apart are one transient.
+    Transients of a kind less than SETTLING_DWELL apart are a single transient.
     """
     if "guidance" not in tape:
         return []
@@ -205,9 +206,9 @@ def guided_transients(tape: Tape) -> list[Transient]:
 
 
 def mask_spans(t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0) -> list[tuple[float, float]]:
-    """Start and stop of each run of True in a mask of shape (N,), s; a run stops at the next sample that is False.
+    """Start and stop of the runs of True in a mask of shape (N,), s; a run stops at the next False sample.
 
-    Spans less than `min_length` apart are merged, and shorter spans are lengthened to it.
+    Spans less than `min_length` apart are merged, and shorter spans are lengthened to `min_length`.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
     spans: list[tuple[float, float]] = []
@@ -221,7 +222,7 @@ def mask_spans(t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0) 
 
 
 def in_spans(t: FloatArray, spans: Iterable[tuple[float, float]], settle: float = 0.0) -> NDArray[np.bool_]:
-    """Mask of the ascending instants t inside a span or up to `settle` seconds after it, shape (N,)."""
+    """Mask of the ascending instants t inside a span or up to `settle` seconds later, shape (N,)."""
     inside = np.zeros(len(t), dtype=bool)
     for start, stop in spans:
         inside[np.searchsorted(t, start) : np.searchsorted(t, stop + settle, side="right")] = True
@@ -231,7 +232,7 @@ def in_spans(t: FloatArray, spans: Iterable[tuple[float, float]], settle: float 
 def part_masks(t: FloatArray, transients: Sequence[Transient], settle: float = SETTLING_DWELL) -> dict[str, NDArray[np.bool_]]:
     """Masks of the instants t of shape (N,) by part of the flight: "whole", "calm", "command", "gust".
 
-    Of a guided flight "capture" and "turn" replace "command". An instant counts to the last part in this order that has it.
+    Of a guided flight "capture" and "turn" replace "command". An instant counts to the last matching part in this order.
     "calm" is undisturbed: no transient of any kind.
     """
     kinds = {transient.kind for transient in transients}
@@ -257,7 +258,7 @@ def errors_by_part(
 ) -> dict[str, dict[str, ErrorMetrics]]:
     """Metrics of `best_error` by channel and part of the flight.
 
-    The max of "calm" is the ultimate bound: the largest abs(e) at least `settle` s after the end of each transient.
+    The max of "calm" is the ultimate bound: the largest abs(e) at least `settle` s after the end of every transient.
     """
     _, error = best_error(tape)
     masks = part_masks((error.stamp_ns - tape.start_ns) / 1e9, transients, settle)
@@ -265,7 +266,7 @@ def errors_by_part(
 
 
 def settling_bands(tape: Tape) -> dict[str, float]:
-    """Half-width of the settling band by channel, in its unit: SETTLING_BAND max abs(y_m), or max abs(e) where y_m is zero.
+    """Half-width of the settling band by channel, SI: SETTLING_BAND max abs(y_m), or max abs(e) where y_m is zero.
 
     The band of a measured error is at least MIN_BAND_NOISE_FLOORS noise floors wide, else noise alone leaves it.
     """
@@ -287,8 +288,8 @@ def settling_bands(tape: Tape) -> dict[str, float]:
 def settling_time(t: FloatArray, e: FloatArray, band: float, leaves: float, dwell: float = SETTLING_DWELL) -> float | None:
     """Time from t[0] until abs(e) <= band holds for `dwell` s or to the last sample, s. Shapes (N,).
 
-    0 where abs(e) stays in the band for the first `leaves` s: a later excursion has another cause. None where abs(e) does not
-    return to the band, or there is no sample.
+    0 where abs(e) stays in the band for the first `leaves` s: a later excursion has a different cause. None where abs(e) does
+    not return to the band, or there is no sample.
     """
     if len(t) == 0:
         return None
@@ -303,7 +304,7 @@ def settling_time(t: FloatArray, e: FloatArray, band: float, leaves: float, dwel
 
 
 class Settling(NamedTuple):
-    """Settling after one transient, by each channel that it excites."""
+    """Settling after a transient, by excited channel."""
 
     transient: Transient
     until: dict[str, float]  # start of the next transient of the channel, or end of the flight, s
@@ -311,21 +312,21 @@ class Settling(NamedTuple):
 
 
 def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling]:
-    """Settling time of `best_error` into `settling_bands` from the start of each transient, for each channel that it excites.
+    """Settling time of `best_error` into `settling_bands` from the start of the transients, by excited channel.
 
-    It is measured up to the next transient that excites the channel. Transients after the end of the flight are left out, and
-    turns and captures: their commands move until they end.
+    The time counts up to the next transient of the channel. Transients after the end of the flight are left out, and
+    turns and captures, whose commands move to the end.
     """
     _, error = best_error(tape)
     t, bands = (error.stamp_ns - tape.start_ns) / 1e9, settling_bands(tape)
     end = float(t[-1]) if len(t) else 0.0
     results = []
-    judged = [one for one in transients if one.start <= end and one.kind not in {"turn", "capture"}]
-    for transient in sorted(judged, key=lambda one: one.start):
+    judged = [transient for transient in transients if transient.start <= end and transient.kind not in {"turn", "capture"}]
+    for transient in sorted(judged, key=attrgetter("start")):
         start, leaves = transient.start, transient.stop + SETTLING_DWELL - transient.start
         until, times = {}, {}
         for name in filter(transient.excites, error.names):
-            until[name] = min([other.start for other in transients if other.excites(name) and other.start > start] + [end])
+            until[name] = min([later.start for later in transients if later.excites(name) and later.start > start] + [end])
             inside = (t >= start) & ((t < until[name]) | (until[name] == end))
             times[name] = settling_time(t[inside], error[name][inside], bands[name], leaves)
         results.append(Settling(transient, until, times))
@@ -337,7 +338,7 @@ def inputs_by_part(
 ) -> dict[str, dict[str, InputMetrics]]:
     """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot).
 
-    mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps that end in the part; NaN without a step.
+    mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps with an end in the part; NaN without a step.
     """
     if "u" not in tape:
         return {}
@@ -365,8 +366,8 @@ def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
 def sign_switches(tape: Tape) -> dict[str, float]:
     """Switching rate of the sign term by output, 1/s.
 
-    It counts changes of sign between successive nonzero increments of Pi, per time of the ticks. On a tape without
-    `internals` it counts changes of sign of the measured error.
+    The count is of changes of sign between successive nonzero increments of Pi, per time of the ticks. On a tape without
+    `internals` the count is of changes of sign of the measured error.
     """
     if "internals" in tape:
         signal = tape["internals"].group("Pi")
@@ -382,10 +383,10 @@ def sign_switches(tape: Tape) -> dict[str, float]:
 
 
 def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Amplitude spectral density of each channel by Welch's method: frequencies in Hz, and values in unit / sqrt(Hz).
+    """Amplitude spectral density of the channels by Welch's method: frequencies in Hz, and values in unit / sqrt(Hz).
 
-    The Hann windows span a tenth of the flight, overlap by half, and have their mean removed. A missing sample repeats the one
-    before. The square of the density, integrated over all frequencies, is the variance. Source: Welch 1967.
+    The Hann windows span a tenth of the flight, overlap by half, without the mean. A missing sample repeats the last
+    sample. The square of the density, integrated over the frequencies, is the variance. Source: Welch 1967.
     """
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
     grid = np.arange(places[-1] + 1)
@@ -396,9 +397,9 @@ def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, Float
 
 
 def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, FloatArray]:
-    """Frequencies, Hz, and one-sided power spectral density of each column, (F, m), as `scipy.signal.welch` computes them.
+    """Frequencies, Hz, and one-sided power spectral density of the columns, (F, m), as of `scipy.signal.welch`.
 
-    That module takes half a second to load, a tenth of a whole flight in one process.
+    scipy.signal takes half a second to load, a tenth of a whole flight in one process.
     """
     hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(window) / window)
     parts = sliding_window_view(values, window, axis=0)[:: window - window // 2]  # (parts, m, window)
@@ -411,7 +412,7 @@ def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, Fl
 def tick_periods(tape: Tape) -> NDArray[np.int64]:
     """Time between successive ticks of the controller, ns, shape (N - 1,).
 
-    The instant of a tick is stamp + "age", which is its deadline plus "late".
+    The instant of a tick is stamp + "age", the deadline plus "late".
     """
     internals = tape["internals"]
     return np.diff(internals.stamp_ns + np.round(internals["age"] * 1e9).astype(np.int64))
@@ -420,7 +421,7 @@ def tick_periods(tape: Tape) -> NDArray[np.int64]:
 def tick_metrics(tape: Tape, period_ns: int) -> TickMetrics | None:
     """Metrics of the controller's ticks from `internals`; None for fewer than two ticks.
 
-    `internals` holds only ticks with a new y. A period without one therefore counts whether y or the tick was missing.
+    `internals` holds only ticks with a new y. A period without a tick therefore counts for a missing y and for a missing tick.
     """
     internals = tape["internals"]
     if len(internals.stamp_ns) < 2:

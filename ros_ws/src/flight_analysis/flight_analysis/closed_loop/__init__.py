@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A scenario, the loop that flies it in one process, and the replay of a recorded flight."""
+"""A scenario, the closed loop in one process, and the replay of a recorded flight."""

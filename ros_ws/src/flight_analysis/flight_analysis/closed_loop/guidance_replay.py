@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of guidance: each step computed again from its logged inputs and the state that the sample before holds."""
+"""Replay of guidance: every step computed again from the logged inputs and the state of the sample before."""
 
 from contextlib import suppress
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class GuidanceReplay(NamedTuple):
 
 
 def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
-    """The route of the section and those that arrived in flight on the topic `route`, by digest, as `guidance` logs it."""
+    """The route of the section and the routes of the topic `route`, by digest, as `guidance` logs them."""
     lists = [list(parameters.waypoints())]
     if "route" in tape:
         received = tape["route"]
@@ -47,10 +47,10 @@ def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
 
 
 def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceReplay:
-    """Compute every step of the topic `guidance` again, and the u_m that was published at its instant.
+    """Compute every step of the topic `guidance` again, and the published u_m of the instant.
 
-    Steps on a route that the log does not hold are not checked. Raises ParameterError for a log without the scenario's section
-    of guidance, and for channels of another version.
+    Steps on a route outside the log are not checked. Raises ParameterError for a log without the scenario's section of
+    guidance, and for channels of a different version.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")

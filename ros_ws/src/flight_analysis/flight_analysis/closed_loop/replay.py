@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Replay of a recorded flight: each tick of the controller computed again from its logged inputs and compared bit by bit."""
+"""Replay of a recorded flight: every tick of the controller computed again from the logged inputs and compared bit by bit."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -42,14 +42,14 @@ class Difference(NamedTuple):
 
     @property
     def ulps(self) -> int | None:
-        """Distance of the two in units in the last place (ULP); None where one of them is NaN."""
+        """Distance of the values in units in the last place (ULP); None for a NaN."""
         if np.isnan(self.recorded) or np.isnan(self.computed):
             return None
         return abs(_ordinal(self.computed) - _ordinal(self.recorded))
 
 
 class ReplayResult(NamedTuple):
-    """The N ticks of a log as recorded and as computed, in k channels: those of `internals`, then those of the topic u."""
+    """The N ticks of a log as recorded and as computed, in k channels: the channels of `internals`, then of the topic u."""
 
     names: tuple[str, ...]
     number: NDArray[np.int64]  # (N,), the channel "number"
@@ -61,7 +61,7 @@ class ReplayResult(NamedTuple):
     notes: tuple[str, ...]
 
     def different(self) -> NDArray[np.bool_]:
-        """Mask of the values that differ in a bit, shape (N, k)."""
+        """Mask of the values with a different bit, shape (N, k)."""
         different: NDArray[np.bool_] = self.checked[:, None] & (_bits(self.recorded) != _bits(self.computed))
         return different
 
@@ -70,7 +70,7 @@ class ReplayResult(NamedTuple):
         return not self.different().any() and not self.other_parameters.any()
 
     def first(self) -> Difference | None:
-        """The first difference in the first tick that differs, in a channel of u if one differs; None without a difference."""
+        """The first difference in the first different tick, in a channel of u if possible; None without a difference."""
         different = self.different()
         rows = np.flatnonzero(different.any(axis=1))
         if len(rows) == 0:
@@ -86,7 +86,7 @@ class ReplayResult(NamedTuple):
 
 
 def recorded_parameters(scenario: StoredFile) -> ControllerConfig:
-    """The controller's section of the scenario in a log; other sections are not validated. Raises ParameterError."""
+    """The controller's section of the scenario in a log; further sections are not validated. Raises ParameterError."""
     sections = parse_recorded_sections(scenario.content, Path(scenario.name))
     return AnyLaw.validate_mapping(sections["controller"], "controller")
 
@@ -97,7 +97,7 @@ def recorded_scenario(stored: StoredFile) -> Scenario:
 
 
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
-    """Parameters with some changed by dotted name, validated; None removes one. Raises ParameterError."""
+    """Parameters with changes by dotted name, validated; None removes a parameter. Raises ParameterError."""
     flat = dict(flatten(parameters.model_dump()))
     for name in changes:
         flat = {key: value for key, value in flat.items() if key != name and not key.startswith(name + ".")}
@@ -109,19 +109,19 @@ def replay(
 ) -> ReplayResult:
     """Compute every tick of `internals` again: (state, now, y, y_m) -> (state, u) by `guard.tick`.
 
-    A tick takes y from the topic `y` where a sample has its stamp; y_m, its instant and whether the controller was active come
-    from `internals`. It computes dt, mode, e, the integrals, Pi and u.
+    A tick takes y from the topic `y` at the stamp of the tick; y_m, the instant of y_m and the activity of the controller come
+    from `internals`. The results are dt, mode, e, the integrals, Pi and u.
 
-    The state is that computed in the previous tick. After a tick that differs it is the logged one, so each tick is judged
-    alone. After a gap it is the logged state of the first engaged tick. That tick and those before it are not checked, nor is
-    u_ff until the next engagement.
+    The state comes from the computation of the previous tick, after a different tick from the log, so a tick is judged alone.
+    After a gap the state is the logged state of the first engaged tick. The ticks up to the first engaged tick are not checked,
+    nor is u_ff until the next engagement.
 
-    `others` computes an open loop: the same inputs with other parameters, and the computed state throughout. Where the log does
-    not begin with the flight, the law engages in its first tick, at the recorded u.
+    `others` computes an open loop: the same inputs with these parameters, and the computed state throughout. Where the log does
+    not begin with the flight, the law engages in the first tick, at the recorded u.
 
-    `changes` are parameter changes in flight, in order. A tick applies those that lead to the parameters named by its channel
-    "parameters". Raises ParameterError for `internals` of other channels or of a version that recorded less, and for invalid
-    changes.
+    `changes` are parameter changes in flight, in order. A tick applies the changes up to the parameters of the channel
+    "parameters". Raises ParameterError for `internals` of different channels or of a version with fewer channels, and for
+    invalid changes.
     """
     ticks = _Ticks(tape, parameters)
     for key in ("outputs", "inputs"):
@@ -154,7 +154,7 @@ def replay(
 
 
 class _ParametersInForce:
-    """The parameters in force at a tick, and the changes after it."""
+    """The parameters in force at a tick, and the later changes."""
 
     def __init__(self, parameters: ControllerConfig, changes: Sequence[Change]) -> None:
         self.notes: list[str] = []
@@ -171,7 +171,7 @@ class _ParametersInForce:
         self.law, self.limits = parameters.tuned_law(), parameters.guard()
 
     def change(self, digest: int, number: int, state: ControllerState | None) -> ControllerState | None:
-        """Apply the changes that lead to the parameters with a digest, if any do. Returns the state after them."""
+        """Apply the changes up to the parameters with a digest, if any. Returns the state afterwards."""
         if digest == self.digest or digest in self._unmatched:
             return state
         steps = [self._parameters]
@@ -198,7 +198,7 @@ class _ParametersInForce:
 
 
 class _Ticks:
-    """`internals` of a log in order of the controller's ticks, and the inputs of each tick."""
+    """`internals` of a log in order of the controller's ticks, and the inputs of the ticks."""
 
     def __init__(self, tape: Tape, parameters: ControllerConfig) -> None:
         require("internals" in tape, "the log", "no sample of internals", "a flight with a controller that engaged")
@@ -234,7 +234,7 @@ class _Ticks:
         self._copied = [names.index(name) for name in COPIED_CHANNELS]
 
     def state(self, k: int, limits: GuardParams, law: TunedLaw, computed: ControllerState | None = None) -> ControllerState:
-        """The recorded state after a tick. What the log does not hold comes from the computed state, if there is one."""
+        """The recorded state after a tick. Values outside the log come from the computed state, if any."""
         row = {name: values[k] for name, values in self._groups.items()}
         of_law = restored(law.control_law, row)
         mode, u, y_m = Mode(int(self._signal["mode"][k])), row["u"], row["y_m"]
@@ -247,7 +247,7 @@ class _Ticks:
         return ControllerState(mode, of_law, y, y_m, u, row["u_free"], row["u_trim"], 0, u, row["u_ff"], feedforward_state)
 
     def tick(self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw) -> tuple[ControllerState, FloatArray]:
-        """One tick: (state after it, its row of `internals`); the row is NaN where the tick publishes nothing."""
+        """A tick: (state afterwards, row of `internals`); the row is NaN for a tick without output."""
         stamp_ns = int(self.stamp_ns[k])
         y, y_m = None, []
         if self.flies[k]:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A scenario: one file with the parameters of every node, validated section by section and against each other."""
+"""A scenario: a file with the parameters of every node, validated by section and together."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ class FlightConfig(Config):
 
 @dataclass(frozen=True)
 class Scenario:
-    """One scenario file, read and validated."""
+    """A scenario file, read and validated."""
 
     name: str
     path: Path
@@ -49,7 +49,7 @@ class Scenario:
     def vary(self, **sections: Mapping[str, Any]) -> "Scenario":
         """A copy with some parameters replaced, as in scenario.vary(controller={"rate": 200.0}).
 
-        The copy is validated. A section of guidance that the scenario lacks begins with the numbers by rule. Raises
+        The copy is validated. A missing section of guidance begins with the numbers by rule. Raises
         ParameterError.
         """
         changed: dict[str, Any] = {
@@ -66,14 +66,14 @@ class Scenario:
         )
 
     def rise_di(self) -> RiseDiConfig:
-        """The parameters of a controller that flies RISE-DI. Raises ParameterError for another law."""
+        """The parameters of a controller with RISE-DI. Raises ParameterError for a different law."""
         if not isinstance(self.controller, RiseDiConfig):
             expected = "rise_di, which has the gains of (20) to (22)"
             raise ParameterError(f"{self.name}: found the law {self.controller.law}, expected {expected}")
         return self.controller
 
     def gust_windows(self) -> dict[str, tuple[float, float]]:
-        """Start and stop of each gust, s: entry and entry + 2 H / V0."""
+        """Start and stop of the gusts, s: entry and entry + 2 H / V0."""
         speed = self.aircraft.channels().speed
         return {name: (gust.start, gust.start + 2.0 * gust.length / speed) for name, gust in self.aircraft.gusts.items()}
 
@@ -90,7 +90,7 @@ OPTIONAL = ("guidance",)
 
 
 def load_scenario(path: Path) -> Scenario:
-    """Read a scenario file and validate it. Raises ParameterError with one sentence."""
+    """Read and validate a scenario file. Raises ParameterError with a sentence."""
     return parse_scenario(read_file(path, str(path), A_SCENARIO), path)
 
 
@@ -126,11 +126,11 @@ def parse_recorded_scenario(content: bytes, path: Path) -> Scenario:
 
 
 def guidance_by_rule(aircraft: AircraftConfig, reference: ReferenceModelConfig, controller: ControllerConfig) -> dict[str, Any]:
-    """Parameters of guidance that follow from the other sections.
+    """Parameters of guidance that follow from the further sections.
 
     The authorities of throttle and aileron are abs(Omega_ii) u of RISE-DI, Omega_ii = omega / input_scale, with the limits of
-    u from trim; none where the controller has no such numbers. Raises ParameterError for a model or an aircraft that guidance
-    cannot fly.
+    u from trim; none for a controller without these numbers. Raises ParameterError for a model or an aircraft beyond
+    guidance.
     """
     key, channels = "reference_model.second_order", aircraft.channels()
     if reference.second_order is None:
@@ -157,7 +157,7 @@ def guidance_by_rule(aircraft: AircraftConfig, reference: ReferenceModelConfig, 
 def scenario_yaml(scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]] | None = None) -> str:
     """The text of a scenario file with every parameter, defaults included. `overrides` replace parameters by section.
 
-    A parameter that is None or empty is left out, for that is its default.
+    A parameter with the value None or empty, the default, is left out.
     """
     sections = {}
     for name, schema in SCHEMAS.items():
@@ -179,7 +179,7 @@ def _yaml_values(values: Any) -> Any:
 
 
 def check_together(scenario: Scenario) -> None:
-    """Check the channels and rates of the sections against each other. Raises ParameterError."""
+    """Check the channels and rates of the sections together. Raises ParameterError."""
     channels = scenario.aircraft.channels()
     controller, reference = scenario.controller, scenario.reference_model
     for key, found, expected in (

@@ -25,7 +25,7 @@ Record = Callable[[Mapping[str, Signal]], None]
 
 
 class _SignalBuilder:
-    """Collects the samples of one topic."""
+    """Collects the samples of a topic."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = tuple(names)
@@ -49,7 +49,7 @@ def simulate(
     progress: Callable[[float], None] | None = None,
     guide: Callable[[GuidanceConfig], Guidance] = Guidance,
 ) -> Tape:
-    """Fly a scenario and return its tape; `outcome` of the tape has the reason of an early end. The rest is as `fly` says."""
+    """Fly a scenario and return the tape; `outcome` of the tape has the reason of an early end. The rest is as `fly` says."""
     parts: list[Mapping[str, Signal]] = []
     outcome = fly(scenario, parts.append, progress, guide)
     signals = {}
@@ -68,11 +68,11 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
 ) -> str:
     """Fly a scenario and return the outcome. `record` takes the samples once per simulated second and at the end.
 
-    `progress` is called with the flight time after `record`. `guide` makes the guidance of a scenario that has a section for
-    it; the default receives the true pose.
+    `progress` is called with the flight time after `record`. `guide` makes the guidance of a scenario with guidance;
+    the default receives the true pose.
 
-    Order at each instant: y of the aircraft, y_m of the reference model, u_m of guidance, u of the controller. The aircraft
-    holds u until the next u. A lost sample of y is not recorded; a delayed sample has its own stamp. A flight that diverges
+    Order at an instant: y of the aircraft, y_m of the reference model, u_m of guidance, u of the controller. The aircraft
+    holds u until the next u. A lost sample of y is not recorded; a delayed sample keeps the stamp. A flight that diverges
     or is interrupted (Ctrl-C) ends early.
     """
     require_euler(scenario)

@@ -29,7 +29,7 @@ TIMING_METRICS = {
 
 
 class ComparisonRow(NamedTuple):
-    """A metric of every flight and its ratio to that of the first; None without a ratio."""
+    """A metric of every flight and the ratio to the first flight; None without a ratio."""
 
     name: str
     texts: tuple[str, ...]
@@ -45,7 +45,7 @@ class ComparisonRow(NamedTuple):
 
 
 class ComparisonTable(NamedTuple):
-    """Metrics of one channel, or of the controller's ticks."""
+    """Metrics of a channel, or of the controller's ticks."""
 
     caption: str
     rows: tuple[ComparisonRow, ...]
@@ -64,7 +64,7 @@ def labels(flights: Sequence[RecordedFlight]) -> list[str]:
 
 
 def units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
-    """Units by channel, those of the first flight that has it."""
+    """Units by channel, of the first flight with the channel."""
     return {name: unit for flight in reversed(flights) for name, unit in summary.display_units(flight.scenario).items()}
 
 
@@ -74,7 +74,7 @@ def units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
 def metric_tables(
     flights: Sequence[RecordedFlight], key: str, columns: Sequence[Column], *, lower_is_better: bool
 ) -> list[ComparisonTable]:
-    """Metrics of "errors" or "inputs" of the summaries: a table per channel, a row per column that has any value."""
+    """Metrics of "errors" or "inputs" of the summaries: a table per channel, a row per column with a value."""
     display, tables = units(flights), []
     for channel in dict.fromkeys(name for flight in flights for name in flight.summary[key]):
         factor = display.get(channel, summary.NO_UNIT).factor
@@ -109,7 +109,7 @@ def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[Comp
 
 
 def tick_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
-    """Timing metrics of the controllers, in one table; none where all of them are 0."""
+    """Timing metrics of the controllers as a table; none for zeros alone."""
     rows = [_row(flights, name, path, 1e3) for name, path in TIMING_METRICS.items()]
     nonzero = tuple(row for row in rows if set(row.texts) - {summary.NO_VALUE, summary.format_value(0.0)})
     return [ComparisonTable("Ticks of the controller", nonzero)] if nonzero else []
@@ -126,7 +126,7 @@ def _row(flights: Sequence[RecordedFlight], name: str, path: Sequence[str], fact
 
 
 def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
-    """The context of all flights: each starts at its own t = 0; the gusts of all flights are shaded."""
+    """The context of the flights, from t = 0 of every flight on, with shaded gusts."""
     intervals: dict[Interval, None] = {}
     for flight in flights:
         intervals |= dict.fromkeys(figures.gust_intervals(flight.tape, flight.scenario.gust_windows()))
@@ -135,7 +135,7 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
 
 
 def tracking_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> Figure:
-    """Y of every flight over each distinct reference."""
+    """Y of every flight over the distinct references."""
     references: dict[str, Signal] = {}
     for label, flight in zip(labels(flights), flights, strict=True):
         y_m = _from_zero(flight.tape["y_m"], flight)
@@ -164,7 +164,7 @@ def input_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> Fig
 
 
 def _curves(flights: Sequence[RecordedFlight], topic: str, signal: Callable[[Tape], Signal], **style: Any) -> dict[str, Curve]:
-    """A curve of each flight that has a topic, in its colour."""
+    """A curve of every flight with a topic, in the colour of the flight."""
     return {
         label: Curve(_from_zero(signal(flight.tape), flight), colour, **style)
         for (label, colour), flight in zip(colours(flights).items(), flights, strict=True)
@@ -173,7 +173,7 @@ def _curves(flights: Sequence[RecordedFlight], topic: str, signal: Callable[[Tap
 
 
 def _from_zero(signal: Signal, flight: RecordedFlight) -> Signal:
-    """The signal with the flight time in ns as its stamps."""
+    """The signal with the flight time in ns as stamps."""
     return Signal(signal.stamp_ns - flight.tape.start_ns, signal.names, signal.values)
 
 

@@ -14,10 +14,10 @@ if TYPE_CHECKING:  # it loads in some tenths of a second
 
 
 def data_frame(tape: Tape) -> "pl.DataFrame":
-    """All signals as one table, SI: a row per instant with a sample of any topic, a column "topic.channel" per channel.
+    """The signals as a table, SI: a row per instant with a sample of any topic, a column "topic.channel" per channel.
 
     The first columns are "stamp_ns" (int64) and "t" = (stamp_ns - start) / 1e9. A topic without a sample at an instant has
-    nulls there. Of two samples with one stamp the table holds the later.
+    nulls there. Of two samples with equal stamps the table holds the later.
     """
     import polars as pl  # noqa: PLC0415
 

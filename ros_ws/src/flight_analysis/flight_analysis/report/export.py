@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Export of flights to other programs: one wide table of all signals (CSV, Parquet), and a figure (PNG)."""
+"""Export of flights: a wide table of the signals (CSV, Parquet), and a figure (PNG)."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -25,7 +25,7 @@ DPI = 120
 
 
 def _joined_table(flights: Sequence[RecordedFlight]) -> "pl.DataFrame":
-    """The table of a flight, or those of several with the name of the flight in a first column "run"."""
+    """The table of a flight, or of several flights with the name of the flight in a first column "run"."""
     import polars as pl  # noqa: PLC0415
 
     if len(flights) == 1:
@@ -50,7 +50,7 @@ def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
 
 
 class _PlotColumn(NamedTuple):
-    """A column of the PNG: a signal of the tapes that have a topic."""
+    """A column of the PNG: a signal of the tapes with a topic."""
 
     title: str
     topic: str
@@ -67,7 +67,7 @@ PLOT_COLUMNS = (
 
 
 def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
-    """Write y over y_m, the best error, and u of one flight or several: a column each, a row a channel."""
+    """Write y over y_m, the best error, and u of a flight or several flights: a column a quantity, a row a channel."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     columns = [(column, names) for column in PLOT_COLUMNS if (names := _channels(flights, column.topic))]
@@ -93,7 +93,7 @@ def _channels(flights: Sequence[RecordedFlight], topic: str) -> list[str]:
 
 
 def _plot_channel(axes: "Axes", flights: Sequence[RecordedFlight], column: _PlotColumn, name: str) -> None:
-    """Plot one channel of all flights that have it, with the reference and the gusts of the first flight."""
+    """Plot a channel of the flights, with the reference and the gusts of the first flight."""
     units = comparison.units(flights)
     factor = units.get(name, NO_UNIT).factor
 

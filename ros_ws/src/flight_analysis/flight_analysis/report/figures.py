@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a flight, drawn from its tape. A figure whose signals the tape does not hold is None.
+"""The figures of a flight, drawn from the tape. A figure without signals on the tape is None.
 
 The figures do not depend on the aircraft: channels are drawn under their own names.
 """
@@ -64,7 +64,7 @@ Runs = Mapping[str, tuple[Tape, int]]  # tape and period of the ticks in ns, by 
 
 
 def plot_context(tape: Tape, units: Mapping[str, DisplayUnit], gusts: Windows) -> PlotContext:
-    """The context of a flight: every figure shades its gusts and the failsafe modes of its controller."""
+    """The context of a flight: every figure shades the gusts and the failsafe modes of the controller."""
     end = flight_end(tape)
     intervals = [*gust_intervals(tape, gusts), *mode_intervals(tape, end * MIN_VISIBLE_FRACTION)]
     return PlotContext(tape, units, intervals, end, SampleStore())
@@ -82,7 +82,7 @@ def gust_intervals(tape: Tape, gusts: Windows) -> list[Interval]:
 
 
 def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
-    """Intervals in which the controller was in a mode other than ENGAGED, by mode, from `internals`."""
+    """Intervals of the modes of the controller except ENGAGED, by mode, from `internals`."""
     if "internals" not in tape:
         return []
     t, modes = tape.time("internals"), tape["internals"]["mode"]
@@ -100,9 +100,9 @@ def tracking_figure(context: PlotContext) -> Figure:
 
 
 def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None) -> Figure:
-    """E = y - y_m of every output. Where the tape holds errors of the sensors, the true error over the measured one.
+    """E = y - y_m of every output. With errors of the sensors on the tape, the true error over the measured error.
 
-    Noise floors, by channel in SI, are lines on both sides of 0 where they are wide enough to see.
+    Noise floors, by channel in SI, are lines above and below 0 where wide enough to see.
     """
     measured, true = Curve(tracking_error(context.tape), ERROR), true_error(context.tape)
     curves = {"e": measured}
@@ -159,7 +159,7 @@ def _limit_pairs(names: Sequence[str], lower: Sequence[float], upper: Sequence[f
 
 
 def integral_figure(context: PlotContext) -> Figure | None:
-    """Both integrals of the law, by output: that of e beside that of the sign."""
+    """The integrals of the law, by output: of e and of the sign."""
     if "internals" not in context.tape:
         return None
     internals = context.tape["internals"]
@@ -173,7 +173,7 @@ def integral_figure(context: PlotContext) -> Figure | None:
 
 
 def spectrum_figure(runs: Runs, colours: Mapping[str, str], units: Mapping[str, DisplayUnit]) -> Figure | None:
-    """Amplitude spectral density of u, both axes logarithmic: one subplot per channel with all runs that have it.
+    """Amplitude spectral density of u, logarithmic axes: a subplot per channel with the runs.
 
     A run with fewer than MIN_SPECTRUM_SAMPLES is left out; None without a run.
     """
@@ -211,7 +211,7 @@ def spectrum_figure(runs: Runs, colours: Mapping[str, str], units: Mapping[str, 
 
 
 def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
-    """Samples of the controller's timing by quantity, ms; a quantity that is always 0 is left out."""
+    """Samples of the controller's timing by quantity, ms, without quantities of zeros alone."""
     samples: dict[str, FloatArray] = {}
     if "internals" in tape:
         periods = tick_periods(tape)
@@ -224,9 +224,9 @@ def _timing_samples(tape: Tape, period_ns: int) -> dict[str, FloatArray]:
 
 
 def timing_figure(runs: Runs, colours: Mapping[str, str]) -> Figure | None:
-    """Histograms of the controller's timing in ms, on common bins and a logarithmic axis; None where all of it is 0.
+    """Histograms of the controller's timing in ms, on common bins and a logarithmic axis; None for zeros alone.
 
-    There is one subplot per quantity with all runs that have it.
+    A quantity has a subplot with the runs.
     """
     timing = {label: _timing_samples(tape, period_ns) for label, (tape, period_ns) in runs.items()}
     quantities = list(dict.fromkeys(quantity for samples in timing.values() for quantity in samples))
@@ -259,7 +259,7 @@ def timing_figure(runs: Runs, colours: Mapping[str, str]) -> Figure | None:
 
 
 def wind_figure(context: PlotContext) -> Figure | None:
-    """Every component of the wind that is not zero throughout."""
+    """Every nonzero component of the wind."""
     wind = _nonzero_group(context.tape, "gust")
     if not wind.names:
         return None
@@ -268,19 +268,19 @@ def wind_figure(context: PlotContext) -> Figure | None:
 
 
 def state_figure(context: PlotContext) -> Figure | None:
-    """All states of a simulated aircraft."""
+    """The states of a simulated aircraft."""
     x = _truth_group(context.tape, "x")
     return time_series_figure(context, {"x": Curve(x, PLANT)}, columns=2, height=130) if x.names else None
 
 
 def sensor_figure(context: PlotContext) -> Figure | None:
-    """Y less the true output, of every sensor that has an error."""
+    """Y less the true output, of every sensor with an error."""
     noise = _nonzero_group(context.tape, "noise")
     return time_series_figure(context, {"error": Curve(noise, ERROR, 0.8)}, columns=2, height=120) if noise.names else None
 
 
 def tick_figure(context: PlotContext) -> Figure | None:
-    """Lateness, age of y and dt of the controller's ticks; None where all ticks were on time with a fresh y."""
+    """Lateness, age of y and dt of the controller's ticks; None for ticks in time with a fresh y alone."""
     tape, channels = context.tape, ("late", "age", "dt")
     if "internals" not in tape:
         return None
@@ -299,14 +299,14 @@ def _truth_group(tape: Tape, group: str) -> Signal:
 
 
 def _nonzero_group(tape: Tape, group: str) -> Signal:
-    """Those channels of `_truth_group` that are not zero throughout."""
+    """The nonzero channels of `_truth_group`."""
     signal = _truth_group(tape, group)
     nonzero = np.flatnonzero(signal.values.any(axis=0))
     return Signal(signal.stamp_ns, tuple(signal.names[i] for i in nonzero), signal.values[:, nonzero])
 
 
 def _saturated(tape: Tape, name: str, kind: Saturation) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """The instants of `internals`, and the mask of those at which an input had a kind of saturation."""
+    """The instants of `internals`, and the mask of the instants of a kind of saturation of an input."""
     channel = f"limited.{name}"
     if "internals" not in tape or channel not in tape["internals"].names:
         return np.zeros(0), np.zeros(0, dtype=bool)
@@ -314,7 +314,7 @@ def _saturated(tape: Tape, name: str, kind: Saturation) -> tuple[FloatArray, NDA
 
 
 def _axis_range(values: FloatArray, bounds: FloatArray) -> tuple[float, float]:
-    """Range of an axis: the values, and the bounds near them."""
+    """Range of an axis: the values, and near bounds."""
     low, high = float(values.min(initial=0.0)), float(values.max(initial=0.0))
     near = [bound for bound in bounds if 0.0 < bound <= LIMIT_VIEW_RATIO * high or LIMIT_VIEW_RATIO * low <= bound < 0.0]
     low, high = min([low, *near]), max([high, *near])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of merit of a guided flight: its segments, by mode and leg, with the errors of what each of them holds."""
+"""Figures of merit of a guided flight: the segments, by mode and leg, with the errors of the held quantities."""
 
 import math
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ BANDS: Mapping[str, float] = {
 
 
 class Held(NamedTuple):
-    """How well a quantity is held over a segment, in SI. A segment that begins outside the band has overshoot and settling."""
+    """Errors of a held quantity over a segment, in SI. A segment with a begin outside the band has overshoot and settling."""
 
     quantity: str
     rms: float
@@ -53,7 +53,7 @@ class Segment(NamedTuple):
 
 
 def segments(tape: Tape) -> list[Segment]:
-    """The segments of a guided flight, from `guidance`. Commands less than SETTLING_DWELL apart begin one segment."""
+    """The segments of a guided flight, from `guidance`. Commands less than SETTLING_DWELL apart begin a single segment."""
     t, errors = tape.time("guidance"), control_errors(tape)
     log = tape["guidance"]
     named = ["mode.lateral", "mode.vertical", "leg", *(f"target.{name}" for name in TARGETS)]
@@ -75,9 +75,9 @@ def segments(tape: Tape) -> list[Segment]:
 
 
 def control_errors(tape: Tape) -> dict[str, FloatArray]:
-    """Error of each quantity that guidance can hold, measured less commanded, at the samples of `guidance`, shape (N,).
+    """Errors of the quantities of guidance, measured less commanded, at the samples of `guidance`, shape (N,).
 
-    The cross-track error is that of the log, positive to the right. Angles are within half a turn.
+    The cross-track error comes from the log, positive to the right. Angles are within half a turn.
     """
     log, pose = tape["guidance"], tape["guidance"].group("pose")
     measured = {
@@ -111,8 +111,8 @@ def guidance_summary(tape: Tape) -> dict[str, Any] | None:
     limited = log.group("limited")
     return {
         "segments": [
-            one._asdict() | {name: getattr(one, name)._asdict() for name in ("lateral", "vertical", "V")}
-            for one in segments(tape)
+            segment._asdict() | {name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")}
+            for segment in segments(tape)
         ],
         "bank": _largest(log["pose.phi"]),
         "age_pose": _largest(log["age.pose"]),

@@ -39,12 +39,12 @@ Bounds = Mapping[str, tuple[float, float]]  # least and largest command by chann
 
 
 def guided_context(context: PlotContext) -> PlotContext:
-    """The context with the units of what guidance holds, and the times at which pose was stale."""
+    """The context with the units of the held quantities, and the times of a stale pose."""
     t, mode = context.tape.time("guidance"), context.tape["guidance"]["mode"]
     stale = [
-        Interval(f"guidance: {one.name.lower().replace('_', ' ')}", start, stop, colour, False)
-        for one, colour in MODE_SHADES.items()
-        for start, stop in mask_spans(t, mode == one)
+        Interval(f"guidance: {shaded.name.lower().replace('_', ' ')}", start, stop, colour, False)
+        for shaded, colour in MODE_SHADES.items()
+        for start, stop in mask_spans(t, mode == shaded)
     ]
     return context._replace(units=QUANTITY_UNITS, intervals=[*context.intervals, *stale])
 
@@ -62,7 +62,7 @@ def bounds_of(scenario: Scenario) -> Bounds:
 
 
 def flown_routes(scenario: Scenario, tape: Tape) -> list[Route]:
-    """The routes that the log says were flown: that of the scenario and those that arrived in flight."""
+    """The flown routes by the log: of the scenario and of the topic `route`."""
     if scenario.guidance is None:
         return []
     flown = set(tape["guidance"]["route"].tolist())
@@ -77,7 +77,7 @@ def track_figure(tape: Tape, routes: Sequence[Route], speed: float) -> Figure:
 
 
 def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:
-    """Ground tracks over routes, equal axes: the tape of a guided flight and its colour by label."""
+    """Ground tracks over routes, equal axes: the tape of a guided flight and the colour by label."""
     figure = Figure(1, 1, TRACK_HEIGHT)
     for route in routes:
         line = {"color": REFERENCE, "width": 6.0}
@@ -99,7 +99,7 @@ def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route
 def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
     """Mean wind over equal parts of the flight, to the north and to the east, m/s, shape (parts, 2).
 
-    It is the velocity over ground less that through the air, V cos(gamma) along psi + beta, with V = V0 + V of y.
+    The wind is the velocity over ground less the velocity through the air, V cos(gamma) along psi + beta, with V = V0 + V of y.
     """
     log = tape["guidance"]
     airspeed, heading = speed + log["y.V"], log["pose.psi"] + log["pose.beta"]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The report as one HTML page without network access: the tables of a flight and its figures, or a comparison of several."""
+"""The report as an HTML page without network access: tables and figures of a flight, or a comparison of flights."""
 
 import base64
 import json
@@ -32,7 +32,7 @@ HERE = Path(__file__).parent
 
 
 class Line(NamedTuple):
-    """A line under the title: the colour and label of a flight, its outcome, and text; each may be empty."""
+    """A line under the title: colour, label and outcome of a flight, and text; any part may be empty."""
 
     text: str
     outcome: str = ""
@@ -41,7 +41,7 @@ class Line(NamedTuple):
 
 
 class TableGroup(NamedTuple):
-    """Tables beside each other. With `colours`, those of the flights, they are comparison tables."""
+    """Adjacent tables. With `colours` of the flights: comparison tables."""
 
     tables: Sequence[tables.Table] | Sequence[comparison.ComparisonTable]
     title: str = ""
@@ -50,7 +50,7 @@ class TableGroup(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A figure with its heading; left out without a figure."""
+    """A figure with a heading; left out without a figure."""
 
     title: str
     hint: str
@@ -185,7 +185,7 @@ def _guidance_sections(flight: RecordedFlight, context: plotting.PlotContext) ->
 
 
 def page_html(page: Page) -> str:
-    """The page as HTML, with plotly, the script and all samples inside."""
+    """The page as HTML, with plotly, the script and the samples inside."""
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -200,14 +200,14 @@ def page_html(page: Page) -> str:
 
 
 def script_json(value: Any) -> Markup:
-    """JSON that cannot end the script element around it: "<" occurs only in strings, where it is escaped."""
+    """JSON for a script element: "<" occurs only in strings, as an escape."""
     content = finite_or_null({"data": value.data, "layout": value.layout} if isinstance(value, Figure) else value)
     text = json.dumps(content, default=_typed_array, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c"))  # noqa: S704
 
 
 def _typed_array(array: FloatArray | NDArray[np.float32]) -> dict[str, str]:
-    """An array as plotly.js takes it: its type, "f8" or "f4", and its bytes, little endian."""
+    """An array for plotly.js: type "f8" or "f4", and bytes, little endian."""
     return {"dtype": array.dtype.str[1:], "bdata": base64.b64encode(array.tobytes()).decode()}
 
 

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Layouts of Foxglove and PlotJuggler for the runs of a scenario.
 
-Foxglove addresses a channel by its index in `position`, PlotJuggler by its name. A layout therefore fits all scenarios with the
-same channels in the same order.
+Foxglove addresses a channel by the index in `position`, PlotJuggler by the name. A layout therefore fits every scenario with
+the same channels in the same order.
 """
 
 import json
@@ -25,21 +25,21 @@ CAMERA_DISTANCE, GRID_SIZE = 3000.0, 10_000.0  # m
 
 
 class Plot(NamedTuple):
-    """Curves over time in one pair of axes, all SI and radians."""
+    """Curves over time in a pair of axes, SI and radians."""
 
     title: str
     curves: tuple[tuple[str, str], ...]  # topic and channel
 
 
 class Tab(NamedTuple):
-    """Plots on one screen."""
+    """Plots on a screen."""
 
     title: str
     plots: tuple[Plot, ...]
 
 
 def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
-    """The channels of each topic of a run, in their order."""
+    """The channels of the topics of a run, in their order."""
     controller = scenario.controller
     guided = {} if scenario.guidance is None else {"guidance": guidance.names(scenario.guidance.outputs)}
     return guided | {
@@ -54,7 +54,7 @@ def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
 def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
     """The tabs: y over y_m and e by output, u with u_free, integral_e and Pi, state and timing of the controller, the wind.
 
-    A guided flight has one more, of what guidance commands and measures.
+    A guided flight has a further tab, of the commands and measurements of guidance.
     """
     outputs, inputs, wind = channels["y_m"], channels["u"], [name for name in channels["truth"] if name.startswith("gust.")]
 
@@ -95,9 +95,9 @@ def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
 
 
 def foxglove(channels: Mapping[str, Sequence[str]]) -> str:
-    """A layout of Foxglove and Lichtblick: JSON, a Tab panel that holds Plot panels.
+    """A layout of Foxglove and Lichtblick: JSON, a Tab panel with Plot panels.
 
-    Paths are "/topic.position[index]". The time axis is log time: stamps are flight time, which in lockstep is far from it.
+    Paths are "/topic.position[index]". The time axis is log time: stamps are flight time, far from log time in lockstep.
     """
     panels: dict[str, Any] = {}
     tabs: list[dict[str, Any]] = []
@@ -164,7 +164,7 @@ def _foxglove_map() -> dict[str, Any]:
 
 
 def _mosaic(names: Sequence[str]) -> Any:
-    """Panels in rows of COLUMNS as a binary tree: each node splits off its first panel."""
+    """Panels in rows of COLUMNS as a binary tree: a node splits off the first panel."""
     rows = [_split(names[start : start + COLUMNS], "row") for start in range(0, len(names), COLUMNS)]
     return _split(rows, "column")
 

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Time-series figures for plotly.js: one subplot per channel, shaded intervals over all subplots.
+"""Time-series figures for plotly.js: a subplot per channel, shaded intervals over every subplot.
 
-All figures of a page share the time axis and the margins, so their subplots line up. A figure holds curves of few samples
-itself. `SampleStore` holds all samples of a longer one: the page decimates them to what the view can show. A figure also holds
-the extremes of a very long curve, since all its samples take the page long to unpack.
+The figures of a page share the time axis and the margins, so the subplots line up. A figure holds short curves. `SampleStore`
+holds the samples of longer curves: the page decimates the samples to the view. A figure also holds the extremes of a very
+long curve, since the page takes long to unpack the samples.
 """
 
 import base64
@@ -43,7 +43,7 @@ class Instants(NamedTuple):
 
 
 class SampleStore:
-    """All samples of the long curves of a page, packed. Equal arrays are stored once, under a hash of their content."""
+    """The samples of the long curves of a page, packed. Equal arrays are stored once, under a hash of the content."""
 
     def __init__(self) -> None:
         self._packed: dict[str, Future[str]] = {}
@@ -55,11 +55,11 @@ class SampleStore:
 
     @property
     def packed(self) -> dict[str, str]:
-        """The arrays as a page holds them, by name."""
+        """The arrays of a page, by name."""
         return {name: packed.result() for name, packed in self._packed.items()}
 
     def instants(self, stamp_ns: NDArray[np.int64], start_ns: int, *, steps: bool) -> Instants:
-        """The instants of a curve, once for all channels of a signal. A step curve has no gaps."""
+        """The instants of a curve, once for the channels of a signal. A step curve has no gaps."""
         key = id(stamp_ns), start_ns, steps
         if key not in self._instants:
             self._instants[key] = _instants(stamp_ns - start_ns, steps), stamp_ns
@@ -90,7 +90,7 @@ class SampleStore:
 def pack(content: bytes | NDArray[Any], width: int = 1) -> str:
     """Base64 of the zlib stream of bytes, after a byte shuffle of items of `width` bytes.
 
-    The shuffle puts the first bytes of all items first, then the second bytes, and so on: high bytes of small steps are equal.
+    The shuffle puts the first bytes of the items first, then the second bytes, and so on: high bytes of small steps are equal.
     """
     shuffled = np.frombuffer(content, dtype=np.uint8).reshape(-1, width).T.tobytes()
     return base64.b64encode(zlib.compress(shuffled, LEVEL)).decode()
@@ -107,7 +107,7 @@ class Interval(NamedTuple):
 
 
 class PlotContext(NamedTuple):
-    """What all figures of a page share."""
+    """Common parts of the figures of a page."""
 
     tape: Tape
     units: Mapping[str, DisplayUnit]  # by channel
@@ -117,7 +117,7 @@ class PlotContext(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A signal and its line style."""
+    """A signal and a line style."""
 
     signal: Signal
     colour: str
@@ -127,9 +127,9 @@ class Curve(NamedTuple):
 
 
 class Figure:
-    """Subplots as plotly.js takes them: the traces `data` and the `layout`, of which `x` and `y` are the axes by subplot.
+    """Subplots for plotly.js: the traces `data` and the `layout`; `x` and `y` are the axes by subplot.
 
-    `count` subplots are filled row by row, `height` pixels each, with `spacing` between the rows as a fraction of the figure.
+    `count` subplots are filled row by row, `height` pixels high, with `spacing` between the rows as a fraction of the figure.
     Source of the names: https://plotly.com/javascript/reference.
     """
 
@@ -148,7 +148,7 @@ class Figure:
             self.y.append({"anchor": axis("x", index), "domain": [bottom, bottom + high]})
         self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
         for letter, axes in (("x", self.x), ("y", self.y)):
-            self.layout |= {axis(f"{letter}axis", index): one for index, one in enumerate(axes)}
+            self.layout |= {axis(f"{letter}axis", index): value for index, value in enumerate(axes)}
 
     def add(self, trace: dict[str, Any], index: int = 0) -> None:
         """Add a trace to a subplot."""
@@ -161,7 +161,7 @@ def axis(name: str, index: int) -> str:
 
 
 def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, columns: int = 1, height: int = 150) -> Figure:
-    """One subplot of `height` pixels per channel, with every curve that has the channel; two columns are filled row by row."""
+    """A subplot of `height` pixels per channel, with the curves of the channel; two columns are filled row by row."""
     channels = list(dict.fromkeys(name for curve in curves.values() for name in curve.signal.names))
     columns = min(columns, len(channels))
     figure = Figure(len(channels), columns, height)
@@ -185,14 +185,14 @@ def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, col
 
 
 def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
-    """Set size, margins and colours: the legend and `labels` pixels above the rows, the axis `below` them."""
+    """Set size, margins and colours: the legend and `labels` pixels above the rows, the axis `below` the rows."""
     above, rows = 24 * any(trace.get("showlegend") for trace in figure.data) + labels, figure.height * figure.rows
     for axes, standoff in ((figure.x, 4), (figure.y, 6)):
-        for one in axes:
-            one |= {"gridcolor": GRID, "zerolinecolor": ZERO, "title": one.get("title", {}) | {"standoff": standoff}}
-            one |= {"type": one.get("type", "linear")}  # plotly reads the samples of an axis without a type
-    for one in figure.y:
-        one["ticklabeloverflow"] = "allow"  # the margin has room for them: plotly does not measure each
+        for axis in axes:
+            axis |= {"gridcolor": GRID, "zerolinecolor": ZERO, "title": axis.get("title", {}) | {"standoff": standoff}}
+            axis |= {"type": axis.get("type", "linear")}  # plotly reads the samples of an axis without a type
+    for axis in figure.y:
+        axis["ticklabeloverflow"] = "allow"  # the margin has room for them: plotly does not measure each
     figure.layout |= {
         "height": above + rows + below,
         "font": {"family": "system-ui, sans-serif", "size": 12, "color": INK},
@@ -207,14 +207,14 @@ def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
 
 
 def first_in_legend(figure: Figure, label: str) -> bool:
-    """Whether the figure has no trace of a label yet; the legend shows each label once."""
+    """Whether the figure has no trace of a label yet; the legend shows a label once."""
     return all(trace["name"] != label for trace in figure.data)
 
 
 def add_line(
     figure: Figure, index: int, label: str, x: Sequence[float | None], y: Sequence[float], style: Mapping[str, Any]
 ) -> None:
-    """Add a line to a subplot, with one entry in the legend. None in x breaks the line."""
+    """Add a line to a subplot, with an entry in the legend. None in x breaks the line."""
     if not x:
         return
     trace = {"type": "scatter", "x": x, "y": y, "mode": "lines", "name": label, "legendgroup": label, "line": style}
@@ -238,7 +238,7 @@ def _trace(context: PlotContext, curve: Curve, channel: str, factor: float, most
 
 
 def extremes(values: FloatArray, most: int) -> NDArray[np.intp]:
-    """Rows of the minimum, the maximum and the first NaN of each of `most` / 2 bins, as the page decimates a view."""
+    """Rows of the minimum, the maximum and the first NaN in `most` / 2 bins, as the page decimates a view."""
     width = -(-len(values) // (most // 2))
     bins = np.append(values, np.full(-len(values) % width, values[-1])).reshape(-1, width)
     gaps = np.isnan(bins)
@@ -250,7 +250,7 @@ def extremes(values: FloatArray, most: int) -> NDArray[np.intp]:
 
 
 def stored(context: PlotContext, signal: Signal, channel: str, factor: float) -> tuple[str, str]:
-    """Where the page has the times and the values of a channel, times a factor. Those of a long curve are there once."""
+    """Places of the times and the values of a channel, times a factor, on the page. A long curve is there once."""
     t_ns, values = _drawn(context, signal, channel, factor, steps=False)
     return context.samples.times(t_ns), context.samples.values(values)
 
@@ -258,7 +258,7 @@ def stored(context: PlotContext, signal: Signal, channel: str, factor: float) ->
 def _drawn(
     context: PlotContext, signal: Signal, channel: str, factor: float, steps: bool
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Instants and values of a channel times a factor, with a NaN at the start of each gap."""
+    """Instants and values of a channel times a factor, with a NaN at the start of a gap."""
     t_ns, gaps = context.samples.instants(signal.stamp_ns, context.tape.start_ns, steps=steps)
     values = signal[channel] * factor
     return t_ns, np.insert(values, gaps, np.nan) if len(gaps) else values
@@ -295,7 +295,7 @@ def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int
 
 
 def _merged_labels(intervals: Sequence[Interval], end: float) -> dict[float, str]:
-    """Labels of intervals by start, s. Labels that would overlap are merged."""
+    """Labels of intervals by start, s. Overlapping labels are merged."""
     labels: dict[float, str] = {}
     for interval in sorted(intervals, key=lambda interval: interval.start):
         start = next((start for start in labels if interval.start - start < LABEL_WIDTH * end), interval.start)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The 3-D replay of a report page: the scene of the live view, with samples that the page holds for its figures."""
+"""The 3-D replay of a report page: the scene of the live view, with the samples of the figures."""
 
 import re
 from pathlib import Path
@@ -25,7 +25,7 @@ MAX_POSES = 6000
 
 
 class Replay(NamedTuple):
-    """What a page needs for the replay beside its samples."""
+    """Data of a page for the replay, except the samples."""
 
     data: dict[str, Any]
     code: str  # packed
@@ -33,7 +33,7 @@ class Replay(NamedTuple):
 
 
 def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
-    """The replay of a flight whose attitude is in its log, else None. Adds the poses to the samples of the page."""
+    """The replay of a flight with a logged attitude, else None. Adds the poses to the samples of the page."""
     tape, topics = flight.tape, {}
     truth = tape.signals.get("truth")
     if (pose := tape.signals.get("pose")) is not None and "phi" in pose.names:
@@ -57,7 +57,7 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
 
 
 def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> dict[str, Any]:
-    """Where times and values of channels are, with the factors of their units; `channels` maps names to those of the units."""
+    """Where times and values of channels are, with the factors of their units; `channels` maps names to names of the units."""
     found, times = {}, ""
     for name, quantity in channels.items():
         if name in signal.names:
@@ -77,7 +77,7 @@ def _thinned(pose: Signal) -> Signal:
 
 
 def _code() -> str:
-    """The scripts as one function that runs at once: modules without imports, exports, comment lines and indentation."""
+    """The scripts as a function with an immediate call: modules without imports, exports, comment lines and indentation."""
     text = "\n".join(path.read_text(encoding="utf-8") for path in SCRIPTS)
     text = re.sub(r"^(import |\s*//).*\n|^\s+", "", text, flags=re.MULTILINE)
     return "(() => {\n" + re.sub(r"^export ", "", text, flags=re.MULTILINE) + "})();\n"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a run: created before a flight, with the attachments of its log; read back and reported on after it."""
+"""The folder of a run: created before a flight, with the attachments of the log; read back and reported on afterwards."""
 
 import json
 import os
@@ -32,7 +32,7 @@ AIRFRAME, PARAMETERS, PROVENANCE = "airframe.yaml", "parameters.yaml", "provenan
 
 
 class FlightResult(NamedTuple):
-    """A flight that has ended, with the paths of its log and report."""
+    """A finished flight, with the paths of log and report."""
 
     flight: RecordedFlight
     mcap: Path
@@ -40,7 +40,7 @@ class FlightResult(NamedTuple):
 
 
 def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
-    """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>. Raises ParameterError where it cannot be created."""
+    """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>. Raises ParameterError for a failure."""
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}{scenario.name}"
     for name in (stem, *(f"{stem}-{k}" for k in range(2, 100))):
         run = (runs / name).absolute()
@@ -55,7 +55,7 @@ def attachments_for(
 ) -> LogAttachments:
     """The attachments of the log of a flight, written into the folder of the run where they are not files yet.
 
-    They are the scenario, the airframe, every parameter as the nodes validate it, `further` files, and the provenance.
+    These are the scenario, the airframe, every parameter after validation, `further` files, and the provenance.
     `overrides` are parameters of the scenario's nodes by the node's name; None for a flight without nodes. Raises
     ParameterError where a file cannot be written.
     """
@@ -75,8 +75,8 @@ def _write(path: Path, text: str) -> Path:
 def read_flight(run: Path, outcome: str | None = None) -> RecordedFlight:
     """Read a recorded flight and summarise it. No file is written.
 
-    Without an outcome, that of the run's summary is kept. Raises ParameterError where the log cannot be read, or holds no
-    scenario.
+    Without an outcome, the outcome in the run's summary is kept. Raises ParameterError where the log cannot be read, or holds
+    no scenario.
     """
     return _flight(read_run(run), run, outcome)
 
@@ -93,27 +93,27 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample
     summary = summarise(scenario, engaged if has_figures else tape, outcome or _previous_outcome(folder / SUMMARY))
     if flown is not None:
-        summary["engagements"] = [_engagement(tape, one) for one in flown]
+        summary["engagements"] = [_engagement(tape, engagement) for engagement in flown]
         summary["notes"] = [*engagement_notes(summary["engagements"], has_figures=has_figures), *summary["notes"]]
     return RecordedFlight(name, scenario, tape, summary)
 
 
 def _engaged(tape: Tape, flown: Sequence[Engagement]) -> Tape:
-    """The engaged part of a flight with a bridge, for its figures. Without an engagement: the whole tape, for its duration."""
+    """The engaged part of a flight with a bridge, for the figures. Without an engagement: the whole tape, for the duration."""
     end_ns = max((int(signal.stamp_ns[-1]) for signal in tape.signals.values() if len(signal.stamp_ns)), default=0)
-    windows = [(one.start_ns, one.stop_ns or end_ns) for one in flown]
+    windows = [(engagement.start_ns, engagement.stop_ns or end_ns) for engagement in flown]
     signals = {name: signal.within(windows) for name, signal in tape.signals.items()} if windows else tape.signals
     return replace(tape, signals={name: signal for name, signal in signals.items() if len(signal.stamp_ns)})
 
 
 def _engagement(tape: Tape, flown: Engagement) -> dict[str, Any]:
-    """Start and end of an engagement in flight time, s, and why it ended."""
-    start, stop = ((one - tape.start_ns) / NANOSECONDS if one else None for one in (flown.start_ns, flown.stop_ns))
+    """Start and end of an engagement in flight time, s, and the reason of the end."""
+    start, stop = ((time_ns - tape.start_ns) / NANOSECONDS if time_ns else None for time_ns in (flown.start_ns, flown.stop_ns))
     return {"start": start, "stop": stop, "reason": flown.reason}
 
 
 def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
-    """The scenario in a log, which is written beside the log. Raises ParameterError where the log holds none."""
+    """The scenario in a log, written beside the log. Raises ParameterError where the log holds none."""
     recorded = read_run(run, namespace)
     scenario = _scenario_in(recorded, run)
     _write_scenario(recorded, scenario.path)
@@ -121,14 +121,14 @@ def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
 
 
 def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
-    """The scenario in a log, with its path beside the log. Raises ParameterError."""
+    """The scenario in a log, with a path beside the log. Raises ParameterError."""
     if recorded.scenario is None:
         raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
     return parse_recorded_scenario(recorded.scenario.content, _folder(run) / recorded.scenario.name)
 
 
 def _write_scenario(recorded: RecordedRun, path: Path) -> None:
-    """Write the scenario of a log, once. Raises ParameterError where a file with other content has its name."""
+    """Write the scenario of a log, once. Raises ParameterError where a file with different content has the name."""
     if recorded.scenario is None:
         return
     if path.is_symlink() or not path.exists():
@@ -144,9 +144,9 @@ def _write_scenario(recorded: RecordedRun, path: Path) -> None:
 
 
 def write_report(run: Path, outcome: str | None = None, output: Path | None = None) -> FlightResult:
-    """Read the bag back, write its scenario, summary.json and report.html, and link runs/latest to the run.
+    """Read the bag back, write scenario, summary.json and report.html, and link runs/latest to the run.
 
-    The files go beside the log, or into the folder `output`, which is created. Without an outcome the report of an old run is
+    The files go beside the log, or into the new folder `output`. Without an outcome the report of an old run is
     written again and runs/latest stays. Raises ParameterError as `read_flight` does, before any file is written.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
@@ -164,14 +164,14 @@ def write_report(run: Path, outcome: str | None = None, output: Path | None = No
 
 
 def write_empty_summary(run: Path, scenario: Scenario, outcome: str) -> None:
-    """Write summary.json of a flight that ended before its first sample. The log stays as it is. Raises ParameterError."""
+    """Write summary.json of a flight with an end before the first sample. The log does not change. Raises ParameterError."""
     with writing("", run, "a folder that can"):
         write_file(run / SUMMARY, json.dumps(empty_summary(scenario, outcome), indent=2) + "\n")
     link_latest(run)
 
 
 def _folder(run: Path) -> Path:
-    """The folder of a run, which may be given by its log or by a link such as runs/latest."""
+    """The folder of a run, given as a folder, a log or a link such as runs/latest."""
     return run.resolve() if run.is_dir() else run.resolve().parent
 
 
@@ -183,7 +183,7 @@ def _previous_outcome(summary: Path) -> str:
 
 
 def _until_last_input(tape: Tape) -> Tape:
-    """The tape up to the controller's last u. Samples after it belong to the shutdown of the processes."""
+    """The tape up to the controller's last u. Later samples belong to the shutdown of the processes."""
     if "u" not in tape:
         return tape
     end_ns = tape["u"].stamp_ns[-1]
@@ -191,7 +191,7 @@ def _until_last_input(tape: Tape) -> Tape:
 
 
 def link_latest(run: Path) -> None:
-    """Point runs/latest at a run, atomically. Raises ParameterError where it cannot be a link."""
+    """Point runs/latest at a run, atomically. Raises ParameterError where no link can be made."""
     latest, temporary = run.parent / "latest", run.parent / f".latest-{os.getpid()}"
     with writing("", latest, "a link to the last run"):
         temporary.symlink_to(run.name)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of a flight as `summary.json` and the tables hold them, with the units and columns of the tables."""
+"""Metrics of a flight for `summary.json` and the tables, with the units and columns of the tables."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -53,13 +53,13 @@ QUANTITY_UNITS = {
 
 
 def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
-    """The name of a channel with its unit."""
+    """The name of a channel with the unit."""
     unit = units.get(name, NO_UNIT).unit
     return f"{name} ({unit})" if unit else name
 
 
 def display_unit(unit: str) -> DisplayUnit:
-    """The unit in which a channel of a unit of the airframe file is shown: mrad/s for rad/s, otherwise that unit."""
+    """The display unit of a unit of the airframe file: mrad/s for rad/s, otherwise the same unit."""
     return DisplayUnit("mrad/s", 1e3) if unit == "rad/s" else DisplayUnit(unit, 1.0 / SI_PER_UNIT[unit])
 
 
@@ -82,9 +82,9 @@ def pulse_edges(scenario: Scenario) -> list[Transient]:
 
 
 def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
-    """Engagements, commands and gusts. From the first live command on, live commands replace those of the scenario.
+    """Engagements, commands and gusts. From the first live command on, live commands replace the commands of the scenario.
 
-    Turns and captures replace all commands of a guided flight.
+    Turns and captures replace the commands of a guided flight.
     """
     gusts = [Transient("gust", name, *window) for name, window in scenario.gust_windows().items()]
     if "guidance" in tape:
@@ -95,7 +95,7 @@ def transients(scenario: Scenario, tape: Tape) -> list[Transient]:
 
 
 class RecordedFlight(NamedTuple):
-    """A flight under the name of its run: what figures, tables, exports and comparisons are made of."""
+    """A flight under the name of its run: the input of figures, tables, exports and comparisons."""
 
     name: str
     scenario: Scenario
@@ -109,7 +109,7 @@ class RecordedFlight(NamedTuple):
 
 
 def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
-    """All metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains each key."""
+    """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains the keys."""
     for topic in ("y", "y_m"):
         require(topic in tape, "the log", f"no sample of {topic}", "a flight with y and y_m")
     events = transients(scenario, tape)
@@ -133,18 +133,18 @@ def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
 
 
 def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
-    """Sentences on the engagements of a flight with a bridge, which have figures unless they are shorter than a sample."""
+    """Sentences on the engagements of a flight with a bridge, with figures unless shorter than a sample."""
     if not flown:
         return ["never engaged: the figures are of an aircraft that this controller did not fly"]
     sentences = []
-    for one in flown:
-        end = "the end of the log" if one["stop"] is None else f"{one['stop']:.1f} s: {one['reason']}"
-        sentences.append(f"engaged from {one['start']:.1f} s to {end}")
+    for engagement in flown:
+        end = "the end of the log" if engagement["stop"] is None else f"{engagement['stop']:.1f} s: {engagement['reason']}"
+        sentences.append(f"engaged from {engagement['start']:.1f} s to {end}")
     return [*sentences, f"the figures are of the {'engaged time alone' if has_figures else 'whole flight: no y while engaged'}"]
 
 
 def empty_summary(scenario: Scenario, outcome: str) -> dict[str, Any]:
-    """The summary of a flight that ended before its first sample."""
+    """The summary of a flight with an end before the first sample."""
     return {
         "scenario": scenario.name,
         "outcome": outcome,
@@ -179,9 +179,9 @@ def _inputs(tape: Tape, events: Sequence[Transient]) -> dict[str, Any]:
 
 
 def finite_or_null(value: Any) -> Any:
-    """A value for JSON, which has no NaN and no infinity: None in their place, also inside mappings and lists.
+    """A value for JSON with None in place of NaN and infinity, also inside mappings and lists.
 
-    A part of the flight without samples has NaN metrics, an overflow infinite ones.
+    A part of the flight without samples has NaN metrics, an overflow infinite metrics.
     """
     if isinstance(value, Mapping):
         return {key: finite_or_null(entry) for key, entry in value.items()}
@@ -191,7 +191,7 @@ def finite_or_null(value: Any) -> Any:
 
 
 class Column(NamedTuple):
-    """A column of a table: its heading, the heading above it that neighbouring columns share, and the path of its metric."""
+    """A column of a table: the heading, the common heading of neighbouring columns above, and the path of the metric."""
 
     group: str
     head: str
@@ -246,7 +246,7 @@ def parts_legend(summary: Mapping[str, Any]) -> str:
 
 
 def metric(summary: Mapping[str, Any], *path: str) -> float | None:
-    """A metric by its path in a summary; None where the summary has none there."""
+    """A metric by the path in a summary; None for a missing metric."""
     value: Any = summary
     for key in path:
         value = value.get(key) if isinstance(value, Mapping) else None
@@ -259,7 +259,7 @@ def format_value(value: float | None, factor: float = 1.0) -> str:
 
 
 def table_rows(channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
-    """Rows for "errors" or "inputs" of a summary: the channel with its unit, then a cell for each column."""
+    """Rows for "errors" or "inputs" of a summary: the channel with the unit, then a cell per column."""
     return [
         [
             channel_label(name, units),
@@ -284,7 +284,7 @@ def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> 
 def slowest_settling(summary: Mapping[str, Any], channel: str, kind: str) -> str:
     """The longest settling time of a channel after transients of a kind, s.
 
-    "> x" where the error did not settle after one of them; x is then the longest time, settled or not.
+    "> x" where the error did not settle after a transient; x is then the longest time, settled or not.
     """
     settled: list[float] = []
     unsettled: list[float] = []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of a flight's report page as data; page.html.jinja turns them into HTML."""
+"""The tables of a flight's report page as data; page.html.jinja makes HTML."""
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby, product
@@ -46,7 +46,7 @@ SATURATION_LEGEND = "; saturated: ticks with saturation by magnitude / by rate"
 
 
 class Table(NamedTuple):
-    """A table whose first column holds the rows' names; `columns` are those after it."""
+    """A table with the names of the rows in the first column; `columns` follow."""
 
     caption: str
     columns: Sequence[Column]
@@ -55,18 +55,18 @@ class Table(NamedTuple):
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """Headings that neighbouring columns share, each with its number of columns."""
+        """Common headings of neighbouring columns, with the number of columns."""
         return [(group, len(list(columns))) for group, columns in groupby(self.columns, key=lambda column: column.group)]
 
     @property
     def group_starts(self) -> list[bool]:
-        """Whether each column starts a group; a column without a group does."""
+        """Whether the columns start a group; a column without a group does."""
         groups = [column.group for column in self.columns]
         return [not group or group != before for group, before in zip(groups, [None, *groups], strict=False)]
 
 
 class Event(NamedTuple):
-    """A gust, a failsafe mode or a saturation, from its first to its last instant in s."""
+    """A gust, a failsafe mode or a saturation, from the first to the last instant in s."""
 
     name: str
     start: float
@@ -75,7 +75,7 @@ class Event(NamedTuple):
 
 
 def events(tape: Tape, gusts: Windows) -> list[Event]:
-    """Gusts, modes other than ENGAGED, and saturations of each input, one event each, in order of their start."""
+    """Gusts, modes other than ENGAGED, and saturations of the inputs, in order of the start."""
     listed = []
     intervals = figures.gust_intervals(tape, gusts) + figures.mode_intervals(tape)
     for label, group in groupby(intervals, key=lambda interval: interval.label):
@@ -100,7 +100,7 @@ def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], 
     tables = (
         _error_table(summary, units),
         Table("Inputs", inputs, input_rows(summary, units), INPUT_LEGEND + SATURATION_LEGEND),
-        Table("Events", times, [(one.name, f"{one.start:.2f}", f"{one.stop:.2f}", one.extent) for one in event_list]),
+        Table("Events", times, [(event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent) for event in event_list]),
         _guidance_table(summary),
         _tick_table(summary),
     )
@@ -127,14 +127,14 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
         columns += [Column(group, head) for head in ("held", *held[:-1], "settling (s)")]
     columns += [Column("V (m/s)", head) for head in held[:2]]
     rows = []
-    for one in guidance["segments"]:
-        name = one["lateral"]["quantity"] if one["leg"] is None else f"leg {one['leg']}"
-        row = [name, f"{one['start']:.1f}", f"{one['stop']:.1f}"]
-        for quantity in (one["lateral"], one["vertical"]):
+    for segment in guidance["segments"]:
+        name = segment["lateral"]["quantity"] if segment["leg"] is None else f"leg {segment['leg']}"
+        row = [name, f"{segment['start']:.1f}", f"{segment['stop']:.1f}"]
+        for quantity in (segment["lateral"], segment["vertical"]):
             unit, factor = QUANTITY_UNITS[quantity["quantity"]]
             factors = (factor, factor, factor, 1.0)
             row += [f"{quantity['quantity']} ({unit})", *map(format_value, (quantity[name] for name in held), factors)]
-        rows.append([*row, *(format_value(one["V"][name]) for name in held[:2])])
+        rows.append([*row, *(format_value(segment["V"][name]) for name in held[:2])])
     return Table("Guidance by segment", columns, rows, GUIDANCE_LEGEND if rows else "")
 
 
