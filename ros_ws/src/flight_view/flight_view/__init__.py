@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A flight on a page, live or recorded. It follows the growing log and joins no ROS graph, except for control where asked.
+"""A flight on a page, live or recorded. The page follows the growing log and joins no ROS graph, except for control.
 
 | module | does |
 |---|---|
-| `series` | keeps the samples of one topic in bounded memory |
+| `series` | keeps the samples of a topic in bounded memory |
 | `flight` | follows the log of a run: samples, events, state |
 | `server` | serves the page and the samples to browsers on this host |
-| `control` | checks and carries out what the page commands, over a link to the nodes |
+| `control` | checks and carries out commands of the page, over a link to the nodes |
 | `foxglove_server` | serves a log to viewers of the Foxglove protocol, an extra |
-| `watch` | finds the run, serves it until Ctrl-C |
+| `watch` | finds the run and serves the run until Ctrl-C |
 | `text` | shows a flight in a terminal |
 | `page/` | the page: markup, style, scripts |
 """

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Control of a flight from its page: who may command it, what may be commanded, and in which order. It needs no ROS.
+"""Control of a flight from the page: permission, range and order of commands, without ROS.
 
-A `Link` reaches the nodes. One page at a time holds the lease. Requests run one after another on a thread of their own;
-to deactivate the controller or disengage the bridge ends the one that runs.
+A `Link` reaches the nodes. A single page at a time holds the lease. Requests run in sequence on a separate thread;
+to deactivate the controller or disengage the bridge ends the running request.
 """
 
 import asyncio
@@ -31,10 +31,10 @@ LEASE = 5.0  # s that a page controls after its last request
 RATE, BURST = 5.0, 10.0  # requests a second, and at once
 KEY_PERIOD = 1.0  # s between two wrong keys
 MAX_WAYPOINTS = 200
-AT_ONCE = ("deactivate", "disengage")  # actions that wait for no other request
-OVER = ("ended", "interrupted")  # states of a recording: its flight can be commanded no more
+AT_ONCE = ("deactivate", "disengage")  # actions that do not queue
+OVER = ("ended", "interrupted")  # states of a recording: the flight can be commanded no more
 GUST_LEAD = 0.2  # s from the request to the begin of a gust
-SYSTEM_TIME_NS = 10**17  # stamps above are of the system clock, those of a lockstep flight begin at 0
+SYSTEM_TIME_NS = 10**17  # stamps above are of the system clock, stamps of a lockstep flight begin at 0
 
 Assess = Callable[[Scenario, ControllerConfig], dict[str, Any]]
 
@@ -43,10 +43,10 @@ class Link(Protocol):
     """What reaches the nodes of a flight. Methods return why something is refused, or "", and may raise ParameterError."""
 
     def nodes(self) -> list[str]:
-        """Nodes that can be commanded: those of aircraft, bridge, controller, guidance that run."""
+        """Nodes under command: the running nodes among aircraft, bridge, controller, guidance."""
 
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
-        """Values of parameters that are set."""
+        """Values of the parameters set."""
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
         """Set parameters together, or none."""
@@ -73,7 +73,7 @@ class Link(Protocol):
         """Disengage the bridge."""
 
     def cancel(self) -> None:
-        """End the wait of a method that runs on another thread."""
+        """End the wait of a method on the worker thread."""
 
     def resume(self) -> None:
         """Wait again, after `cancel`."""
@@ -83,7 +83,7 @@ class Link(Protocol):
 
 
 class RefusedError(Exception):
-    """A request that is refused: the status and a sentence."""
+    """A refused request: the status and a sentence."""
 
     def __init__(self, status: HTTPStatus, sentence: str) -> None:
         super().__init__(sentence)
@@ -126,7 +126,7 @@ class Control:
         self._undo: list[dict[str, Any]] = []  # earlier values, the last change at the end
         self._digest = 0  # of the controller's parameters, as far as known
         self._values: dict[str, Any] = {}  # the controller's tunable parameters that are set
-        self._faults: dict[str, Any] = {}  # those of the aircraft that are no gusts
+        self._faults: dict[str, Any] = {}  # parameters of the aircraft, without gusts
         self._actions: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
             "state": self._refresh,
             "gains": self._set_gains,
@@ -153,7 +153,7 @@ class Control:
             raise RefusedError(
                 HTTPStatus.BAD_REQUEST, f"do: found {short_repr(action)}, expected one of {', '.join(self._actions)}"
             )
-        # A later flight in this domain is another one.
+        # A later flight in this domain is a new flight.
         if action not in {"state", "check", *AT_ONCE} and self._flight.state() in OVER:
             raise RefusedError(
                 HTTPStatus.CONFLICT, "the flight of this page is over: rise-di watch --control shows a later one"
@@ -168,15 +168,15 @@ class Control:
         return await loop.run_in_executor(self._worker, self._carry_out, action, request, self._cancellations)
 
     def close(self) -> None:
-        """End the request that runs, and take no further one."""
+        """End the running request, and take no further request."""
         self._link.cancel()
-        for one in (self._worker, self._assessor):
-            one.shutdown(cancel_futures=True)
+        for executor in (self._worker, self._assessor):
+            executor.shutdown(cancel_futures=True)
 
     # Who may command
 
     def _require_key(self, key: str, lease: str) -> None:
-        """Refuse a wrong key, and for a while after one any key but that of the page that has control."""
+        """Refuse a wrong key. For KEY_PERIOD after a wrong key, accept only the page in control."""
         holds = bool(self._lease) and hmac.compare_digest(lease.encode(), self._lease.encode())
         if not holds and self._now() - self._wrong_key < KEY_PERIOD:
             raise RefusedError(HTTPStatus.TOO_MANY_REQUESTS, f"a wrong key less than {KEY_PERIOD:g} s ago")
@@ -205,7 +205,7 @@ class Control:
     # What may be commanded
 
     def _carry_out(self, action: str, request: Mapping[str, Any], cancellations: int) -> dict[str, Any]:
-        """Carry out a request that came after so many cancellations; a later one refuses it. A line of the log says so."""
+        """Carry out a request and write a line in the log. Refused after a cancellation later than `cancellations`."""
         self._link.resume()
         before = dict(self._values)
         what = {name: value for name, value in request.items() if name != "digest"}
@@ -228,20 +228,20 @@ class Control:
             return self.state()
 
     def state(self) -> dict[str, Any]:
-        """What the page shows: lease, nodes, gains with their ranges, digests, faults, the bridge."""
+        """State for the page: lease, nodes, gains with their ranges, digests, faults, the bridge."""
         nodes, scenario = self._link.nodes(), self._flight.scenario
-        found: dict[str, Any] = {"lease": self._lease, "nodes": nodes, "undo": len(self._undo), "targets": list(TARGETS)}
+        shown: dict[str, Any] = {"lease": self._lease, "nodes": nodes, "undo": len(self._undo), "targets": list(TARGETS)}
         if scenario is not None and "controller" in nodes and gains_of(scenario.controller):
-            found |= {"gains": self._gains(scenario), "digest": f"{self._digest:012x}", "logged": f"{self._flight.digest:012x}"}
+            shown |= {"gains": self._gains(scenario), "digest": f"{self._digest:012x}", "logged": f"{self._flight.digest:012x}"}
         if scenario is not None and "aircraft" in nodes:
             channels = scenario.aircraft.channels()
             truth = self._flight.samples.get("truth")
             axes = [] if truth is None else [name.partition(".")[2] for name in truth.names if name.startswith("gust.")]
-            found["aircraft"] = {"outputs": list(channels.outputs), "inputs": list(channels.inputs), "axes": axes}
-            found["faults"] = self._faults
+            shown["aircraft"] = {"outputs": list(channels.outputs), "inputs": list(channels.inputs), "axes": axes}
+            shown["faults"] = self._faults
         if "bridge" in nodes:
-            found["bridge"] = {"map": self._map(), "sends": self._sends()}
-        return found
+            shown["bridge"] = {"map": self._map(), "sends": self._sends()}
+        return shown
 
     def _controller(self) -> ControllerConfig:
         if self._flight.scenario is None:
@@ -253,13 +253,13 @@ class Control:
             {
                 "name": name,
                 "values": list(_as_list(self._values.get(name, base))),
-                "ranges": [_range(one) for one in _as_list(base)],
+                "ranges": [_range(value) for value in _as_list(base)],
             }
             for name, base in gains_of(scenario.controller).items()
         ]
 
     def _refresh(self, request: Mapping[str, Any]) -> str:
-        """Read the faults; at first, and where the log shows others than the known ones, also the controller's parameters."""
+        """Read the faults; at first, and where the digest in the log differs, also the controller's parameters."""
         stale = not self._digest or self._flight.digest not in {0, self._digest}  # 0 before the first tick
         scenario, nodes = self._flight.scenario, self._link.nodes()
         if scenario is not None and "controller" in nodes and stale:
@@ -274,7 +274,7 @@ class Control:
         self._digest = self._with(self._values).digest()
 
     def _with(self, values: Mapping[str, Any]) -> ControllerConfig:
-        """The controller's parameters with others. Raises ParameterError."""
+        """The controller's parameters with new values. Raises ParameterError."""
         base = self._controller()
         content = {**dict(flatten(base.model_dump(exclude_none=True))), **values}
         return type(base).validate_mapping(nest(content), "controller")
@@ -297,7 +297,7 @@ class Control:
         return refusal
 
     def _apply(self, request: Mapping[str, Any], values: Mapping[str, Any], *, undo: bool) -> str:
-        """Compare and set: refused where the parameters are not those that the page has seen."""
+        """Compare and set: refused where the parameters differ from the parameters on the page."""
         self._require_simulated()
         self._read()
         if request.get("digest") != f"{self._digest:012x}":
@@ -337,7 +337,7 @@ class Control:
             )
 
     def _activate(self, *, active: bool) -> str:
-        """Activate or deactivate the controller of a flight without a bridge, which engages and disengages with it."""
+        """Activate or deactivate the controller. With a bridge this is refused: the bridge does so with engagement."""
         if "bridge" in self._link.nodes():
             return "the bridge activates and deactivates the controller: engage or disengage it"
         return self._link.activate(active=active)
@@ -380,7 +380,7 @@ class Control:
             raise RefusedError(HTTPStatus.BAD_REQUEST, f"points: expected 2 to {MAX_WAYPOINTS} of north, east, altitude")
         if any(not isinstance(point, list) or len(point) != len(("north", "east", "altitude")) for point in points):
             raise RefusedError(HTTPStatus.BAD_REQUEST, "points: expected north, east and altitude of each")
-        return self._link.send_route([[_number("points", one) for one in point] for point in points])
+        return self._link.send_route([[_number("points", coordinate) for coordinate in point] for point in points])
 
     def _engage(self, request: Mapping[str, Any]) -> str:
         if request.get("map") != (name := self._map()):
@@ -391,15 +391,15 @@ class Control:
 
 
 def gains_of(controller: ControllerConfig) -> dict[str, Any]:
-    """The numeric parameters of a law that may change in flight, by name: a number, or one for each channel."""
+    """The numeric parameters of a law tunable in flight, by name: a number, or a number per channel."""
     fields = type(controller).model_fields
     own = [name for name in fields if name not in ControllerConfig.model_fields and name in controller.tunable()]
     values = {name: getattr(controller, name) for name in own}
-    return {name: value for name, value in values.items() if all(isinstance(one, float) for one in _as_list(value))}
+    return {name: value for name, value in values.items() if all(isinstance(number, float) for number in _as_list(value))}
 
 
 def _faults_of(scenario: Scenario) -> list[str]:
-    """The parameters of the aircraft that may change in flight, without the gusts."""
+    """The parameters of the aircraft tunable in flight, without the gusts."""
     return sorted(name for name in scenario.aircraft.tunable() if not name.startswith("gusts."))
 
 
@@ -416,17 +416,17 @@ def _range(value: float) -> list[float]:
 
 
 def _require_range(name: str, value: Any, base: Any) -> None:
-    for one, middle in zip(_as_list(value), _as_list(base), strict=True):
+    for number, middle in zip(_as_list(value), _as_list(base), strict=True):
         low, high = _range(middle)
-        if not low <= one <= high:
+        if not low <= number <= high:
             raise RefusedError(
                 HTTPStatus.BAD_REQUEST,
-                f"{name}: found {one:g}, expected {low:g} to {high:g}, {RANGE[0]:g} to {RANGE[1]:g} times that of the scenario",
+                f"{name}: found {number:g}, expected {low:g} to {high:g}, {RANGE[0]:g} to {RANGE[1]:g} times the scenario's",
             )
 
 
 def _like(name: str, base: Any, value: Any) -> Any:
-    """A value as a float or a list, as its parameter has it."""
+    """A value as a float or a list, by the type of the parameter."""
     values, expected = _as_list(_numbers(name, value)), len(_as_list(base))
     if len(values) != expected:
         raise RefusedError(HTTPStatus.BAD_REQUEST, f"{name}: found {len(values)} values, expected {expected}")
@@ -434,10 +434,10 @@ def _like(name: str, base: Any, value: Any) -> Any:
 
 
 def _mapping(request: Mapping[str, Any], key: str) -> dict[str, Any]:
-    found = request.get(key)
-    if not isinstance(found, dict) or not found:
+    values = request.get(key)
+    if not isinstance(values, dict) or not values:
         raise RefusedError(HTTPStatus.BAD_REQUEST, f"{key}: expected values by name")
-    return found
+    return values
 
 
 def _number(name: str, value: Any) -> float:
@@ -451,7 +451,7 @@ def _number(name: str, value: Any) -> float:
 
 
 def _numbers(name: str, value: Any) -> Any:
-    """A number, or a list of them; null in a list stands for never, infinity."""
+    """A number, or a list of numbers; null in a list stands for never, infinity."""
     if not isinstance(value, list):
         return _number(name, value)
-    return [math.inf if one is None else _number(name, one) for one in value]
+    return [math.inf if number is None else _number(name, number) for number in value]

@@ -74,11 +74,11 @@ class _Topic:
     decode: Decoder
     messages: list[bytes] = field(default_factory=list)  # not decoded yet
     names: tuple[str, ...] = ()  # of all channels
-    columns: NDArray[np.intp] | None = None  # those of the kept channels
+    columns: NDArray[np.intp] | None = None  # of the kept channels
 
 
 class Flight:
-    """A flight in its log. `update` reads what was written meanwhile."""
+    """A flight in a log. `update` reads new messages."""
 
     def __init__(self, run: Path, now: Callable[[], float] = time.monotonic) -> None:
         self.run = run
@@ -86,15 +86,15 @@ class Flight:
         self.samples: dict[str, Series] = {}  # by topic
         self.events: list[Event] = []
         modes = {"": Mode, "mode": guidance.Mode, "mode.lateral": guidance.Lateral, "mode.vertical": guidance.Vertical}
-        # What a page shows beside the samples, ready for JSON: the names of modes; what `_described` has once it is read.
+        # What a page shows beside the samples, ready for JSON: the names of modes; `_described` once the scenario is read.
         self.description: dict[str, Any] = {
             "name": self.name,
             "modes": {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind in modes.items()},
         }
         self.notes: list[str] = []
         self.described = 0  # counts the changes of `description`
-        self.scenario: Scenario | None = None  # once it is read
-        self.digest = 0  # of the controller's parameters in the newest tick; exact, as float32 it would not be
+        self.scenario: Scenario | None = None  # once read
+        self.digest = 0  # of the controller's parameters in the newest tick; exact, unlike float32
         self.bands: dict[str, float] = {}  # half-widths of the settling bands, SI
         self._follower = Follower(run, self._rate_of)
         self._topics: dict[str, _Topic] = {}  # by full name
@@ -105,15 +105,15 @@ class Flight:
         self._reference_ns: int | None = None  # of the first y_m
         self._first_ns: int | None = None
         self._mode = -1
-        self._banded = 0  # rows of internals that the bands are of
+        self._banded = 0  # rows of internals behind the bands
         self._now = now
         self._changed = now()
         self._behind = False  # there is more to read at once
 
     @property
     def start_ns(self) -> int:
-        """Stamp of flight time 0: by `truth`, else the first y_m, since commands count from it; else the earliest stamp."""
-        return next((one for one in (self._start_ns, self._reference_ns, self._first_ns) if one is not None), 0)
+        """Stamp of flight time 0: by `truth`, else the first y_m, the origin of commands; else the earliest stamp."""
+        return next((stamp for stamp in (self._start_ns, self._reference_ns, self._first_ns) if stamp is not None), 0)
 
     @property
     def end(self) -> float:
@@ -154,10 +154,10 @@ class Flight:
 
         Raises ParameterError where the log cannot be read, or for a folder with several bags.
         """
-        deadline, found, self._behind = time.monotonic() + budget, False, False
+        deadline, news, self._behind = time.monotonic() + budget, False, False
         try:
             for record in self._follower.read():
-                found = True
+                news = True
                 if isinstance(record, Messages):
                     self._take(record)
                 else:
@@ -167,12 +167,12 @@ class Flight:
                     break
         except OSError as error:
             raise ParameterError(f"{self.run}: cannot be read ({error.strerror}), expected the log of a flight") from None
-        if found:
+        if news:
             for topic in self._topics.values():
                 self._decode(topic)
             self._changed = self._now()
             self._update_bands()
-        return found
+        return news
 
     def _rate_of(self, topic: str, type_name: str) -> float:
         if (topic, type_name) in ((LOG, LOG_TYPE), (PARAMETER_EVENTS, PARAMETER_EVENT)):
@@ -192,7 +192,7 @@ class Flight:
         return RATES[name]
 
     def _shows(self, namespace: str) -> bool:
-        """Whether a namespace is that of the aircraft that is shown, which may not be known yet."""
+        """Whether a namespace belongs to the aircraft on the page, or the aircraft is not known yet."""
         return self._namespace in {None, namespace}
 
     def _note(self, sentence: str) -> None:
@@ -231,7 +231,7 @@ class Flight:
             self._decode(topic)
 
     def _decode(self, topic: _Topic) -> None:
-        """The messages of a topic that have been read, together: one by one is slow."""
+        """Decode the messages read of a topic together: single messages are slow."""
         messages, topic.messages = topic.messages, []
         for decoded in map(topic.decode, tables(messages)):
             self._unreadable += decoded.unreadable
@@ -240,10 +240,10 @@ class Flight:
 
     def _take_samples(self, topic: _Topic, decoded: Samples) -> None:
         names, stamp_ns, values, _ = decoded
-        # A pose has the channels that a bridge has received so far: those with fewer than the widest one are left out.
+        # A pose has the channels that a bridge has received so far: poses with fewer than the widest pose are left out.
         if topic.name == POSE and set(names) > set(topic.names):
             topic.columns = None
-        if names != topic.names and sorted(names) == sorted(topic.names):  # of another publisher: values are matched by name
+        if names != topic.names and sorted(names) == sorted(topic.names):  # of a second publisher: values are matched by name
             names, values = topic.names, values[:, [names.index(name) for name in topic.names]]
         if topic.columns is None:
             kept = GROUPS.get(topic.name)
@@ -302,9 +302,9 @@ class Flight:
                 elif message.name.rpartition(".")[2] == CONTROL:
                     self._add_event(Event(sent_ns, CONTROL, message.msg.removeprefix(f"{CONTROL}: ")))
             elif messages.type_name == PARAMETER_EVENT:
-                # Before the first sample, nodes that start declare theirs.
+                # Before the first sample, starting nodes declare parameters.
                 new = message.new_parameters if self._first_ns is not None else []
-                changed = {one.name: parameter_value(one.value) for one in (*new, *message.changed_parameters)}
+                changed = {entry.name: parameter_value(entry.value) for entry in (*new, *message.changed_parameters)}
                 text = ", ".join(f"{name} = {value}" for name, value in changed.items())
                 namespace, _, node = message.node.rpartition("/")
                 if text and self._shows(namespace):
@@ -312,13 +312,13 @@ class Flight:
             elif messages.type_name == ROUTE_TYPE:
                 if message.header.frame_id not in ROUTE_FRAMES:
                     continue
-                places = [one.pose.position for one in message.poses]
-                self._take_route(sent_ns, [Waypoint(one.y, one.x, one.z) for one in places])
+                places = [stamped.pose.position for stamped in message.poses]
+                self._take_route(sent_ns, [Waypoint(place.y, place.x, place.z) for place in places])
             else:
                 self._add_event(Event(sent_ns, "bridge", f"{message.key} {message.value}".strip()))
 
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
-        """A route that was given in flight replaces the one before, unless guidance refuses it."""
+        """A route received in flight replaces the route before, unless guidance refuses the new route."""
         guided = None if self.scenario is None else self.scenario.guidance
         if guided is None or not self._takes_routes:
             return
@@ -371,7 +371,7 @@ def _described(scenario: Scenario) -> dict[str, Any]:
         "duration": scenario.flight.duration,
         "units": {name: unit._asdict() for name, unit in display_units(scenario).items()},
         "positive": scenario.aircraft.channels().positive,
-        "limits": {name: [one if math.isfinite(one) else None for one in pair] for name, *pair in bounds},
+        "limits": {name: [bound if math.isfinite(bound) else None for bound in pair] for name, *pair in bounds},
         "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
         "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],
         "route": route_outline(guided.plan(waypoints)) if guided is not None and waypoints else [],

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Serves a flight that is recorded to viewers of the Foxglove protocol: Foxglove, Lichtblick, PlotJuggler. From its log, too.
+"""Serves a flight in progress to viewers of the Foxglove protocol: Foxglove, Lichtblick, PlotJuggler.
 
-The messages are those of the log, byte for byte, from the connection on. A viewer can send nothing.
+The messages are copies from the log, byte for byte, from the connection on. A viewer can send nothing.
 """
 
 import math
@@ -22,7 +22,7 @@ BACKLOG = 4096  # messages that wait for a slow viewer; the oldest is dropped
 
 
 def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
-    """Serve a run until its recording ends, SIGINT or SIGTERM. `announce` gets a line for the user.
+    """Serve a run until the end of the recording, SIGINT or SIGTERM. `announce` gets a line for the user.
 
     Raises ParameterError where the port is taken, or the recording has ended before.
     """
@@ -31,7 +31,7 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
         signal.signal(number, lambda *_: ended.set())
     follower = Follower(run, lambda topic, type_name: math.inf)
     before = {
-        one.topic: one._replace(data=[]) for one in follower.read() if isinstance(one, Messages)
+        record.topic: record._replace(data=[]) for record in follower.read() if isinstance(record, Messages)
     }  # what defines a channel
     require(
         not follower.complete,
@@ -52,9 +52,9 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
         for first in before.values():
             _channel(first, follower, channels, context)
         while not ended.wait(POLL_PERIOD) and not follower.complete and not follower.fault:
-            for one in follower.read():
-                if (channel := _channel(one, follower, channels, context)) is not None and isinstance(one, Messages):
-                    for sent_ns, data in zip(one.sent_ns, one.data, strict=True):
+            for record in follower.read():
+                if (channel := _channel(record, follower, channels, context)) is not None and isinstance(record, Messages):
+                    for sent_ns, data in zip(record.sent_ns, record.data, strict=True):
                         channel.log(data, log_time=sent_ns)
     finally:
         server.stop()
@@ -62,13 +62,13 @@ def serve(run: Path, port: int, announce: Callable[[str], None]) -> None:
 
 
 def _channel(
-    one: object, follower: Follower, channels: dict[str, foxglove.Channel], context: foxglove.Context
+    record: object, follower: Follower, channels: dict[str, foxglove.Channel], context: foxglove.Context
 ) -> foxglove.Channel | None:
-    """The channel of messages, which is advertised with the first ones."""
-    if not isinstance(one, Messages):
+    """The channel of a topic, advertised with the first messages; None for a record without messages."""
+    if not isinstance(record, Messages):
         return None
-    if one.topic not in channels:
-        definition = follower.definitions.get(one.type_name, "").encode()
-        schema = foxglove.Schema(name=one.type_name, encoding="ros2msg", data=definition)
-        channels[one.topic] = foxglove.Channel(one.topic, schema=schema, message_encoding="cdr", context=context)
-    return channels[one.topic]
+    if record.topic not in channels:
+        definition = follower.definitions.get(record.type_name, "").encode()
+        schema = foxglove.Schema(name=record.type_name, encoding="ros2msg", data=definition)
+        channels[record.topic] = foxglove.Channel(record.topic, schema=schema, message_encoding="cdr", context=context)
+    return channels[record.topic]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The samples of one topic in bounded memory: a long flight becomes coarser, and keeps its peaks."""
+"""The samples of a topic in bounded memory: a long flight becomes coarser, and keeps the peaks."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ MAX_ROWS = 100_000
 """Rows of a topic. 30 channels then need 12 MB; 100 Hz last 17 min before the samples become coarser, 50 Hz 33 min."""
 
 DISORDER_NS = 1_000_000_000
-"""A controller that recovers from an overrun has ticks a few ms older than the one before."""
+"""A controller that recovers from an overrun has ticks a few ms older than the tick before."""
 
 FIRST_ROWS = 4096
 BLOCK = 4096  # rows that are thinned together; whole groups of four
@@ -40,7 +40,7 @@ class Series:
         return self._values[: self.count]
 
     def append(self, stamp_ns: NDArray[np.int64], values: FloatArray) -> None:
-        """Append rows. A row up to DISORDER_NS older than one before it takes that one's stamp; an older one is refused."""
+        """Append rows. A row up to DISORDER_NS older than an earlier row takes the newer stamp; an older row is refused."""
         earliest = self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min + DISORDER_NS
         ordered = np.maximum.accumulate(np.concatenate([[earliest], stamp_ns]))[1:]
         kept = stamp_ns >= ordered - DISORDER_NS
@@ -64,7 +64,7 @@ class Series:
         self.count = end
 
     def _thin(self) -> None:
-        """Replace each four rows by two, the minima and the maxima of each channel: a plot keeps its peaks."""
+        """Replace groups of four rows by two, the minima and the maxima per channel: a plot keeps the peaks."""
         whole, k = self.count - self.count % 4, len(self.names)
         for start in range(0, whole, BLOCK):  # in place: temporary arrays of all rows would stay in the heap of the process
             groups = self._values[start : min(start + BLOCK, whole)].reshape(-1, 4, k)

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Serves the page and the samples of one or two flights to browsers on this host, over HTTP.
 
-A browser asks for what is new, and draws the answer before it asks again: nothing queues for a slow one. After the first
-answer it asks by a WebSocket, where a request takes two fifths of the processor time of one by HTTP. Only GET is answered,
-for a fixed list of names. The Host header has to name this host, against DNS rebinding. The token of the address is kept in a
-cookie, against other users of this host. A WebSocket has to come from the page itself. With `Control` there is one POST,
-which takes a second key and the origin of the page.
+A browser asks for news, and draws the answer before the next request: nothing queues for a slow browser. After the first
+answer the browser asks by a WebSocket, with two fifths of the processor time of an HTTP request. Only GET is answered, for a
+fixed list of names. The Host header has to name this host, against DNS rebinding. The token of the address is kept in a
+cookie, against foreign users of this host. A WebSocket has to come from the page. With `Control` there is a single POST, with
+a second key and the origin of the page.
 """
 
 import asyncio
@@ -50,19 +50,19 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 MAX_CONNECTIONS = 64  # a browser holds up to six
-REQUEST_TIMEOUT = 10.0  # s, for a request to arrive in full, and for the next one to begin
+REQUEST_TIMEOUT = 10.0  # s, for a request to arrive in full, and for the next request to begin
 MAX_REQUEST_BYTES = 8192
-MAX_WAIT = 2.0  # s that a request for samples waits for new ones
+MAX_WAIT = 2.0  # s that a request for samples waits for new samples
 MAX_ROWS = 10_000  # of a topic in one answer
 MAX_DIGITS = 18  # of a number of rows: below 2^63
 POLICY_VIOLATION = 1008  # status of a closed WebSocket, RFC 6455, 7.4.1
-REST, POLL_PERIOD = 0.09, 0.03  # s, after a chunk and until the next: the recorder closes one each 0.1 s
+REST, POLL_PERIOD = 0.09, 0.03  # s, after a chunk and until the next: the recorder closes a chunk each 0.1 s
 STATE_PERIOD = 0.25  # s, between two looks at the state of the recording
 BUDGET = 0.05  # s of reading between two answers
 
 
 class Server:
-    """The server of one or two flights, and the task that follows their logs."""
+    """The server of one or two flights, and the task to follow the logs."""
 
     def __init__(self, flights: Sequence[Flight], token: str, control: Control | None = None) -> None:
         self.flights = flights
@@ -87,7 +87,7 @@ class Server:
         )
 
     def listen(self, port: int) -> None:
-        """Listen on this host alone; port 0 takes any free one. Raises OSError where the port is taken."""
+        """Listen on this host alone; port 0 takes any free port. Raises OSError where the port is taken."""
         listener = socket.create_server((ADDRESS, port), backlog=MAX_CONNECTIONS)
         listener.setblocking(False)
         self.port = listener.getsockname()[1]
@@ -108,19 +108,19 @@ class Server:
         """Read the logs, and answer the WebSockets, until cancelled. Raises as `Flight.update` does."""
         looked = -math.inf
         while True:
-            found, rest = [flight.update(BUDGET) for flight in self.flights], POLL_PERIOD
-            if any(found):
+            changed, rest = [flight.update(BUDGET) for flight in self.flights], POLL_PERIOD
+            if any(changed):
                 self._news.set()
                 self._news.clear()
                 rest = 0.0 if any(flight.state() == "reading" for flight in self.flights) else REST
-            if any(found) or time.monotonic() > looked + STATE_PERIOD:
+            if any(changed) or time.monotonic() > looked + STATE_PERIOD:
                 looked = time.monotonic()
                 for stream in [*self.streams]:
                     stream.look()
             await asyncio.sleep(rest)
 
     async def news(self, flight: Flight, known: Mapping[str, str]) -> bytes:
-        """The answer to a browser that knows so many rows of each topic; waits up to MAX_WAIT s for something new."""
+        """The answer to a browser with the `known` numbers of rows by topic; waits up to MAX_WAIT s for news."""
         deadline = time.monotonic() + MAX_WAIT
         while not has_news(flight, known) and (rest := deadline - time.monotonic()) > 0.0:
             with suppress(TimeoutError):
@@ -128,17 +128,17 @@ class Server:
         return self.answer(flight, known)
 
     def answer(self, flight: Flight, known: Mapping[str, str]) -> bytes:
-        """The answer to a browser that knows so many rows of each topic. Raises HTTPError for a number that is too long."""
+        """The answer to a browser with the `known` numbers of rows by topic. Raises HTTPError for too long a number."""
         return answer(flight, known, ghost=len(self.flights) > 1, control=self.control is not None)
 
 
 def _epoch(flight: Flight) -> str:
-    """Changes when rows that a browser knows have changed: by thinning, or with the instant of flight time 0."""
+    """Changes when rows known to a browser have changed: by thinning, or with the instant of flight time 0."""
     return f"{flight.start_ns}.{sum(samples.thinned for samples in flight.samples.values())}"
 
 
 def _first_rows(flight: Flight, known: Mapping[str, str]) -> dict[str, int]:
-    """The first row of each topic that a browser does not know. Raises HTTPError for a number that is too long."""
+    """The first row unknown to a browser, by topic. Raises HTTPError for too long a number."""
     same = known.get("epoch") == _epoch(flight)
     rows = {name: known.get(name, "") if same else "" for name in (*flight.samples, "events")}
     if any(len(text) > MAX_DIGITS for text in rows.values()):
@@ -158,10 +158,10 @@ def has_news(flight: Flight, known: Mapping[str, str]) -> bool:
 
 
 def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False, control: bool = False) -> bytes:
-    """What a browser lacks: the length of a head as uint32, the head as JSON, then columns for each topic of it.
+    """Data unknown to a browser: the length of a head as uint32, the head as JSON, then columns per topic of the head.
 
     Little endian; the head ends at a multiple of 8 bytes. Columns of a topic with `count` rows: flight time in s as float64,
-    then each channel as float32, filled up to a multiple of 8 bytes. At most MAX_ROWS rows of a topic.
+    then the channels as float32, filled up to a multiple of 8 bytes. At most MAX_ROWS rows of a topic.
     """
     first = _first_rows(flight, known)
     topics, columns = [], []
@@ -172,7 +172,9 @@ def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False, con
             topics.append({"name": name, "channels": samples.names, "first": rows.start, "count": len(t)})
             values = np.ascontiguousarray(samples.values[rows].T, dtype="<f4").tobytes()
             columns += [t.astype("<f8").tobytes(), values, bytes(-len(values) % 8)]
-    events = [[(one.stamp_ns - flight.start_ns) / NANOSECONDS, one.kind, one.text] for one in flight.events[first["events"] :]]
+    events = [
+        [(event.stamp_ns - flight.start_ns) / NANOSECONDS, event.kind, event.text] for event in flight.events[first["events"] :]
+    ]
     head: dict[str, Any] = {
         "epoch": _epoch(flight),
         "state": flight.state(),
@@ -212,7 +214,7 @@ class _LimitedServer(HTTPServer):
 
 
 class _Handler(RequestHandler):
-    """Checks each request: its Host header, its token. By itself it answers that there is nothing of that name."""
+    """Checks the Host header and the token of a request. Answers 404, not found, where no subclass answers."""
 
     @property
     def server(self) -> Server:
@@ -235,7 +237,7 @@ class _Handler(RequestHandler):
             raise HTTPError(HTTPStatus.UNAUTHORIZED, reason="Open the whole address that rise-di watch printed")
 
     def require_page(self) -> None:
-        """Refuse a request that the page itself has not made."""
+        """Refuse a request from a foreign page."""
         if self.request.headers.get_list("Origin") != [f"http://{self.request.host}"]:
             raise HTTPError(HTTPStatus.FORBIDDEN, reason="A request of another page")
 
@@ -247,7 +249,7 @@ class _Handler(RequestHandler):
         self.finish(f"{status_code}: {self._reason}\n")
 
     def compute_etag(self) -> None:
-        """No hash of each answer: nothing is to be kept."""
+        """No hash of an answer: nothing is to be kept."""
 
     def log_exception(self, *args: Any) -> None:
         if not isinstance(args[1], HTTPError):
@@ -255,7 +257,7 @@ class _Handler(RequestHandler):
 
 
 class _File(_Handler):
-    """The page and its files."""
+    """The page and the files of the page."""
 
     def get(self, *names: str) -> None:
         if self.get_query_argument("token", None) is not None:
@@ -270,7 +272,7 @@ class _File(_Handler):
 
 
 class _Data(_Handler):
-    """The samples of a flight; the query holds how many rows of each topic the browser knows."""
+    """The samples of a flight; the query holds the numbers of rows known to the browser, by topic."""
 
     async def get(self, *names: str) -> None:
         number = int(names[0])
@@ -284,7 +286,7 @@ class _Data(_Handler):
 
 
 class _News(_Handler, WebSocketHandler):
-    """The samples of a flight, again and again: each message is the query of a request for `_Data`, and gets its answer."""
+    """The samples of a flight, again and again: a message holds a query as for `_Data` and gets the same answer."""
 
     def prepare(self) -> None:
         super().prepare()
@@ -314,7 +316,7 @@ class _News(_Handler, WebSocketHandler):
         return self._answered  # before it is done, the next message is not read
 
     def look(self) -> None:
-        """Answer the request where there is news, or it has waited for so long. Close where there has been none for so long."""
+        """Answer the request on news or after MAX_WAIT. Close after REQUEST_TIMEOUT without a request."""
         waited = time.monotonic() - self._since
         if self._known is None:
             if waited > REQUEST_TIMEOUT:
@@ -331,7 +333,7 @@ class _News(_Handler, WebSocketHandler):
         self._sending = asyncio.ensure_future(self._send(content))
 
     async def _send(self, content: bytes) -> None:
-        with suppress(WebSocketClosedError):  # the browser has left, or it is closed
+        with suppress(WebSocketClosedError):  # the browser has left, or the stream is closed
             await self.write_message(content, binary=True)
         self._answered.set_result(None)
 
@@ -340,7 +342,7 @@ class _News(_Handler, WebSocketHandler):
 
 
 class _Control(_Handler):
-    """Requests of a page that commands the flight: JSON, from the page's own origin, with the key that a user has typed."""
+    """Requests of a page to command the flight: JSON, from the page's own origin, with the key typed by the user."""
 
     def get(self, *_: str) -> None:
         raise HTTPError(HTTPStatus.METHOD_NOT_ALLOWED)
@@ -354,7 +356,7 @@ class _Control(_Handler):
         except (ValueError, RecursionError):
             raise HTTPError(HTTPStatus.BAD_REQUEST, reason="Not JSON") from None
         headers = self.request.headers
-        assert self.server.control is not None  # noqa: S101 - the route exists with it alone
+        assert self.server.control is not None  # noqa: S101 - the route exists with control alone
         try:
             result = await self.server.control.answer(
                 request, headers.get("X-Control-Key", ""), headers.get("X-Control-Lease", "")

@@ -17,13 +17,13 @@ from flight_view.flight import Flight
 from rise_di_controller.internals import Saturation
 
 REFRESH = 10.0  # Hz
-EVENTS = 6  # the last ones
-SATURATED = {float(one): one.name.lower() for one in (Saturation.MAGNITUDE, Saturation.RATE)}
+EVENTS = 6  # the last events
+SATURATED = {float(kind): kind.name.lower() for kind in (Saturation.MAGNITUDE, Saturation.RATE)}
 STYLES = {"recording": "bold green", "no data": "bold red", "interrupted": "bold yellow", "waiting": "yellow"}
 
 
 def show(flight: Flight) -> None:
-    """Show a flight until its recording has ended, or Ctrl-C. Raises as `Flight.update`."""
+    """Show a flight until the end of the recording, or Ctrl-C. Raises as `Flight.update`."""
     with Live(picture(flight), refresh_per_second=REFRESH, transient=False) as live:
         while True:
             flight.update()
@@ -34,7 +34,7 @@ def show(flight: Flight) -> None:
 
 
 def picture(flight: Flight) -> RenderableType:
-    """All that is shown of a flight, at its newest samples."""
+    """Text of a flight at the newest samples."""
     mode = flight.description["modes"][""].get(f"{_newest(flight, 'internals', 'mode'):.0f}", "")
     head = Text.assemble(
         (flight.name, "bold"),
@@ -46,7 +46,9 @@ def picture(flight: Flight) -> RenderableType:
     if "pose" in flight.samples:
         parts.append(Text(_attitude(flight)))
     start_ns = flight.start_ns
-    lines = [f"{(one.stamp_ns - start_ns) / NANOSECONDS:8.2f} s  {one.kind}: {one.text}" for one in flight.events[-EVENTS:]]
+    lines = [
+        f"{(event.stamp_ns - start_ns) / NANOSECONDS:8.2f} s  {event.kind}: {event.text}" for event in flight.events[-EVENTS:]
+    ]
     parts += [Text(line, style="dim") for line in lines]
     return Group(*parts, *(Text(f"note: {sentence}", style="yellow") for sentence in flight.faults()))
 
@@ -100,7 +102,7 @@ def _unit(flight: Flight, name: str) -> tuple[str, float]:
 
 
 def _newest(flight: Flight, topic: str, channel: str) -> float:
-    """The newest value of a channel; NaN without one."""
+    """The newest value of a channel; NaN where absent."""
     samples = flight.samples.get(topic)
     if samples is None or not samples.count or channel not in samples.names:
         return math.nan

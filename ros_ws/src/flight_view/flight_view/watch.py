@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the run to watch and serves it until SIGINT or SIGTERM."""
+"""Finds the run to watch and serves the run until SIGINT or SIGTERM."""
 
 import asyncio
 import os
@@ -23,8 +23,8 @@ DEFAULT_PORT = 8077
 
 
 def newest_run(runs: Path) -> Path:
-    """The newest run that is being recorded, else the last one that was flown. Raises ParameterError without either."""
-    folders = sorted((one for one in runs.iterdir() if is_folder(one)), reverse=True) if is_folder(runs) else []
+    """The newest run in recording, else the last run flown. Raises ParameterError without a run."""
+    folders = sorted((folder for folder in runs.iterdir() if is_folder(folder)), reverse=True) if is_folder(runs) else []
     for folder in folders:
         with suppress(ParameterError, OSError):
             if any(is_locked(file) for file in bag_files(folder)):
@@ -45,11 +45,11 @@ def serve(
     announce: Callable[[str], None],
     control: Callable[[Flight], Control] | None = None,
 ) -> None:
-    """Serve a run, and a second one as its ghost, on the first free port, until SIGINT or SIGTERM.
+    """Serve a run, and a second run as a ghost, on the first free port, until SIGINT or SIGTERM.
 
     `announce` gets two lines for the user. `control` lets the page command the first flight.
 
-    Raises ParameterError where all ports are taken, or a log cannot be read.
+    Raises ParameterError where no port is free, or a log is unreadable.
     """
     asyncio.run(_serve(runs, ports, announce, control))
 
