@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The wheel, built and installed beside strangers, flies, reports and replays."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tests.conftest import REPOSITORY
+from tests.ros.peer import HANG
+
+PACKAGES = sorted(path.parent.name for path in (REPOSITORY / "ros_ws" / "src").glob("*/package.xml"))
+DECOY = "raise RuntimeError(f'{__name__} of a stranger')\n"
+
+Run = Callable[..., str]
+
+
+def write_package(folder: Path, name: str) -> None:
+    """A package that cannot be imported, and the metadata of an installation of it."""
+    for path, text in {
+        f"{name}/__init__.py": DECOY,
+        f"{name}-9.9.dist-info/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: 9.9\n",
+    }.items():
+        (folder / path).parent.mkdir(parents=True)
+        (folder / path).write_text(text, encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that holds the installed wheel, and a stranger named as the package guidance of PyPI."""
+    built, target = tmp_path_factory.mktemp("built"), tmp_path_factory.mktemp("installed")
+    build = (sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(built))
+    subprocess.run(build, cwd=REPOSITORY, check=True, capture_output=True, timeout=HANG)
+    (wheel,) = built.glob("*.whl")
+    options = ("--quiet", "--no-index", "--no-deps", "--target", str(target))
+    subprocess.run((sys.executable, "-m", "pip", "install", *options, str(wheel)), check=True, timeout=HANG)
+    write_package(target, "guidance")
+    return target
+
+
+@pytest.fixture
+def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs Python with the wheel. Strangers of all names are in the working folder and behind the wheel on the path."""
+    behind, working = tmp_path / "behind", tmp_path / "working"
+    for name in PACKAGES:
+        write_package(behind, name)
+        write_package(working, name)
+    monkeypatch.setenv("PYTHONPATH", f"{installed}{os.pathsep}{behind}")
+
+    def run_python(*arguments: str) -> str:
+        command = [sys.executable, *arguments]
+        done = subprocess.run(command, cwd=working, capture_output=True, text=True, timeout=HANG, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    return run_python
+
+
+def test_every_package_comes_from_the_wheel(installed: Path, run: Run) -> None:
+    code = f"import importlib\nfor name in {PACKAGES}: print(importlib.import_module(name).__file__)"
+    assert run("-P", "-c", code).split() == [str(installed / name / "__init__.py") for name in PACKAGES]
+    assert [path.name for path in (installed / "bin").iterdir()] == ["rise-di"]
+
+
+@pytest.mark.parametrize("options", [["--in-process"], ["--lockstep"]], ids=" ".join)
+def test_the_wheel_flies_beside_strangers(options: list[str], installed: Path, run: Run) -> None:
+    """In one process, and as four processes over DDS; the replay is equal to the bit."""
+    rise_di = str(installed / "bin" / "rise-di")
+    assert "outcome: completed" in run(rise_di, "fly", "osprey_gust", "--duration", "2", *options)
+    assert "outcome: completed" in run(rise_di, "report", "runs/latest")
+    assert run(rise_di, "replay", "runs/latest") == "201 ticks, every bit equal\n"
